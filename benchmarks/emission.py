@@ -12,9 +12,9 @@ asserted: machines differ.
 import sys
 import time
 
-from harness.names import parse
-from harness.verify.measure import memory_mib
-from problems import PROBLEMS
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.measure import memory_mib
+from mortarbench.problems import PROBLEMS
 
 CASE = "beam-ring/Nr=224/Nh=128/steps=1/feti=16/dual"
 TOL = 1e-6
@@ -23,7 +23,9 @@ TOL = 1e-6
 def whole(name: str = CASE) -> None:
     """Build the case in this process."""
     import mortarbench as mb
-    from problems.models import beam_ring  # its imports are none of the case's memory
+    from mortarbench.problems.models import (
+        beam_ring,  # its imports are none of the case's memory
+    )
 
     del beam_ring
     before, start = memory_mib("VmHWM"), time.perf_counter()
@@ -37,11 +39,11 @@ def emitted(name: str = CASE) -> None:
     """Emit, prepare and solve on all ranks."""
     from mpi4py import MPI
 
-    from harness.distributed.vectors import Ranks
-    from problems.feti import emission
-    from problems.models import beam_ring, membranes, patch, plate
-    from solvers.reference.over_ranks import reference_over_ranks
-    from solvers.smalbe.solver import SMALBE
+    from mortarbench.harness.distributed.vectors import Ranks
+    from mortarbench.problems.feti import emission
+    from mortarbench.problems.models import beam_ring, membranes, patch, plate
+    from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+    from mortarbench.solvers.smalbe.solver import SMALBE
 
     del emission, beam_ring, membranes, patch, plate
     ranks, case = Ranks(MPI.COMM_WORLD), parse(name, PROBLEMS)

@@ -27,19 +27,19 @@ from time import perf_counter, process_time
 import numpy as np
 from scipy.stats import linregress, t
 
-from harness import Mechanics, certify, no_rows
-from problems.contact.bodies import clamped, floating
-from problems.contact.node_to_segment import node_to_segment
-from problems.duality.dualisation import dualise
-from problems.duality.stepping import primal_qp
-from problems.duality.torn_dual import torn_dual
-from problems.feti.elastic import torn
-from problems.feti.operators import dual_operator
-from problems.feti.spectrum import spectra_of_equations
-from problems.feti.substructures import LocalProblems
-from problems.models.beam_ring import model, subdivided
-from solvers.baselines.feti import FETI
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import Mechanics, certify, no_rows
+from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.torn_dual import torn_dual
+from mortarbench.problems.feti.elastic import torn
+from mortarbench.problems.feti.operators import dual_operator
+from mortarbench.problems.feti.spectrum import spectra_of_equations
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.models.beam_ring import model, subdivided
+from mortarbench.solvers.baselines.feti import FETI
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = {"feti": 1e-7, "whole": 1e-8}  #: with which errors are certified to 1e-6
 REDUCTION = 1e-6

@@ -19,8 +19,8 @@ from statistics import median
 from mpi4py import MPI
 
 import mortarbench as mb
-from harness.distributed.vectors import Ranks
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 CASE = "beam-ring/Nr=224/Nh=128/steps=1/feti=32/dual"
 TOL = 1e-6

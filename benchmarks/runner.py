@@ -17,14 +17,14 @@ from pathlib import Path
 from statistics import median, quantiles
 from time import perf_counter
 
-from harness.names import assemble
-from harness.registry import SolverSpec, load_plugin, resolve
-from harness.results.journal import read_journal
-from harness.results.work_unit import Commands
-from harness.running.pairs import paired_ratio
-from harness.running.run import run
-from harness.suite.suite import NULL, Suite
-from harness.verify.measure import SAMPLE_SECONDS, memory_mib
+from mortarbench.harness.names import assemble
+from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.work_unit import Commands
+from mortarbench.harness.running.pairs import paired_ratio
+from mortarbench.harness.running.run import run
+from mortarbench.harness.suite.suite import NULL, Suite
+from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
 ATTACKERS = PLUGIN.with_name("attackers.py")

@@ -15,12 +15,12 @@ from time import perf_counter
 import numpy as np
 from scipy.stats import linregress, t
 
-from problems.contact.bodies import clamped, floating
-from problems.contact.node_to_segment import node_to_segment
-from problems.duality.dualisation import dual_bounds, dualise
-from problems.duality.stepping import primal_qp
-from problems.models.beam_ring import model
-from solvers.smalbe.solver import SMALBE
+from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
 

@@ -28,14 +28,14 @@ import numpy as np
 from scipy.linalg.blas import dsymv
 
 import mortarbench as mb
-from harness import QP, InputError, Solution, kkt_residuals
-from harness.errors import unknown
-from harness.plugin import Solver
-from harness.record import VERIFIED_FACTOR
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.compiled import Product
+from mortarbench.harness import QP, InputError, Solution, kkt_residuals
+from mortarbench.harness.errors import unknown
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.compiled import Product
 
 DUALS = {
     "dual": [(12, 6, 5), (12, 7, 5), (24, 12, 10), (30, 15, 10), (60, 30, 5)],

@@ -27,7 +27,7 @@ TIMES = """() => new Promise((done) =>
 
 def read(folder):
     """Read the journal of a folder in this process."""
-    from harness.results.journal import read_journal
+    from mortarbench.harness.results.journal import read_journal
 
     start = process_time()
     records = read_journal(Path(folder))
@@ -37,7 +37,7 @@ def read(folder):
 
 def measure(folder):
     """Write the report of a folder in this process."""
-    from reports import write_report
+    from mortarbench.reports import write_report
 
     start = process_time()
     write_report(Path(folder), FORMATS)

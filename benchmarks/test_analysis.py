@@ -14,12 +14,12 @@ import pytest
 from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
-from problems.contact.bodies import clamped, floating
-from problems.contact.node_to_segment import node_to_segment
-from problems.duality.dualisation import dual_bounds, dualise
-from problems.duality.stepping import LoadPath
-from problems.models.beam_ring import model
-from solvers.smalbe.solver import SMALBE
+from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
 TIP = [0.04101815, -0.29791196]  #: m, see tests/problems/families/test_beam_ring.py

@@ -8,9 +8,14 @@ import pytest
 from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from problems.fem.elasticity import Material, elasticity_matrix, sparsity, stiffness
-from problems.fem.mesh import rectangle
-from problems.fem.triplets import stiffness_by_triplets
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    sparsity,
+    stiffness,
+)
+from mortarbench.problems.fem.mesh import rectangle
+from mortarbench.problems.fem.triplets import stiffness_by_triplets
 
 STEEL = Material(E=200e9, nu=0.3)
 D = elasticity_matrix(STEEL, "strain")

@@ -5,11 +5,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from problems.contact.mortar import mortar
-from problems.contact.node_to_segment import node_to_segment
-from problems.contact.polyline import polyline
-from problems.contact.segment_search import nearest
-from problems.models.beam_ring import model
+from mortarbench.problems.contact.mortar import mortar
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.polyline import polyline
+from mortarbench.problems.contact.segment_search import nearest
+from mortarbench.problems.models.beam_ring import model
 
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from problems.contact.bodies import floating
-from problems.duality.dualisation import dualise
-from problems.families.beam_ring import BeamRing
-from problems.models.beam_ring import model
-from solvers.reference.solve import reference_solution
+from mortarbench.problems.contact.bodies import floating
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 @pytest.fixture(scope="module")

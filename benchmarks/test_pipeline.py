@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from problems.contact.bodies import clamped, floating
-from problems.contact.node_to_segment import node_to_segment
-from problems.duality.dualisation import dualise
-from problems.families.beam_ring import BeamRing
-from problems.fem.elasticity import elasticity_matrix, stiffness
-from problems.models.beam_ring import BEAM, model
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
+from mortarbench.problems.models.beam_ring import BEAM, model
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 SIZES = pytest.mark.parametrize(("Nr", "Nh"), [(12, 6), (30, 15)])
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from scipy.linalg.blas import dsymv
 
-from harness import Status, kkt_residuals
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.compiled import Product
+from mortarbench.harness import Status, kkt_residuals
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.compiled import Product
 from tests.support.generated_bodies import generated_case
 
 #: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError, shown, unknown
+from mortarbench.harness.errors import InputError, shown, unknown
 
 MOST_REPEATS = 1_000_000  #: of anything
 

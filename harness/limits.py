@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from harness.errors import InputError, shown
+from mortarbench.harness.errors import InputError, shown
 
 #: environment variables that keep libraries to one thread, read when they load
 ONE_THREAD = {

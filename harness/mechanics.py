@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
 
-from harness.qp import QP, Matrix, Vector, no_rows
-from harness.solution import Solution
+from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
+from mortarbench.harness.solution import Solution
 
 #: extended where the machine has it (x86: 64-bit mantissa), so that residuals near the
 #: rounding of doubles are known to some digits

@@ -19,9 +19,9 @@ from contextlib import redirect_stdout
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 
-from harness.checked import has_control
-from harness.errors import PLUGINS, InputError, shortened, shown, unknown
-from harness.plugin import Case, Family, Reference, Value
+from mortarbench.harness.checked import has_control
+from mortarbench.harness.errors import PLUGINS, InputError, shortened, shown, unknown
+from mortarbench.harness.plugin import Case, Family, Reference, Value
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")

@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from harness.distributed.vectors import Emitted, Ranks
-    from harness.mechanics import Mechanics
-    from harness.qp import QP, Vector
-    from harness.solution import Solution
+    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.harness.mechanics import Mechanics
+    from mortarbench.harness.qp import QP, Vector
+    from mortarbench.harness.solution import Solution
 
 Value = int | float | str  #: of one key of a case name
 #: the injected high-accuracy solve

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
-from harness.errors import InputError, shown
+from mortarbench.harness.errors import InputError, shown
 
 Vector = NDArray[np.float64]
 NEEDS_MATRICES = "needs explicit matrices"

@@ -12,7 +12,7 @@ from functools import cache
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any, NoReturn, Self, get_type_hints
 
-from harness.errors import shown
+from mortarbench.harness.errors import shown
 
 if TYPE_CHECKING:
     from msgspec import Struct

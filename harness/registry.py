@@ -7,32 +7,35 @@ there.
 
 A plug-in in a file is loaded as a Python package of its own, whose path is the folder
 of the file. So it may import the modules and packages beside it (its neighbours), and
-two plug-ins have neighbours of their own, even of the same names.
+two plug-ins have neighbours of their own, even of the same names: as the code is
+compiled, ``import helper`` becomes an import of the package's module ``helper``. In the
+same way ``from harness import QP`` means `mortarbench.harness`.
 """
 
 from __future__ import annotations
 
 import ast
-import builtins
 import importlib
 import importlib.util
 import os
 import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.machinery import (
     EXTENSION_SUFFIXES,
     SOURCE_SUFFIXES,
+    ExtensionFileLoader,
+    FileFinder,
     ModuleSpec,
     PathFinder,
     SourceFileLoader,
 )
 from pathlib import Path
-from types import ModuleType, NoneType, UnionType
+from types import CodeType, ModuleType, NoneType, UnionType
 from typing import (
     TYPE_CHECKING,
     Any,
@@ -44,12 +47,12 @@ from typing import (
     get_type_hints,
 )
 
-from harness.digest import hex_digest, pieces
-from harness.errors import PLUGINS, InputError, shown, unknown
-from harness.plugin import Family, Solver, as_family
+from mortarbench.harness.digest import hex_digest, pieces
+from mortarbench.harness.errors import PLUGINS, InputError, shown, unknown
+from mortarbench.harness.plugin import Family, Solver, as_family
 
 if TYPE_CHECKING:
-    from harness.operators import Maker
+    from mortarbench.harness.operators import Maker
 
 T = TypeVar("T")
 
@@ -59,9 +62,10 @@ _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
 #: that a plug-in finds where everybody does, whatever lies beside it
-_NEVER_BESIDE = sys.stdlib_module_names | {
-    "harness", "problems", "solvers", "reports", "mortarbench",
-}  # fmt: skip
+_NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
+#: subpackages of ours that plug-ins of old import without the name of the package
+_ROOMS = ("harness", "problems", "solvers", "reports")
+_BESIDE = "beside a plug-in: "  #: before a folder on the path of a plug-in's package
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -300,7 +304,7 @@ def entry_point_plugins() -> Plugin:
     for group, entries in found.items():
         for point in entry_points(group=f"mortarbench.{group}"):
             try:
-                with redirect_stdout(sys.stderr):
+                with redirect_stdout(sys.stderr), _standing_for_harness():
                     entries[point.name] = point.load()
             except Exception as e:  # somebody else's code
                 raise _import_error(f"entry point {point.value}", e) from None
@@ -433,7 +437,7 @@ def _imported(path: Path) -> ModuleType:
         name,
         whole,
         loader=_PluginLoader(name, str(whole)) if path.suffix == ".py" else None,
-        submodule_search_locations=[str(whole.parent)],
+        submodule_search_locations=[_BESIDE + str(whole.parent)],
     )
     if spec is None or spec.loader is None:
         raise InputError(f"{path}: no Python file; its name must end in .py")
@@ -450,61 +454,113 @@ def _imported(path: Path) -> ModuleType:
 
 
 def _forget(package: str) -> None:
-    """Have a package and its modules imported anew; their files may have changed."""
+    """Remove a package and its modules from memory; their files may have changed."""
     for name in [n for n in sys.modules if f"{n}.".startswith(f"{package}.")]:
         del sys.modules[name]
     importlib.invalidate_caches()
 
 
 class _PluginLoader(SourceFileLoader):
-    """Runs a module of a plug-in such that its imports find its neighbours first."""
+    """Compiles a module of a plug-in so that its imports find its neighbours first."""
 
-    def exec_module(self, module: ModuleType) -> None:
-        package, folder = _package_of(module.__name__)
-        found = partial(_import_beside, package, folder)
-        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": found}
-        super().exec_module(module)
+    def get_code(self, fullname: str) -> CodeType:
+        # not from __pycache__: the meaning of an import depends on the folder's files
+        package = fullname.partition(".")[0]
+        (entry,) = sys.modules[package].__path__
+        imports = _Imports(package, entry.removeprefix(_BESIDE))
+        tree = imports.visit(ast.parse(self.get_data(self.path), self.path))
+        code: CodeType = compile(tree, self.path, "exec", dont_inherit=True)
+        return code
 
 
-class _NeighbourFinder:
-    """Finds the modules of the packages that plug-ins are."""
+class _Imports(ast.NodeTransformer):
+    """Import statements of a plug-in, with the full names of the modules they mean."""
 
-    @staticmethod
+    def __init__(self, package: str, folder: str) -> None:
+        self._package = package
+        self._folder = folder
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> ast.AST:
+        if node.level == 0 and node.module is not None:
+            node.module = self._full(node.module)
+        return node
+
+    def visit_Import(self, node: ast.Import) -> list[ast.AST]:
+        statements = []
+        for alias in node.names:
+            full, bound = self._full(alias.name), alias.asname
+            names = [alias]
+            if full != alias.name:
+                first = alias.name.partition(".")[0]
+                names = [ast.alias(full, bound or first)]
+                if bound is None and first != alias.name:  # it binds the first part
+                    names += [ast.alias(self._full(first), first)]
+            statements += [ast.Import([name]) for name in names]
+        return [
+            ast.fix_missing_locations(ast.copy_location(statement, node))
+            for statement in statements
+        ]
+
+    def _full(self, name: str) -> str:
+        first = name.partition(".")[0]
+        if _neighbour(first, self._folder) is not None:
+            return f"{self._package}.{name}"
+        return f"mortarbench.{name}" if first in _ROOMS else name
+
+
+class _NeighbourFinder(FileFinder):
+    """Finds the modules beside a plug-in, as those of the package that it is."""
+
+    def __init__(self, folder: str) -> None:
+        super().__init__(
+            folder,
+            (ExtensionFileLoader, EXTENSION_SUFFIXES),
+            (_PluginLoader, SOURCE_SUFFIXES),
+        )
+
     def find_spec(
-        name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+        self, fullname: str, target: ModuleType | None = None
     ) -> ModuleSpec | None:
-        if not re.match(r"plugin_\w+_[0-9a-f]{12}\.", name):
-            return None
-        spec = PathFinder.find_spec(name, path, target)
-        if spec is not None and type(spec.loader) is SourceFileLoader:
-            spec.loader = _PluginLoader(spec.loader.name, spec.loader.path)
+        spec = super().find_spec(fullname, target)
+        if spec is not None and spec.submodule_search_locations is not None:
+            folders = spec.submodule_search_locations
+            spec.submodule_search_locations = [_BESIDE + folder for folder in folders]
         return spec
 
 
-sys.meta_path.insert(0, _NeighbourFinder)
+def _neighbour_finder(entry: str) -> _NeighbourFinder:
+    """Return the finder for an entry of the path of a plug-in's package."""
+    if not entry.startswith(_BESIDE):
+        raise ImportError  # an entry of somebody else's
+    return _NeighbourFinder(entry.removeprefix(_BESIDE))
 
 
-def _package_of(name: str) -> tuple[str, str]:
-    """Name the package of a module of a plug-in, and its folder."""
-    package = name.partition(".")[0]
-    return package, sys.modules[package].__path__[0]
+sys.path_hooks.append(_neighbour_finder)
 
 
-def _import_beside(
-    package: str,
-    folder: str,
-    name: str,
-    globals: Mapping[str, object] | None = None,  # noqa: A002  # as Python has it
-    locals: Mapping[str, object] | None = None,  # noqa: A002
-    fromlist: Sequence[str] | None = (),
-    level: int = 0,
-) -> ModuleType:
-    """Do what an import statement in a plug-in says."""
-    first = name.partition(".")[0]
-    if level or _neighbour(first, folder) is None:
-        return importlib.__import__(name, globals, locals, fromlist or (), level)
-    own = importlib.__import__(f"{package}.{name}", globals, locals, fromlist or (), 0)
-    return own if fromlist else sys.modules[f"{package}.{first}"]
+def stand_for_harness() -> None:
+    """Import the exported names under `harness`, as plug-ins of old name the package.
+
+    In a process of ours; elsewhere the name belongs to the user, see
+    `_standing_for_harness`.
+    """
+    exports = ModuleType("harness")  # without a path: it has no submodules
+    exports.__dict__["__getattr__"] = partial(getattr, import_module(__package__))
+    exports.__dict__["__all__"] = import_module(__package__).__all__
+    sys.modules["harness"] = exports
+
+
+@contextmanager
+def _standing_for_harness() -> Iterator[None]:
+    """Let `harness` stand for the exported names while a package is imported."""
+    before = sys.modules.get("harness")
+    stand_for_harness()
+    try:
+        yield
+    finally:
+        del sys.modules["harness"]
+        if before is not None:
+            sys.modules["harness"] = before
 
 
 def _neighbour(name: str, folder: str) -> ModuleSpec | None:

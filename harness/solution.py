@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.qp import QP, Vector
+from mortarbench.harness.qp import QP, Vector
 
 History = Mapping[str, NDArray[Any]]
 

@@ -13,101 +13,33 @@ command line is a thin caller of these functions.
 """
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from types import ModuleType
+from typing import Any
 
-if TYPE_CHECKING:
-    from harness.errors import InputError
-    from harness.plugin import Case, Family
-    from harness.qp import QP
-    from harness.record import Verdict
-    from harness.solution import Solution, Status
-    from mortarbench.answer import Answer, Multipliers, Verification, solve, verify
-    from mortarbench.case import build, export
-    from mortarbench.listing import Listing, problems, solvers, suites
-    from mortarbench.progress import Event
-    from mortarbench.replaying import Replay, replay
-    from mortarbench.reporting import Report, report
-    from mortarbench.results import Results, load, merge, run
-    from mortarbench.validation import Conformance, Validation, test_solver, validate
+from lazy_loader import attach_stub
 
-_MODULES = {
-    "Answer": "mortarbench.answer",
-    "Case": "harness.plugin",
-    "Conformance": "mortarbench.validation",
-    "Event": "mortarbench.progress",
-    "Family": "harness.plugin",
-    "InputError": "harness.errors",
-    "Listing": "mortarbench.listing",
-    "Multipliers": "mortarbench.answer",
-    "QP": "harness.qp",
-    "Replay": "mortarbench.replaying",
-    "Report": "mortarbench.reporting",
-    "Results": "mortarbench.results",
-    "Solution": "harness.solution",
-    "Status": "harness.solution",
-    "Validation": "mortarbench.validation",
-    "Verdict": "harness.record",
-    "Verification": "mortarbench.answer",
-    "build": "mortarbench.case",
-    "export": "mortarbench.case",
-    "load": "mortarbench.results",
-    "merge": "mortarbench.results",
-    "problems": "mortarbench.listing",
-    "replay": "mortarbench.replaying",
-    "report": "mortarbench.reporting",
-    "run": "mortarbench.results",
-    "solve": "mortarbench.answer",
-    "solvers": "mortarbench.listing",
-    "suites": "mortarbench.listing",
-    "test_solver": "mortarbench.validation",
-    "validate": "mortarbench.validation",
-    "verify": "mortarbench.answer",
-}
+from mortarbench import problems, solvers
 
-__all__ = [
-    "QP",
-    "Answer",
-    "Case",
-    "Conformance",
-    "Event",
-    "Family",
-    "InputError",
-    "Listing",
-    "Multipliers",
-    "Replay",
-    "Report",
-    "Results",
-    "Solution",
-    "Status",
-    "Validation",
-    "Verdict",
-    "Verification",
-    "build",
-    "export",
-    "load",
-    "merge",
-    "problems",
-    "replay",
-    "report",
-    "run",
-    "solve",
-    "solvers",
-    "suites",
-    "test_solver",
-    "validate",
-    "verify",
-]
+# imported at their first use: a help text needs neither numpy nor scipy
+_export, __dir__, __all__ = attach_stub(__name__, __file__)
 
 
 def __getattr__(name: str) -> Any:
-    """Import a name at its first use: a help text needs neither numpy nor scipy."""
     if name == "__version__":
         return import_module("importlib.metadata").version(__name__)
-    if name not in _MODULES:
+    if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(import_module(_MODULES[name]), name)
-    return value
+    return _export(name)
 
 
-def __dir__() -> list[str]:
-    return sorted(__all__)
+class _Listed(ModuleType):
+    """A package that, called, lists its contents: `solvers()`, `problems()`."""
+
+    def __call__(self, **options: Any) -> Any:
+        """Return the `Listing` of the same name in `mortarbench.listing`."""
+        function = self.__name__.rpartition(".")[2]
+        return getattr(import_module("mortarbench.listing"), function)(**options)
+
+
+for package in (problems, solvers):
+    package.__class__ = _Listed

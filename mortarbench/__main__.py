@@ -9,7 +9,7 @@ import sys
 def main() -> None:
     """Run the command line, with one thread in every library."""
     # first of all: libraries read these when they load, and once
-    from harness.limits import ONE_THREAD
+    from mortarbench.harness.limits import ONE_THREAD
 
     os.environ.update(ONE_THREAD)
     from mortarbench.cli.main import main as cli

@@ -15,26 +15,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from harness import QP, Fields, Record, Residuals, Solution, Solver, Verdict
-from harness.distributed.mpi import ranks_asked
-from harness.environment.environment import digest
-from harness.errors import InputError
-from harness.names import assemble, emitted_by_ranks
-from harness.processes.measurement import (
-    measured_once,
-    scratch_folder,
-    single_worker,
-)
-from harness.processes.solver_file import write_solver
-from harness.processes.termination import ended_by_signals
-from harness.qp import Vector, numeric_vector
-from harness.record import finite
-from harness.registry import SolverSpec, check_solver, options_of, resolve
-from harness.solution import History
-from harness.verify.kkt import allowed, kkt_residuals, verdict
-from harness.verify.multipliers import with_multipliers
-from harness.verify.optimum import decided, proves
-from harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.arguments import (
     GRIDS,
     PICTURES,
@@ -44,6 +24,26 @@ from mortarbench.arguments import (
     writable,
 )
 from mortarbench.case import Case, as_case, built_case
+from mortarbench.harness import QP, Fields, Record, Residuals, Solution, Solver, Verdict
+from mortarbench.harness.distributed.mpi import ranks_asked
+from mortarbench.harness.environment.environment import digest
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.names import assemble, emitted_by_ranks
+from mortarbench.harness.processes.measurement import (
+    measured_once,
+    scratch_folder,
+    single_worker,
+)
+from mortarbench.harness.processes.solver_file import write_solver
+from mortarbench.harness.processes.termination import ended_by_signals
+from mortarbench.harness.qp import Vector, numeric_vector
+from mortarbench.harness.record import finite
+from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
+from mortarbench.harness.solution import History
+from mortarbench.harness.verify.kkt import allowed, kkt_residuals, verdict
+from mortarbench.harness.verify.multipliers import with_multipliers
+from mortarbench.harness.verify.optimum import decided, proves
+from mortarbench.harness.verify.verdicts import has_point, new_record, plain
 from mortarbench.registries import TURN, Plugins, Registries, one_thread
 from mortarbench.text import outcome, outcome_rows
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
 
-    from harness.crossval.discretisation import Discretisation
+    from mortarbench.harness.crossval.discretisation import Discretisation
 
 LOOSE = 0.01  #: certified relative error above which a verified answer has a remark
 #: sum of the contact forces, relative to that of the loads, up to which there is no
@@ -122,7 +122,7 @@ class Answer:
 
         budget : s; a mesh that would take longer than what is left is not begun
         """
-        from harness.crossval.discretisation import discretisation_errors
+        from mortarbench.harness.crossval.discretisation import discretisation_errors
 
         with TemporaryDirectory() as folder:
             (found,) = discretisation_errors(
@@ -160,9 +160,9 @@ class Answer:
             As `fields`; when the file cannot be written, or the scale is no number.
 
         """
-        from reports.figures.deformed import deformed_figure
-        from reports.figures.tractions import traction_figure
-        from reports.render.saving import draw, save
+        from mortarbench.reports.figures.deformed import deformed_figure
+        from mortarbench.reports.figures.tractions import traction_figure
+        from mortarbench.reports.render.saving import draw, save
 
         fields = self.fields()
         drawn = None if scale is None else drawn_scale(scale)
@@ -186,7 +186,7 @@ class Answer:
             no point.
 
         """
-        from reports.export.vtu import write_series, write_vtu
+        from mortarbench.reports.export.vtu import write_series, write_vtu
 
         path, fields = writable(path, GRIDS), self.fields()
         if not len(fields.cells):
@@ -404,7 +404,7 @@ def answers_of(
 
     work = None
     if forks and ranks == 1:
-        from harness.processes.worker import serve  # late: few need it here
+        from mortarbench.harness.processes.worker import serve  # late: few need it here
 
         work = partial(serve, configured)
     with scratch_folder() as scratch:

@@ -8,8 +8,8 @@ from numbers import Real
 from pathlib import Path
 from typing import Any
 
-from harness import checked
-from harness.errors import InputError, shown, unknown
+from mortarbench.harness import checked
+from mortarbench.harness.errors import InputError, shown, unknown
 
 EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
 PICTURES = (".png", ".pdf", ".svg")

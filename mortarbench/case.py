@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import csc_array, csc_matrix
 
-from harness import QP, Fields, Matrix, Solution, plugin
-from harness.errors import InputError, shown
-from harness.names import CaseId, parse, unbuilt
-from harness.verify.verdicts import plain
 from mortarbench.arguments import EXPORTS, writable
+from mortarbench.harness import QP, Fields, Matrix, Solution, plugin
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.names import CaseId, parse, unbuilt
+from mortarbench.harness.verify.verdicts import plain
 from mortarbench.registries import TURN, Plugins, Registries, known, one_thread
 
 if TYPE_CHECKING:
-    from harness import Mechanics, Vector
+    from mortarbench.harness import Mechanics, Vector
 
 
 class Case(plugin.Case):
@@ -159,19 +159,19 @@ class Case(plugin.Case):
         )
         match path.suffix:
             case ".mat":
-                from harness.files.matfile import save_mat
+                from mortarbench.harness.files.matfile import save_mat
 
                 save_mat(path, self.qp, meta, self.made.matrices)
             case ".parquet":
-                from harness.files.parquetfile import save_parquet
+                from mortarbench.harness.files.parquetfile import save_parquet
 
                 save_parquet(path, self.qp, meta)
             case ".qps":
-                from problems.files.qps import save_qps
+                from mortarbench.problems.files.qps import save_qps
 
                 save_qps(path, self.qp, meta)
             case _:
-                from harness.files.qpfile import save_qp
+                from mortarbench.harness.files.qpfile import save_qp
 
                 save_qp(path, self.qp, meta)
         return path

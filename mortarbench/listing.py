@@ -11,12 +11,12 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from harness.names import completed
-from harness.plugin import About, Solver
-from harness.registry import options_of
+from mortarbench.harness.names import completed
+from mortarbench.harness.plugin import About, Solver
+from mortarbench.harness.registry import options_of
 from mortarbench.registries import Plugins, Registries, known
+from mortarbench.solvers import SOLVERS
 from mortarbench.text import first_comment, first_sentence, listing
-from solvers import SOLVERS
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from harness.distributed.vectors import Emitted, Ranks
-from harness.errors import InputError
-from harness.processes.case_worker import CaseWorker
-from harness.processes.case_worker import serve as serve_cases
-from harness.processes.ranks import launch, this_rank
-from harness.processes.solver_file import read_solver
-from harness.processes.worker import serve
-from harness.registry import SolverSpec, resolve
+from mortarbench.harness.distributed.vectors import Emitted, Ranks
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.processes.case_worker import CaseWorker
+from mortarbench.harness.processes.case_worker import serve as serve_cases
+from mortarbench.harness.processes.ranks import launch, this_rank
+from mortarbench.harness.processes.solver_file import read_solver
+from mortarbench.harness.processes.worker import serve
+from mortarbench.harness.registry import SolverSpec, resolve, stand_for_harness
 from mortarbench.registries import Registries
 
 
@@ -22,6 +22,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Be the worker that `Registries.worker_command` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
+    stand_for_harness()
     registries = registries.with_files(request["plugins"])
     spec = SolverSpec(
         name=request["name"], label=request["name"], options=request["options"]
@@ -33,7 +34,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
     def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted:
-        from solvers.reference.over_ranks import reference_over_ranks
+        from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 
         family = registries.families[case["family"]]
         made = family.emission(case["form"], case["params"])
@@ -58,6 +59,7 @@ def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
     """Be the case worker that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
+    stand_for_harness()
     registries = registries.with_files(request["plugins"])
     families = registries.families
     if "folder" in request:

@@ -15,10 +15,10 @@ from html import escape as html_escape
 from time import monotonic
 from typing import Any, TextIO
 
-from harness.errors import InputError
-from harness.errors import shown as repeated
-from harness.record import Record, Verdict
-from harness.running.progress import Progress
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.errors import shown as repeated
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.running.progress import Progress
 
 _REASON = 120  #: characters of why a solver declined
 _WIDE = 60  #: columns of a terminal that has room for a bar beside its numbers

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
-from harness import checked
-from harness.errors import InputError, shown, unknown
-from harness.limits import ONE_THREAD
-from harness.plugin import Family, Reference, Solver, as_family
-from harness.processes.turns import Turn
-from harness.registry import (
+from mortarbench.harness import checked
+from mortarbench.harness.errors import InputError, shown, unknown
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.plugin import Family, Reference, Solver, as_family
+from mortarbench.harness.processes.turns import Turn
+from mortarbench.harness.registry import (
     COPIES,
     Plugin,
     PluginFile,
@@ -25,15 +25,15 @@ from harness.registry import (
     load_plugin,
     merged,
 )
-from problems import OPERATORS, PROBLEMS
-from solvers import SOLVERS
+from mortarbench.problems import OPERATORS, PROBLEMS
+from mortarbench.solvers import SOLVERS
 
 if TYPE_CHECKING:
-    from harness.crossval.discretisation import Discretisation
-    from harness.operators import Maker
-    from harness.qp import QP
-    from harness.results.work_unit import Commands
-    from harness.solution import Solution
+    from mortarbench.harness.crossval.discretisation import Discretisation
+    from mortarbench.harness.operators import Maker
+    from mortarbench.harness.qp import QP
+    from mortarbench.harness.results.work_unit import Commands
+    from mortarbench.harness.solution import Solution
 
 #: of the thread that loads plug-ins, builds, solves, runs or validates: these set
 #: numbers of threads, standard output and modules of the whole process
@@ -95,7 +95,7 @@ def one_thread() -> Iterator[None]:
 
 def reference(qp: QP) -> Solution:
     """Solve to the last digits, by a method that is none of the solvers compared."""
-    from solvers.reference.solve import reference_solution
+    from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)
 
@@ -108,8 +108,8 @@ def report_folder(
     pool_forms: bool = False,
 ) -> list[Path]:
     """Write our report on a result folder."""
-    from harness.record import VERIFIED_FACTOR
-    from reports import write_report
+    from mortarbench.harness.record import VERIFIED_FACTOR
+    from mortarbench.reports import write_report
 
     factor = VERIFIED_FACTOR if factor is None else factor
     return write_report(folder, formats, factor, pool_forms=pool_forms)
@@ -123,7 +123,7 @@ ValidationPage: TypeAlias = (
 def _validation_page(
     folder: Path, data: Mapping[str, Any], meshes: Sequence[Discretisation]
 ) -> list[Path]:
-    from reports.validation.report import write_validation
+    from mortarbench.reports.validation.report import write_validation
 
     return write_validation(folder, data, meshes)
 
@@ -274,7 +274,7 @@ class Registries:
 
         folder : the result folder, whose copies of files cases may be built from
         """
-        from harness.results.work_unit import Commands
+        from mortarbench.harness.results.work_unit import Commands
 
         request: dict[str, Any] = {"plugins": self._absolute_files()}
         if folder is not None:
@@ -290,8 +290,8 @@ class Registries:
 
         In a process that is not ours, other libraries and more threads are at work.
         """
-        from harness.environment.environment import capture, capture_in
-        from solvers.common.libraries import PACKAGES
+        from mortarbench.harness.environment.environment import capture, capture_in
+        from mortarbench.solvers.common.libraries import PACKAGES
 
         if ONE_THREAD.items() <= os.environ.items():
             here = capture(self.files, PACKAGES)

@@ -12,17 +12,26 @@ from typing import Any
 
 import numpy as np
 
-from harness import checked
-from harness.checked import text
-from harness.environment.environment import digest
-from harness.errors import FaultError, InputError
-from harness.files.store import Arrays, digest_of, load_solution, point_arrays
-from harness.record import Record, finite
-from harness.results.folder import differences
-from harness.results.stored_run import StoredRun, open_stored_run, work_unit_of
-from harness.results.work_unit import Result, Unbuilt, Unmade
-from harness.running.executor import one_by_one
-from harness.solution import Status
+from mortarbench.harness import checked
+from mortarbench.harness.checked import text
+from mortarbench.harness.environment.environment import digest
+from mortarbench.harness.errors import FaultError, InputError
+from mortarbench.harness.files.store import (
+    Arrays,
+    digest_of,
+    load_solution,
+    point_arrays,
+)
+from mortarbench.harness.record import Record, finite
+from mortarbench.harness.results.folder import differences
+from mortarbench.harness.results.stored_run import (
+    StoredRun,
+    open_stored_run,
+    work_unit_of,
+)
+from mortarbench.harness.results.work_unit import Result, Unbuilt, Unmade
+from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.solution import Status
 from mortarbench.registries import TURN, Plugins, Registries, known
 from mortarbench.text import aligned
 

@@ -9,17 +9,17 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness import checked
-from harness.errors import InputError
-from harness.files.durable import full_disk_told
-from harness.record import VERIFIED_FACTOR
 from mortarbench.arguments import FORMATS, GATES, check_known
+from mortarbench.harness import checked
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.registries import Registries, known, report_folder
 
 if TYPE_CHECKING:
-    from harness.running.pairs import Ratio
-    from reports.compare.changes import Comparison, Pair
-    from reports.compare.regressions import Slower
+    from mortarbench.harness.running.pairs import Ratio
+    from mortarbench.reports.compare.changes import Comparison, Pair
+    from mortarbench.reports.compare.regressions import Slower
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +102,7 @@ def report(
             files = write(first, formats, factor=factor, pool_forms=pool_forms)
         if write is not report_folder:  # somebody's own report has no such sentence
             return Report(files=tuple(files))
-        from reports import answer
+        from mortarbench.reports import answer
 
         return Report(files=tuple(files), said=tuple(answer(first, factor)[:1]))
     if pool_forms:
@@ -110,7 +110,7 @@ def report(
             "forms are pooled in the report on one folder (--pool-forms), not in a "
             "comparison of two, which pairs equal cases; leave one of them out"
         )
-    from reports import write_comparisons
+    from mortarbench.reports import write_comparisons
 
     with ExitStack() as told:
         for one in after:
@@ -146,8 +146,8 @@ def _unjudged(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list
 
 def _change(c: Comparison) -> dict[str, Any]:
     """Say what changed between two folders as plain data."""
-    from reports.compare.changes import mean_ratio
-    from reports.compare.regressions import regressions
+    from mortarbench.reports.compare.changes import mean_ratio
+    from mortarbench.reports.compare.regressions import regressions
 
     judged = regressions(c)
     means = {s: mean for s in c.solvers if (mean := mean_ratio(c.of(s)))}

@@ -12,27 +12,27 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness import checked
-from harness.checked import located
-from harness.environment.doctor import load_advice
-from harness.environment.environment import digest
-from harness.errors import InputError, some, unknown
-from harness.errors import shown as given
-from harness.files.reading import MOST_TOML, read_text
-from harness.record import Record, Verdict
-from harness.registry import is_solver, resolve
-from harness.results.faults import in_words
-from harness.results.folder import keep_environment, refuse_links
-from harness.results.journal import read_journal
-from harness.results.merge import merge as merge_folders
-from harness.running.executor import one_by_one
-from harness.running.progress import Progress
-from harness.running.run import Missing
-from harness.running.run import run as run_suite
-from harness.suite.overrides import with_overrides
-from harness.suite.solver_options import as_given
-from harness.suite.suite import load_suite, name_in, parse_suite, suite_text
 from mortarbench.arguments import PICTURES, writable
+from mortarbench.harness import checked
+from mortarbench.harness.checked import located
+from mortarbench.harness.environment.doctor import load_advice
+from mortarbench.harness.environment.environment import digest
+from mortarbench.harness.errors import InputError, some, unknown
+from mortarbench.harness.errors import shown as given
+from mortarbench.harness.files.reading import MOST_TOML, read_text
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.registry import is_solver, resolve
+from mortarbench.harness.results.faults import in_words
+from mortarbench.harness.results.folder import keep_environment, refuse_links
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.merge import merge as merge_folders
+from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.progress import Progress
+from mortarbench.harness.running.run import Missing
+from mortarbench.harness.running.run import run as run_suite
+from mortarbench.harness.suite.overrides import with_overrides
+from mortarbench.harness.suite.solver_options import as_given
+from mortarbench.harness.suite.suite import load_suite, name_in, parse_suite, suite_text
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, known
 from mortarbench.reporting import Report, report
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from harness.results.work_unit import Opens
+    from mortarbench.harness.results.work_unit import Opens
 
 
 #: the solver said something of its answer that is not so
@@ -146,8 +146,8 @@ class Results:
             cannot be written.
 
         """
-        from reports import figures
-        from reports.render.saving import draw, save
+        from mortarbench.reports import figures
+        from mortarbench.reports.render.saving import draw, save
 
         target = None if path is None else writable(path, PICTURES)
         drawn = figures(self.folder)
@@ -339,7 +339,7 @@ def run(
         if dask is None:
             engine = partial(one_by_one, operators=registries.operators)
         else:
-            from harness.running.cluster import on_cluster
+            from mortarbench.harness.running.cluster import on_cluster
 
             engine = stack.enter_context(
                 on_cluster(

@@ -8,13 +8,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.record import Record, Verdict
+from mortarbench.harness.record import Record, Verdict
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from harness.solution import History
+    from mortarbench.harness.solution import History
 
 #: of quantities of elastic bodies, as the interface promises them; others are bare
 UNITS = {

@@ -11,22 +11,31 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from harness import checked
-from harness.conformance.conformance import CHECKS, FINDS, KEEPS, Grade, Result
-from harness.crossval.comparison import brief
-from harness.crossval.discretisation import Discretisation, discretisation_errors
-from harness.crossval.summary import as_data
-from harness.crossval.validation import validated
-from harness.errors import InputError, some, unknown
-from harness.files.durable import full_disk_told, replace_file
-from harness.names import CaseId, assemble
-from harness.plugin import Family, Reference, Solver
-from harness.processes.measurement import scratch_folder
-from harness.processes.solver_file import write_solver
-from harness.processes.supervisor import WorkerProcess
-from harness.registry import SolverSpec, check_solver, resolve
-from harness.results.journal import read_journal
 from mortarbench.arguments import budget as checked_budget
+from mortarbench.harness import checked
+from mortarbench.harness.conformance.conformance import (
+    CHECKS,
+    FINDS,
+    KEEPS,
+    Grade,
+    Result,
+)
+from mortarbench.harness.crossval.comparison import brief
+from mortarbench.harness.crossval.discretisation import (
+    Discretisation,
+    discretisation_errors,
+)
+from mortarbench.harness.crossval.summary import as_data
+from mortarbench.harness.crossval.validation import validated
+from mortarbench.harness.errors import InputError, some, unknown
+from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.names import CaseId, assemble
+from mortarbench.harness.plugin import Family, Reference, Solver
+from mortarbench.harness.processes.measurement import scratch_folder
+from mortarbench.harness.processes.solver_file import write_solver
+from mortarbench.harness.processes.supervisor import WorkerProcess
+from mortarbench.harness.registry import SolverSpec, check_solver, resolve
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.progress import ignore
 from mortarbench.registries import Plugins, Registries, known, one_thread
 from mortarbench.text import aligned, legible

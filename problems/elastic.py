@@ -14,9 +14,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.sparse import vstack
 
-from harness import QP, Case, InputError, Reference, Solution
-from problems.contact.balance import check_balance
-from problems.contact.bodies import (
+from mortarbench.harness import QP, Case, InputError, Reference, Solution
+from mortarbench.problems.contact.balance import check_balance
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
@@ -24,14 +24,14 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import FORMS, contact_case
-from problems.duality.stepping import single_load
-from problems.fem.elasticity import Material
-from problems.fem.gmsh_mesh import NamedMesh, read_msh
-from problems.fem.mesh import (
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import FORMS, contact_case
+from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
+from mortarbench.problems.fem.mesh import (
     Mesh,
     half_disc,
     half_ring,
@@ -40,10 +40,10 @@ from problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from problems.feti.elastic import subdivide, torn
-from problems.feti.partition import graph_partition
-from problems.feti.torn import Torn
-from problems.ranges import (
+from mortarbench.problems.feti.elastic import subdivide, torn
+from mortarbench.problems.feti.partition import graph_partition
+from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.ranges import (
     GLUES,
     LAWS,
     NEEDED,

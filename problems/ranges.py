@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
-from harness.checked import is_number
-from harness.errors import shown
-from harness.limits import CASE_VARIABLE, case_limit_mib
+from mortarbench.harness import InputError
+from mortarbench.harness.checked import is_number
+from mortarbench.harness.errors import shown
+from mortarbench.harness.limits import CASE_VARIABLE, case_limit_mib
 
 if TYPE_CHECKING:
-    from harness import Value
+    from mortarbench.harness import Value
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
 #: values of the keys that choose the method; node-to-segment takes no notice of basis

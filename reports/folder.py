@@ -6,38 +6,43 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from harness.errors import unknown
-from harness.record import VERIFIED_FACTOR
-from reports.data.aggregation import ranking_of
-from reports.data.cells import BY_OPTIMUM
-from reports.data.comparison_groups import ComparisonGroup, all_groups
-from reports.data.environment import dateline
-from reports.data.evidence import Evidence, read_evidence
-from reports.data.fastest import answers_of, fastest_solvers
-from reports.data.size_series import SizeSeries, size_series, sweeps
-from reports.data.ways import compare_ways
-from reports.document.fields import FieldFigure
-from reports.document.figure import Figure
-from reports.document.formatting import TIMED, clean
-from reports.document.layout import Page, Picture, Section
-from reports.export.csv_tables import csv_tables, frame_csv
-from reports.export.parquet import write_records
-from reports.figures.accuracy import accuracy_figure
-from reports.figures.scaling import MOST_SERIES, scaling_figure
-from reports.render.writing import RENDERED, write_page, write_text
-from reports.sections.answer import opening
-from reports.sections.convergence import convergence
-from reports.sections.performance import profiles
-from reports.sections.physics import agreement, deformed, physics, tractions
-from reports.sections.ranking import left_out, means, ranking
-from reports.sections.ranks import ranks
-from reports.sections.results import claim_counts, claims, errors, iterations
-from reports.sections.scaling import growth, own_results, scaling, steps
-from reports.sections.settings import cases, definitions, environment
-from reports.sections.summary import summary
-from reports.sections.sweeps import accuracy, certified_sweeps
-from reports.sections.times import precision, ratios, times
-from reports.sections.value_of_accuracy import value_of_accuracy
+from mortarbench.harness.errors import unknown
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.reports.data.aggregation import ranking_of
+from mortarbench.reports.data.cells import BY_OPTIMUM
+from mortarbench.reports.data.comparison_groups import ComparisonGroup, all_groups
+from mortarbench.reports.data.environment import dateline
+from mortarbench.reports.data.evidence import Evidence, read_evidence
+from mortarbench.reports.data.fastest import answers_of, fastest_solvers
+from mortarbench.reports.data.size_series import SizeSeries, size_series, sweeps
+from mortarbench.reports.data.ways import compare_ways
+from mortarbench.reports.document.fields import FieldFigure
+from mortarbench.reports.document.figure import Figure
+from mortarbench.reports.document.formatting import TIMED, clean
+from mortarbench.reports.document.layout import Page, Picture, Section
+from mortarbench.reports.export.csv_tables import csv_tables, frame_csv
+from mortarbench.reports.export.parquet import write_records
+from mortarbench.reports.figures.accuracy import accuracy_figure
+from mortarbench.reports.figures.scaling import MOST_SERIES, scaling_figure
+from mortarbench.reports.render.writing import RENDERED, write_page, write_text
+from mortarbench.reports.sections.answer import opening
+from mortarbench.reports.sections.convergence import convergence
+from mortarbench.reports.sections.performance import profiles
+from mortarbench.reports.sections.physics import agreement, deformed, physics, tractions
+from mortarbench.reports.sections.ranking import left_out, means, ranking
+from mortarbench.reports.sections.ranks import ranks
+from mortarbench.reports.sections.results import (
+    claim_counts,
+    claims,
+    errors,
+    iterations,
+)
+from mortarbench.reports.sections.scaling import growth, own_results, scaling, steps
+from mortarbench.reports.sections.settings import cases, definitions, environment
+from mortarbench.reports.sections.summary import summary
+from mortarbench.reports.sections.sweeps import accuracy, certified_sweeps
+from mortarbench.reports.sections.times import precision, ratios, times
+from mortarbench.reports.sections.value_of_accuracy import value_of_accuracy
 
 FORMATS = ("html", "md", "tex", "csv", "parquet")
 

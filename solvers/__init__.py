@@ -1,42 +1,56 @@
 """Every solver of the comparison, one line each."""
 
-from harness.plugin import Solver
-from harness.registry import Registry, entry
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.registry import Registry, entry
 
 SOLVERS: Registry[Solver] = Registry(
     {
-        "smalbe": entry("solvers.smalbe.solver", "SMALBE"),
-        "smalbe-condensed": entry("solvers.smalbe.solver", "CONDENSED"),
-        "smalbe-direct": entry("solvers.smalbe.direct", "Direct"),
-        "smalbe-permon": entry("solvers.smalbe.solver", "PERMON"),
-        "smalbe-espreso": entry("solvers.smalbe.solver", "ESPRESO"),
-        "smalbe-paper": entry("solvers.smalbe.solver", "PAPER"),
-        "pdas": entry("solvers.baselines.pdas", "PDAS"),
-        "feti": entry("solvers.baselines.feti", "FETI"),
+        "smalbe": entry("mortarbench.solvers.smalbe.solver", "SMALBE"),
+        "smalbe-condensed": entry("mortarbench.solvers.smalbe.solver", "CONDENSED"),
+        "smalbe-direct": entry("mortarbench.solvers.smalbe.direct", "Direct"),
+        "smalbe-permon": entry("mortarbench.solvers.smalbe.solver", "PERMON"),
+        "smalbe-espreso": entry("mortarbench.solvers.smalbe.solver", "ESPRESO"),
+        "smalbe-paper": entry("mortarbench.solvers.smalbe.solver", "PAPER"),
+        "pdas": entry("mortarbench.solvers.baselines.pdas", "PDAS"),
+        "feti": entry("mortarbench.solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
-            "solvers.baselines.projected_gradient", "ProjectedGradient"
+            "mortarbench.solvers.baselines.projected_gradient", "ProjectedGradient"
         ),
-        "bvls": entry("solvers.baselines.bvls", "BVLS"),
-        "osqp": entry("solvers.adapters.osqp_", "OSQP"),
-        "osqp-polish": entry("solvers.adapters.osqp_", "OSQP", polishing=True),
-        "clarabel": entry("solvers.adapters.clarabel_", "Clarabel"),
-        "proxqp": entry("solvers.adapters.proxqp_", "ProxQP"),
-        "proxqp-dense": entry("solvers.adapters.proxqp_", "ProxQP", backend="dense"),
-        "proxqp-sparse": entry("solvers.adapters.proxqp_", "ProxQP", backend="sparse"),
-        "piqp": entry("solvers.adapters.piqp_", "PIQP"),
-        "piqp-dense": entry("solvers.adapters.piqp_", "PIQP", backend="dense"),
-        "piqp-sparse": entry("solvers.adapters.piqp_", "PIQP", backend="sparse"),
-        "highs": entry("solvers.adapters.highs_", "HiGHS"),
-        "highs-hipo": entry("solvers.adapters.highs_", "HiGHS", method="hipo"),
-        "scs": entry("solvers.adapters.scs_", "SCS"),
-        "scs-qdldl": entry("solvers.adapters.scs_", "SCS", linear_solver="qdldl"),
-        "daqp": entry("solvers.adapters.daqp_", "DAQP"),
-        "qpalm": entry("solvers.adapters.qpalm_", "QPALM"),
-        "qoco": entry("solvers.adapters.qoco_", "QOCO"),
-        "qtqp": entry("solvers.adapters.qtqp_", "QTQP"),
-        "quadprog": entry("solvers.adapters.quadprog_", "Quadprog"),
-        "cvxopt": entry("solvers.adapters.cvxopt_", "CVXOPT"),
-        "qpsolvers:*": entry("solvers.adapters.qpsolvers_", "QPSolvers"),
-        "cvxpy:*": entry("solvers.adapters.cvxpy_", "CVXPY"),
+        "bvls": entry("mortarbench.solvers.baselines.bvls", "BVLS"),
+        "osqp": entry("mortarbench.solvers.adapters.osqp_", "OSQP"),
+        "osqp-polish": entry(
+            "mortarbench.solvers.adapters.osqp_", "OSQP", polishing=True
+        ),
+        "clarabel": entry("mortarbench.solvers.adapters.clarabel_", "Clarabel"),
+        "proxqp": entry("mortarbench.solvers.adapters.proxqp_", "ProxQP"),
+        "proxqp-dense": entry(
+            "mortarbench.solvers.adapters.proxqp_", "ProxQP", backend="dense"
+        ),
+        "proxqp-sparse": entry(
+            "mortarbench.solvers.adapters.proxqp_", "ProxQP", backend="sparse"
+        ),
+        "piqp": entry("mortarbench.solvers.adapters.piqp_", "PIQP"),
+        "piqp-dense": entry(
+            "mortarbench.solvers.adapters.piqp_", "PIQP", backend="dense"
+        ),
+        "piqp-sparse": entry(
+            "mortarbench.solvers.adapters.piqp_", "PIQP", backend="sparse"
+        ),
+        "highs": entry("mortarbench.solvers.adapters.highs_", "HiGHS"),
+        "highs-hipo": entry(
+            "mortarbench.solvers.adapters.highs_", "HiGHS", method="hipo"
+        ),
+        "scs": entry("mortarbench.solvers.adapters.scs_", "SCS"),
+        "scs-qdldl": entry(
+            "mortarbench.solvers.adapters.scs_", "SCS", linear_solver="qdldl"
+        ),
+        "daqp": entry("mortarbench.solvers.adapters.daqp_", "DAQP"),
+        "qpalm": entry("mortarbench.solvers.adapters.qpalm_", "QPALM"),
+        "qoco": entry("mortarbench.solvers.adapters.qoco_", "QOCO"),
+        "qtqp": entry("mortarbench.solvers.adapters.qtqp_", "QTQP"),
+        "quadprog": entry("mortarbench.solvers.adapters.quadprog_", "Quadprog"),
+        "cvxopt": entry("mortarbench.solvers.adapters.cvxopt_", "CVXOPT"),
+        "qpsolvers:*": entry("mortarbench.solvers.adapters.qpsolvers_", "QPSolvers"),
+        "cvxpy:*": entry("mortarbench.solvers.adapters.cvxpy_", "CVXPY"),
     }
 )

@@ -12,10 +12,10 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadScopeScheduling
 from xdist.workermanage import WorkerController
 
-from harness import QP, Solution
-from harness.conformance.manufactured import manufactured as drawn
-from harness.limits import ONE_THREAD
-from harness.processes import supervisor
+from mortarbench.harness import QP, Solution
+from mortarbench.harness.conformance.manufactured import manufactured as drawn
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.processes import supervisor
 from tests.support import ROOT
 from tests.support.fork_server import Forks
 
@@ -157,7 +157,7 @@ def svg_only():
     @contextmanager
     def context():
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("reports.render.saving.ENDINGS", (".svg",))
+            patch.setattr("mortarbench.reports.render.saving.ENDINGS", (".svg",))
             yield
 
     return context

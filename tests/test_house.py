@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from solvers import SOLVERS
-from solvers.common.libraries import PACKAGES as LIBRARIES
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.libraries import PACKAGES as LIBRARIES
 
 pytestmark = pytest.mark.together
 

@@ -3,7 +3,7 @@
 import json
 
 from mortarbench.listing import CATALOGUE, described
-from solvers import SOLVERS
+from mortarbench.solvers import SOLVERS
 
 CATALOGUE.write_text(
     json.dumps({name: described(s) for name, s in SOLVERS.items()}, indent=1) + "\n"

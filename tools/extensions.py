@@ -18,17 +18,17 @@ from setuptools import Distribution, Extension
 ROOT = Path(__file__).parents[1]
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
-    "harness.verify.products": [],
-    "harness.distributed.sparse": [],
+    "mortarbench.harness.verify.products": [],
+    "mortarbench.harness.distributed.sparse": [],
     # the digits of a stiffness, and the order of its factor, are the same everywhere
-    "problems.fem.kernels": ["-ffp-contract=off"],
-    "problems.fem.tangents": ["-ffp-contract=off"],
-    "problems.fem.ordering": ["-ffp-contract=off"],
-    "problems.fem.elimination": ["-ffp-contract=off"],
-    "problems.feti.blocks": [],
+    "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
+    "mortarbench.problems.fem.tangents": ["-ffp-contract=off"],
+    "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
+    "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
+    "mortarbench.problems.feti.blocks": [],
     # sums may be vectorised, which needs another order; inf and NaN are kept
-    "solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
-    "solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],
+    "mortarbench.solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
+    "mortarbench.solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],
 }
 
 

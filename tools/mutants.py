@@ -323,7 +323,7 @@ def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
     os.environ["PYTHONPATH"] = sys.path[0] = str(folder)
     for library in LIBRARIES:
         import_module(library)
-    spec = find_spec("harness")
+    spec = find_spec("mortarbench.harness")
     assert spec is not None
     assert spec.origin is not None
     assert Path(spec.origin).is_relative_to(folder), f"{spec.origin} is no copy"
@@ -390,7 +390,7 @@ def copy_of_the_project(folder: Path) -> None:
     for path in filter(Path.is_file, paths + compiled):
         copy = folder / path.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy2(path, copy)
+        shutil.copy2(path, copy, follow_symlinks=False)
 
 
 def read_plan() -> Plan:

@@ -18,13 +18,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse.linalg import aslinearoperator
 
-from harness.conformance.equivalence import (
+from mortarbench.harness.conformance.equivalence import (
     DeclinedError,
     WeakError,
     changes_of,
     same_answer,
 )
-from harness.conformance.manufactured import (
+from mortarbench.harness.conformance.manufactured import (
     FORMS,
     SHAPES,
     infeasible,
@@ -33,13 +33,13 @@ from harness.conformance.manufactured import (
     one_of_each,
     unbounded,
 )
-from harness.plugin import Solver
-from harness.qp import QP, Vector
-from harness.record import VERIFIED_FACTOR
-from harness.solution import Solution, Status
-from harness.verify.infeasibility import infeasibility_margin
-from harness.verify.kkt import kkt_residuals
-from harness.verify.measure import (
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.harness.verify.measure import (
     ReasonError,
     failure,
     measure,

@@ -14,8 +14,8 @@ from functools import partial
 
 import numpy as np
 
-from harness.conformance.manufactured import strings
-from harness.conformance.metamorphic import (
+from mortarbench.harness.conformance.manufactured import strings
+from mortarbench.harness.conformance.metamorphic import (
     Equivalent,
     Order,
     change_units,
@@ -26,12 +26,12 @@ from harness.conformance.metamorphic import (
     scale_rows,
     shift_unknowns,
 )
-from harness.plugin import Solver
-from harness.qp import QP, Vector
-from harness.record import VERIFIED_FACTOR, Verdict
-from harness.solution import Solution, Status
-from harness.verify.kkt import kkt_residuals, verdict
-from harness.verify.measure import measure
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.record import VERIFIED_FACTOR, Verdict
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.kkt import kkt_residuals, verdict
+from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8
 ALLOWED = 10 * VERIFIED_FACTOR * TOL  #: of the energies; 10 for what adds up over rows

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness.qp import QP, Vector
-from harness.solution import Solution, Status
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.solution import Solution, Status
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

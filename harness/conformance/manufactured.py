@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-from harness.qp import QP, Matrix, Structure, Vector, no_rows
-from harness.solution import Solution, Status
+from mortarbench.harness.qp import QP, Matrix, Structure, Vector, no_rows
+from mortarbench.harness.solution import Solution, Status
 
 #: m equality and p inequality rows, which bounds, fixed variables, rank of P, …
 SHAPES: Mapping[str, Mapping[str, Any]] = {

@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array
 
-from harness.qp import QP, Matrix, Structure, Vector
-from harness.solution import Solution
+from mortarbench.harness.qp import QP, Matrix, Structure, Vector
+from mortarbench.harness.solution import Solution
 
 Order = NDArray[Any]  #: of indices, or a mask
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from harness.conformance.conformance import KEEPS, Grade, Result
-from harness.conformance.equivalence import AS_IT_IS, CHANGES, TOL, UNITS, changes_of
-from harness.conformance.manufactured import FORMS
+from mortarbench.harness.conformance.conformance import KEEPS, Grade, Result
+from mortarbench.harness.conformance.equivalence import (
+    AS_IT_IS,
+    CHANGES,
+    TOL,
+    UNITS,
+    changes_of,
+)
+from mortarbench.harness.conformance.manufactured import FORMS
 
 TOLD = 2.0  #: times the iterations that are worth telling
 

@@ -19,21 +19,26 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from harness.crossval.assessment import Assessment, Deviation, distances, energy_allowed
-from harness.crossval.ground_truth import (
+from mortarbench.harness.crossval.assessment import (
+    Assessment,
+    Deviation,
+    distances,
+    energy_allowed,
+)
+from mortarbench.harness.crossval.ground_truth import (
     Given,
     GroundTruth,
     ground_truth_of,
     nan_last,
     residuals_of,
 )
-from harness.errors import some
-from harness.plugin import Reference
-from harness.record import Verdict
-from harness.solution import Status
-from harness.verify.kkt import allowed, verdict
-from harness.verify.optimum import Proves, decided, proves
-from harness.verify.verdicts import note_of
+from mortarbench.harness.errors import some
+from mortarbench.harness.plugin import Reference
+from mortarbench.harness.record import Verdict
+from mortarbench.harness.solution import Status
+from mortarbench.harness.verify.kkt import allowed, verdict
+from mortarbench.harness.verify.optimum import Proves, decided, proves
+from mortarbench.harness.verify.verdicts import note_of
 
 OUTLYING = 100  #: times the median of the other solvers, from where on one stands out
 PEERS = 3  #: answers of others that make a median

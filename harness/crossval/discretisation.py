@@ -32,15 +32,15 @@ from math import log2, sqrt
 from pathlib import Path
 from time import perf_counter
 
-from harness.crossval.comparison import brief
-from harness.crossval.mesh_refinement import prolongation
-from harness.errors import InputError
-from harness.files.durable import full_disk_told, replace_file
-from harness.files.reading import read_json
-from harness.mechanics import Extended, Grid, Mechanics, Real
-from harness.names import CaseId, assemble, unbuilt
-from harness.plugin import Family, Reference
-from harness.verify.references import UnsolvedError, reference_point
+from mortarbench.harness.crossval.comparison import brief
+from mortarbench.harness.crossval.mesh_refinement import prolongation
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.reading import read_json
+from mortarbench.harness.mechanics import Extended, Grid, Mechanics, Real
+from mortarbench.harness.names import CaseId, assemble, unbuilt
+from mortarbench.harness.plugin import Family, Reference
+from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
 FILE = "discretisation.json"  #: in the result folder
 SCHEMA = 1

@@ -14,17 +14,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.crossval.assessment import Assessment, Deviation, assess, assess_point
-from harness.mechanics import Mechanics
-from harness.plugin import Case, Reference
-from harness.qp import Matrix
-from harness.record import Record
-from harness.solution import Solution
-from harness.verify.active_set_refinement import suggested
-from harness.verify.certificate import UncertifiableError, certify
-from harness.verify.kkt import Residuals, kkt_residuals
-from harness.verify.references import ReferencePoint, UnsolvedError, reference_point
-from harness.verify.verdicts import note_of
+from mortarbench.harness.crossval.assessment import (
+    Assessment,
+    Deviation,
+    assess,
+    assess_point,
+)
+from mortarbench.harness.mechanics import Mechanics
+from mortarbench.harness.plugin import Case, Reference
+from mortarbench.harness.qp import Matrix
+from mortarbench.harness.record import Record
+from mortarbench.harness.solution import Solution
+from mortarbench.harness.verify.active_set_refinement import suggested
+from mortarbench.harness.verify.certificate import UncertifiableError, certify
+from mortarbench.harness.verify.kkt import Residuals, kkt_residuals
+from mortarbench.harness.verify.references import (
+    ReferencePoint,
+    UnsolvedError,
+    reference_point,
+)
+from mortarbench.harness.verify.verdicts import note_of
 
 #: KKT residual up to which the best answer may stand for a reference
 GOOD_ENOUGH = 1e-3

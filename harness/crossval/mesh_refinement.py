@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, eye_array, vstack
 from scipy.spatial import cKDTree
 
-from harness.mechanics import Grid
+from mortarbench.harness.mechanics import Grid
 
 Nodes = NDArray[np.int64]
 

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from harness.crossval.comparison import Answer, Problem
-from harness.crossval.ground_truth import Given
-from harness.plugin import Reference
-from harness.qp import Vector
-from harness.verify.references import reference_point
+from mortarbench.harness.crossval.comparison import Answer, Problem
+from mortarbench.harness.crossval.ground_truth import Given
+from mortarbench.harness.plugin import Reference
+from mortarbench.harness.qp import Vector
+from mortarbench.harness.verify.references import reference_point
 
 ALIKE = 1e-3  #: relative difference of contact forces up to which they are the same
 

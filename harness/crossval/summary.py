@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from statistics import median
 from typing import Any
 
-from harness.crossval.comparison import Answer, Pair, Problem
-from harness.crossval.validation import Listed, Validation
-from harness.errors import some
-from harness.record import finite
-from harness.verify.verdicts import plain
+from mortarbench.harness.crossval.comparison import Answer, Pair, Problem
+from mortarbench.harness.crossval.validation import Listed, Validation
+from mortarbench.harness.errors import some
+from mortarbench.harness.record import finite
+from mortarbench.harness.verify.verdicts import plain
 
 SCHEMA = 1  #: of the data
 

@@ -12,20 +12,29 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from harness.crossval.comparison import Problem, brief, compared
-from harness.crossval.ground_truth import Given
-from harness.crossval.misattribution import recognised, suspects, true_forces
-from harness.errors import InputError
-from harness.files.qpfile import qp_digest
-from harness.files.store import digest_of, is_stored, load_solution, point_arrays
-from harness.plugin import Case, Family, Reference
-from harness.qp import QP, Vector
-from harness.record import Record, Verdict
-from harness.results.journal import read_journal
-from harness.results.rebuild import rebuild
-from harness.solution import Solution, Status
-from harness.verify.infeasibility import infeasibility_margin
-from harness.verify.verdicts import has_point
+from mortarbench.harness.crossval.comparison import Problem, brief, compared
+from mortarbench.harness.crossval.ground_truth import Given
+from mortarbench.harness.crossval.misattribution import (
+    recognised,
+    suspects,
+    true_forces,
+)
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.qpfile import qp_digest
+from mortarbench.harness.files.store import (
+    digest_of,
+    is_stored,
+    load_solution,
+    point_arrays,
+)
+from mortarbench.harness.plugin import Case, Family, Reference
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.rebuild import rebuild
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
 PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none

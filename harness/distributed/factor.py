@@ -29,8 +29,12 @@ from scipy.linalg import blas, eigh, lapack, qr
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
-from harness.distributed.vectors import DistributedVector, Ranks, distributed
-from harness.qp import Matrix
+from mortarbench.harness.distributed.vectors import (
+    DistributedVector,
+    Ranks,
+    distributed,
+)
+from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]

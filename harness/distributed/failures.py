@@ -20,7 +20,7 @@ from typing import NoReturn, TypeVar
 
 import numpy as np
 
-from harness.distributed.vectors import Ranks
+from mortarbench.harness.distributed.vectors import Ranks
 
 T = TypeVar("T")
 

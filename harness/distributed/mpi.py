@@ -7,7 +7,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
-from harness.errors import InputError, shown
+from mortarbench.harness.errors import InputError, shown
 
 MOST_RANKS = 4096
 MISSING = (

@@ -1,6 +1,6 @@
 from scipy.sparse import csr_array
 
-from harness.qp import Vector
+from mortarbench.harness.qp import Vector
 
 class CompressedRows:
     shape: tuple[int, int]

@@ -32,8 +32,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from harness.qp import QP, Vector
-from harness.solution import Solution
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.solution import Solution
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm

@@ -9,8 +9,8 @@ from typing import Any
 
 from rich.text import Text
 
-from harness.environment.environment import digest
-from harness.environment.noise import NoiseFloor
+from mortarbench.harness.environment.environment import digest
+from mortarbench.harness.environment.noise import NoiseFloor
 
 ENOUGH_MEMORY_MIB = 2048
 QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells

@@ -23,8 +23,8 @@ from typing import Any
 
 from threadpoolctl import threadpool_info
 
-from harness.digest import hex_digest
-from harness.registry import PluginFile
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.registry import PluginFile
 
 #: that measurements rest on, whichever solvers there are
 PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
@@ -107,7 +107,7 @@ def capture_in(
     Libraries read their thread variables only once, when they are loaded.
     """
     program = (
-        "import json, sys, harness.environment.environment as e; "
+        "import json, sys, mortarbench.harness.environment.environment as e; "
         "plugins, packages = map(json.loads, sys.argv[1:]); "
         "print(json.dumps(e.capture(plugins, packages)))"
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from harness.errors import shortened
+from mortarbench.harness.errors import shortened
 
 Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-from harness.qp import Vector
+from mortarbench.harness.qp import Vector
 
 _SIDE = 120  #: of the kernel's square grid: its matrix has 14 400 rows
 _PRODUCTS = 10  #: about 1 ms

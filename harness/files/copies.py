@@ -15,13 +15,13 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from harness.checked import has_control
-from harness.digest import hex_digest, pieces, running_digest
-from harness.errors import InputError, shortened, some
-from harness.files.datafile import MIB, opened
-from harness.files.durable import replace_file, replacing
-from harness.files.reading import read_json
-from harness.plugin import SourceFile
+from mortarbench.harness.checked import has_control
+from mortarbench.harness.digest import hex_digest, pieces, running_digest
+from mortarbench.harness.errors import InputError, shortened, some
+from mortarbench.harness.files.datafile import MIB, opened
+from mortarbench.harness.files.durable import replace_file, replacing
+from mortarbench.harness.files.reading import read_json
+from mortarbench.harness.plugin import SourceFile
 
 FOLDER = "files"
 LIST = "copies.json"

@@ -19,8 +19,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from harness.errors import InputError, shortened
-from harness.files import reading
+from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 MOST_MIB = 2048

@@ -15,7 +15,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import IO
 
-from harness.errors import InputError
+from mortarbench.harness.errors import InputError
 
 _UNFINISHED = ".mortarbench-*.tmp"  #: what files are called until they are whole
 _OTHERS = ("*.tmp", "*.new", ".*.new")  #: of older versions, and of a case being built

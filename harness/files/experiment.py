@@ -16,12 +16,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
-from harness.files.csvfile import csv_text
-from harness.files.durable import replace_file
-from harness.files.reading import read_json
-from harness.files.store import load_fields, save_fields
-from harness.plugin import Fields, Value
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.csvfile import csv_text
+from mortarbench.harness.files.durable import replace_file
+from mortarbench.harness.files.reading import read_json
+from mortarbench.harness.files.store import load_fields, save_fields
+from mortarbench.harness.plugin import Fields, Value
 
 Row = Mapping[str, Value]
 

@@ -14,10 +14,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from harness.digest import Digest, running_digest
-from harness.errors import InputError
-from harness.files.datafile import opened
-from harness.files.durable import replace_file, sync_folder
+from mortarbench.harness.digest import Digest, running_digest
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.datafile import opened
+from mortarbench.harness.files.durable import replace_file, sync_folder
 
 LONGEST_LINE = 2**24  #: bytes
 _CHUNK = 2**16

@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 from scipy.io import loadmat, savemat
 from scipy.sparse import csc_array, issparse
 
-from harness.errors import InputError, shortened
-from harness.files.datafile import check_size, content, json_object, parsing
-from harness.files.durable import replacing
-from harness.files.qpfile import (
+from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.files.datafile import check_size, content, json_object, parsing
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.files.qpfile import (
     check_dense,
     compressed,
     explicit_matrices,
     listed_dense,
 )
-from harness.qp import QP, Matrix, Vector, canonical, check_symmetric
+from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetric
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from harness.errors import InputError, shortened
-from harness.files.datafile import check_size, opened
-from harness.files.durable import replacing
+from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.files.datafile import check_size, opened
+from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
 ALIGNMENT = 64

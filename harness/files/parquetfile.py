@@ -27,11 +27,16 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, issparse
 
-from harness.errors import InputError, shortened
-from harness.files.datafile import check_size, json_object, most_bytes, opened
-from harness.files.durable import replacing
-from harness.files.qpfile import explicit_matrices, listed_dense
-from harness.qp import QP, Matrix, Vector, check_symmetric, no_rows
+from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.files.datafile import (
+    check_size,
+    json_object,
+    most_bytes,
+    opened,
+)
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.files.qpfile import explicit_matrices, listed_dense
+from mortarbench.harness.qp import QP, Matrix, Vector, check_symmetric, no_rows
 
 _MATRICES = ("P", "G", "A")
 _KEY = "mortarbench"

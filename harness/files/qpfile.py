@@ -28,12 +28,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from harness.errors import InputError, shortened, unknown
-from harness.files.datafile import check_size, json_object
-from harness.files.npz import write_mappable
-from harness.files.store import digest_of, mapped_arrays
-from harness.operators import Maker, SerialisableOperator, assembled
-from harness.qp import QP, Matrix, Structure, Vector, canonical, check_symmetric
+from mortarbench.harness.errors import InputError, shortened, unknown
+from mortarbench.harness.files.datafile import check_size, json_object
+from mortarbench.harness.files.npz import write_mappable
+from mortarbench.harness.files.store import digest_of, mapped_arrays
+from mortarbench.harness.operators import Maker, SerialisableOperator, assembled
+from mortarbench.harness.qp import (
+    QP,
+    Matrix,
+    Structure,
+    Vector,
+    canonical,
+    check_symmetric,
+)
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")

@@ -20,8 +20,8 @@ from math import isinf
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn
 
-from harness.errors import InputError
-from harness.files.durable import FULL
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.durable import FULL
 
 VARIABLE = "MORTARBENCH_TEXT_MIB"  #: the largest text file that is read
 MOST_TOML = 1.0  #: MiB, where the variable is not set: a second to parse

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.digest import hex_digest
-from harness.errors import InputError, shortened
-from harness.files import npz
-from harness.files.durable import replace_file, replacing
-from harness.files.reading import opened
-from harness.plugin import ContactSide, Fields
-from harness.solution import History, Solution, Status, checked_history
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.errors import InputError, shortened
+from mortarbench.harness.files import npz
+from mortarbench.harness.files.durable import replace_file, replacing
+from mortarbench.harness.files.reading import opened
+from mortarbench.harness.plugin import ContactSide, Fields
+from mortarbench.harness.solution import History, Solution, Status, checked_history
 
 Arrays = Mapping[str, NDArray[Any]]
 

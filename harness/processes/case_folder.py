@@ -23,10 +23,10 @@ from pathlib import Path
 from secrets import token_bytes
 from typing import Any
 
-from harness.digest import hex_digest, pieces
-from harness.errors import InputError
-from harness.files.durable import keep_private, move_file, replace_file
-from harness.files.reading import read_text
+from mortarbench.harness.digest import hex_digest, pieces
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.durable import keep_private, move_file, replace_file
+from mortarbench.harness.files.reading import read_text
 
 _KEY_BYTES = 32
 

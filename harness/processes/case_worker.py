@@ -30,9 +30,9 @@ from typing import Any
 
 import numpy as np
 
-from harness.errors import PastEndError
-from harness.files.qpfile import load_qp, save_qp
-from harness.files.store import (
+from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.files.store import (
     digest_of,
     field_arrays,
     point_arrays,
@@ -40,14 +40,14 @@ from harness.files.store import (
     write_arrays,
     write_point,
 )
-from harness.names import CaseId, emitted_by_ranks, unbuilt
-from harness.operators import NO_MAKERS, Maker
-from harness.plugin import Case, Family, Reference
-from harness.processes.protocol import Events, answer_requests
-from harness.qp import QP
-from harness.record import finite
-from harness.solution import Solution, Status
-from harness.verify.verdicts import certified, note_of, plain, quantities_of
+from mortarbench.harness.names import CaseId, emitted_by_ranks, unbuilt
+from mortarbench.harness.operators import NO_MAKERS, Maker
+from mortarbench.harness.plugin import Case, Family, Reference
+from mortarbench.harness.processes.protocol import Events, answer_requests
+from mortarbench.harness.qp import QP
+from mortarbench.harness.record import finite
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
 MOST_CERTIFIED = 10_000  #: points whose bounds are kept
 #: s; the first dual case of a process is built twice where building took less. First

@@ -15,7 +15,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from harness.processes import reaper
+from mortarbench.harness.processes import reaper
 
 SHARED = Path("/dev/shm")
 

@@ -26,7 +26,7 @@ from contextlib import suppress
 from functools import partial
 from typing import BinaryIO
 
-from harness.processes import reaper
+from mortarbench.harness.processes import reaper
 
 #: what a worker does with the two file descriptors of its requests and its replies
 Serve = Callable[[int, int], None]

@@ -21,22 +21,34 @@ from zipfile import ZIP_STORED, ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import FaultError
-from harness.files.qpfile import save_qp
-from harness.files.store import write_point
-from harness.plugin import Case, Reference
-from harness.processes.case_folder import content_digest
-from harness.processes.forking import Serve
-from harness.processes.protocol import MOST_ECHOED
-from harness.processes.ranks import without_content
-from harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
-from harness.qp import QP
-from harness.record import MEASURED, Measurement, Record, Verdict, journal_name
-from harness.solution import Solution, Status, checked_history
-from harness.verify.kkt import Residuals
-from harness.verify.measure import one_line
-from harness.verify.optimum import Proves, proves
-from harness.verify.verdicts import certified, has_point, judged, noted, quantities_of
+from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.qpfile import save_qp
+from mortarbench.harness.files.store import write_point
+from mortarbench.harness.plugin import Case, Reference
+from mortarbench.harness.processes.case_folder import content_digest
+from mortarbench.harness.processes.forking import Serve
+from mortarbench.harness.processes.protocol import MOST_ECHOED
+from mortarbench.harness.processes.ranks import without_content
+from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
+from mortarbench.harness.qp import QP
+from mortarbench.harness.record import (
+    MEASURED,
+    Measurement,
+    Record,
+    Verdict,
+    journal_name,
+)
+from mortarbench.harness.solution import Solution, Status, checked_history
+from mortarbench.harness.verify.kkt import Residuals
+from mortarbench.harness.verify.measure import one_line
+from mortarbench.harness.verify.optimum import Proves, proves
+from mortarbench.harness.verify.verdicts import (
+    certified,
+    has_point,
+    judged,
+    noted,
+    quantities_of,
+)
 
 MOST_HISTORY = 2**28  #: bytes of a history, and of what a file has around its arrays
 OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped

@@ -26,9 +26,9 @@ from dataclasses import Field, dataclass, fields
 from math import isfinite
 from typing import Any, TextIO
 
-from harness.record import Measurement, finite, journal_name
-from harness.solution import Status
-from harness.verify.kkt import Residuals
+from mortarbench.harness.record import Measurement, finite, journal_name
+from mortarbench.harness.solution import Status
+from mortarbench.harness.verify.kkt import Residuals
 
 LONGEST_REPLY = 2**22  #: bytes
 MOST_ECHOED = 200  #: characters of what came, in a message

@@ -34,7 +34,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator
 
-from harness.distributed.failures import (
+from mortarbench.harness.distributed.failures import (
     ALONE_SECONDS,
     RECORD,
     RankFailedError,
@@ -42,24 +42,24 @@ from harness.distributed.failures import (
     agreed,
     in_a_line,
 )
-from harness.distributed.mpi import MISSING, mpiexec
-from harness.distributed.network import network
-from harness.distributed.vectors import (
+from mortarbench.harness.distributed.mpi import MISSING, mpiexec
+from mortarbench.harness.distributed.network import network
+from mortarbench.harness.distributed.vectors import (
     Distributable,
     Emit,
     Emitted,
     Ranks,
     Share,
 )
-from harness.errors import InputError
-from harness.files.qpfile import load_qp
-from harness.operators import Maker, SerialisableOperator
-from harness.plugin import Solver
-from harness.processes import reaper
-from harness.qp import QP, no_rows
-from harness.solution import Solution
-from harness.verify.measure import memory_mib
-from harness.verify.verdicts import evaluated_by_ranks
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.operators import Maker, SerialisableOperator
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.processes import reaper
+from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.solution import Solution
+from mortarbench.harness.verify.measure import memory_mib
+from mortarbench.harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: tag of what rank 0 tells the others to do
 _IDLE_SECONDS = 2e-4  #: between two looks for an order

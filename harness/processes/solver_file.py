@@ -20,8 +20,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from harness.errors import FaultError, InputError, one_line
-from harness.plugin import Solver
+from mortarbench.harness.errors import FaultError, InputError, one_line
+from mortarbench.harness.plugin import Solver
 
 
 def write_solver(path: Path, solver: Solver) -> None:

@@ -33,12 +33,12 @@ from select import poll, select
 from typing import Any, ClassVar
 from weakref import WeakSet
 
-from harness import limits
-from harness.limits import ONE_THREAD
-from harness.processes import reaper
-from harness.processes.footprint import Footprint
-from harness.processes.forking import Fork, Serve, fork, is_safe
-from harness.processes.protocol import (
+from mortarbench.harness import limits
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes.footprint import Footprint
+from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
+from mortarbench.harness.processes.protocol import (
     LONGEST_REPLY,
     ForeignReplyError,
     checked_answer,
@@ -47,9 +47,9 @@ from harness.processes.protocol import (
     kind_of,
     measures,
 )
-from harness.processes.turns import Turn
-from harness.record import Verdict
-from harness.verify.measure import one_line
+from mortarbench.harness.processes.turns import Turn
+from mortarbench.harness.record import Verdict
+from mortarbench.harness.verify.measure import one_line
 
 POLL_SECONDS = 0.02
 START_SECONDS = 120.0  #: for imports, and for loading a QP

@@ -38,18 +38,18 @@ from typing import Any
 import numpy as np
 from threadpoolctl import ThreadpoolController
 
-from harness.distributed.vectors import Emit, Ranks
-from harness.files.qpfile import load_qp
-from harness.files.store import point_arrays
-from harness.operators import NO_MAKERS, Maker
-from harness.plugin import Solver
-from harness.processes.case_folder import content_digest
-from harness.processes.protocol import Events, answer_requests
-from harness.processes.ranks import OnRanks, Spent, follow
-from harness.qp import QP, Vector, no_rows
-from harness.record import finite, journal_name
-from harness.solution import Solution, Status
-from harness.verify.measure import Prepare, Timed, measure, memory_mib
+from mortarbench.harness.distributed.vectors import Emit, Ranks
+from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.files.store import point_arrays
+from mortarbench.harness.operators import NO_MAKERS, Maker
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.processes.case_folder import content_digest
+from mortarbench.harness.processes.protocol import Events, answer_requests
+from mortarbench.harness.processes.ranks import OnRanks, Spent, follow
+from mortarbench.harness.qp import QP, Vector, no_rows
+from mortarbench.harness.record import finite, journal_name
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
 _MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
@@ -121,7 +121,9 @@ class _Bench:
     def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
         """Measure once, or run one check."""
         if "check" in request:
-            from harness.conformance.conformance import run_check  # few ask for it
+            from mortarbench.harness.conformance.conformance import (
+                run_check,  # few ask for it
+            )
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())

@@ -14,8 +14,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError, some
-from harness.files.lines import read_lines
+from mortarbench.harness.errors import InputError, some
+from mortarbench.harness.files.lines import read_lines
 
 FAULTS = "faults.jsonl"
 

@@ -12,16 +12,26 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from harness.environment.environment import VOLATILE
-from harness.environment.labels import in_words
-from harness.errors import InputError, shortened, some
-from harness.files.copies import FOLDER as COPIES
-from harness.files.copies import is_copy, remove_copies
-from harness.files.durable import full_disk_told, remove_unfinished, replace_file
-from harness.files.reading import MOST_TOML, opened, read_json, read_text, toml
-from harness.results.faults import FAULTS
-from harness.suite.growth import refused
-from harness.suite.suite import Suite, read_stored
+from mortarbench.harness.environment.environment import VOLATILE
+from mortarbench.harness.environment.labels import in_words
+from mortarbench.harness.errors import InputError, shortened, some
+from mortarbench.harness.files.copies import FOLDER as COPIES
+from mortarbench.harness.files.copies import is_copy, remove_copies
+from mortarbench.harness.files.durable import (
+    full_disk_told,
+    remove_unfinished,
+    replace_file,
+)
+from mortarbench.harness.files.reading import (
+    MOST_TOML,
+    opened,
+    read_json,
+    read_text,
+    toml,
+)
+from mortarbench.harness.results.faults import FAULTS
+from mortarbench.harness.suite.growth import refused
+from mortarbench.harness.suite.suite import Suite, read_stored
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")

@@ -15,10 +15,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from harness.errors import InputError, shown, some
-from harness.files.lines import Lines, read_lines
-from harness.record import Record
-from harness.results.folder import refuse_links
+from mortarbench.harness.errors import InputError, shown, some
+from mortarbench.harness.files.lines import Lines, read_lines
+from mortarbench.harness.record import Record
+from mortarbench.harness.results.folder import refuse_links
 
 
 class Journal:

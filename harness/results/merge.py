@@ -17,23 +17,23 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from harness.digest import hex_digest
-from harness.errors import InputError
-from harness.files.copies import check_copies, merge_copies
-from harness.files.durable import full_disk_told, replace_file
-from harness.files.store import copy_stored
-from harness.record import Record
-from harness.results.faults import FAULTS, read_faults
-from harness.results.folder import (
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.copies import check_copies, merge_copies
+from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.store import copy_stored
+from mortarbench.harness.record import Record
+from mortarbench.harness.results.faults import FAULTS, read_faults
+from mortarbench.harness.results.folder import (
     environment_of,
     keep_environment,
     locked,
     refuse_foreign,
     refuse_links,
 )
-from harness.results.journal import read_journal
-from harness.suite.growth import as_toml, united
-from harness.suite.suite import read_stored
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.suite.growth import as_toml, united
+from mortarbench.harness.suite.suite import read_stored
 
 _AGAIN = "are there already, and count once"
 JOURNAL = "merged"  #: name of the only journal of a folder that was merged

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from harness.distributed.vectors import EMITTED
-from harness.errors import InputError
-from harness.files.qpfile import qp_digest
-from harness.names import assemble, unbuilt
-from harness.plugin import Case, Family, Reference
-from harness.record import Record
-from harness.results.folder import environment_of
-from harness.results.stored_run import plugins_needed
+from mortarbench.harness.distributed.vectors import EMITTED
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.qpfile import qp_digest
+from mortarbench.harness.names import assemble, unbuilt
+from mortarbench.harness.plugin import Case, Family, Reference
+from mortarbench.harness.record import Record
+from mortarbench.harness.results.folder import environment_of
+from mortarbench.harness.results.stored_run import plugins_needed
 
 
 def rebuild(

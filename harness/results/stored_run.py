@@ -8,17 +8,17 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from harness.errors import InputError
-from harness.names import CaseId, assemble
-from harness.plugin import Family, Solver
-from harness.record import Record
-from harness.registry import SolverSpec, options_of, resolve
-from harness.results.folder import environment_of, suite_text
-from harness.results.journal import read_journal
-from harness.results.work_unit import WorkUnit
-from harness.suite.solver_options import without_options
-from harness.suite.suite import NULL, asked_solvers, limits, steps_up_to
-from harness.verify.verdicts import new_record, plain
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.names import CaseId, assemble
+from mortarbench.harness.plugin import Family, Solver
+from mortarbench.harness.record import Record
+from mortarbench.harness.registry import SolverSpec, options_of, resolve
+from mortarbench.harness.results.folder import environment_of, suite_text
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.work_unit import WorkUnit
+from mortarbench.harness.suite.solver_options import without_options
+from mortarbench.harness.suite.suite import NULL, asked_solvers, limits, steps_up_to
+from mortarbench.harness.verify.verdicts import new_record, plain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

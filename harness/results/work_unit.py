@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from harness.files.store import Arrays
-from harness.record import Record
+from mortarbench.harness.files.store import Arrays
+from mortarbench.harness.record import Record
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -22,13 +22,13 @@ from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
 from uuid import uuid4
 
-from harness.environment.environment import packages_of
-from harness.environment.labels import in_words
-from harness.errors import InputError
-from harness.operators import Maker
-from harness.registry import PluginFile
-from harness.results.folder import differences
-from harness.results.work_unit import (
+from mortarbench.harness.environment.environment import packages_of
+from mortarbench.harness.environment.labels import in_words
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.operators import Maker
+from mortarbench.harness.registry import PluginFile
+from mortarbench.harness.results.folder import differences
+from mortarbench.harness.results.work_unit import (
     Commands,
     Engine,
     Opens,
@@ -40,7 +40,7 @@ from harness.results.work_unit import (
 )
 
 if TYPE_CHECKING:  # it needs the package distributed
-    from harness.running.dask_worker import Delivery
+    from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
 CONNECT_SECONDS = 10
@@ -96,7 +96,7 @@ def on_cluster(
 
         @contextmanager
         def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
-            from harness.running.dask_worker import ExecutorPlugin
+            from mortarbench.harness.running.dask_worker import ExecutorPlugin
 
             name = f"mortarbench-{client.id}"
             with ExitStack() as ends, _scheduler_there(client, address):
@@ -247,7 +247,7 @@ class _Cluster:
             raise _SchedulerGoneError from e
 
     def _submit(self, task: _Task, worker: str) -> None:
-        from harness.running.dask_worker import execute
+        from mortarbench.harness.running.dask_worker import execute
 
         key = task.key
         task.worker = worker
@@ -284,7 +284,7 @@ class _Cluster:
 
     def _collected(self, task: _Task) -> Iterator[Outcome]:
         """Fetch what a worker has measured; nothing if it cannot be reached."""
-        from harness.running.dask_worker import collect
+        from mortarbench.harness.running.dask_worker import collect
 
         with suppress(OSError):  # it is lost, or about to be found so
             found = self._client.run(

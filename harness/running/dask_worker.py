@@ -22,13 +22,13 @@ from typing import Any, cast
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
 
-from harness.environment.environment import capture_in, digest
-from harness.errors import InputError
-from harness.limits import ONE_THREAD
-from harness.operators import Maker
-from harness.registry import PluginFile, load_plugin, merged
-from harness.results.work_unit import Commands, Outcome, WorkUnit
-from harness.running.executor import Executor
+from mortarbench.harness.environment.environment import capture_in, digest
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.operators import Maker
+from mortarbench.harness.registry import PluginFile, load_plugin, merged
+from mortarbench.harness.results.work_unit import Commands, Outcome, WorkUnit
+from mortarbench.harness.running.executor import Executor
 
 COLLECT_SECONDS = 10.0  #: that a worker waits for its parent to fetch a result
 

@@ -10,18 +10,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from harness.errors import FaultError
-from harness.files.durable import full_disk_told, refuse_full_disk
-from harness.files.qpfile import load_qp
-from harness.files.store import point_arrays, read_arrays, read_point
-from harness.operators import NO_MAKERS, Maker
-from harness.processes.case_folder import Entry, entry
-from harness.processes.measurement import emission_request, measured
-from harness.processes.supervisor import WorkerProcess
-from harness.qp import QP
-from harness.record import Record, Verdict
-from harness.registry import COPIES
-from harness.results.work_unit import (
+from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.durable import full_disk_told, refuse_full_disk
+from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
+from mortarbench.harness.operators import NO_MAKERS, Maker
+from mortarbench.harness.processes.case_folder import Entry, entry
+from mortarbench.harness.processes.measurement import emission_request, measured
+from mortarbench.harness.processes.supervisor import WorkerProcess
+from mortarbench.harness.qp import QP
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.registry import COPIES
+from mortarbench.harness.results.work_unit import (
     Commands,
     Outcome,
     Result,
@@ -29,10 +29,10 @@ from harness.results.work_unit import (
     Unmade,
     WorkUnit,
 )
-from harness.solution import Solution, Status
-from harness.verify.measure import SAMPLE_SECONDS
-from harness.verify.optimum import Optimum, proven_optimum
-from harness.verify.verdicts import has_point, noted
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.measure import SAMPLE_SECONDS
+from mortarbench.harness.verify.optimum import Optimum, proven_optimum
+from mortarbench.harness.verify.verdicts import has_point, noted
 
 _MOST_PROVEN = 1000  #: small QPs whose optima are kept
 LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
-    from harness.record import Record
+    from mortarbench.harness.record import Record
 
 
 @runtime_checkable

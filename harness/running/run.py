@@ -15,17 +15,17 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any
 
-from harness.errors import InputError, shown
-from harness.files.copies import keep_copies, refuse_own_copies
-from harness.files.durable import full_disk_told
-from harness.files.lines import Lines
-from harness.files.store import save
-from harness.plugin import Solver
-from harness.processes.termination import TerminatedError, ended_by_signals
-from harness.record import Record, finite
-from harness.registry import SolverSpec, options_of
-from harness.results.faults import FAULTS, Fault
-from harness.results.folder import (
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.files.copies import keep_copies, refuse_own_copies
+from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.lines import Lines
+from mortarbench.harness.files.store import save
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
+from mortarbench.harness.record import Record, finite
+from mortarbench.harness.registry import SolverSpec, options_of
+from mortarbench.harness.results.faults import FAULTS, Fault
+from mortarbench.harness.results.folder import (
     REMEDY,
     Held,
     claim,
@@ -35,13 +35,20 @@ from harness.results.folder import (
     refuse_other,
     scratch_in,
 )
-from harness.results.journal import Journal, read_journal
-from harness.results.work_unit import Commands, Opens, Outcome, Result, Unbuilt, Unmade
-from harness.running.executor import one_by_one
-from harness.running.progress import Progress
-from harness.running.schedule import Schedule
-from harness.suite.suite import Suite
-from harness.verify.verdicts import plain
+from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.results.work_unit import (
+    Commands,
+    Opens,
+    Outcome,
+    Result,
+    Unbuilt,
+    Unmade,
+)
+from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.progress import Progress
+from mortarbench.harness.running.schedule import Schedule
+from mortarbench.harness.suite.suite import Suite
+from mortarbench.harness.verify.verdicts import plain
 
 _log = logging.getLogger(__name__)
 

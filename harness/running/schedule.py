@@ -16,12 +16,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from harness.record import Record, Verdict
-from harness.results.work_unit import WorkUnit
-from harness.running.pairs import Block, widest
-from harness.running.progress import Progress
-from harness.suite.suite import Group, Suite
-from harness.verify.verdicts import new_record
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.results.work_unit import WorkUnit
+from mortarbench.harness.running.pairs import Block, widest
+from mortarbench.harness.running.progress import Progress
+from mortarbench.harness.suite.suite import Group, Suite
+from mortarbench.harness.verify.verdicts import new_record
 
 Cell = tuple[str, str, float]  #: mode, case and tolerance
 

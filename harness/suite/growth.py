@@ -14,8 +14,8 @@ from collections.abc import Iterator, Mapping
 from itertools import chain
 from typing import Any
 
-from harness.errors import InputError, shown
-from harness.suite.suite import DEFAULTS
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.suite.suite import DEFAULTS
 
 SAME = ("time_limit", "memory_limit", "accuracy")  #: what a verdict or time depends on
 RAISED = ("repeats", "max_repeats", "budget")  #: may grow

@@ -7,14 +7,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from harness import checked
-from harness.errors import InputError, some
-from harness.files.reading import toml
-from harness.names import CaseId, match, parse
-from harness.plugin import Family, Solver
-from harness.registry import SolverSpec, resolve
-from harness.suite.solver_options import swept
-from harness.suite.suite import NULL, Suite
+from mortarbench.harness import checked
+from mortarbench.harness.errors import InputError, some
+from mortarbench.harness.files.reading import toml
+from mortarbench.harness.names import CaseId, match, parse
+from mortarbench.harness.plugin import Family, Solver
+from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.suite.solver_options import swept
+from mortarbench.harness.suite.suite import NULL, Suite
 
 
 def with_overrides(

@@ -11,10 +11,10 @@ from math import prod
 from pathlib import Path, PurePath
 from typing import Any
 
-from harness import checked
-from harness.errors import PLUGINS, InputError, shown, some, unknown
-from harness.names import CaseId, assemble
-from harness.plugin import Family
+from mortarbench.harness import checked
+from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
+from mortarbench.harness.names import CaseId, assemble
+from mortarbench.harness.plugin import Family
 
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 

@@ -14,11 +14,11 @@ from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
-from harness.checked import located
-from harness.errors import InputError, shown, unknown
-from harness.plugin import Solver
-from harness.registry import SolverSpec, option_types, options_of, resolve
-from harness.suite.suite import NULL
+from mortarbench.harness.checked import located
+from mortarbench.harness.errors import InputError, shown, unknown
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.registry import SolverSpec, option_types, options_of, resolve
+from mortarbench.harness.suite.suite import NULL
 
 _KEY = re.compile(r"[^\W\d]\w*")
 _NUMBERS = {

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from harness import checked
-from harness.distributed.mpi import ranks_asked
-from harness.errors import InputError, shown, unknown
-from harness.files.reading import MOST_TOML, read_text, read_toml, toml
-from harness.names import CaseId
-from harness.plugin import Family, Solver
-from harness.record import TIGHTENING
-from harness.registry import SolverSpec, resolve
-from harness.suite.parameter_grid import planned
+from mortarbench.harness import checked
+from mortarbench.harness.distributed.mpi import ranks_asked
+from mortarbench.harness.errors import InputError, shown, unknown
+from mortarbench.harness.files.reading import MOST_TOML, read_text, read_toml, toml
+from mortarbench.harness.names import CaseId
+from mortarbench.harness.plugin import Family, Solver
+from mortarbench.harness.record import TIGHTENING
+from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.suite.parameter_grid import planned
 
 DEFAULTS: Mapping[str, Any] = {
     "tolerances": [1e-6],

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mechanics import Exact, Extended, Mechanics, Real
-from harness.verify.admissible import closing
+from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
+from mortarbench.harness.verify.admissible import closing
 
 EXCHANGES = 60  #: of active sets
 REFINEMENTS = 6

@@ -23,8 +23,15 @@ from scipy.sparse import (
 )
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from harness.mechanics import UNFELT, Exact, Extended, Mechanics, Real, felt_first
-from harness.qp import Vector
+from mortarbench.harness.mechanics import (
+    UNFELT,
+    Exact,
+    Extended,
+    Mechanics,
+    Real,
+    felt_first,
+)
+from mortarbench.harness.qp import Vector
 
 ROUNDS = 20  #: of growing the set of rows
 DENSE = 2000  #: rows up to which F_VV is formed

@@ -55,24 +55,24 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.mechanics import Exact, Extended, Mechanics, Real
-from harness.qp import Vector
-from harness.solution import Solution
-from harness.verify.active_set_refinement import (
+from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
+from mortarbench.harness.qp import Vector
+from mortarbench.harness.solution import Solution
+from mortarbench.harness.verify.active_set_refinement import (
     CLOSED,
     at_bounds,
     exchanged,
     suggested,
     unconstrained_guess,
 )
-from harness.verify.admissible import (
+from mortarbench.harness.verify.admissible import (
     UncertifiableError,
     admissible,
     balanced,
     held_and_loose,
     relative,
 )
-from harness.verify.substructured import (
+from mortarbench.harness.verify.substructured import (
     Rounding,
     Split,
     Torn,

@@ -29,9 +29,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, hstack, vstack
 
-from harness.qp import QP, Vector
-from harness.solution import Solution
-from harness.verify.rational import (
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.solution import Solution
+from mortarbench.harness.verify.rational import (
     nonnegative_solution,
     rational,
     rational_product,

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness.qp import QP, Matrix, Vector
-from harness.record import VERIFIED_FACTOR, Record, Verdict
-from harness.solution import Solution, Status
+from mortarbench.harness.qp import QP, Matrix, Vector
+from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
+from mortarbench.harness.solution import Solution, Status
 
 ROUNDING = 8 * float(np.finfo(float).eps)  #: of a sum of terms, relative to their sizes
 EXCUSED = 2e-4  #: of its scale: more of a residual is never called rounding

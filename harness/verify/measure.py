@@ -19,13 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.sparse import issparse
 
-from harness.errors import shortened, shown
-from harness.limits import too_large
-from harness.operators import SerialisableOperator, assembled
-from harness.plugin import Solver
-from harness.qp import NEEDS_MATRICES, QP, Matrix, Vector
-from harness.record import Measurement
-from harness.solution import Solution, Status, usable_history
+from mortarbench.harness.errors import shortened, shown
+from mortarbench.harness.limits import too_large
+from mortarbench.harness.operators import SerialisableOperator, assembled
+from mortarbench.harness.plugin import Solver
+from mortarbench.harness.qp import NEEDS_MATRICES, QP, Matrix, Vector
+from mortarbench.harness.record import Measurement
+from mortarbench.harness.solution import Solution, Status, usable_history
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
 MOST_INNER = 100

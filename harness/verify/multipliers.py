@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from scipy.linalg import qr, solve_triangular
 from scipy.sparse import csr_array
 
-from harness.errors import InputError
-from harness.qp import QP, Matrix, Vector
-from harness.solution import Solution, Status
-from harness.verify.kkt import energy_at, kkt_residuals
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.qp import QP, Matrix, Vector
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 
 #: A row is left out if its multiplier, by as much as moves the stationarity residual by
 #: tol, moves complementarity by more than this many tol: it cannot help.

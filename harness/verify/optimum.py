@@ -30,11 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from harness.operators import assembled
-from harness.plugin import Reference
-from harness.qp import QP, Vector
-from harness.solution import Solution, Status
-from harness.verify.kkt import (
+from mortarbench.harness.operators import assembled
+from mortarbench.harness.plugin import Reference
+from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.kkt import (
     EXCUSED,
     ROUNDING,
     Residuals,
@@ -46,7 +46,7 @@ from harness.verify.kkt import (
     tightened,
     violation,
 )
-from harness.verify.rational import rational, solutions
+from mortarbench.harness.verify.rational import rational, solutions
 
 LARGEST = 400  #: coupled variables, and rows, of a QP that is cheap to solve once more
 MOST_APART = 4000  #: variables, the others coupled to none

@@ -26,20 +26,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
-from harness.distributed.vectors import Ranks
-from harness.mechanics import Exact, Extended, Real, Substructures, felt_first
-from harness.qp import Vector
-from harness.verify.active_set_refinement import CLOSED, at_bounds, suggested
-from harness.verify.admissible import (
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.harness.mechanics import (
+    Exact,
+    Extended,
+    Real,
+    Substructures,
+    felt_first,
+)
+from mortarbench.harness.qp import Vector
+from mortarbench.harness.verify.active_set_refinement import (
+    CLOSED,
+    at_bounds,
+    suggested,
+)
+from mortarbench.harness.verify.admissible import (
     Balance,
     UncertifiableError,
     driven,
     inside_at_rows,
     is_driven,
 )
-from harness.verify.certificate import Certificate, is_sharp, proven, sharpest
-from harness.verify.products import times_columns, times_rows
-from harness.verify.substructured import (
+from mortarbench.harness.verify.certificate import (
+    Certificate,
+    is_sharp,
+    proven,
+    sharpest,
+)
+from mortarbench.harness.verify.products import times_columns, times_rows
+from mortarbench.harness.verify.substructured import (
     SAFETY,
     Residual,
     Rounding,

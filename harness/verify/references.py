@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.errors import InputError
-from harness.files.qpfile import qp_digest
-from harness.files.store import read_arrays, write_arrays
-from harness.mechanics import Extended, Mechanics
-from harness.plugin import Reference
-from harness.qp import QP, no_rows
-from harness.verify.active_set_refinement import (
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.files.qpfile import qp_digest
+from mortarbench.harness.files.store import read_arrays, write_arrays
+from mortarbench.harness.mechanics import Extended, Mechanics
+from mortarbench.harness.plugin import Reference
+from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.verify.active_set_refinement import (
     CLOSED,
     UPPER,
     States,
@@ -30,9 +30,9 @@ from harness.verify.active_set_refinement import (
     predicted,
     unconstrained_guess,
 )
-from harness.verify.admissible import DENSE
-from harness.verify.certificate import UncertifiableError, proof
-from harness.verify.substructured import Undivided
+from mortarbench.harness.verify.admissible import DENSE
+from mortarbench.harness.verify.certificate import UncertifiableError, proof
+from mortarbench.harness.verify.substructured import Undivided
 
 TRUSTED = 1e-7  #: bound up to which a solution from stored rows is one
 

@@ -40,9 +40,9 @@ from scipy.linalg import qr
 from scipy.sparse import csc_array, csc_matrix, csr_array, hstack
 from scipy.sparse.linalg import splu
 
-from harness.mechanics import Extended, Mechanics, Real, Substructures
-from harness.qp import Vector
-from harness.verify.products import times_columns, times_rows
+from mortarbench.harness.mechanics import Extended, Mechanics, Real, Substructures
+from mortarbench.harness.qp import Vector
+from mortarbench.harness.verify.products import times_columns, times_rows
 
 #: by how much energies in K and in K_T may differ more than those of û do: it is among
 #: the softest displacements, for which they differ most

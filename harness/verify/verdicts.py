@@ -12,20 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from harness.digest import hex_digest
-from harness.distributed.failures import agreed
-from harness.distributed.vectors import DistributedColumns, Emitted, Ranks
-from harness.names import CaseId
-from harness.plugin import Case
-from harness.qp import QP, no_rows
-from harness.record import Record, Verdict
-from harness.registry import COPIES, SolverSpec
-from harness.solution import Solution, Status
-from harness.verify.certificate import Certificate, UncertifiableError, certify
-from harness.verify.infeasibility import infeasibility_margin
-from harness.verify.kkt import Residuals, kkt_residuals, verdict
-from harness.verify.optimum import Proves, decided
-from harness.verify.over_ranks import certify_over_ranks
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.failures import agreed
+from mortarbench.harness.distributed.vectors import DistributedColumns, Emitted, Ranks
+from mortarbench.harness.names import CaseId
+from mortarbench.harness.plugin import Case
+from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.registry import COPIES, SolverSpec
+from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.certificate import (
+    Certificate,
+    UncertifiableError,
+    certify,
+)
+from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
+from mortarbench.harness.verify.optimum import Proves, decided
+from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
 #: first part of what a run_id digests; it names a measurement, whatever is stored of it
 IDENTITY = 1

@@ -12,9 +12,9 @@ def run(registries: Registries, options: Namespace) -> int:
     """Describe this machine and say what to change before measuring."""
     from rich.console import Console
 
-    from harness.environment.doctor import as_json, examine, render
-    from harness.environment.environment import digest
-    from harness.environment.noise import noise_floor
+    from mortarbench.harness.environment.doctor import as_json, examine, render
+    from mortarbench.harness.environment.environment import digest
+    from mortarbench.harness.environment.noise import noise_floor
 
     environment, noise = registries.environment(), noise_floor()
     checks = examine(environment, noise)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from harness.names import parse
 from mortarbench.arguments import EXPORTS, writable
+from mortarbench.harness.names import parse
 from mortarbench.registries import Registries
 
 

@@ -11,13 +11,13 @@ from functools import cache
 from textwrap import dedent
 from typing import TYPE_CHECKING
 
-from harness.errors import InputError
-from harness.registry import options_of
 from mortarbench import listing
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.registry import options_of
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
-    from harness.plugin import Solver
+    from mortarbench.harness.plugin import Solver
 
 HEAD = """\
 # Solvers

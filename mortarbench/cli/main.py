@@ -21,10 +21,11 @@ from itertools import takewhile
 from pathlib import Path
 from typing import NoReturn
 
-from harness.errors import InputError, one_line
-from harness.processes.termination import TerminatedError, ended_by_signals
-from harness.registry import PluginFile
 from mortarbench.arguments import FORMATS, GATES
+from mortarbench.cli.numpy_parts import defer_parts_of_numpy
+from mortarbench.harness.errors import InputError, one_line
+from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
+from mortarbench.harness.registry import PluginFile
 from mortarbench.registries import Registries, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
@@ -88,6 +89,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
     if argv[:1] in (["worker"], ["ranks"], ["generator"]):  # how runs start processes
+        defer_parts_of_numpy()
         from mortarbench import processes
 
         starts = {
@@ -116,7 +118,9 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
 
 def _told(e: OSError) -> int:
     """Name the file that something is wrong with, or the disk that is full."""
-    from harness.files.durable import FULL  # late: a help text needs no files
+    from mortarbench.harness.files.durable import (
+        FULL,  # late: a help text needs no files
+    )
 
     if e.filename is not None:
         return _complain(_remedied(e, Path(os.fsdecode(e.filename))))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from argparse import Namespace
 
-from harness.errors import say
 from mortarbench.arguments import existing
+from mortarbench.harness.errors import say
 from mortarbench.registries import Registries
 
 

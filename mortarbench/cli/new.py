@@ -7,7 +7,7 @@ from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
 
-from harness.errors import InputError, say, shown
+from mortarbench.harness.errors import InputError, say, shown
 from mortarbench.registries import Registries
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from harness.errors import InputError, say
-from harness.files.durable import full_disk_told
+from mortarbench.harness.errors import InputError, say
+from mortarbench.harness.files.durable import full_disk_told
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
-    from harness.plugin import Reference
+    from mortarbench.harness.plugin import Reference
 
 #: suites whose figures the paper does not have, and what is left of them when quick
 BEYOND: Mapping[str, Mapping[str, Any]] = {
@@ -57,10 +57,10 @@ def measured_paper(
         When the folder is in use, or no folder of such measurements.
 
     """
-    from harness.files.experiment import save_experiment
+    from mortarbench.harness.files.experiment import save_experiment
+    from mortarbench.problems.experiments import PAPER, QUICK, paper_experiment
+    from mortarbench.reports.paper.report import write_paper
     from mortarbench.results import run as run_suite
-    from problems.experiments import PAPER, QUICK, paper_experiment
-    from reports.paper.report import write_paper
 
     data = out / "data"
     experiment = paper_experiment(

@@ -7,9 +7,9 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-from harness.checked import positive
-from harness.errors import InputError
 from mortarbench.arguments import FORMATS, GATES, check_known, existing
+from mortarbench.harness.checked import positive
+from mortarbench.harness.errors import InputError
 from mortarbench.registries import Registries
 
 
@@ -25,7 +25,7 @@ def run(registries: Registries, options: Namespace) -> int:
         positive("--factor", options.factor)
     for folder in (options.folder, *options.others):
         existing(folder)
-    from harness.record import VERIFIED_FACTOR
+    from mortarbench.harness.record import VERIFIED_FACTOR
     from mortarbench.reporting import report
 
     found = report(

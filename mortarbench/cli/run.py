@@ -8,9 +8,9 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from harness.errors import some
-from harness.files.durable import full_disk_told
-from harness.suite.solver_options import given_options
+from mortarbench.harness.errors import some
+from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.suite.solver_options import given_options
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:

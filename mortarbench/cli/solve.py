@@ -9,12 +9,13 @@ from argparse import Namespace
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
-from harness.distributed.mpi import ranks_asked
-from harness.errors import InputError, say
-from harness.names import assemble, emitted_by_ranks, parse
-from harness.registry import check_name
-from harness.suite.solver_options import options_for
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
+from mortarbench.cli.numpy_parts import defer_parts_of_numpy
+from mortarbench.harness.distributed.mpi import ranks_asked
+from mortarbench.harness.errors import InputError, say
+from mortarbench.harness.names import assemble, emitted_by_ranks, parse
+from mortarbench.harness.registry import check_name
+from mortarbench.harness.suite.solver_options import options_for
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -32,6 +33,7 @@ def run(registries: Registries, options: Namespace) -> int:
     check_name(options.solver, registries.solvers)
     changed = options_for(options.solver, options.option, registries.solvers)
 
+    defer_parts_of_numpy()
     from mortarbench.answer import answers_of
     from mortarbench.case import Case
 
@@ -70,7 +72,7 @@ def _check(options: Namespace) -> None:
 
 def _print(answer: Answer, options: Namespace) -> None:
     """Print the answer, and the error of the mesh where it was asked for."""
-    from harness.record import Verdict
+    from mortarbench.harness.record import Verdict
 
     record = answer.record
     mesh = answer.mesh_error() if options.mesh_error else None
@@ -102,9 +104,9 @@ def _hint(answer: Answer) -> str:
         return ""
     import numpy as np
 
-    from harness.qp import no_rows
-    from harness.registry import resolve
-    from harness.verify.measure import reason_to_decline
+    from mortarbench.harness.qp import no_rows
+    from mortarbench.harness.registry import resolve
+    from mortarbench.harness.verify.measure import reason_to_decline
 
     qp = case.made.qp
     n = qp.q.size

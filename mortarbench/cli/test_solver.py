@@ -7,8 +7,8 @@ import json
 from argparse import Namespace
 from collections.abc import Collection
 
-from harness.errors import say
-from harness.registry import SolverSpec, check_name, resolve
+from mortarbench.harness.errors import say
+from mortarbench.harness.registry import SolverSpec, check_name, resolve
 from mortarbench.registries import Registries
 
 
@@ -22,8 +22,8 @@ def run(registries: Registries, options: Namespace) -> int:
     ]
     for spec in specs:
         check_name(spec.name, registries.solvers)
-    from harness.conformance.conformance import CHECKS, KEEPS
-    from harness.conformance.weaknesses import weaknesses_page
+    from mortarbench.harness.conformance.conformance import CHECKS, KEEPS
+    from mortarbench.harness.conformance.weaknesses import weaknesses_page
     from mortarbench.validation import test_solver
 
     for spec in specs:

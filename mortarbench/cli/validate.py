@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 from argparse import Namespace
 
-from harness.errors import say
 from mortarbench.arguments import budget, existing
+from mortarbench.harness.errors import say
 from mortarbench.registries import Registries
 
 

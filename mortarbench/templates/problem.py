@@ -16,7 +16,16 @@ from typing import Any
 import numpy as np
 from scipy.sparse import diags_array
 
-from harness import QP, Case, Family, InputError, Reference, Solution, Value, no_rows
+from mortarbench.harness import (
+    QP,
+    Case,
+    Family,
+    InputError,
+    Reference,
+    Solution,
+    Value,
+    no_rows,
+)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness import QP, Solution, Status, Vector, kkt_residuals, needs_matrices
+from mortarbench.harness import (
+    QP,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+    needs_matrices,
+)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import Friction, InputError, Matrix
-from problems.contact.bodies import UnassembledBodies
+from mortarbench.harness import Friction, InputError, Matrix
+from mortarbench.problems.contact.bodies import UnassembledBodies
 
 #: part of the load that may be left: rounding of coordinates, normals and tractions
 UNBALANCED = 1e-6

@@ -9,23 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array
 
-from harness import InputError, Vector
-from problems.fem.elasticity import (
+from mortarbench.harness import InputError, Vector
+from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
     elasticity_matrix,
     rigid_modes,
     stiffness,
 )
-from problems.fem.fixing import fixing_nodes
-from problems.fem.inverse import (
+from mortarbench.problems.fem.fixing import fixing_nodes
+from mortarbench.problems.fem.inverse import (
     GeneralisedInverse,
     Interface,
     floating_inverse,
     regular_inverse,
     supported_inverse,
 )
-from problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
+from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
 
 
 class ContactPair(NamedTuple):

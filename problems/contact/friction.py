@@ -22,12 +22,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from harness import Friction, InputError, Vector
-from harness.errors import PastEndError
-from harness.mechanics import NO_FRICTION
-from problems.contact.bodies import ContactSides, UnassembledBodies
-from problems.contact.node_to_segment import ContactRows
-from problems.fem.mesh import Nodes
+from mortarbench.harness import Friction, InputError, Vector
+from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.problems.contact.bodies import ContactSides, UnassembledBodies
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 

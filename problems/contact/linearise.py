@@ -10,18 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
-from harness import InputError, Vector
-from problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
-from problems.contact.friction import FrictionLaw
-from problems.contact.mortar import mortar
-from problems.contact.node_to_segment import (
+from mortarbench.harness import InputError, Vector
+from mortarbench.problems.contact.bodies import Bodies, ContactSides, UnassembledBodies
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.mortar import mortar
+from mortarbench.problems.contact.node_to_segment import (
     ContactRows,
     closest_points,
     geometric_stiffness,
     node_to_segment,
 )
-from problems.contact.polyline import current_polyline, current_positions
-from problems.fem.mesh import Nodes
+from mortarbench.problems.contact.polyline import current_polyline, current_positions
+from mortarbench.problems.fem.mesh import Nodes
 
 
 def linearisation(

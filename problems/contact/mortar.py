@@ -62,11 +62,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 
-from harness import Vector
-from problems.contact.node_to_segment import ContactRows
-from problems.contact.polyline import Points, Polyline, cross, current_polyline, unit
-from problems.contact.segment_search import Reach, facing
-from problems.fem.mesh import Nodes, dofs_of
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.polyline import (
+    Points,
+    Polyline,
+    cross,
+    current_polyline,
+    unit,
+)
+from mortarbench.problems.contact.segment_search import Reach, facing
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
 NEGLIGIBLE = 1e-8

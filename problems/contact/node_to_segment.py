@@ -38,8 +38,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import Vector
-from problems.contact.polyline import (
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.polyline import (
     Points,
     Polyline,
     current_polyline,
@@ -47,8 +47,8 @@ from problems.contact.polyline import (
     polyline,
     unit,
 )
-from problems.contact.segment_search import Reach, nearest
-from problems.fem.mesh import Nodes, dofs_of, nodal_lengths
+from mortarbench.problems.contact.segment_search import Reach, nearest
+from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 

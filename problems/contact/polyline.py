@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import InputError, Vector
-from problems.fem.mesh import Nodes, as_vectors
+from mortarbench.harness import InputError, Vector
+from mortarbench.problems.fem.mesh import Nodes, as_vectors
 
 Points = NDArray[np.float64]  #: (…, 2), m or dimensionless
 

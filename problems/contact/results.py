@@ -8,13 +8,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import QP, Fields, Friction, Solution, Vector
-from harness.mechanics import NO_FRICTION, contact_rows
-from harness.plugin import SLIDING
-from problems.contact.bodies import Bodies, ContactSides
-from problems.contact.sides import ACTIVE, active, bodies_of, contact_sides, states
-from problems.fem.mesh import as_vectors
-from problems.fem.stress import centre_stress, recover, von_mises
+from mortarbench.harness import QP, Fields, Friction, Solution, Vector
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.harness.plugin import SLIDING
+from mortarbench.problems.contact.bodies import Bodies, ContactSides
+from mortarbench.problems.contact.sides import (
+    ACTIVE,
+    active,
+    bodies_of,
+    contact_sides,
+    states,
+)
+from mortarbench.problems.fem.mesh import as_vectors
+from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 
 
 class Inside(NamedTuple):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csr_array
 
-from problems.contact.node_to_segment import ContactRows
-from problems.fem.mesh import Mesh, Nodes, nodal_lengths
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.fem.mesh import Mesh, Nodes, nodal_lengths
 
 
 def above_plane(mesh: Mesh, side: Nodes, *, tangential: bool = False) -> ContactRows:

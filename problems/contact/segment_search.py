@@ -24,9 +24,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import InputError, Vector
-from problems.contact.polyline import Points, Polyline, cross
-from problems.fem.mesh import Nodes
+from mortarbench.harness import InputError, Vector
+from mortarbench.problems.contact.polyline import Points, Polyline, cross
+from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
 ROOTS = 16  #: levels with fewer sub-chains than this are not worth a visit

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import QP, ContactSide, Friction, Solution, Vector
-from harness.mechanics import NO_FRICTION
-from harness.plugin import SLIDING
-from problems.contact.bodies import Bodies, ContactPair, ContactSides
-from problems.contact.node_to_segment import tangent
-from problems.contact.polyline import current_polyline
-from problems.fem.mesh import Nodes, as_vectors, nodal_lengths
+from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
+from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.harness.plugin import SLIDING
+from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
+from mortarbench.problems.contact.node_to_segment import tangent
+from mortarbench.problems.contact.polyline import current_polyline
+from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 
 RIGID = "rigid"  #: name of a master that is no body
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ

@@ -10,15 +10,27 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Case, Friction, Grid, InputError, Mechanics, Solution
-from harness.mechanics import NO_FRICTION, contact_rows
-from problems.contact.bodies import Bodies
-from problems.contact.results import fields
-from problems.duality.dualisation import dual_bounds, dualise, posed
-from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
-from problems.fem.inverse import GeneralisedInverse
-from problems.feti.substructures import LocalProblems
-from problems.feti.torn import Torn
+from mortarbench.harness import (
+    QP,
+    Case,
+    Friction,
+    Grid,
+    InputError,
+    Mechanics,
+    Solution,
+)
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.contact.results import fields
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
+from mortarbench.problems.duality.torn_dual import (
+    torn_dual,
+    torn_matrices,
+    torn_quantities,
+)
+from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.torn import Torn
 
 FORMS = ("primal", "dual", "dual-bounds")
 

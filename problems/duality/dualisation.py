@@ -18,9 +18,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from harness import QP, Friction, Solution, Structure, Vector, no_rows
-from harness.mechanics import NO_FRICTION, contact_rows, with_friction
-from problems.fem.inverse import GeneralisedInverse
+from mortarbench.harness import QP, Friction, Solution, Structure, Vector, no_rows
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows, with_friction
+from mortarbench.problems.fem.inverse import GeneralisedInverse
 
 
 class Transformed(NamedTuple):

@@ -51,14 +51,22 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.sparse import csc_array
 
-from harness import QP, InputError, Reference, Solution, Status, Vector, kkt_residuals
-from harness.errors import PastEndError
-from problems.contact.bodies import Bodies, clamped
-from problems.contact.node_to_segment import ContactRows
-from problems.contact.sides import ACTIVE
-from problems.duality.dualisation import dual_bounds, dualise
-from problems.duality.stepping import REFERENCE, Linearise, primal_qp
-from problems.fem.finite_strain import (
+from mortarbench.harness import (
+    QP,
+    InputError,
+    Reference,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+)
+from mortarbench.harness.errors import PastEndError
+from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.stepping import REFERENCE, Linearise, primal_qp
+from mortarbench.problems.fem.finite_strain import (
     Cells,
     Evaluated,
     InvertedCellError,
@@ -67,9 +75,13 @@ from problems.fem.finite_strain import (
     convexified,
     evaluate,
 )
-from problems.fem.fixing import fixing_nodes
-from problems.fem.inverse import GeneralisedInverse, Interface, floating_inverse
-from problems.fem.mesh import dofs_of
+from mortarbench.problems.fem.fixing import fixing_nodes
+from mortarbench.problems.fem.inverse import (
+    GeneralisedInverse,
+    Interface,
+    floating_inverse,
+)
+from mortarbench.problems.fem.mesh import dofs_of
 
 SETTLED = 1e-9  #: residual of equilibrium and gaps at the end of a step
 ROUNDING = 2 * float(np.finfo(float).eps)  #: of the forces |K||u| within cells

@@ -10,26 +10,26 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from harness import Case, Fields, Reference, Solution, Vector
-from problems.contact.bodies import Bodies, clamped, supported
-from problems.contact.linearise import (
+from mortarbench.harness import Case, Fields, Reference, Solution, Vector
+from mortarbench.problems.contact.bodies import Bodies, clamped, supported
+from mortarbench.problems.contact.linearise import (
     closest_segments,
     contact_stiffness,
     linearisation,
 )
-from problems.contact.results import fields, quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.newton import Gaps, Iteration, NewtonPath, guided
-from problems.duality.stepping import Linearise
-from problems.fem.finite_strain import (
+from mortarbench.problems.contact.results import fields, quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.newton import Gaps, Iteration, NewtonPath, guided
+from mortarbench.problems.duality.stepping import Linearise
+from mortarbench.problems.fem.finite_strain import (
     Cells,
     InvertedCellError,
     cauchy_stress,
     cells_of,
     strain_energy,
 )
-from problems.fem.hyperelastic import hyperelastic
-from problems.fem.stress import recover, von_mises_of
+from mortarbench.problems.fem.hyperelastic import hyperelastic
+from mortarbench.problems.fem.stress import recover, von_mises_of
 
 
 def newton_path(

@@ -24,20 +24,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
-from problems.contact.balance import check_friction
-from problems.contact.bodies import Bodies
-from problems.contact.friction import (
+from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
+from mortarbench.problems.contact.balance import check_friction
+from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.contact.friction import (
     FrictionLaw,
     forces_at_nodes,
     friction_of,
     iterate_of,
     settled,
 )
-from problems.contact.node_to_segment import ContactRows
-from problems.duality.dualisation import Transformed, bounded, dual_bounds, dualise
-from problems.fem.inverse import GeneralisedInverse
-from problems.fem.mesh import Nodes
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.duality.dualisation import (
+    Transformed,
+    bounded,
+    dual_bounds,
+    dualise,
+)
+from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.fem.mesh import Nodes
 
 Linearise = Callable[[Vector], ContactRows]  #: displacement (n,) in m → rows
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]

@@ -17,11 +17,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csr_array
 
-from harness import QP, Friction, Solution, Vector, no_rows
-from harness.mechanics import NO_FRICTION, contact_rows
-from problems.duality.dualisation import Transformed
-from problems.feti.operators import block_bytes, dual_operator, touched
-from problems.feti.torn import Torn
+from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.problems.duality.dualisation import Transformed
+from mortarbench.problems.feti.operators import block_bytes, dual_operator, touched
+from mortarbench.problems.feti.torn import Torn
 
 
 def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Transformed:

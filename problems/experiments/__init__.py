@@ -6,13 +6,19 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from typing import Any
 
-from harness import Reference
-from harness.files.experiment import Experiment
-from problems.experiments.analysis import scaling, states
-from problems.experiments.parts import Rows, assembly, contact, counts, inverse
-from problems.experiments.physics import pressures, stepping, verification
-from problems.experiments.plan import PAPER, QUICK, Plan
-from problems.models.beam_ring import BEAM, LOAD, RING
+from mortarbench.harness import Reference
+from mortarbench.harness.files.experiment import Experiment
+from mortarbench.problems.experiments.analysis import scaling, states
+from mortarbench.problems.experiments.parts import (
+    Rows,
+    assembly,
+    contact,
+    counts,
+    inverse,
+)
+from mortarbench.problems.experiments.physics import pressures, stepping, verification
+from mortarbench.problems.experiments.plan import PAPER, QUICK, Plan
+from mortarbench.problems.models.beam_ring import BEAM, LOAD, RING
 
 __all__ = ["PAPER", "QUICK", "Plan", "paper_experiment"]
 

@@ -11,17 +11,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 
-from harness import QP, Fields, Reference, Solution, Status, Vector
-from problems.contact.bodies import Bodies, floating
-from problems.contact.linearise import linearisation
-from problems.contact.node_to_segment import ContactRows
-from problems.contact.results import fields
-from problems.duality.dualisation import dualise
-from problems.duality.stepping import LoadPath
-from problems.experiments.clock import Laps, Stopwatch, race
-from problems.experiments.parts import Rows
-from problems.experiments.plan import Plan
-from problems.models.beam_ring import model
+from mortarbench.harness import QP, Fields, Reference, Solution, Status, Vector
+from mortarbench.problems.contact.bodies import Bodies, floating
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.results import fields
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
+from mortarbench.problems.experiments.parts import Rows
+from mortarbench.problems.experiments.plan import Plan
+from mortarbench.problems.models.beam_ring import model
 
 WAYS = {"per-row": False, "condensed": True}  #: condense?
 

@@ -9,17 +9,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Value
-from problems.contact.mortar import mortar
-from problems.contact.node_to_segment import node_to_segment
-from problems.experiments.clock import Laps, Stopwatch, race, whole
-from problems.experiments.plan import Plan
-from problems.fem.elasticity import elasticity_matrix, rigid_modes, sparsity, stiffness
-from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
-from problems.fem.inverse import floating_inverse
-from problems.fem.mesh import Mesh, Nodes, rectangle
-from problems.fem.triplets import stiffness_by_triplets
-from problems.models.beam_ring import BEAM, LENGTH, LOAD, model
+from mortarbench.harness import Value
+from mortarbench.problems.contact.mortar import mortar
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.experiments.clock import Laps, Stopwatch, race, whole
+from mortarbench.problems.experiments.plan import Plan
+from mortarbench.problems.fem.elasticity import (
+    elasticity_matrix,
+    rigid_modes,
+    sparsity,
+    stiffness,
+)
+from mortarbench.problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
+from mortarbench.problems.fem.inverse import floating_inverse
+from mortarbench.problems.fem.mesh import Mesh, Nodes, rectangle
+from mortarbench.problems.fem.triplets import stiffness_by_triplets
+from mortarbench.problems.models.beam_ring import BEAM, LENGTH, LOAD, model
 
 Rows = Iterator[dict[str, Value]]
 

@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from harness import Reference, Value
-from problems.contact.bodies import Bodies, clamped
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.stepping import LoadPath
-from problems.experiments.parts import Rows
-from problems.experiments.plan import Plan
-from problems.families.hertz import HertzCylinder
-from problems.families.patch import ContactPatch
-from problems.fem.mesh import dofs_of, nodal_lengths
-from problems.models.beam_ring import LENGTH, model
+from mortarbench.harness import Reference, Value
+from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.experiments.parts import Rows
+from mortarbench.problems.experiments.plan import Plan
+from mortarbench.problems.families.hertz import HertzCylinder
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
+from mortarbench.problems.models.beam_ring import LENGTH, model
 
 SETTLED = (2, 8)  #: steps, linearisations of each: further ones change nothing
 

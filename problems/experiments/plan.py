@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from problems.experiments.clock import Rounds
+from mortarbench.problems.experiments.clock import Rounds
 
 
 @dataclass(frozen=True, kw_only=True)

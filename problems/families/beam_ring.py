@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import (
+from mortarbench.harness import InputError
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     CONTACT_STIFFNESS,
     DECOMPOSITION,
@@ -32,8 +32,8 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
@@ -100,7 +100,7 @@ class BeamRing(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.beam_ring import in_subdomains
+        from mortarbench.problems.models.beam_ring import in_subdomains
 
         return in_subdomains(params)
 
@@ -108,7 +108,7 @@ class BeamRing(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP of one load step in one form."""
-        from problems.models.beam_ring import load_step
+        from mortarbench.problems.models.beam_ring import load_step
 
         self.check(params)
         return load_step(form, params, reference)

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import Family, InputError
-from problems.ranges import (
+from mortarbench.harness import Family, InputError
+from mortarbench.problems.ranges import (
     FINITE,
     MOST_STEPS,
     at_least,
@@ -19,7 +19,7 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
+    from mortarbench.harness import Case, Reference, Value
 
 THICKEST = 2.0  #: smallest length of the beam over its thickness
 LEAST_LOAD, MOST_LOAD = 1e-3, 1e3  #: PL²/EI; the elastica loses digits beyond
@@ -79,7 +79,7 @@ class Cantilever(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP of one Newton iteration of one load step in one form."""
-        from problems.models.cantilever import newton_step
+        from mortarbench.problems.models.cantilever import newton_step
 
         self.check(params)
         return newton_step(form, params, reference)

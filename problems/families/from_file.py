@@ -8,13 +8,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
-from harness.files.copies import Copies, content_digest
-from harness.plugin import SourceFile
-from problems.files.file_digest import check_digest, format_of
+from mortarbench.harness import Family, InputError
+from mortarbench.harness.files.copies import Copies, content_digest
+from mortarbench.harness.plugin import SourceFile
+from mortarbench.problems.files.file_digest import check_digest, format_of
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Solution, Value
+    from mortarbench.harness import Case, Reference, Solution, Value
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class FromFile(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Read the QP; its objective in the units of the file is the quantity value."""
-        from harness import Case
-        from problems.files.readers import read
+        from mortarbench.harness import Case
+        from mortarbench.problems.files.readers import read
 
         qp, scale, constant = read(self._located(params))
 

@@ -8,12 +8,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
-from harness.checked import located
-from harness.files.copies import content_digest
-from problems.families.in_subdomains import InSubdomains
-from problems.files.file_digest import check_digest
-from problems.ranges import (
+from mortarbench.harness import InputError
+from mortarbench.harness.checked import located
+from mortarbench.harness.files.copies import content_digest
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.files.file_digest import check_digest
+from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
     LAW,
@@ -32,8 +32,8 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class GmshBodies(InSubdomains):
         """Fill in what the file says, its digest, and step, by default steps."""
         params: dict[str, Value] = {**self.defaults, **given}
         if params["path"]:
-            from problems.models.description import read_description
+            from mortarbench.problems.models.description import read_description
 
             path = Path(str(params["path"]))
             table = read_description(path)
@@ -74,7 +74,7 @@ class GmshBodies(InSubdomains):
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range and the files are there."""
-        from problems.models.description import pair_laws, read_description
+        from mortarbench.problems.models.description import pair_laws, read_description
 
         p: Any = params
         if not p["path"]:
@@ -101,7 +101,7 @@ class GmshBodies(InSubdomains):
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every edge of the mesh halved."""
-        from problems.models.gmsh_bodies import laws_of
+        from mortarbench.problems.models.gmsh_bodies import laws_of
 
         one_state(self.name, params)
         laws = [law.kind for law in laws_of(params)]
@@ -110,7 +110,7 @@ class GmshBodies(InSubdomains):
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Name the arcs of contact sides, whose chords halving leaves as they are."""
-        from problems.models.gmsh_bodies import has_arcs
+        from mortarbench.problems.models.gmsh_bodies import has_arcs
 
         if not has_arcs(params):
             return ""
@@ -125,7 +125,7 @@ class GmshBodies(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.gmsh_bodies import in_subdomains
+        from mortarbench.problems.models.gmsh_bodies import in_subdomains
 
         self.check(params)
         return in_subdomains(params)
@@ -134,7 +134,7 @@ class GmshBodies(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP of one load step in one form."""
-        from problems.models.gmsh_bodies import load_step
+        from mortarbench.problems.models.gmsh_bodies import load_step
 
         self.check(params)
         return load_step(form, params, reference)

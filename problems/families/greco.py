@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import InputError
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import (
+from mortarbench.harness import InputError
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
     MOST,
@@ -20,8 +20,8 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Greco(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.greco import in_subdomains
+        from mortarbench.problems.models.greco import in_subdomains
 
         return in_subdomains(params)
 
@@ -63,7 +63,7 @@ class Greco(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit a Tresca problem of the fixed point in one form."""
-        from problems.models.greco import greco
+        from mortarbench.problems.models.greco import greco
 
         self.check(params)
         return greco(form, params, reference)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
-from problems.ranges import at_least, fits_dense, one_of, tangential
+from mortarbench.harness import Family, InputError
+from mortarbench.problems.ranges import at_least, fits_dense, one_of, tangential
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
+    from mortarbench.harness import Case, Reference, Value
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class HalfPlane(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP."""
-        from problems.models.half_plane import half_planes
+        from mortarbench.problems.models.half_plane import half_planes
 
         del form, reference
         self.check(params)

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import InputError
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import (
+from mortarbench.harness import InputError
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
     KINEMATICS,
@@ -31,8 +31,8 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class HertzPlane(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.hertz import on_plane_in_subdomains
+        from mortarbench.problems.models.hertz import on_plane_in_subdomains
 
         return on_plane_in_subdomains(params)
 
@@ -79,7 +79,7 @@ class HertzPlane(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP in one form."""
-        from problems.models.hertz import cylinder_on_plane
+        from mortarbench.problems.models.hertz import cylinder_on_plane
 
         self.check(params)
         return cylinder_on_plane(form, params, reference)
@@ -161,7 +161,7 @@ class HertzCylinder(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.hertz import on_cylinder_in_subdomains
+        from mortarbench.problems.models.hertz import on_cylinder_in_subdomains
 
         return on_cylinder_in_subdomains(params)
 
@@ -169,7 +169,7 @@ class HertzCylinder(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP, with contact linearised at the undeformed state, in one form."""
-        from problems.models.hertz import cylinder_on_cylinder
+        from mortarbench.problems.models.hertz import cylinder_on_cylinder
 
         params = self.complete(params)
         self.check(params)

@@ -6,12 +6,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING
 
-from harness import Family
+from mortarbench.harness import Family
 
 if TYPE_CHECKING:
-    from harness import ReferenceOverRanks, Value
-    from harness.distributed.vectors import Emitted, Ranks
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import ReferenceOverRanks, Value
+    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 class InSubdomains(Family):
@@ -33,7 +33,7 @@ class InSubdomains(Family):
             return None
 
         def emit(ranks: Ranks, reference: ReferenceOverRanks) -> Emitted:
-            from problems.feti.emission import emitted
+            from mortarbench.problems.feti.emission import emitted
 
             return emitted(self.in_subdomains(params), ranks, reference)
 

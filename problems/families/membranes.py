@@ -7,12 +7,12 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import GLUES, at_least, doubled, fits, one_of
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import GLUES, at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Membranes(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.membranes import in_subdomains
+        from mortarbench.problems.models.membranes import in_subdomains
 
         return in_subdomains(params)
 
@@ -53,7 +53,7 @@ class Membranes(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP in one form."""
-        from problems.models.membranes import membranes
+        from mortarbench.problems.models.membranes import membranes
 
         del reference
         params = self.complete(params)

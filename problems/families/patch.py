@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import InputError
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import (
+from mortarbench.harness import InputError
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
     KINEMATICS,
@@ -30,8 +30,8 @@ from problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class ContactPatch(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.patch import in_subdomains
+        from mortarbench.problems.models.patch import in_subdomains
 
         return in_subdomains(params)
 
@@ -104,7 +104,7 @@ class ContactPatch(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP in one form."""
-        from problems.models.patch import two_blocks
+        from mortarbench.problems.models.patch import two_blocks
 
         self.check(params)
         return two_blocks(form, params, reference)

@@ -7,13 +7,21 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from harness import InputError
-from problems.families.in_subdomains import InSubdomains
-from problems.ranges import GLUES, PLANES, at_least, doubled, fits, one_of, positive
+from mortarbench.harness import InputError
+from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.ranges import (
+    GLUES,
+    PLANES,
+    at_least,
+    doubled,
+    fits,
+    one_of,
+    positive,
+)
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
-    from problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
@@ -64,7 +72,7 @@ class Plate(InSubdomains):
 
     def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
         """Describe the dual that ranks emit."""
-        from problems.models.plate import in_subdomains
+        from mortarbench.problems.models.plate import in_subdomains
 
         return in_subdomains(params)
 
@@ -72,7 +80,7 @@ class Plate(InSubdomains):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP in one form."""
-        from problems.models.plate import clamped_plate
+        from mortarbench.problems.models.plate import clamped_plate
 
         del reference
         self.check(params)

@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from harness import Family, InputError
-from problems.ranges import at_least, fits, positive
+from mortarbench.harness import Family, InputError
+from mortarbench.problems.ranges import at_least, fits, positive
 
 if TYPE_CHECKING:
-    from harness import Case, Reference, Value
+    from mortarbench.harness import Case, Reference, Value
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class String(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP."""
-        from problems.models.variational import string
+        from mortarbench.problems.models.variational import string
 
         del form, reference
         self.check(params)
@@ -65,7 +65,7 @@ class JournalBearing(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP."""
-        from problems.models.variational import journal_bearing
+        from mortarbench.problems.models.variational import journal_bearing
 
         del form, reference
         self.check(params)
@@ -92,7 +92,7 @@ class Torsion(Family):
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
         """Emit the QP."""
-        from problems.models.variational import torsion
+        from mortarbench.problems.models.variational import torsion
 
         del form, reference
         self.check(params)

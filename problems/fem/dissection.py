@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Matrix
-from problems.fem.mesh import Nodes
-from problems.fem.ordering import borders, dissected, node_graph
+from mortarbench.harness import Matrix
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.ordering import borders, dissected, node_graph
 
 LEAF = 8  #: nodes that are cut no more
 

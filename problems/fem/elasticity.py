@@ -15,9 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from harness import Vector
-from problems.fem.kernels import add_stiffness, dof_pattern, node_pattern, slots
-from problems.fem.mesh import Mesh, dofs_of
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.kernels import (
+    add_stiffness,
+    dof_pattern,
+    node_pattern,
+    slots,
+)
+from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
 

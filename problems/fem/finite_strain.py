@@ -32,17 +32,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from harness import Vector
-from problems.fem.elasticity import (
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.elasticity import (
     GAUSS,
     Pattern,
     cell_dofs,
     shape_gradients,
     sparsity,
 )
-from problems.fem.hyperelastic import Floats, Hyperelastic, determinant
-from problems.fem.mesh import Mesh, triangular
-from problems.fem.tangents import add_tangents, cell_tangents
+from mortarbench.problems.fem.hyperelastic import Floats, Hyperelastic, determinant
+from mortarbench.problems.fem.mesh import Mesh, triangular
+from mortarbench.problems.fem.tangents import add_tangents, cell_tangents
 
 #: Poisson's ratio from which on cells take the mean dilatation
 NEARLY_INCOMPRESSIBLE = 0.4

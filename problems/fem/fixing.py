@@ -12,8 +12,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import laplacian
 from scipy.sparse.linalg import eigsh
 
-from harness import Matrix
-from problems.fem.mesh import Nodes
+from mortarbench.harness import Matrix
+from mortarbench.problems.fem.mesh import Nodes
 
 PARTS = 4  #: per body; fewer condition worse, more fill the factor
 

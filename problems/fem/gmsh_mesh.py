@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from harness import InputError
-from harness.files.datafile import check_size, opened, parsing
-from problems.fem.mesh import Nodes, boundary_edges, triangular
+from mortarbench.harness import InputError
+from mortarbench.harness.files.datafile import check_size, opened, parsing
+from mortarbench.problems.fem.mesh import Nodes, boundary_edges, triangular
 
 _COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from problems.fem.elasticity import Material
+from mortarbench.problems.fem.elasticity import Material
 
 Floats = NDArray[np.float64]
 

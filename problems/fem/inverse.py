@@ -31,12 +31,12 @@ from scipy.sparse import block_diag as sparse_block_diag
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, cholesky
 
-from harness import Matrix, Vector
-from problems.fem.dissection import index_arrays
-from problems.fem.elimination import spread_symmetric
-from problems.fem.kernels import congruence
-from problems.fem.mesh import Nodes, dofs_of
-from problems.fem.multifrontal import Multifrontal, multifrontal
+from mortarbench.harness import Matrix, Vector
+from mortarbench.problems.fem.dissection import index_arrays
+from mortarbench.problems.fem.elimination import spread_symmetric
+from mortarbench.problems.fem.kernels import congruence
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.multifrontal import Multifrontal, multifrontal
 
 NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
+from mortarbench.harness import Vector
 
 Nodes = NDArray[np.int64]
 

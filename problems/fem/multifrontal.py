@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Matrix, Vector
-from problems.fem.dissection import Fronts, dissect, index_arrays, spread
-from problems.fem.elimination import eliminate, substitute
-from problems.fem.mesh import Nodes
+from mortarbench.harness import Matrix, Vector
+from mortarbench.problems.fem.dissection import Fronts, dissect, index_arrays, spread
+from mortarbench.problems.fem.elimination import eliminate, substitute
+from mortarbench.problems.fem.mesh import Nodes
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -15,15 +15,15 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from problems.fem.elasticity import (
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.elasticity import (
     GAUSS,
     Plane,
     cell_dofs,
     shape_gradients,
     strain_matrix,
 )
-from problems.fem.mesh import Mesh, boundary_edges, triangular
+from mortarbench.problems.fem.mesh import Mesh, boundary_edges, triangular
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

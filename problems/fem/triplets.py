@@ -10,8 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
-from problems.fem.elasticity import GAUSS, cell_dofs, shape_gradients, strain_matrix
-from problems.fem.mesh import Mesh
+from mortarbench.problems.fem.elasticity import (
+    GAUSS,
+    cell_dofs,
+    shape_gradients,
+    strain_matrix,
+)
+from mortarbench.problems.fem.mesh import Mesh
 
 
 def stiffness_by_triplets(mesh: Mesh, D: NDArray[np.float64]) -> csc_array:

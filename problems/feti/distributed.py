@@ -24,20 +24,20 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from harness import QP, InputError, Solution, Vector, no_rows
-from harness.digest import hex_digest
-from harness.distributed.factor import Touched, local_factor, touched_rows
-from harness.distributed.sparse import CompressedRows
-from harness.distributed.vectors import (
+from mortarbench.harness import QP, InputError, Solution, Vector, no_rows
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.factor import Touched, local_factor, touched_rows
+from mortarbench.harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
     Ranks,
     Share,
     distributed,
 )
-from harness.operators import Product
-from problems.fem.mesh import Nodes
-from problems.feti.operators import (
+from mortarbench.harness.operators import Product
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.operators import (
     ROUNDING,
     SHIFT,
     DualOperator,
@@ -47,7 +47,7 @@ from problems.feti.operators import (
     touched,
     uncoupled,
 )
-from problems.feti.torn import Condensed, Dense, Subdomains
+from mortarbench.problems.feti.torn import Condensed, Dense, Subdomains
 
 #: of what a kind of subdomains takes, what comes after the factor of its stiffness
 AFTER_FACTOR = 0.25

@@ -11,29 +11,39 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array, vstack
 
-from harness import QP, Friction, Solution, Status, Value, Vector, no_rows
-from harness.mechanics import NO_FRICTION, contact_rows
-from problems.contact.bodies import (
+from mortarbench.harness import QP, Friction, Solution, Status, Value, Vector, no_rows
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     ContactSides,
     elasticity_matrices,
 )
-from problems.contact.friction import FrictionLaw, forces_at_nodes, friction_of
-from problems.contact.linearise import linearisation
-from problems.contact.node_to_segment import ContactRows
-from problems.contact.results import Inside, results_of
-from problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
-from problems.fem.fixing import fixing_nodes
-from problems.fem.mesh import Mesh, Nodes, as_vectors, boundary_edges, dofs_of
-from problems.fem.stress import centre_stress, recover, von_mises
-from problems.feti.emission import Contact, FixedPoint, ProblemInParts
-from problems.feti.gluing import glue
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.structured import Layout
-from problems.feti.subdivision import Subdivision
-from problems.feti.tearing import Decomposition, Part, decompose
-from problems.feti.torn import Kind, Torn
+from mortarbench.problems.contact.friction import (
+    FrictionLaw,
+    forces_at_nodes,
+    friction_of,
+)
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.results import Inside, results_of
+from mortarbench.problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
+from mortarbench.problems.fem.fixing import fixing_nodes
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    as_vectors,
+    boundary_edges,
+    dofs_of,
+)
+from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
+from mortarbench.problems.feti.emission import Contact, FixedPoint, ProblemInParts
+from mortarbench.problems.feti.gluing import glue
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdivision import Subdivision
+from mortarbench.problems.feti.tearing import Decomposition, Part, decompose
+from mortarbench.problems.feti.torn import Kind, Torn
 
 
 @dataclass(frozen=True, eq=False)

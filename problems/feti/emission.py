@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array, csr_array
 
-from harness import (
+from mortarbench.harness import (
     QP,
     Friction,
     InputError,
@@ -36,8 +36,8 @@ from harness import (
     Vector,
     no_rows,
 )
-from harness.digest import hex_digest
-from harness.distributed.vectors import (
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.vectors import (
     EMITTED,
     DistributedColumns,
     DistributedVector,
@@ -46,9 +46,9 @@ from harness.distributed.vectors import (
     Share,
     distributed,
 )
-from problems.contact.friction import iterate_of, settled
-from problems.fem.mesh import Nodes
-from problems.feti.distributed import (
+from mortarbench.problems.contact.friction import iterate_of, settled
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.distributed import (
     Halo,
     RankOperator,
     balanced,
@@ -57,23 +57,28 @@ from problems.feti.distributed import (
     halo,
     owners,
 )
-from problems.feti.gluing import GLUE, without
-from problems.feti.operators import (
+from mortarbench.problems.feti.gluing import GLUE, without
+from mortarbench.problems.feti.operators import (
     DualOperator,
     block_bytes,
     explicit_kinds,
     touched,
 )
-from problems.feti.own_bodies import (
+from mortarbench.problems.feti.own_bodies import (
     OwnSolution,
     Results,
     answers,
     contact_multipliers,
     own_solution,
 )
-from problems.feti.subdivision import Integers, Points, Subdivision, TornNodes
-from problems.feti.tearing import ALIKE, Part, classify, images, spread_of
-from problems.feti.torn import Kind, Subdomains
+from mortarbench.problems.feti.subdivision import (
+    Integers,
+    Points,
+    Subdivision,
+    TornNodes,
+)
+from mortarbench.problems.feti.tearing import ALIKE, Part, classify, images, spread_of
+from mortarbench.problems.feti.torn import Kind, Subdomains
 
 
 class Contact(NamedTuple):

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space, qr
 from scipy.sparse import bsr_array, csc_array, csr_array, diags_array, eye_array, vstack
 
-from harness import Vector
-from problems.fem.mesh import Nodes
-from problems.feti.tearing import Decomposition
-from problems.feti.torn import Kind, Subdomains, Torn
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.tearing import Decomposition
+from mortarbench.problems.feti.torn import Kind, Subdomains, Torn
 
 Weights = Callable[[int], NDArray[np.float64]]
 

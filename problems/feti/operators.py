@@ -41,12 +41,12 @@ from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_arr
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from harness import QP, Vector
-from harness.distributed.vectors import Ranks, Share
-from harness.operators import Arrays, Product, SerialisableOperator
-from problems.fem.mesh import Nodes
-from problems.feti.blocks import multiply
-from problems.feti.torn import Condensed, Dense, Kind, Subdomains
+from mortarbench.harness import QP, Vector
+from mortarbench.harness.distributed.vectors import Ranks, Share
+from mortarbench.harness.operators import Arrays, Product, SerialisableOperator
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.blocks import multiply
+from mortarbench.problems.feti.torn import Condensed, Dense, Kind, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
@@ -237,7 +237,9 @@ class DualOperator:
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Take this rank's share of a dual with this F."""
-        from problems.feti.distributed import shared  # late: one process needs none
+        from mortarbench.problems.feti.distributed import (
+            shared,  # late: one process needs none
+        )
 
         return shared(qp, self, ranks)
 

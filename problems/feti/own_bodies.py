@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
 from scipy.sparse import bsr_array, csr_array, hstack
 
-from harness import Solution, Vector
-from harness.distributed.vectors import Answered
-from harness.verify.over_ranks import Contact, OwnBodies, Unheld
-from problems.fem.mesh import Nodes
-from problems.feti.distributed import Halo
-from problems.feti.subdivision import Points
-from problems.feti.substructures import LocalProblems
-from problems.feti.torn import Torn
+from mortarbench.harness import Solution, Vector
+from mortarbench.harness.distributed.vectors import Answered
+from mortarbench.harness.verify.over_ranks import Contact, OwnBodies, Unheld
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.distributed import Halo
+from mortarbench.problems.feti.subdivision import Points
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.torn import Torn
 
 if TYPE_CHECKING:
-    from problems.feti.emission import OwnSubdomains, ProblemInParts
+    from mortarbench.problems.feti.emission import OwnSubdomains, ProblemInParts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
-from harness import InputError
-from problems.fem.mesh import Nodes
+from mortarbench.harness import InputError
+from mortarbench.problems.fem.mesh import Nodes
 
 Labels = NDArray[np.int64]
 

@@ -25,12 +25,17 @@ from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import csc_matrix, csr_array
 from sksparse.cholmod import cholesky
 
-from harness import Vector
-from harness.distributed.vectors import DistributedColumns
-from problems.fem.mesh import Nodes
-from problems.feti.distributed import RankOperator
-from problems.feti.operators import dual_operator, inverted_blocks, made, uncoupled
-from problems.feti.torn import Torn
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.vectors import DistributedColumns
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.distributed import RankOperator
+from mortarbench.problems.feti.operators import (
+    dual_operator,
+    inverted_blocks,
+    made,
+    uncoupled,
+)
+from mortarbench.problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 

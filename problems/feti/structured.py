@@ -28,10 +28,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from problems.fem.mesh import Nodes, StructuredGrid, cells_of_block
-from problems.feti.subdivision import Integers, Points, TornNodes
-from problems.feti.tearing import blocks
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.mesh import Nodes, StructuredGrid, cells_of_block
+from mortarbench.problems.feti.subdivision import Integers, Points, TornNodes
+from mortarbench.problems.feti.tearing import blocks
 
 
 class Places(NamedTuple):

@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, triu
 
-from harness.digest import hex_digest
-from problems.fem.mesh import HalfDisc, Mesh, Nodes
-from problems.feti.tearing import Block
+from mortarbench.harness.digest import hex_digest
+from mortarbench.problems.fem.mesh import HalfDisc, Mesh, Nodes
+from mortarbench.problems.feti.tearing import Block
 
 Integers = NDArray[np.integer[Any]]
 Points = NDArray[np.float64]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array
 
-from harness import Vector
-from harness.verify.products import projected_products
-from problems.feti.torn import Kind, Torn
+from mortarbench.harness import Vector
+from mortarbench.harness.verify.products import projected_products
+from mortarbench.problems.feti.torn import Kind, Torn
 
 
 @dataclass(frozen=True, eq=False)

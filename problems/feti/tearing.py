@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from problems.fem.mesh import Nodes
+from mortarbench.harness import Vector
+from mortarbench.problems.fem.mesh import Nodes
 
 ALIKE = 1e-11  #: distance of the points of equal subdomains, of their diameter
 

@@ -23,9 +23,9 @@ from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
-from harness import Vector
-from harness.distributed.factor import with_int32
-from problems.fem.mesh import Nodes
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.factor import with_int32
+from mortarbench.problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
 _STRIP = 256  #: right-hand sides that are solved for at once

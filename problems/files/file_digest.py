@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness import InputError, Value
-from harness.errors import unknown
+from mortarbench.harness import InputError, Value
+from mortarbench.harness.errors import unknown
 
 COMPRESSIBLE = (".qps", ".mps", ".sif", ".mat")
 FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files

@@ -32,11 +32,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import coo_array, csc_array, tril, vstack
 
-from harness import QP, InputError, Vector
-from harness.errors import shortened, unknown
-from harness.files.durable import replacing
-from harness.files.qpfile import explicit_matrices
-from problems.files.two_sided import INFINITE, TwoSidedQP
+from mortarbench.harness import QP, InputError, Vector
+from mortarbench.harness.errors import shortened, unknown
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.files.qpfile import explicit_matrices
+from mortarbench.problems.files.two_sided import INFINITE, TwoSidedQP
 
 _NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",

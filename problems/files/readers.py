@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 from scipy.sparse import eye_array
 
-from harness import QP, InputError
-from harness.checked import is_number, located
-from harness.files.datafile import content
-from harness.files.matfile import matrix, read_mat, to_qp, vector
-from harness.files.parquetfile import load_parquet
-from harness.files.qpfile import load_qp
-from harness.qp import check_convex
-from problems.files.file_digest import format_of
-from problems.files.qps import parse_qps
-from problems.files.two_sided import TwoSidedQP, one_sided
+from mortarbench.harness import QP, InputError
+from mortarbench.harness.checked import is_number, located
+from mortarbench.harness.files.datafile import content
+from mortarbench.harness.files.matfile import matrix, read_mat, to_qp, vector
+from mortarbench.harness.files.parquetfile import load_parquet
+from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.qp import check_convex
+from mortarbench.problems.files.file_digest import format_of
+from mortarbench.problems.files.qps import parse_qps
+from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 
 #: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
 Loaded = tuple[QP, float, float]

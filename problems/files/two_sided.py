@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, vstack
 
-from harness import QP, InputError, Vector
-from harness.qp import check_symmetric
+from mortarbench.harness import QP, InputError, Vector
+from mortarbench.harness.qp import check_symmetric
 
 INFINITE = 1e20  #: bounds of at least this size mean that there is none
 

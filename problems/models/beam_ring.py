@@ -18,18 +18,24 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case, Reference, Solution, Value
-from problems.contact.bodies import Bodies, ContactPair, assemble, clamped, floating
-from problems.contact.friction import FrictionLaw, law_of
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.newton import NewtonPath
-from problems.duality.newton_case import newton_case, newton_path
-from problems.duality.stepping import LoadPath
-from problems.fem.elasticity import Material, Plane
-from problems.fem.inverse import GeneralisedInverse
-from problems.fem.mesh import (
+from mortarbench.harness import Case, Reference, Solution, Value
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+)
+from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.newton import NewtonPath
+from mortarbench.problems.duality.newton_case import newton_case, newton_path
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.fem.elasticity import Material, Plane
+from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     dofs_of,
@@ -38,7 +44,7 @@ from problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from problems.feti.elastic import (
+from mortarbench.problems.feti.elastic import (
     Displaced,
     SubdividedBodies,
     in_parts,
@@ -47,9 +53,9 @@ from problems.feti.elastic import (
     posed_on,
     subdivide,
 )
-from problems.feti.emission import ProblemInParts
-from problems.feti.structured import Layout
-from problems.feti.tearing import structured_bodies
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.tearing import structured_bodies
 
 LENGTH = 2.0  #: l, m
 LOAD = 1e8  #: F₀, N/m

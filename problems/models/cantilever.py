@@ -30,13 +30,13 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ellipe, ellipeinc, ellipk, ellipkinc
 
-from harness import Case, Reference, Solution, Value, no_rows
-from problems.contact.bodies import Bodies, assemble
-from problems.contact.node_to_segment import ContactRows
-from problems.duality.newton import Iteration, NewtonPath
-from problems.duality.newton_case import newton_case, newton_path
-from problems.fem.elasticity import Material
-from problems.fem.mesh import dofs_of, nodal_lengths, rectangle
+from mortarbench.harness import Case, Reference, Solution, Value, no_rows
+from mortarbench.problems.contact.bodies import Bodies, assemble
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.duality.newton import Iteration, NewtonPath
+from mortarbench.problems.duality.newton_case import newton_case, newton_path
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle
 
 LENGTH = 1.0  #: L, m
 E = 10e6  #: Pa, that of rubber

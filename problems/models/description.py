@@ -54,16 +54,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import InputError, checked
-from harness.checked import located
-from harness.errors import shown, unknown
-from harness.files.reading import read_toml
-from problems.contact.bodies import ContactPair, UnassembledBodies, unassembled
-from problems.contact.friction import FrictionLaw, law_of
-from problems.fem.elasticity import Material
-from problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
-from problems.fem.mesh import Mesh, Nodes
-from problems.ranges import (
+from mortarbench.harness import InputError, checked
+from mortarbench.harness.checked import located
+from mortarbench.harness.errors import shown, unknown
+from mortarbench.harness.files.reading import read_toml
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    UnassembledBodies,
+    unassembled,
+)
+from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
+from mortarbench.problems.fem.mesh import Mesh, Nodes
+from mortarbench.problems.ranges import (
     FINITE,
     LAWS,
     LOADINGS,

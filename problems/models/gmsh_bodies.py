@@ -15,25 +15,25 @@ import numpy as np
 from scipy.sparse import vstack
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-from harness import QP, Case, Friction, InputError, Reference, Value
-from harness.checked import located
-from problems.contact.balance import check_balance, check_friction
-from problems.contact.bodies import (
+from mortarbench.harness import QP, Case, Friction, InputError, Reference, Value
+from mortarbench.harness.checked import located
+from mortarbench.problems.contact.balance import check_balance, check_friction
+from mortarbench.problems.contact.bodies import (
     Bodies,
     assembled,
     clamped,
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw, friction_of
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.newton import NewtonPath
-from problems.duality.newton_case import newton_case, newton_path
-from problems.duality.stepping import LoadPath, single_load
-from problems.fem.inverse import GeneralisedInverse
-from problems.feti.elastic import (
+from mortarbench.problems.contact.friction import FrictionLaw, friction_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.newton import NewtonPath
+from mortarbench.problems.duality.newton_case import newton_case, newton_path
+from mortarbench.problems.duality.stepping import LoadPath, single_load
+from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.feti.elastic import (
     Displaced,
     SubdividedBodies,
     in_parts,
@@ -42,11 +42,11 @@ from problems.feti.elastic import (
     subdivide,
     torn,
 )
-from problems.feti.emission import ProblemInParts
-from problems.feti.own_bodies import holds_all
-from problems.feti.partition import graph_partition
-from problems.feti.subdivision import mesh_in_parts
-from problems.models.description import (
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.own_bodies import holds_all
+from mortarbench.problems.feti.partition import graph_partition
+from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.models.description import (
     described_bodies,
     pair_laws,
     read_description,

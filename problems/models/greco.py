@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from harness import QP, Case, Friction, Reference, Solution, Value, Vector
-from problems.contact.bodies import (
+from mortarbench.harness import QP, Case, Friction, Reference, Solution, Value, Vector
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     ContactSides,
@@ -29,14 +29,19 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw
-from problems.contact.results import quantities
-from problems.contact.rigid_plane import above_plane
-from problems.duality.case_forms import contact_case
-from problems.duality.stepping import LoadPath
-from problems.fem.elasticity import Material
-from problems.fem.mesh import Nodes, StructuredGrid, nodal_lengths, rectangle_grid
-from problems.feti.elastic import (
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    StructuredGrid,
+    nodal_lengths,
+    rectangle_grid,
+)
+from mortarbench.problems.feti.elastic import (
     AtSides,
     SubdividedBodies,
     in_parts,
@@ -44,10 +49,10 @@ from problems.feti.elastic import (
     subdivide,
     tresca_problems,
 )
-from problems.feti.emission import ProblemInParts
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.structured import Layout
-from problems.feti.tearing import blocks
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.tearing import blocks
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)

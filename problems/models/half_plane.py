@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import toeplitz
 
-from harness import (
+from mortarbench.harness import (
     QP,
     Case,
     ContactSide,
@@ -43,9 +43,9 @@ from harness import (
     Vector,
     no_rows,
 )
-from problems.contact.sides import ACTIVE
-from problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
-from problems.models.line_contact import LineContact, TangentialContact
+from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
+from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: P, N/m

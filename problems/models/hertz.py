@@ -43,8 +43,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
-from harness import QP, Case, Fields, Friction, Reference, Solution, Value, Vector
-from problems.contact.bodies import (
+from mortarbench.harness import (
+    QP,
+    Case,
+    Fields,
+    Friction,
+    Reference,
+    Solution,
+    Value,
+    Vector,
+)
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     ContactSides,
@@ -53,18 +62,18 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw, law_of
-from problems.contact.linearise import linearisation
-from problems.contact.node_to_segment import ContactRows
-from problems.contact.results import contact_forces, quantities
-from problems.contact.rigid_plane import above_plane
-from problems.duality.case_forms import contact_case
-from problems.duality.dualisation import dualise
-from problems.duality.newton import NewtonPath
-from problems.duality.newton_case import newton_case, newton_path
-from problems.duality.stepping import LoadPath, State, primal_qp
-from problems.fem.elasticity import Material, Plane
-from problems.fem.mesh import (
+from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.results import contact_forces, quantities
+from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.duality.newton import NewtonPath
+from mortarbench.problems.duality.newton_case import newton_case, newton_path
+from mortarbench.problems.duality.stepping import LoadPath, State, primal_qp
+from mortarbench.problems.fem.elasticity import Material, Plane
+from mortarbench.problems.fem.mesh import (
     HalfDisc,
     Mesh,
     Nodes,
@@ -73,7 +82,7 @@ from problems.fem.mesh import (
     joined_sides,
     nodal_lengths,
 )
-from problems.feti.elastic import (
+from mortarbench.problems.feti.elastic import (
     AtSides,
     Displaced,
     SubdividedBodies,
@@ -84,11 +93,11 @@ from problems.feti.elastic import (
     subdivide,
     tresca_problems,
 )
-from problems.feti.emission import ProblemInParts
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.subdivision import half_discs_in_blocks
-from problems.feti.tearing import Block, compact_blocks, labelled
-from problems.models.line_contact import LineContact, TangentialContact
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.subdivision import half_discs_in_blocks
+from mortarbench.problems.feti.tearing import Block, compact_blocks, labelled
+from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
 ALONE, NAMES = ("cylinder",), ("upper", "lower")

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness import Vector
+from mortarbench.harness import Vector
 
 
 @dataclass(frozen=True)

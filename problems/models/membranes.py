@@ -24,14 +24,18 @@ from typing import Any
 import numpy as np
 from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
-from harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
-from problems.contact.sides import active
-from problems.duality.dualisation import posed
-from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
-from problems.fem.fixing import fixing_nodes
-from problems.fem.inverse import GeneralisedInverse, supported_inverse
-from problems.fem.laplacian import grid_stiffness
-from problems.fem.mesh import (
+from mortarbench.harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
+from mortarbench.problems.contact.sides import active
+from mortarbench.problems.duality.dualisation import posed
+from mortarbench.problems.duality.torn_dual import (
+    torn_dual,
+    torn_matrices,
+    torn_quantities,
+)
+from mortarbench.problems.fem.fixing import fixing_nodes
+from mortarbench.problems.fem.inverse import GeneralisedInverse, supported_inverse
+from mortarbench.problems.fem.laplacian import grid_stiffness
+from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
@@ -39,13 +43,13 @@ from problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from problems.feti.emission import Contact, ProblemInParts
-from problems.feti.gluing import glue
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.structured import Layout
-from problems.feti.substructures import LocalProblems
-from problems.feti.tearing import Part, blocks, decompose
-from problems.feti.torn import Kind, Torn
+from mortarbench.problems.feti.emission import Contact, ProblemInParts
+from mortarbench.problems.feti.gluing import glue
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.tearing import Part, blocks, decompose
+from mortarbench.problems.feti.torn import Kind, Torn
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at

@@ -38,7 +38,7 @@ from numpy.polynomial.legendre import leggauss
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array
 
-from harness import (
+from mortarbench.harness import (
     QP,
     Case,
     Grid,
@@ -49,20 +49,24 @@ from harness import (
     Vector,
     no_rows,
 )
-from problems.contact.sides import ACTIVE
-from problems.duality.dualisation import Transformed, dual_bounds, dualise
-from problems.duality.torn_dual import torn_dual, torn_quantities
-from problems.fem.inverse import GeneralisedInverse, regular_inverse, supported_inverse
-from problems.fem.laplacian import grid_stiffness
-from problems.fem.mesh import Nodes, StructuredGrid
-from problems.feti.emission import Contact, ProblemInParts
-from problems.feti.gluing import glue
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.structured import Layout
-from problems.feti.substructures import LocalProblems
-from problems.feti.tearing import blocks, decompose
-from problems.feti.torn import Torn
-from problems.models.membranes import membrane_kind
+from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
+from mortarbench.problems.duality.torn_dual import torn_dual, torn_quantities
+from mortarbench.problems.fem.inverse import (
+    GeneralisedInverse,
+    regular_inverse,
+    supported_inverse,
+)
+from mortarbench.problems.fem.laplacian import grid_stiffness
+from mortarbench.problems.fem.mesh import Nodes, StructuredGrid
+from mortarbench.problems.feti.emission import Contact, ProblemInParts
+from mortarbench.problems.feti.gluing import glue
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.tearing import blocks, decompose
+from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.models.membranes import membrane_kind
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m

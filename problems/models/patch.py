@@ -31,8 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from harness import Case, InputError, Reference, Solution, Value, Vector
-from problems.contact.bodies import (
+from mortarbench.harness import Case, InputError, Reference, Solution, Value, Vector
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
@@ -41,17 +41,17 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import law_of
-from problems.contact.linearise import linearisation
-from problems.contact.results import contact_forces, quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.newton import Iteration, NewtonPath
-from problems.duality.newton_case import newton_case, newton_path
-from problems.duality.stepping import single_load
-from problems.fem.elasticity import Material
-from problems.fem.finite_strain import cauchy_stress, strain_energy
-from problems.fem.hyperelastic import Hyperelastic, hyperelastic
-from problems.fem.mesh import (
+from mortarbench.problems.contact.friction import law_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import contact_forces, quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.newton import Iteration, NewtonPath
+from mortarbench.problems.duality.newton_case import newton_case, newton_path
+from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.finite_strain import cauchy_stress, strain_energy
+from mortarbench.problems.fem.hyperelastic import Hyperelastic, hyperelastic
+from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
@@ -61,8 +61,8 @@ from problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from problems.fem.stress import gauss_stress
-from problems.feti.elastic import (
+from mortarbench.problems.fem.stress import gauss_stress
+from mortarbench.problems.feti.elastic import (
     AtSides,
     SubdividedBodies,
     at_rest,
@@ -72,11 +72,11 @@ from problems.feti.elastic import (
     posed_on,
     subdivide,
 )
-from problems.feti.emission import ProblemInParts
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.structured import Layout
-from problems.feti.tearing import structured_bodies
-from problems.ranges import SHORTEST
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.tearing import structured_bodies
+from mortarbench.problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 NAMES = ("lower", "upper")

@@ -24,13 +24,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array, eye_array
 
-from harness import QP, Case, Fields, Grid, Mechanics, Solution, Value, Vector, no_rows
-from harness.mechanics import Substructures
-from problems.duality.dualisation import Transformed, posed
-from problems.duality.torn_dual import torn_dual, torn_matrices, torn_quantities
-from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.fem.inverse import GeneralisedInverse, regular_inverse
-from problems.fem.mesh import (
+from mortarbench.harness import (
+    QP,
+    Case,
+    Fields,
+    Grid,
+    Mechanics,
+    Solution,
+    Value,
+    Vector,
+    no_rows,
+)
+from mortarbench.harness.mechanics import Substructures
+from mortarbench.problems.duality.dualisation import Transformed, posed
+from mortarbench.problems.duality.torn_dual import (
+    torn_dual,
+    torn_matrices,
+    torn_quantities,
+)
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    rigid_modes,
+    stiffness,
+)
+from mortarbench.problems.fem.inverse import GeneralisedInverse, regular_inverse
+from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
@@ -39,19 +58,19 @@ from problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from problems.feti.elastic import elastic_kind, forces_at
-from problems.feti.emission import Contact, ProblemInParts, dual_of
-from problems.feti.gluing import glue, without_supports
-from problems.feti.own_bodies import OwnSolution
-from problems.feti.spectrum import (
+from mortarbench.problems.feti.elastic import elastic_kind, forces_at
+from mortarbench.problems.feti.emission import Contact, ProblemInParts, dual_of
+from mortarbench.problems.feti.gluing import glue, without_supports
+from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_of_equations,
     spectra_over_ranks,
 )
-from problems.feti.structured import Layout
-from problems.feti.substructures import LocalProblems
-from problems.feti.tearing import blocks, decompose
-from problems.feti.torn import Torn
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.tearing import blocks, decompose
+from mortarbench.problems.feti.torn import Torn
 
 LENGTH = 1.0  #: l, m
 LOAD = 1e6  #: F₀, N/m

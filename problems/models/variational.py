@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array, kron
 
-from harness import QP, Case, Solution, Vector, no_rows
+from mortarbench.harness import QP, Case, Solution, Vector, no_rows
 
 HALF_WIDTH = 10.0  #: b of the journal bearing's rectangle (0, 2π) × (0, 2b)
 

@@ -15,10 +15,10 @@ from zlib import crc32
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from harness.running.pairs import Ratio, unpaired_ratio
-from reports.compare.conditions import hardware
-from reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Outcome
-from reports.statistics.intervals import COVERAGE
+from mortarbench.harness.running.pairs import Ratio, unpaired_ratio
+from mortarbench.reports.compare.conditions import hardware
+from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Outcome
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
 ALIKE = 1.5  #: an interval that excludes such a factor either way can tell "no change"

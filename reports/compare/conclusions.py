@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from harness.record import VERIFIED_FACTOR
-from harness.running.pairs import Ratio
-from reports.compare.changes import (
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.running.pairs import Ratio
+from mortarbench.reports.compare.changes import (
     ALIKE,
     Comparison,
     Mean,
@@ -14,11 +14,17 @@ from reports.compare.changes import (
     resolved,
     side,
 )
-from reports.compare.conditions import environments, machines_differ
-from reports.compare.regressions import Slower, regressions
-from reports.data.environment import busy_with, dateline
-from reports.document.formatting import VERDICTS, clean, plural, power, tolerance
-from reports.statistics.intervals import COVERAGE
+from mortarbench.reports.compare.conditions import environments, machines_differ
+from mortarbench.reports.compare.regressions import Slower, regressions
+from mortarbench.reports.data.environment import busy_with, dateline
+from mortarbench.reports.document.formatting import (
+    VERDICTS,
+    clean,
+    plural,
+    power,
+    tolerance,
+)
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 NAMED = 8  #: changes that are named; tables have all
 WORDS = ("slower", "faster", "no change seen", "not resolved")

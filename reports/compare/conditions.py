@@ -6,10 +6,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from harness import InputError
-from harness.results.folder import differences, environment_of
-from reports.data.environment import flatten
-from reports.data.evidence import Evidence
+from mortarbench.harness import InputError
+from mortarbench.harness.results.folder import differences, environment_of
+from mortarbench.reports.data.environment import flatten
+from mortarbench.reports.data.evidence import Evidence
 
 #: parts of an environment that have to be equal for times to be comparable; the others
 #: (versions, source, plugins) are what a comparison is usually about

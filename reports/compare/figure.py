@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from reports.compare.changes import Comparison, Pair, mean_ratio
-from reports.document.figure import (
+from mortarbench.reports.compare.changes import Comparison, Pair, mean_ratio
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
@@ -22,7 +22,7 @@ from reports.document.figure import (
     categories,
     limits,
 )
-from reports.figures.style import legible, look, run_ids
+from mortarbench.reports.figures.style import legible, look, run_ids
 
 _ROW = 0.42  #: height of a solver's row, inches
 _SHIFT = 0.16  #: of cells above the row's middle, and of the mean below

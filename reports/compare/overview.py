@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.compare.changes import Comparison, Pair, mean_ratio, side
-from reports.compare.conclusions import change_word, headline, ratio_text
-from reports.data.cells import case_cells, source
-from reports.data.environment import dateline
-from reports.data.evidence import Outcome
-from reports.document.formatting import ABSENT, TIMED, VERDICTS, clean, seconds
-from reports.document.layout import Cell, Page, Section, Table, name_cell
-from reports.statistics.intervals import COVERAGE
+from mortarbench.reports.compare.changes import Comparison, Pair, mean_ratio, side
+from mortarbench.reports.compare.conclusions import change_word, headline, ratio_text
+from mortarbench.reports.data.cells import case_cells, source
+from mortarbench.reports.data.environment import dateline
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    TIMED,
+    VERDICTS,
+    clean,
+    seconds,
+)
+from mortarbench.reports.document.layout import Cell, Page, Section, Table, name_cell
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 
 def overview(found: Sequence[Comparison]) -> Page:

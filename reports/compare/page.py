@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from reports.compare.changes import (
+from mortarbench.reports.compare.changes import (
     Comparison,
     Mean,
     Pair,
@@ -13,7 +13,7 @@ from reports.compare.changes import (
     relative_ratio,
     side,
 )
-from reports.compare.conclusions import (
+from mortarbench.reports.compare.conclusions import (
     cell_name,
     change_word,
     dates,
@@ -21,11 +21,16 @@ from reports.compare.conclusions import (
     ratio_text,
     sentences,
 )
-from reports.compare.conditions import Difference, environments, options, settings
-from reports.compare.figure import ratios_figure
-from reports.data.cells import case_cells, legend, source, verdict_cell
-from reports.data.evidence import Outcome
-from reports.document.formatting import (
+from mortarbench.reports.compare.conditions import (
+    Difference,
+    environments,
+    options,
+    settings,
+)
+from mortarbench.reports.compare.figure import ratios_figure
+from mortarbench.reports.data.cells import case_cells, legend, source, verdict_cell
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     VERDICTS,
@@ -36,8 +41,15 @@ from reports.document.formatting import (
     significant,
     span,
 )
-from reports.document.layout import Cell, Page, Picture, Section, Table, name_cell
-from reports.statistics.intervals import COVERAGE
+from mortarbench.reports.document.layout import (
+    Cell,
+    Page,
+    Picture,
+    Section,
+    Table,
+    name_cell,
+)
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 
 def compose(c: Comparison) -> Page:

@@ -29,10 +29,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import stdtrit
 
-from harness.running.pairs import Block, Ratio, unpaired_ratio
-from reports.compare.changes import FEWEST, Comparison, Pair
-from reports.data.evidence import Outcome
-from reports.statistics.intervals import COVERAGE
+from mortarbench.harness.running.pairs import Block, Ratio, unpaired_ratio
+from mortarbench.reports.compare.changes import FEWEST, Comparison, Pair
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 CELLS = 8  #: that it takes to know how much they scatter
 _NORMAL = 1.4826  #: standard deviation of a normal law over its median distance

@@ -8,15 +8,15 @@ from typing import Any
 
 import pandas as pd
 
-from harness.files.durable import replacing
-from harness.record import VERIFIED_FACTOR
-from reports.compare.changes import Comparison, Pair, compare
-from reports.compare.conclusions import verdict_lines
-from reports.compare.overview import overview
-from reports.compare.page import compose
-from reports.data.evidence import Outcome, read_evidence
-from reports.export.csv_tables import frame_csv
-from reports.render.writing import RENDERED, write_page, write_text
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.reports.compare.changes import Comparison, Pair, compare
+from mortarbench.reports.compare.conclusions import verdict_lines
+from mortarbench.reports.compare.overview import overview
+from mortarbench.reports.compare.page import compose
+from mortarbench.reports.data.evidence import Outcome, read_evidence
+from mortarbench.reports.export.csv_tables import frame_csv
+from mortarbench.reports.render.writing import RENDERED, write_page, write_text
 
 
 def write_comparison(

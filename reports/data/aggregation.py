@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from reports.data.comparison_groups import CASES, ComparisonGroup
-from reports.statistics import resampling
+from mortarbench.reports.data.comparison_groups import CASES, ComparisonGroup
+from mortarbench.reports.statistics import resampling
 
 Array = NDArray[np.float64]
 

@@ -4,9 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 
-from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import ABSENT, VERDICTS, clean, plural, tolerance
-from reports.document.layout import Cell, Table, name_cell, sources
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    VERDICTS,
+    clean,
+    plural,
+    tolerance,
+)
+from mortarbench.reports.document.layout import Cell, Table, name_cell, sources
 
 #: after a verdict that a proven optimum decided against the residuals
 BY_OPTIMUM = "⋆"

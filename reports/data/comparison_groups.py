@@ -13,10 +13,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from harness import Record, Verdict
-from harness.running.pairs import Block, ratio_of
-from reports.data.evidence import Evidence
-from reports.document.formatting import clean, listing, plural, tolerance
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.running.pairs import Block, ratio_of
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
 #: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
 CASES = 6

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from reports.data.evidence import Evidence
-from reports.document.formatting import clean, plural
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.document.formatting import clean, plural
 
 QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 

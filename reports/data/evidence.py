@@ -10,17 +10,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from harness import InputError, Record, Verdict
-from harness.errors import say, some
-from harness.files.reading import read_json
-from harness.record import VERIFIED_FACTOR
-from harness.results.faults import Fault, left, read_faults
-from harness.results.folder import environment_of, times_compare
-from harness.results.journal import read_journal
-from harness.running.pairs import Block
-from harness.suite.suite import read_stored
-from harness.verify.kkt import allowed, rejudged
-from reports.statistics.intervals import Interval, median_interval
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.errors import say, some
+from mortarbench.harness.files.reading import read_json
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.results.faults import Fault, left, read_faults
+from mortarbench.harness.results.folder import environment_of, times_compare
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.running.pairs import Block
+from mortarbench.harness.suite.suite import read_stored
+from mortarbench.harness.verify.kkt import allowed, rejudged
+from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 FROM_FILE = "file"  #: the family of QPs from files, whose cases are named by paths
 _MARKED = 6  #: digits of an environment, after the label of a solver

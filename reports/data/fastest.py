@@ -26,17 +26,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import Verdict
-from harness.running.pairs import Ratio, paired_ratio, ratio_of
-from reports.data.comparison_groups import (
+from mortarbench.harness import Verdict
+from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
+from mortarbench.reports.data.comparison_groups import (
     CASES,
     POOLED,
     ComparisonGroup,
     Kind,
     kind_of,
 )
-from reports.data.evidence import Evidence, Outcome
-from reports.statistics.resampling import symmetric_interval
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.statistics.resampling import symmetric_interval
 
 Row = Mapping[str, Outcome]  #: by solver
 Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case

@@ -10,10 +10,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import InputError, Record, Vector
-from harness.files.store import load_history
-from harness.solution import History
-from reports.data.evidence import Evidence, Outcome
+from mortarbench.harness import InputError, Record, Vector
+from mortarbench.harness.files.store import load_history
+from mortarbench.harness.solution import History
+from mortarbench.reports.data.evidence import Evidence, Outcome
 
 MOST = 4  #: cases that are drawn
 

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
 from typing import Any, NamedTuple
 
-from reports.data.cells import source
-from reports.data.evidence import Outcome
-from reports.document.formatting import clean, significant, span
-from reports.document.layout import Cell
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.document.formatting import clean, significant, span
+from mortarbench.reports.document.layout import Cell
 
 SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
 _CONTACTS, _PRESSURE = "contacts", "largest_pressure"  #: per pair, and what of it

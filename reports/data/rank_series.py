@@ -16,13 +16,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.registry import COPIES
-from harness.running.pairs import Block, Ratio, paired_ratio, unpaired_ratio
-from reports.data.evidence import Evidence, Outcome
-from reports.data.size_series import held_keys
-from reports.document.formatting import clean, tolerance
-from reports.statistics.cost_model import Communication, CostModel, cost_model
-from reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.harness.registry import COPIES
+from mortarbench.harness.running.pairs import Block, Ratio, paired_ratio, unpaired_ratio
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.size_series import held_keys
+from mortarbench.reports.document.formatting import clean, tolerance
+from mortarbench.reports.statistics.cost_model import (
+    Communication,
+    CostModel,
+    cost_model,
+)
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
 ALIKE = 0.05  #: dofs of a rank may differ by that much, relatively, in weak scaling

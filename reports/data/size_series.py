@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from harness.registry import COPIES
-from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import clean, tolerance
-from reports.statistics.intervals import PowerLaw, power_law
+from mortarbench.harness.registry import COPIES
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.formatting import clean, tolerance
+from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
 SIZES = 3  #: fewer different sizes make no table
 

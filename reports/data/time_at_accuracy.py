@@ -24,11 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Verdict
-from harness.digest import hex_digest
-from reports.data.evidence import Outcome
-from reports.statistics.intervals import COVERAGE, Interval
-from reports.statistics.resampling import limits
+from mortarbench.harness import Verdict
+from mortarbench.harness.digest import hex_digest
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.statistics.resampling import limits
 
 RESAMPLES = 400
 SMALLEST = 1e-17  #: errors below, zero among them, count as this

@@ -11,10 +11,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from harness import Record
-from reports.data.comparison_groups import all_groups
-from reports.data.evidence import Evidence, arrange
-from reports.data.fastest import (
+from mortarbench.harness import Record
+from mortarbench.reports.data.comparison_groups import all_groups
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.fastest import (
     Competitor,
     FastestSolver,
     Finding,

@@ -11,8 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from reports.document.figure import INK, MARGIN, WIDTH, Look, Numbers
+from mortarbench.harness import Vector
+from mortarbench.reports.document.figure import INK, MARGIN, WIDTH, Look, Numbers
 
 Points = NDArray[np.float64]  #: (n, 2)
 

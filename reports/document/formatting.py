@@ -8,9 +8,9 @@ import unicodedata
 from collections.abc import Sequence
 from functools import lru_cache
 
-from harness import Verdict
-from harness.files.csvfile import inert
-from reports.statistics.intervals import Interval, PowerLaw
+from mortarbench.harness import Verdict
+from mortarbench.harness.files.csvfile import inert
+from mortarbench.reports.statistics.intervals import Interval, PowerLaw
 
 ABSENT = "–"  #: what was not or cannot be measured
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from harness import Record
-from reports.document.fields import FieldFigure
-from reports.document.figure import Figure
-from reports.document.formatting import ABSENT, clean
+from mortarbench.harness import Record
+from mortarbench.reports.document.fields import FieldFigure
+from mortarbench.reports.document.figure import Figure
+from mortarbench.reports.document.formatting import ABSENT, clean
 
 _RUN = "run "  #: before the run_ids in a title
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from harness.crossval.discretisation import Discretisation
-from reports.document.formatting import ABSENT, clean, power
-from reports.document.layout import Cell, Table, name_cell
+from mortarbench.harness.crossval.discretisation import Discretisation
+from mortarbench.reports.document.formatting import ABSENT, clean, power
+from mortarbench.reports.document.layout import Cell, Table, name_cell
 
 
 def mesh_table(found: Sequence[Discretisation]) -> Table:

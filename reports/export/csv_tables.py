@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from harness import Record, Verdict
-from harness.files.csvfile import csv_text
-from harness.record import JOURNAL
-from reports.data.aggregation import (
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.files.csvfile import csv_text
+from mortarbench.harness.record import JOURNAL
+from mortarbench.reports.data.aggregation import (
     EVERY,
     USUAL,
     Convention,
@@ -19,14 +19,17 @@ from reports.data.aggregation import (
     ranking_of,
     ranks,
 )
-from reports.data.aggregation import geometric_means as means_by
-from reports.data.comparison_groups import ComparisonGroup, comparison_groups
-from reports.data.evidence import RESIDUALS, Evidence, Outcome
-from reports.data.quantities import spreads
-from reports.data.size_series import SizeSeries, size_series
-from reports.export.parquet import texts
-from reports.statistics.intervals import PowerLaw
-from reports.statistics.profiles import performance_ratios
+from mortarbench.reports.data.aggregation import geometric_means as means_by
+from mortarbench.reports.data.comparison_groups import (
+    ComparisonGroup,
+    comparison_groups,
+)
+from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
+from mortarbench.reports.data.quantities import spreads
+from mortarbench.reports.data.size_series import SizeSeries, size_series
+from mortarbench.reports.export.parquet import texts
+from mortarbench.reports.statistics.intervals import PowerLaw
+from mortarbench.reports.statistics.profiles import performance_ratios
 
 _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
 

@@ -11,9 +11,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
-from harness import Record
-from harness.files.durable import replacing
-from harness.record import JOURNAL, finite
+from mortarbench.harness import Record
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.record import JOURNAL, finite
 
 _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 

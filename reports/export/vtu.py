@@ -14,10 +14,10 @@ import meshio
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import ContactSide, Fields, InputError, Vector
-from harness.files.csvfile import csv_text
-from harness.files.durable import replacing
-from harness.plugin import SLIDING
+from mortarbench.harness import ContactSide, Fields, InputError, Vector
+from mortarbench.harness.files.csvfile import csv_text
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.plugin import SLIDING
 
 #: a node is in contact where its force exceeds this · the largest; of pairs with
 #: friction, where it sticks or slips

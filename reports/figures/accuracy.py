@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from reports.data.evidence import Evidence, Outcome, shared
-from reports.document.figure import (
+from mortarbench.reports.data.evidence import Evidence, Outcome, shared
+from mortarbench.reports.document.figure import (
     INK,
     Figure,
     Key,
@@ -18,7 +18,14 @@ from reports.document.figure import (
     Series,
     Text,
 )
-from reports.figures.style import LEGEND_LINE, TITLE, legible, log, look, run_ids
+from mortarbench.reports.figures.style import (
+    LEGEND_LINE,
+    TITLE,
+    legible,
+    log,
+    look,
+    run_ids,
+)
 
 CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
 _LEAST = 1e-10  #: worst residuals over the tolerance below, zero among them

@@ -9,9 +9,9 @@ from math import ceil, hypot, log10
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from reports.data.histories import CaseHistories, SolverRun
-from reports.document.figure import (
+from mortarbench.harness import Vector
+from mortarbench.reports.data.histories import CaseHistories, SolverRun
+from mortarbench.reports.document.figure import (
     INK,
     WIDTH,
     Axis,
@@ -29,8 +29,8 @@ from reports.document.figure import (
     limits,
     numbers,
 )
-from reports.document.formatting import VERDICTS, tolerance
-from reports.figures.style import TITLE, below, legible, look
+from mortarbench.reports.document.formatting import VERDICTS, tolerance
+from mortarbench.reports.figures.style import TITLE, below, legible, look
 
 #: letter of a step, its name, and its mark; the others, CG above all, are bare
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))

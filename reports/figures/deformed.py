@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Fields, InputError, Vector
-from harness.plugin import SLIDING
-from reports.document.fields import (
+from mortarbench.harness import Fields, InputError, Vector
+from mortarbench.harness.plugin import SLIDING
+from mortarbench.reports.document.fields import (
     ColourField,
     ColourScale,
     FieldFigure,
@@ -23,7 +23,7 @@ from reports.document.fields import (
     Strokes,
     Vectors,
 )
-from reports.document.figure import INK, Look
+from mortarbench.reports.document.figure import INK, Look
 
 PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corners
 SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them

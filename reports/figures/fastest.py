@@ -8,10 +8,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness.running.pairs import Ratio
-from reports.data.evidence import case_set
-from reports.data.fastest import Competitor, FastestSolver, Finding, time_of
-from reports.document.figure import (
+from mortarbench.harness.running.pairs import Ratio
+from mortarbench.reports.data.evidence import case_set
+from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding, time_of
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
@@ -27,8 +27,8 @@ from reports.document.figure import (
     limits,
     numbers,
 )
-from reports.document.formatting import VERDICTS, clean
-from reports.figures.style import legible, look, run_ids
+from mortarbench.reports.document.formatting import VERDICTS, clean
+from mortarbench.reports.figures.style import legible, look, run_ids
 
 PANELS = 4  #: forms that are drawn
 SOLVERS = 12  #: of a panel

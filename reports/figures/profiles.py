@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from reports.data.aggregation import Ranking
-from reports.document.figure import (
+from mortarbench.reports.data.aggregation import Ranking
+from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,
@@ -23,9 +23,9 @@ from reports.document.figure import (
     in_rows,
     numbers,
 )
-from reports.document.formatting import plural
-from reports.figures.style import LEGEND_LINE, TITLE, below, legible, look
-from reports.statistics.profiles import Array, curve, performance_ratios
+from mortarbench.reports.document.formatting import plural
+from mortarbench.reports.figures.style import LEGEND_LINE, TITLE, below, legible, look
+from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
 ROW = 4  #: solvers that are told apart in one panel, with their bands
 ROWS = 4  #: of panels; further solvers are grey in all of them

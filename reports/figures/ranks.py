@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from reports.data.evidence import Outcome
-from reports.data.rank_series import PHASES, StrongSeries, WeakSeries, rank_parts
-from reports.document.figure import (
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.data.rank_series import (
+    PHASES,
+    StrongSeries,
+    WeakSeries,
+    rank_parts,
+)
+from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,
@@ -24,7 +29,7 @@ from reports.document.figure import (
     Text,
     categories,
 )
-from reports.figures.style import (
+from mortarbench.reports.figures.style import (
     COLOURS,
     DASHED,
     DOTTED,
@@ -36,7 +41,7 @@ from reports.figures.style import (
     look,
     run_ids,
 )
-from reports.statistics.intervals import Interval
+from mortarbench.reports.statistics.intervals import Interval
 
 _BAND = 0.18  #: opacity
 _PALE = "#a9cde6"  #: a band in the first colour, in a legend

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import sqrt
 
-from reports.data.size_series import SizeSeries
-from reports.document.figure import (
+from mortarbench.reports.data.size_series import SizeSeries
+from mortarbench.reports.document.figure import (
     Axis,
     Figure,
     Intervals,
@@ -20,8 +20,8 @@ from reports.document.figure import (
     Text,
     limits,
 )
-from reports.document.formatting import exponent
-from reports.figures.style import (
+from mortarbench.reports.document.formatting import exponent
+from mortarbench.reports.figures.style import (
     GUIDE,
     LEGEND_LINE,
     TITLE,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reports.data.evidence import Outcome
-from reports.data.size_series import SizeSeries, Sweep
-from reports.document.figure import (
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.data.size_series import SizeSeries, Sweep
+from mortarbench.reports.document.figure import (
     Axis,
     Figure,
     Key,
@@ -21,8 +21,8 @@ from reports.document.figure import (
     in_rows,
     numbers,
 )
-from reports.document.formatting import exponent
-from reports.figures.style import (
+from mortarbench.reports.document.formatting import exponent
+from mortarbench.reports.figures.style import (
     COLOURS,
     DASHED,
     LEGEND_LINE,
@@ -33,7 +33,7 @@ from reports.figures.style import (
     log,
     run_ids,
 )
-from reports.statistics.intervals import PowerLaw
+from mortarbench.reports.statistics.intervals import PowerLaw
 
 #: panels of counts, whose names are those of SMALBE; others are in the tables
 PANELS = (

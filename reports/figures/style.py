@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from math import lcm
 
-from harness import Record
-from reports.document.figure import INK, Axis, Key, Legend, Look
-from reports.document.formatting import clean
+from mortarbench.harness import Record
+from mortarbench.reports.document.figure import INK, Axis, Key, Legend, Look
+from mortarbench.reports.document.formatting import clean
 
 #: One hue for each solver, at least 28° apart up to the eighth and 6° up to the last.
 #: The first four are Okabe and Ito's; each further one is the colour of OKLCH that is

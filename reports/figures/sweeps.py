@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
 
-from reports.data.evidence import Outcome
-from reports.data.time_at_accuracy import SMALLEST, counts
-from reports.document.figure import (
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.data.time_at_accuracy import SMALLEST, counts
+from mortarbench.reports.document.figure import (
     INK,
     Figure,
     Intervals,
@@ -19,7 +19,7 @@ from reports.document.figure import (
     Series,
     in_rows,
 )
-from reports.figures.style import (
+from mortarbench.reports.figures.style import (
     DASHED,
     DOTTED,
     LEGEND_LINE,

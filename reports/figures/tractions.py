@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness import ContactSide, Fields, Vector
-from reports.document.figure import (
+from mortarbench.harness import ContactSide, Fields, Vector
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
@@ -18,8 +18,8 @@ from reports.document.figure import (
     Series,
     numbers,
 )
-from reports.figures.deformed import FRICTION, length_unit, prefixed
-from reports.figures.style import below, legible
+from mortarbench.reports.figures.deformed import FRICTION, length_unit, prefixed
+from mortarbench.reports.figures.style import below, legible
 
 SHOWN = 1e-6  #: tractions below this times the largest pressure are not looked for
 BESIDE = 0.15  #: of the loaded part, shown on either side of it

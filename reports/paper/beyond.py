@@ -5,18 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from harness.files.experiment import Experiment
-from reports.data.evidence import Evidence
-from reports.document.formatting import TIMED, plural
-from reports.document.layout import Picture, Section
-from reports.paper.contact import (
+from mortarbench.harness.files.experiment import Experiment
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.document.formatting import TIMED, plural
+from mortarbench.reports.document.layout import Picture, Section
+from mortarbench.reports.paper.contact import (
     CONTACTS,
     active,
     pressure_figure,
     verification_figure,
     zoom_figure,
 )
-from reports.paper.fleet import (
+from mortarbench.reports.paper.fleet import (
     DUALS,
     certified_figure,
     certified_table,
@@ -25,7 +25,7 @@ from reports.paper.fleet import (
     primal_dual_figure,
     totals_table,
 )
-from reports.paper.stepping import SINCE, orders, stepping_figure
+from mortarbench.reports.paper.stepping import SINCE, orders, stepping_figure
 
 REPEATED = (
     "Medians of interleaved, randomised repeats in worker processes of their own, with "

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness import Fields, Vector
-from harness.files.experiment import Row
-from reports.document import figure
-from reports.document.fields import (
+from mortarbench.harness import Fields, Vector
+from mortarbench.harness.files.experiment import Row
+from mortarbench.reports.document import figure
+from mortarbench.reports.document.fields import (
     Arrow,
     FieldFigure,
     FieldMark,
@@ -21,7 +21,7 @@ from reports.document.fields import (
     Polygons,
     Vectors,
 )
-from reports.document.figure import (
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     ColourBar,
@@ -34,9 +34,9 @@ from reports.document.figure import (
     Series,
     limits,
 )
-from reports.figures.deformed import moved
-from reports.figures.style import COLOURS, below, log, look
-from reports.paper.geometry import mesh
+from mortarbench.reports.figures.deformed import moved
+from mortarbench.reports.figures.style import COLOURS, below, log, look
+from mortarbench.reports.paper.geometry import mesh
 
 ACTIVE = 1e-6  #: a node is in contact if its force exceeds this times the largest
 CONTACTS = {  #: of the tables → as the figures call them

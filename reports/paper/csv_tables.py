@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pandas as pd
 
-from harness.files.experiment import Experiment
-from reports.paper import published
-from reports.paper.samples import medians
-from reports.paper.timings import pinv_fit
+from mortarbench.harness.files.experiment import Experiment
+from mortarbench.reports.paper import published
+from mortarbench.reports.paper.samples import medians
+from mortarbench.reports.paper.timings import pinv_fit
 
 KEYS = {
     "figure3": ("Nr", "n", "method"),

@@ -6,10 +6,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from harness import Verdict
-from reports.data.cells import legend, source, verdict_cell
-from reports.data.evidence import Evidence, Outcome
-from reports.document.figure import (
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.cells import legend, source, verdict_cell
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
@@ -21,7 +21,7 @@ from reports.document.figure import (
     Series,
     categories,
 )
-from reports.document.formatting import (
+from mortarbench.reports.document.formatting import (
     TIMED,
     clean,
     exponent,
@@ -29,8 +29,8 @@ from reports.document.formatting import (
     significant,
     tolerance,
 )
-from reports.document.layout import Cell, Table
-from reports.figures.style import (
+from mortarbench.reports.document.layout import Cell, Table
+from mortarbench.reports.figures.style import (
     LEGEND_LINE,
     below,
     legible,
@@ -39,7 +39,7 @@ from reports.figures.style import (
     run_ids,
     solver_keys,
 )
-from reports.statistics.intervals import Interval, power_law
+from mortarbench.reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")
 TARGETS = (1e-2, 1e-4, 1e-6)  #: certified relative errors in the energy norm

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from harness import Fields
-from reports.document.fields import (
+from mortarbench.harness import Fields
+from mortarbench.reports.document.fields import (
     Arrow,
     FieldFigure,
     FieldMark,
@@ -19,9 +19,9 @@ from reports.document.fields import (
     Strokes,
     box,
 )
-from reports.document.figure import INK, Look, Numbers
-from reports.figures.deformed import SCALE, edges, moved, outlines
-from reports.figures.style import COLOURS
+from mortarbench.reports.document.figure import INK, Look, Numbers
+from mortarbench.reports.figures.deformed import SCALE, edges, moved, outlines
+from mortarbench.reports.figures.style import COLOURS
 
 #: of beam and ring: transparent, so that ink stays readable on any page
 FILLS = ((COLOURS[0], 0.18), (COLOURS[1], 0.22))

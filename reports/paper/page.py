@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from harness.files.experiment import Experiment, Row
-from reports.data.evidence import Evidence
-from reports.document.formatting import clean, seconds, significant
-from reports.document.layout import Page, Picture, Section
-from reports.figures.deformed import PERCENTILE, SCALE
-from reports.paper import beyond, published
-from reports.paper.geometry import geometry_figure, mesh_figure
-from reports.paper.samples import curve
-from reports.paper.stress import STRESSES, extent, stress_figure
-from reports.paper.tables import here, largest, of_table_1, table_1, timings
-from reports.paper.timings import (
+from mortarbench.harness.files.experiment import Experiment, Row
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.document.formatting import clean, seconds, significant
+from mortarbench.reports.document.layout import Page, Picture, Section
+from mortarbench.reports.figures.deformed import PERCENTILE, SCALE
+from mortarbench.reports.paper import beyond, published
+from mortarbench.reports.paper.geometry import geometry_figure, mesh_figure
+from mortarbench.reports.paper.samples import curve
+from mortarbench.reports.paper.stress import STRESSES, extent, stress_figure
+from mortarbench.reports.paper.tables import here, largest, of_table_1, table_1, timings
+from mortarbench.reports.paper.timings import (
     assembly_figure,
     contact_figure,
     inverse_figure,

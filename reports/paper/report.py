@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from harness.files.experiment import load_experiment
-from reports.data.evidence import read_evidence
-from reports.export.csv_tables import csv_tables as report_tables
-from reports.export.csv_tables import frame_csv
-from reports.paper.csv_tables import csv_tables
-from reports.paper.page import BEYOND, compose
-from reports.render.html_page import html
-from reports.render.latex import latex
-from reports.render.writing import write_figures, write_text
+from mortarbench.harness.files.experiment import load_experiment
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.export.csv_tables import csv_tables as report_tables
+from mortarbench.reports.export.csv_tables import frame_csv
+from mortarbench.reports.paper.csv_tables import csv_tables
+from mortarbench.reports.paper.page import BEYOND, compose
+from mortarbench.reports.render.html_page import html
+from mortarbench.reports.render.latex import latex
+from mortarbench.reports.render.writing import write_figures, write_text
 
 
 def write_paper(folder: Path) -> list[Path]:

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from harness.files.experiment import Row
-from reports.statistics.intervals import Interval, median_interval
+from mortarbench.harness.files.experiment import Row
+from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 Key = tuple[Any, ...]
 

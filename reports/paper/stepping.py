@@ -8,14 +8,14 @@ from math import sqrt
 
 import numpy as np
 
-from harness.files.experiment import Row
-from reports.document import figure
-from reports.document.figure import Figure, Key, Panel, Series, Text, limits
-from reports.document.formatting import exponent, significant
-from reports.document.layout import Cell, Table
-from reports.figures.scaling import along
-from reports.figures.style import GUIDE, below, log, look
-from reports.statistics.intervals import PowerLaw, power_law
+from mortarbench.harness.files.experiment import Row
+from mortarbench.reports.document import figure
+from mortarbench.reports.document.figure import Figure, Key, Panel, Series, Text, limits
+from mortarbench.reports.document.formatting import exponent, significant
+from mortarbench.reports.document.layout import Cell, Table
+from mortarbench.reports.figures.scaling import along
+from mortarbench.reports.figures.style import GUIDE, below, log, look
+from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
 QUANTITIES = {  #: of the figure → the columns that make a vector
     "tip displacement": ("tip_x", "tip_y"),

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import Fields
-from reports.document.fields import (
+from mortarbench.harness import Fields
+from mortarbench.reports.document.fields import (
     ColourField,
     ColourScale,
     FieldFigure,
@@ -16,8 +16,8 @@ from reports.document.fields import (
     Path,
     box,
 )
-from reports.document.figure import INK, Look
-from reports.figures.deformed import PERCENTILE, moved, outlines, triangles
+from mortarbench.reports.document.figure import INK, Look
+from mortarbench.reports.figures.deformed import PERCENTILE, moved, outlines, triangles
 
 STRESSES = {
     "sxx": r"normal stress $\sigma_x$",

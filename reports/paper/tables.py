@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from harness.files.experiment import Experiment, Row
-from reports.document.formatting import clean, seconds, significant
-from reports.document.layout import Cell, Table
-from reports.paper import published
-from reports.paper.samples import curve
+from mortarbench.harness.files.experiment import Experiment, Row
+from mortarbench.reports.document.formatting import clean, seconds, significant
+from mortarbench.reports.document.layout import Cell, Table
+from mortarbench.reports.paper import published
+from mortarbench.reports.paper.samples import curve
 
 LINES = {  #: of the table of times → the parts of an analysis
     "mesh and assembly": ("assembly",),

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness import Vector
-from harness.files.experiment import Row
-from reports.document import figure
-from reports.document.figure import (
+from mortarbench.harness import Vector
+from mortarbench.harness.files.experiment import Row
+from mortarbench.reports.document import figure
+from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,
@@ -25,9 +25,9 @@ from reports.document.figure import (
     limits,
     numbers,
 )
-from reports.figures.style import COLOURS, below, log, look
-from reports.paper import published
-from reports.paper.samples import Fit, Point, curve, fit
+from mortarbench.reports.figures.style import COLOURS, below, log, look
+from mortarbench.reports.paper import published
+from mortarbench.reports.paper.samples import Fit, Point, curve, fit
 
 DOFS = "degrees of freedom $n$"
 METHODS = {  #: of the tables → as the figures and tables of the report call them

@@ -24,7 +24,7 @@ from matplotlib.ticker import (
     NullLocator,
 )
 
-from reports.document.figure import (
+from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,

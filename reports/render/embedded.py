@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
-from harness import Record
-from harness.record import JOURNAL, finite
-from reports.document.figure import Figure
-from reports.document.formatting import VERDICTS, clean, tolerance
-from reports.document.layout import Cell, Page, Table, named, short
-from reports.figures.style import look
-from reports.render.plots import Data, panels
+from mortarbench.harness import Record
+from mortarbench.harness.record import JOURNAL, finite
+from mortarbench.reports.document.figure import Figure
+from mortarbench.reports.document.formatting import VERDICTS, clean, tolerance
+from mortarbench.reports.document.layout import Cell, Page, Table, named, short
+from mortarbench.reports.figures.style import look
+from mortarbench.reports.render.plots import Data, panels
 
 Rows = Mapping[str, int]  #: run_id, as titles have it → position among the records
 

@@ -13,7 +13,7 @@ from matplotlib.colors import Normalize, to_rgba
 from matplotlib.figure import Figure as Canvas
 from matplotlib.tri import Triangulation
 
-from reports.document.fields import (
+from mortarbench.reports.document.fields import (
     Arrow,
     ColourField,
     ColourScale,
@@ -26,7 +26,7 @@ from reports.document.fields import (
     Strokes,
     Vectors,
 )
-from reports.render.drawing import STYLE, look_of
+from mortarbench.reports.render.drawing import STYLE, look_of
 
 _CASING: list[patheffects.AbstractPathEffect] = [
     patheffects.withStroke(linewidth=1.6, foreground="white")

@@ -13,10 +13,17 @@ from urllib.parse import quote
 from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
-from reports.document.layout import Cell, Page, Picture, short
-from reports.render.embedded import Rows, data, details, plots, rows_of, runs_of
-from reports.render.formulas import mathml, split
-from reports.render.svg import Svg, inline
+from mortarbench.reports.document.layout import Cell, Page, Picture, short
+from mortarbench.reports.render.embedded import (
+    Rows,
+    data,
+    details,
+    plots,
+    rows_of,
+    runs_of,
+)
+from mortarbench.reports.render.formulas import mathml, split
+from mortarbench.reports.render.svg import Svg, inline
 
 FIRST = 50  #: rows of a table that are in the page as written; its script has all
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
@@ -59,7 +66,9 @@ def html(page: Page, drawings: Mapping[str, Svg] | None = None) -> str:
 
 
 def _asset(name: str) -> str:
-    return files("reports.render").joinpath("assets", name).read_text("utf-8")
+    return (
+        files("mortarbench.reports.render").joinpath("assets", name).read_text("utf-8")
+    )
 
 
 def _policy(code: str) -> str:
@@ -114,7 +123,9 @@ def drawn(picture: Picture, drawings: Mapping[str, Svg]) -> Markup:
     """Embed a figure; its text was made by us from names that `legible` has cleaned."""
     svg = drawings.get(picture.name)
     if svg is None:
-        from reports.render.saving import draw_svg  # late: it loads matplotlib
+        from mortarbench.reports.render.saving import (
+            draw_svg,  # late: it loads matplotlib
+        )
 
         svg = draw_svg(picture.figure)
     return Markup(inline(svg, picture.name))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from reports.document.layout import Cell, Statement, Table
+from mortarbench.reports.document.layout import Cell, Statement, Table
 
 _NOT_IN_OT1 = "«»ÐðÞþ"
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from reports.document.layout import Cell, Page, Section, Statement, Table
-from reports.render.formulas import split
+from mortarbench.reports.document.layout import Cell, Page, Section, Statement, Table
+from mortarbench.reports.render.formulas import split
 
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)

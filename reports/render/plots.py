@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from reports.document.figure import (
+from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,
@@ -27,7 +27,7 @@ from reports.document.figure import (
     Text,
     fitted,
 )
-from reports.render.mathtext import plain
+from mortarbench.reports.render.mathtext import plain
 
 Data = dict[str, Any]
 

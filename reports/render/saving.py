@@ -12,12 +12,12 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 from matplotlib.transforms import Bbox
 
-from harness import InputError
-from reports.document.fields import FieldFigure
-from reports.document.figure import Figure
-from reports.render.drawing import STYLE, draw_curves
-from reports.render.field_drawing import draw_fields
-from reports.render.svg import PAPER, Svg
+from mortarbench.harness import InputError
+from mortarbench.reports.document.fields import FieldFigure
+from mortarbench.reports.document.figure import Figure
+from mortarbench.reports.render.drawing import STYLE, draw_curves
+from mortarbench.reports.render.field_drawing import draw_fields
+from mortarbench.reports.render.svg import PAPER, Svg
 
 ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
 _METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}

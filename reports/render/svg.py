@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from reports.document.figure import INK
+from mortarbench.reports.document.figure import INK
 
 PAPER = "#ffffff"
 

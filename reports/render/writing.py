@@ -6,12 +6,12 @@ import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
-from harness.files.durable import replace_file
-from reports.document.layout import Page
-from reports.render.html_page import html
-from reports.render.latex import latex
-from reports.render.markdown import markdown
-from reports.render.svg import Svg
+from mortarbench.harness.files.durable import replace_file
+from mortarbench.reports.document.layout import Page
+from mortarbench.reports.render.html_page import html
+from mortarbench.reports.render.latex import latex
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.svg import Svg
 
 _NUMBERED = re.compile(r"[a-z]+-\d+\.(pdf|svg|png)")  #: files of figures in a series
 RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
@@ -57,7 +57,7 @@ def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Sv
         Name → what is in the SVG file.
 
     """
-    from reports.render.saving import save_all  # late: it loads matplotlib
+    from mortarbench.reports.render.saving import save_all  # late: it loads matplotlib
 
     folder = target / "figures"
     folder.mkdir(parents=True, exist_ok=True)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from harness import Verdict
-from reports.data.comparison_groups import CASES
-from reports.data.environment import busy_with
-from reports.data.evidence import Evidence, Outcome
-from reports.data.fastest import (
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.comparison_groups import CASES
+from mortarbench.reports.data.environment import busy_with
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.fastest import (
     Answers,
     Competitor,
     FastestSolver,
@@ -20,9 +20,9 @@ from reports.data.fastest import (
     time_of,
     unverified,
 )
-from reports.data.time_at_accuracy import time_at_accuracy
-from reports.data.ways import Ways
-from reports.document.formatting import (
+from mortarbench.reports.data.time_at_accuracy import time_at_accuracy
+from mortarbench.reports.data.ways import Ways
+from mortarbench.reports.document.formatting import (
     ENDINGS,
     TIMED,
     bracketed,
@@ -34,10 +34,10 @@ from reports.document.formatting import (
     significant,
     tolerance,
 )
-from reports.document.layout import Picture, Section, Statement
-from reports.figures.fastest import PANELS, SOLVERS, fastest_figure
-from reports.sections.scaling import OwnResults
-from reports.sections.sweeps import ERRORS, Sweeps, places
+from mortarbench.reports.document.layout import Picture, Section, Statement
+from mortarbench.reports.figures.fastest import PANELS, SOLVERS, fastest_figure
+from mortarbench.reports.sections.scaling import OwnResults
+from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, places
 
 ACCURACIES = 3  #: per form that have a sentence; of more, the ends and the middle
 FAILURES = 3  #: per form that are told one by one

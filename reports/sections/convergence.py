@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from reports.data.evidence import Evidence
-from reports.data.histories import RULE, CaseHistories, chosen, unread
-from reports.document.formatting import clean, listing, tolerance
-from reports.document.layout import Picture, Section
-from reports.figures.convergence import (
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.data.histories import RULE, CaseHistories, chosen, unread
+from mortarbench.reports.document.formatting import clean, listing, tolerance
+from mortarbench.reports.document.layout import Picture, Section
+from mortarbench.reports.figures.convergence import (
     FLOOR,
     active_set_figure,
     convergence_figure,

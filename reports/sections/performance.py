@@ -6,18 +6,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from reports.data.aggregation import Ranking
-from reports.document.formatting import clean, plural
-from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.profiles import (
+from mortarbench.reports.data.aggregation import Ranking
+from mortarbench.reports.document.formatting import clean, plural
+from mortarbench.reports.document.layout import Cell, Picture, Section, Table, name_cell
+from mortarbench.reports.figures.profiles import (
     banded,
     pairwise_figure,
     profile_figure,
     rivals,
     rows_of,
 )
-from reports.sections.ranking import described
-from reports.statistics.profiles import Array, performance_ratios, solved_within
+from mortarbench.reports.sections.ranking import described
+from mortarbench.reports.statistics.profiles import (
+    Array,
+    performance_ratios,
+    solved_within,
+)
 
 DRAWN = 4  #: groups that are drawn; all are tabulated
 FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table

@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from harness import Fields, InputError
-from harness.files.store import load_fields
-from reports.data.cells import source
-from reports.data.evidence import Evidence, Outcome
-from reports.data.quantities import (
+from mortarbench.harness import Fields, InputError
+from mortarbench.harness.files.store import load_fields
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.quantities import (
     Spread,
     best_of,
     elastic,
@@ -19,16 +19,22 @@ from reports.data.quantities import (
     spreads,
     unit,
 )
-from reports.document.formatting import clean, plural, power, significant, tolerance
-from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.deformed import (
+from mortarbench.reports.document.formatting import (
+    clean,
+    plural,
+    power,
+    significant,
+    tolerance,
+)
+from mortarbench.reports.document.layout import Cell, Picture, Section, Table, name_cell
+from mortarbench.reports.figures.deformed import (
     PERCENTILE,
     SCALE,
     automatic_scale,
     clipped_at,
     deformed_figure,
 )
-from reports.figures.tractions import traction_figure
+from mortarbench.reports.figures.tractions import traction_figure
 
 
 def agreement(evidence: Evidence) -> Section | None:

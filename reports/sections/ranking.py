@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from harness.running.pairs import paired_ratio
-from reports.data.aggregation import (
+from mortarbench.harness.running.pairs import paired_ratio
+from mortarbench.reports.data.aggregation import (
     EVERY,
     PENALTIES,
     SHIFTS,
@@ -20,9 +20,13 @@ from reports.data.aggregation import (
     common_cases,
     panel,
 )
-from reports.data.aggregation import geometric_means as means_by
-from reports.data.comparison_groups import CASES, LARGEST_SHIFT, ComparisonGroup
-from reports.document.formatting import (
+from mortarbench.reports.data.aggregation import geometric_means as means_by
+from mortarbench.reports.data.comparison_groups import (
+    CASES,
+    LARGEST_SHIFT,
+    ComparisonGroup,
+)
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     bracketed,
@@ -30,9 +34,9 @@ from reports.document.formatting import (
     seconds,
     significant,
 )
-from reports.document.layout import Cell, Section, Table, name_cell
-from reports.statistics.censoring import restricted_mean
-from reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.statistics.censoring import restricted_mean
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 _LACKING = 6  #: groups that are named as not compared
 _COLUMNS = (

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from reports.data.cells import source
-from reports.data.evidence import Evidence, Outcome
-from reports.data.rank_series import (
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.rank_series import (
     ALIKE,
     PHASES,
     Member,
@@ -19,7 +19,7 @@ from reports.data.rank_series import (
     strong_series,
     weak_series,
 )
-from reports.document.formatting import (
+from mortarbench.reports.document.formatting import (
     TIMED,
     bracketed,
     clean,
@@ -29,15 +29,15 @@ from reports.document.formatting import (
     span,
     tolerance,
 )
-from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.ranks import (
+from mortarbench.reports.document.layout import Cell, Picture, Section, Table, name_cell
+from mortarbench.reports.figures.ranks import (
     model_figure,
     parts_figure,
     strong_figure,
     weak_figure,
 )
-from reports.statistics.cost_model import CostModel
-from reports.statistics.intervals import Interval
+from mortarbench.reports.statistics.cost_model import CostModel
+from mortarbench.reports.statistics.intervals import Interval
 
 MOST_DRAWN = 4  #: series of a figure; all are tabulated
 MISFIT = 0.2  #: of a model that is not asked about more ranks

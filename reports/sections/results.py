@@ -5,12 +5,24 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Mapping
 
-from harness import Verdict
-from reports.data.cells import case_cells, grid, legend, source, verdict_cell
-from reports.data.evidence import RESIDUALS, Evidence, Outcome
-from reports.document.formatting import ABSENT, clean, plain_value, power, span
-from reports.document.layout import Cell, Section, Table, name_cell, sources
-from reports.statistics.profiles import share
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.cells import (
+    case_cells,
+    grid,
+    legend,
+    source,
+    verdict_cell,
+)
+from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    clean,
+    plain_value,
+    power,
+    span,
+)
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell, sources
+from mortarbench.reports.statistics.profiles import share
 
 #: (claimed to be solved, verified) and what that is called
 KINDS = {

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from reports.data.cells import source
-from reports.data.evidence import Evidence, Outcome
-from reports.data.rank_series import strong_series
-from reports.data.size_series import SIZES as SERIES
-from reports.data.size_series import SizeSeries, Sweep, sweeps
-from reports.document.formatting import (
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.rank_series import strong_series
+from mortarbench.reports.data.size_series import SIZES as SERIES
+from mortarbench.reports.data.size_series import SizeSeries, Sweep, sweeps
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     bracketed,
@@ -25,11 +25,21 @@ from reports.document.formatting import (
     span,
     tolerance,
 )
-from reports.document.layout import Cell, Picture, Section, Statement, Table
-from reports.figures.scaling import iterations_figure
-from reports.figures.steps import condition_numbers, steps_figure, torn_figure
-from reports.statistics.growth import PRACTICAL, SIZES, Growth, Trend, growth_of
-from reports.statistics.intervals import PowerLaw
+from mortarbench.reports.document.layout import Cell, Picture, Section, Statement, Table
+from mortarbench.reports.figures.scaling import iterations_figure
+from mortarbench.reports.figures.steps import (
+    condition_numbers,
+    steps_figure,
+    torn_figure,
+)
+from mortarbench.reports.statistics.growth import (
+    PRACTICAL,
+    SIZES,
+    Growth,
+    Trend,
+    growth_of,
+)
+from mortarbench.reports.statistics.intervals import PowerLaw
 
 #: What the sizes of a series count, wherever they are shown.
 SIZES_NAMED = (

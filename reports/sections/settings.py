@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from reports.data.cells import source
-from reports.data.environment import flatten
-from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import (
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.environment import flatten
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     clean,
@@ -19,7 +19,7 @@ from reports.document.formatting import (
     plural,
     tolerance,
 )
-from reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
 
 _SIZES = ("variables", "equalities", "inequalities", "bounds")
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
-from harness import InputError, Record, Verdict
-from harness.record import SCHEMA, VERIFIED_FACTOR
-from harness.results.faults import in_words
-from harness.results.folder import differences, environment_of
-from reports.data.environment import QUIET_LOAD, busy_with, machine
-from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import (
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.record import SCHEMA, VERIFIED_FACTOR
+from mortarbench.harness.results.faults import in_words
+from mortarbench.harness.results.folder import differences, environment_of
+from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.formatting import (
     ENDINGS,
     VERDICTS,
     clean,
@@ -20,7 +20,7 @@ from reports.document.formatting import (
     power,
     tolerance,
 )
-from reports.document.layout import Cell, Section, Table, name_cell, sources
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell, sources
 
 _LIMITS = (Verdict.ITERATION_LIMIT, Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
 _GROUPS: dict[str, tuple[Verdict, ...]] = {

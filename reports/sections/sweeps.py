@@ -4,15 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from harness import Verdict
-from harness.crossval.discretisation import Discretisation, read_discretisation
-from reports.data.cells import source
-from reports.data.evidence import Evidence, Outcome
-from reports.data.time_at_accuracy import TimeAtAccuracy, counts, time_at_accuracy
-from reports.document.formatting import ABSENT, TIMED, clean, power, seconds, tolerance
-from reports.document.layout import Cell, Picture, Section, Table, name_cell
-from reports.figures.sweeps import certified_figure, sweep_figure
-from reports.statistics.intervals import COVERAGE
+from mortarbench.harness import Verdict
+from mortarbench.harness.crossval.discretisation import (
+    Discretisation,
+    read_discretisation,
+)
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.time_at_accuracy import (
+    TimeAtAccuracy,
+    counts,
+    time_at_accuracy,
+)
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    TIMED,
+    clean,
+    power,
+    seconds,
+    tolerance,
+)
+from mortarbench.reports.document.layout import Cell, Picture, Section, Table, name_cell
+from mortarbench.reports.figures.sweeps import certified_figure, sweep_figure
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 _PANELS = 4  #: cases that are drawn; all are tabulated
 

@@ -11,12 +11,12 @@ from statistics import median
 
 import numpy as np
 
-from harness import Record
-from harness.running.pairs import Ratio, paired_ratio, ratio_of
-from harness.suite.suite import NULL
-from reports.data.cells import case_cells, grid, source
-from reports.data.evidence import Evidence, Outcome
-from reports.document.formatting import (
+from mortarbench.harness import Record
+from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
+from mortarbench.harness.suite.suite import NULL
+from mortarbench.reports.data.cells import case_cells, grid, source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     VERDICTS,
@@ -25,8 +25,8 @@ from reports.document.formatting import (
     plural,
     seconds,
 )
-from reports.document.layout import Cell, Section, Table, name_cell
-from reports.statistics.intervals import COVERAGE, Interval, median_interval
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval, median_interval
 
 _UNPAIRED = (
     "Unpaired: the two were not measured in the same blocks, since one was added to "

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from statistics import median
 
-from harness.crossval.discretisation import Discretisation, read_discretisation
-from harness.running.pairs import ratio_of
-from reports.data.cells import source
-from reports.data.evidence import Evidence, Outcome
-from reports.data.time_at_accuracy import counts
-from reports.document.formatting import (
+from mortarbench.harness.crossval.discretisation import (
+    Discretisation,
+    read_discretisation,
+)
+from mortarbench.harness.running.pairs import ratio_of
+from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.time_at_accuracy import counts
+from mortarbench.reports.document.formatting import (
     ABSENT,
     TIMED,
     clean,
@@ -20,9 +23,9 @@ from reports.document.formatting import (
     significant,
     tolerance,
 )
-from reports.document.layout import Cell, Section, Table, name_cell
-from reports.document.mesh_errors import mesh_table
-from reports.figures.sweeps import SHARE
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.document.mesh_errors import mesh_table
+from mortarbench.reports.figures.sweeps import SHARE
 
 _KNOWN = ("limit", "change")  #: kinds with an error to compare with
 

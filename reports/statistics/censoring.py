@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 Array = NDArray[np.float64]
 

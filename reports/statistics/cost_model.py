@@ -40,8 +40,8 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from reports.statistics.intervals import COVERAGE, Interval
-from reports.statistics.resampling import DRAWS, limits
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.statistics.resampling import DRAWS, limits
 
 NEIGHBOURS = 6  #: of a rank, at most, on the average of a planar graph
 MOST_RANKS = 2**20  #: that an efficiency is looked for at

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import stdtrit
 
-from reports.statistics.intervals import COVERAGE, Interval, power_law
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval, power_law
 
 SIZES = 4  #: fewer different sizes leave less than two degrees of freedom
 PRACTICAL = 0.10  #: relative change per decade of n that nobody need care about

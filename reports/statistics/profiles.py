@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import betainccinv, betaincinv
 
-from reports.statistics.intervals import COVERAGE
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 POINTS = 200  #: of a curve; with more cases than that, the share at so many places
 

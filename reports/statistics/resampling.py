@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, stdtrit
 
-from reports.statistics.intervals import COVERAGE
+from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
 

@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from reports.document.formatting import ABSENT, clean, listing, power, tolerance
-from reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    clean,
+    listing,
+    power,
+    tolerance,
+)
+from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
 
 Data = Mapping[str, Any]
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from reports.document.figure import (
+from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
@@ -20,8 +20,8 @@ from reports.document.figure import (
     Text,
     categories,
 )
-from reports.document.formatting import tolerance
-from reports.figures.style import COLOURS, below, legible
+from mortarbench.reports.document.formatting import tolerance
+from mortarbench.reports.figures.style import COLOURS, below, legible
 
 _SPREAD = 0.3  #: of the marks of a solver, up and down, so that none hides another
 _FLOOR = 1e-17  #: where errors of zero are drawn

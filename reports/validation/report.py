@@ -5,15 +5,28 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from harness import Verdict
-from harness.crossval.discretisation import Discretisation
-from reports.document.formatting import ABSENT, VERDICTS, clean, plural, tolerance
-from reports.document.layout import Cell, Page, Picture, Section, Table, name_cell
-from reports.document.mesh_errors import mesh_table
-from reports.render.html_page import html
-from reports.render.markdown import markdown
-from reports.render.writing import write_figures, write_text
-from reports.validation.compared import (
+from mortarbench.harness import Verdict
+from mortarbench.harness.crossval.discretisation import Discretisation
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    VERDICTS,
+    clean,
+    plural,
+    tolerance,
+)
+from mortarbench.reports.document.layout import (
+    Cell,
+    Page,
+    Picture,
+    Section,
+    Table,
+    name_cell,
+)
+from mortarbench.reports.document.mesh_errors import mesh_table
+from mortarbench.reports.render.html_page import html
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.writing import write_figures, write_text
+from mortarbench.reports.validation.compared import (
     Data,
     count_cell,
     left_out,
@@ -24,7 +37,7 @@ from reports.validation.compared import (
     run,
     tol_cell,
 )
-from reports.validation.error_figure import error_figure
+from mortarbench.reports.validation.error_figure import error_figure
 
 _FOOTER = (
     "All answers and all pairs are in validation.json beside the journal, at full "

@@ -13,15 +13,15 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     csc,
     from_one_sided,
     objective_factor,
     one_sided,
     positive,
 )
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 PRIMAL = "PrimalInfeasible"  #: it comes with a certificate
 CLAIMS = {

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness import QP, About, Matrix, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Matrix, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     csc,
     dense,
     from_one_sided,

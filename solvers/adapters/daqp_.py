@@ -13,9 +13,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector
-from solvers.common.conversion import dense, needs_dense, objective_factor, positive
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.harness import QP, About, Solution, Status, Vector
+from mortarbench.solvers.common.conversion import (
+    dense,
+    needs_dense,
+    objective_factor,
+    positive,
+)
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 CLAIMS = {
     1: Status.SOLVED,

@@ -13,8 +13,8 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy.sparse import csc_matrix, tril, vstack
 
-from harness import QP, About, Solution, Status, Vector, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.solvers.common.conversion import (
     csc,
     needs_dense,
     objective_factor,

@@ -12,8 +12,8 @@ from typing import ClassVar
 
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_two_sided,
@@ -22,7 +22,7 @@ from solvers.common.conversion import (
     to_two_sided,
     two_sided,
 )
-from solvers.common.sequence import Session, tightening
+from mortarbench.solvers.common.sequence import Session, tightening
 
 PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {

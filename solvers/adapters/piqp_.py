@@ -12,8 +12,8 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     as_stored,
     csc,
@@ -23,7 +23,7 @@ from solvers.common.conversion import (
     one_of,
     positive,
 )
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {

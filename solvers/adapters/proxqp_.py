@@ -12,8 +12,8 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     as_stored,
     boxed,
@@ -26,7 +26,7 @@ from solvers.common.conversion import (
     positive,
     two_sided,
 )
-from solvers.common.sequence import Session, tightening
+from mortarbench.solvers.common.sequence import Session, tightening
 
 PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {

@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
     csc,
@@ -22,7 +22,7 @@ from solvers.common.conversion import (
     one_sided,
     positive,
 )
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,

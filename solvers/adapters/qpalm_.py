@@ -12,8 +12,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_two_sided,
@@ -21,7 +21,7 @@ from solvers.common.conversion import (
     to_two_sided,
     two_sided,
 )
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 PRIMAL = "PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {

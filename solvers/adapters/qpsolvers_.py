@@ -15,9 +15,17 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from harness import QP, About, Matrix, Solution, Status, Vector, needs_matrices
-from solvers.common.backends import Call, adapter_files, why_not
-from solvers.common.conversion import (
+from mortarbench.harness import (
+    QP,
+    About,
+    Matrix,
+    Solution,
+    Status,
+    Vector,
+    needs_matrices,
+)
+from mortarbench.solvers.common.backends import Call, adapter_files, why_not
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     dense,

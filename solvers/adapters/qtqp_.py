@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     csc,
     from_one_sided,
     objective_factor,

@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
-from harness import QP, About, Solution, Status
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status
+from mortarbench.solvers.common.conversion import (
     dense,
     from_one_sided,
     needs_dense,

@@ -13,8 +13,8 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import triu
 
-from harness import QP, About, Solution, Status, needs_matrices
-from solvers.common.conversion import (
+from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
     from_one_sided,
@@ -23,7 +23,7 @@ from solvers.common.conversion import (
     positive,
     to_one_sided,
 )
-from solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, in_sequence
 
 PRIMAL = -2  #: it comes with a certificate
 CLAIMS = {

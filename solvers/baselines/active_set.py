@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import diags_array
 
-from harness import QP, Matrix, Vector
-from solvers.baselines.face import Faces, Solve, faces
-from solvers.common.conversion import csc, dense
+from mortarbench.harness import QP, Matrix, Vector
+from mortarbench.solvers.baselines.face import Faces, Solve, faces
+from mortarbench.solvers.common.conversion import csc, dense
 
 DELTA = 1e-9  #: δᵢ/Pᵢᵢ
 KAPPA = 1e4  #: ρ·aD⁻¹aᵀ

@@ -15,8 +15,16 @@ from typing import ClassVar
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals, needs_matrices
-from solvers.common.conversion import dense, positive
+from mortarbench.harness import (
+    QP,
+    About,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+    needs_matrices,
+)
+from mortarbench.solvers.common.conversion import dense, positive
 
 LARGEST = 5_000  #: components; P is made dense
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance

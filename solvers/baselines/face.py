@@ -22,7 +22,7 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.sparse import csc_matrix, diags_array
 from sksparse.cholmod import cholesky as sparse_cholesky
 
-from harness import Matrix, Vector
+from mortarbench.harness import Matrix, Vector
 
 Mask = NDArray[np.bool_]
 Solve = Callable[[Vector], Vector]  #: r (n,) → dx (n,), zero off F; reads r_F only

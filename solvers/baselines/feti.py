@@ -27,9 +27,17 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csc_matrix, csr_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals, too_large
-from harness.operators import Preconditioned, Product, SerialisableOperator
-from solvers.common.conversion import boxed, one_of, positive
+from mortarbench.harness import (
+    QP,
+    About,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+    too_large,
+)
+from mortarbench.harness.operators import Preconditioned, Product, SerialisableOperator
+from mortarbench.solvers.common.conversion import boxed, one_of, positive
 
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]

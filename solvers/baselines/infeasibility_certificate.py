@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness import QP, Matrix, Vector
+from mortarbench.harness import QP, Matrix, Vector
 
 ROUNDING = 1e-10  #: of a sum, relative to the largest term that it could have
 

@@ -37,8 +37,16 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals, needs_matrices
-from solvers.baselines.active_set import (
+from mortarbench.harness import (
+    QP,
+    About,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+    needs_matrices,
+)
+from mortarbench.solvers.baselines.active_set import (
     DELTA,
     KAPPA,
     Active,
@@ -48,8 +56,11 @@ from solvers.baselines.active_set import (
     penalised,
     settled,
 )
-from solvers.baselines.infeasibility_certificate import contradicts, descends
-from solvers.common.conversion import positive
+from mortarbench.solvers.baselines.infeasibility_certificate import (
+    contradicts,
+    descends,
+)
+from mortarbench.solvers.common.conversion import positive
 
 STIFFER = 100.0  #: factor of ρ where the residuals fall too slowly
 MOST_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ up to which it is used

@@ -21,9 +21,9 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals
-from solvers.baselines.infeasibility_certificate import descends
-from solvers.common.conversion import positive
+from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
+from mortarbench.solvers.baselines.infeasibility_certificate import descends
+from mortarbench.solvers.common.conversion import positive
 
 SUFFICIENT = 1e-4  #: share of the linear decrease that a step must bring
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance

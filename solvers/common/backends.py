@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from solvers.common.conversion import OBJECTIVE_SIZE
+from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import QP, Matrix, Solution
+from mortarbench.harness import QP, Matrix, Solution
 
 
 class Session(NamedTuple):

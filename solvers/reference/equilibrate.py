@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from harness import QP, Matrix, Solution, Vector
+from mortarbench.harness import QP, Matrix, Solution, Vector
 
 ROUNDS = 20  #: more than it takes units that differ by 1e±12 from entry to entry
 Exponents = NDArray[np.int64]

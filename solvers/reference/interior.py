@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, eye_array, vstack
 
-from harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
-from solvers.reference.saddle import Factorise, Solve, saddle
+from mortarbench.harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
+from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: of a QP whose largest entries are about one
 CLOSE = 1e-11  #: KKT residual that tells the active constraints from the others

@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, cholesky
 
-from harness import QP, Solution, Status, Vector, kkt_residuals, no_rows
-from harness.distributed.vectors import DistributedColumns, distributed
+from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals, no_rows
+from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
 
 Mask = NDArray[np.bool_]
 

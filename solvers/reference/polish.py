@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import vstack
 
-from harness import QP, Matrix, Solution, Status
-from solvers.reference.saddle import saddle
+from mortarbench.harness import QP, Matrix, Solution, Status
+from mortarbench.solvers.reference.saddle import saddle
 
 Extended = NDArray[np.longdouble]
 DELTA = 1e-10  #: of a QP whose largest entries are about one

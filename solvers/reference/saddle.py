@@ -15,7 +15,7 @@ from scipy.linalg.lapack import dgetrf, dgetrs
 from scipy.sparse import block_array, csc_array, diags_array
 from scipy.sparse.linalg import splu
 
-from harness import Matrix, Vector
+from mortarbench.harness import Matrix, Vector
 
 #: for `splu`
 LEAST_FILL = dict(

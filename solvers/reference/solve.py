@@ -23,12 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from harness import QP, Solution, Status, kkt_residuals
-from harness.operators import assembled
-from harness.verify.optimum import is_small
-from solvers.reference.equilibrate import equilibrated
-from solvers.reference.interior import interior_point
-from solvers.reference.polish import polished
+from mortarbench.harness import QP, Solution, Status, kkt_residuals
+from mortarbench.harness.operators import assembled
+from mortarbench.harness.verify.optimum import is_small
+from mortarbench.solvers.reference.equilibrate import equilibrated
+from mortarbench.solvers.reference.interior import interior_point
+from mortarbench.solvers.reference.polish import polished
 
 ENOUGH = 1e-14  #: KKT residual that is not refined any more
 NEAR = 1e-3  #: KKT residual of a start: from farther off refinement ends, where the

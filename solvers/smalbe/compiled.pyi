@@ -3,10 +3,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Matrix, Vector
-from solvers.smalbe.options import Options
-from solvers.smalbe.outer_loop import Iterate
-from solvers.smalbe.projected import Projected
+from mortarbench.harness import Matrix, Vector
+from mortarbench.solvers.smalbe.options import Options
+from mortarbench.solvers.smalbe.outer_loop import Iterate
+from mortarbench.solvers.smalbe.projected import Projected
 
 Array = NDArray[np.float64]
 Kept = NDArray[np.int32]

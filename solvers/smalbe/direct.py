@@ -24,13 +24,13 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from harness import QP, About, Solution, Status, Vector, kkt_residuals
-from solvers.common.conversion import dense, needs_dense, positive
-from solvers.smalbe.compiled import residual_bound
-from solvers.smalbe.driver import CLAIM, PATIENCE
-from solvers.smalbe.faces import Faces
-from solvers.smalbe.outer_loop import infeasible
-from solvers.smalbe.rows import FREE_RANK, DenseRows, prepared_rows
+from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
+from mortarbench.solvers.common.conversion import dense, needs_dense, positive
+from mortarbench.solvers.smalbe.compiled import residual_bound
+from mortarbench.solvers.smalbe.driver import CLAIM, PATIENCE
+from mortarbench.solvers.smalbe.faces import Faces
+from mortarbench.solvers.smalbe.outer_loop import infeasible
+from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, prepared_rows
 
 LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
 RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import issparse
 
-from harness import QP, Solution, Status, Vector, kkt_residuals
-from harness.distributed.vectors import DistributedVector
-from solvers.smalbe import compiled
-from solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
-from solvers.smalbe.mprgp import Face, Point, Rules, Watch, split
-from solvers.smalbe.options import Options
-from solvers.smalbe.outer_loop import (
+from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
+from mortarbench.harness.distributed.vectors import DistributedVector
+from mortarbench.solvers.smalbe import compiled
+from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
+from mortarbench.solvers.smalbe.mprgp import Face, Point, Rules, Watch, split
+from mortarbench.solvers.smalbe.options import Options
+from mortarbench.solvers.smalbe.outer_loop import (
     Constants,
     InnerSolver,
     Iterate,
@@ -27,8 +27,12 @@ from solvers.smalbe.outer_loop import (
     infeasible,
     smalbe,
 )
-from solvers.smalbe.preconditioner import chosen, face_preconditioner, offered
-from solvers.smalbe.projected import (
+from mortarbench.solvers.smalbe.preconditioner import (
+    chosen,
+    face_preconditioner,
+    offered,
+)
+from mortarbench.solvers.smalbe.projected import (
     Projected,
     Spectrum,
     by_lanczos,
@@ -36,8 +40,8 @@ from solvers.smalbe.projected import (
     prepared_problem,
     projected_problem,
 )
-from solvers.smalbe.rows import DenseRows, Rows, is_sparse
-from solvers.smalbe.spectrum import random_start
+from mortarbench.solvers.smalbe.rows import DenseRows, Rows, is_sparse
+from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
     "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",

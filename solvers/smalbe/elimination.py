@@ -26,8 +26,8 @@ from scipy.linalg import LinAlgError
 from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.sparse import csr_array
 
-from harness import QP, Matrix, Solution, Vector, no_rows
-from solvers.smalbe.rows import prepared_rows
+from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
+from mortarbench.solvers.smalbe.rows import prepared_rows
 
 #: singular values of orthonormal rows, cut to E, are zero below and good above these;
 #: rows that hardly meet E would make the reduced matrix as large as they are small

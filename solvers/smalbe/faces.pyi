@@ -1,7 +1,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
+from mortarbench.harness import Vector
 
 class Faces:
     products: int

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas
 
-from harness import Vector
-from harness.distributed.vectors import inner_products, on_slices
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.vectors import inner_products, on_slices
 
 Mask = NDArray[np.bool_]
 ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations

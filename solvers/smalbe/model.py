@@ -19,10 +19,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Vector
-from harness.distributed.vectors import inner_products, on_slices
-from solvers.smalbe import kernels
-from solvers.smalbe.kernels import Mask
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.vectors import inner_products, on_slices
+from mortarbench.solvers.smalbe import kernels
+from mortarbench.solvers.smalbe.kernels import Mask
 
 NEWTON_STEPS = 100
 SEARCH_STEPS = 60

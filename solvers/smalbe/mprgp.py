@@ -35,11 +35,11 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
-from harness import Vector
-from harness.distributed.vectors import inner_products
-from solvers.smalbe import kernels
-from solvers.smalbe.kernels import Mask
-from solvers.smalbe.model import BoxModel
+from mortarbench.harness import Vector
+from mortarbench.harness.distributed.vectors import inner_products
+from mortarbench.solvers.smalbe import kernels
+from mortarbench.solvers.smalbe.kernels import Mask
+from mortarbench.solvers.smalbe.model import BoxModel
 
 Operator = Callable[[Vector], Vector]
 Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner

@@ -7,9 +7,14 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from solvers.common.conversion import positive
-from solvers.smalbe.mprgp import EXPANSIONS, PROPORTIONINGS, Expansion, Proportioning
-from solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
+from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.smalbe.mprgp import (
+    EXPANSIONS,
+    PROPORTIONINGS,
+    Expansion,
+    Proportioning,
+)
+from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
 Norm = Literal["lanczos", "power"]
 Eliminate = Literal["never", "sequences", "always"]

@@ -30,9 +30,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from harness import Status, Vector
-from solvers.smalbe.model import BoxModel
-from solvers.smalbe.mprgp import (
+from mortarbench.harness import Status, Vector
+from mortarbench.solvers.smalbe.model import BoxModel
+from mortarbench.solvers.smalbe.mprgp import (
     Directions,
     Face,
     Minimum,
@@ -42,8 +42,8 @@ from solvers.smalbe.mprgp import (
     Watch,
     mprgp,
 )
-from solvers.smalbe.projected import Projected
-from solvers.smalbe.rows import Rows
+from mortarbench.solvers.smalbe.projected import Projected
+from mortarbench.solvers.smalbe.rows import Rows
 
 REACH = 1e6  #: how far to look for feasible points where there is no bound
 NOISE = 1e-12  #: what rounding may leave in sums of products

@@ -31,12 +31,12 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 
-from harness import QP, Structure, Vector
-from harness.operators import Preconditioned, SerialisableOperator
-from solvers.smalbe import kernels
-from solvers.smalbe.kernels import Mask
-from solvers.smalbe.mprgp import Operator, Precondition
-from solvers.smalbe.projected import Projected
+from mortarbench.harness import QP, Structure, Vector
+from mortarbench.harness.operators import Preconditioned, SerialisableOperator
+from mortarbench.solvers.smalbe import kernels
+from mortarbench.solvers.smalbe.kernels import Mask
+from mortarbench.solvers.smalbe.mprgp import Operator, Precondition
+from mortarbench.solvers.smalbe.projected import Projected
 
 Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
 PRECONDITIONERS = get_args(Preconditioner)

@@ -11,14 +11,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import QP, Matrix, Vector
-from harness.distributed.vectors import DistributedVector
-from solvers.common.conversion import boxed
-from solvers.smalbe import compiled, kernels
-from solvers.smalbe.compiled import Product
-from solvers.smalbe.model import BoxModel, Model
-from solvers.smalbe.rows import Rows, equality_rows, prepared_rows
-from solvers.smalbe.spectrum import Ritz, lanczos, power_method, random_start, size
+from mortarbench.harness import QP, Matrix, Vector
+from mortarbench.harness.distributed.vectors import DistributedVector
+from mortarbench.solvers.common.conversion import boxed
+from mortarbench.solvers.smalbe import compiled, kernels
+from mortarbench.solvers.smalbe.compiled import Product
+from mortarbench.solvers.smalbe.model import BoxModel, Model
+from mortarbench.solvers.smalbe.rows import Rows, equality_rows, prepared_rows
+from mortarbench.solvers.smalbe.spectrum import (
+    Ritz,
+    lanczos,
+    power_method,
+    random_start,
+    size,
+)
 
 NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
 FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays

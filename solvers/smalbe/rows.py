@@ -32,8 +32,8 @@ from scipy.linalg import cho_solve, qr, solve_triangular
 from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
-from harness import Matrix, Vector, too_large
-from harness.distributed.factor import (
+from mortarbench.harness import Matrix, Vector, too_large
+from mortarbench.harness.distributed.factor import (
     DependentRowsError,
     LocalFactor,
     SummedFactor,
@@ -43,11 +43,15 @@ from harness.distributed.factor import (
     touched_rows,
     with_int32,
 )
-from harness.distributed.sparse import CompressedRows
-from harness.distributed.vectors import DistributedColumns, Ranks, distributed
-from solvers.smalbe import compiled, kernels
-from solvers.smalbe.kernels import Mask
-from solvers.smalbe.model import BoxModel, Model, Tilted, minimised
+from mortarbench.harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed.vectors import (
+    DistributedColumns,
+    Ranks,
+    distributed,
+)
+from mortarbench.solvers.smalbe import compiled, kernels
+from mortarbench.solvers.smalbe.kernels import Mask
+from mortarbench.solvers.smalbe.model import BoxModel, Model, Tilted, minimised
 
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 

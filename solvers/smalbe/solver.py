@@ -22,10 +22,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from harness import QP, About, Solution
-from solvers.smalbe.driver import Carry, prepared
-from solvers.smalbe.options import Options
-from solvers.smalbe.preconditioner import lacking
+from mortarbench.harness import QP, About, Solution
+from mortarbench.solvers.smalbe.driver import Carry, prepared
+from mortarbench.solvers.smalbe.options import Options
+from mortarbench.solvers.smalbe.preconditioner import lacking
 
 
 @dataclass(frozen=True)

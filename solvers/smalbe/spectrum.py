@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
 
-from harness import Vector
+from mortarbench.harness import Vector
 
 FEW = 5  #: steps after which a flat spectrum shows
 FLAT = 10.0  #: ratio of Ritz values of one size

@@ -5,18 +5,18 @@ import os
 
 import pytest
 
-from harness import InputError
-from harness.errors import one_line, shown
-from harness.files.reading import VARIABLE, read_json, read_toml, toml
-from harness.limits import CASE_VARIABLE
-from harness.names import parse
-from harness.record import Record, Verdict
-from harness.results.journal import read_journal
-from harness.suite.suite import load_suite
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.errors import one_line, shown
+from mortarbench.harness.files.reading import VARIABLE, read_json, read_toml, toml
+from mortarbench.harness.limits import CASE_VARIABLE
+from mortarbench.harness.names import parse
+from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.suite.suite import load_suite
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from solvers import SOLVERS
+from mortarbench.solvers import SOLVERS
 
 SUITE = 'name = "s"\nsolvers = ["osqp"]\n[[problems]]\nfamily = "beam-ring"\n'
 

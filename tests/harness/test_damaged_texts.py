@@ -17,32 +17,32 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness import InputError, Solution, Status
-from harness.crossval import discretisation
-from harness.files.reading import toml
-from harness.files.store import (
+from mortarbench.cli.main import main
+from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness.crossval import discretisation
+from mortarbench.harness.files.reading import toml
+from mortarbench.harness.files.store import (
     load_fields,
     load_history,
     load_solution,
     point_arrays,
     save,
 )
-from harness.names import parse
-from harness.registry import SolverSpec
-from harness.results.faults import FAULTS
-from harness.results.folder import environment_of, refuse_other
-from harness.results.journal import read_journal
-from harness.suite.growth import as_toml
-from harness.suite.solver_options import as_given, options_for, swept
-from harness.suite.suite import load_suite, read_stored
-from mortarbench.cli.main import main
+from mortarbench.harness.names import parse
+from mortarbench.harness.registry import SolverSpec
+from mortarbench.harness.results.faults import FAULTS
+from mortarbench.harness.results.folder import environment_of, refuse_other
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.suite.growth import as_toml
+from mortarbench.harness.suite.solver_options import as_given, options_for, swept
+from mortarbench.harness.suite.suite import load_suite, read_stored
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.bodies import assembled
+from mortarbench.problems.models.description import described_bodies
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from problems.contact.bodies import assembled
-from problems.models.description import described_bodies
-from reports.data.evidence import read_evidence
-from reports.folder import compose, write_report
-from solvers import SOLVERS
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.folder import compose, write_report
+from mortarbench.solvers import SOLVERS
 from tests.support import damaged_files, damaged_texts, synthetic_results
 from tests.support.bounded import bounded
 

@@ -3,8 +3,8 @@
 from io import BytesIO
 from pathlib import Path
 
-from harness.digest import hex_digest, pieces
-from harness.files.store import digest_of, read_arrays
+from mortarbench.harness.digest import hex_digest, pieces
+from mortarbench.harness.files.store import digest_of, read_arrays
 
 OLD = Path(__file__).parents[1] / "data" / "results-2026-11"
 

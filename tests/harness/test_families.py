@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import pytest
 
-from harness import Family, InputError
-from harness.names import assemble, parse
-from harness.plugin import as_family
+from mortarbench.harness import Family, InputError
+from mortarbench.harness.names import assemble, parse
+from mortarbench.harness.plugin import as_family
 from tests.support.toy_problem import Well
 
 

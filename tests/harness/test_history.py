@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from solvers import SOLVERS
-from solvers.smalbe.driver import COLUMNS, STEPS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.smalbe.driver import COLUMNS, STEPS
 
 PRESETS = [
     "smalbe",

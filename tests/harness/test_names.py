@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness import InputError
-from harness.names import CaseId, assemble, match, parse
-from harness.plugin import as_family
+from mortarbench.harness import InputError
+from mortarbench.harness.names import CaseId, assemble, match, parse
+from mortarbench.harness.plugin import as_family
 
 
 @dataclass(frozen=True)

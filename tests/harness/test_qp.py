@@ -5,7 +5,7 @@ import pytest
 from scipy.sparse import coo_array, csc_matrix, csr_array, eye_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, InputError
+from mortarbench.harness import QP, InputError
 
 I2, ZERO = np.eye(2), np.zeros(2)
 UPPER = np.array([[2.0, 1.0], [0.0, 2.0]])

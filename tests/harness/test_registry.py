@@ -7,8 +7,8 @@ from zipfile import ZipFile
 
 import pytest
 
-from harness import InputError
-from harness.registry import (
+from mortarbench.harness import QP, InputError, Solution
+from mortarbench.harness.registry import (
     PluginFile,
     SolverSpec,
     entry_point_plugins,
@@ -17,6 +17,7 @@ from harness.registry import (
     options_of,
     resolve,
 )
+from mortarbench.problems.elastic import one_step
 
 
 @dataclass(frozen=True)
@@ -265,6 +266,7 @@ def install(tmp_path, monkeypatch):
         folder.mkdir(parents=True)
         (folder / "entry_points.txt").write_text(offers)
         monkeypatch.syspath_prepend(folder.parent)
+        return folder.parent
 
     return install
 
@@ -365,12 +367,69 @@ def test_a_neighbour_that_changed_is_imported_anew(tmp_path):
 
 
 def test_what_lies_beside_a_plugin_takes_the_place_of_neither_us_nor_python(tmp_path):
-    for name in ("harness", "json", "solvers"):
+    for name in ("harness", "json", "mortarbench"):
         (tmp_path / f"{name}.py").write_text("raise RuntimeError('mine')")
     file = tmp_path / "plug.py"
-    file.write_text(f"{PLUGIN}\nimport json, solvers\nfrom harness import QP")
+    file.write_text(f"{PLUGIN}\nimport json, mortarbench\nfrom harness import QP")
 
     assert list(load_plugin(file).solvers) == ["mine", "mine-9"]
+
+
+OF_OLD = """
+import harness, harness.qp as of_qp
+import solvers
+from harness import QP
+from problems.elastic import one_step
+
+class Mine:
+    def declines(self, qp):
+        import harness.errors
+        from harness import Solution
+        from harness.solution import Solution as same
+        return [harness.QP, QP, of_qp.QP, Solution, same, one_step, solvers]
+    def prepare(self, qp, tol): raise AssertionError("it is only named, never run")
+
+SOLVERS = {"mine": Mine()}
+"""
+
+
+def test_the_names_that_packages_of_ours_had_go_on_working_in_plugins(tmp_path):
+    """In calls, too; a neighbour of such a name goes before our package."""
+    (tmp_path / "solvers.py").write_text("NAME = 'of the user'")
+    (tmp_path / "plug.py").write_text(OF_OLD)
+    of_user = sys.modules.get("harness")
+
+    *classes, beside = load_plugin(tmp_path / "plug.py").solvers["mine"].declines(None)
+
+    assert classes == [QP, QP, QP, Solution, Solution, one_step]
+    assert beside.NAME == "of the user"
+    assert sys.modules.get("harness") is of_user
+
+
+def test_a_traceback_of_a_plugin_names_its_lines(tmp_path):
+    (tmp_path / "late.py").write_text("import json, os\n\n1 / 0")
+    file = tmp_path / "plug.py"
+    file.write_text(PLUGIN.replace("return None", "\n        import late"))
+    mine = load_plugin(file).solvers["mine"]
+
+    with pytest.raises(ZeroDivisionError) as e:
+        mine.declines(None)
+
+    places = [(t.path.name, t.lineno + 1) for t in e.traceback]
+    assert ("plug.py", 9) in places
+    assert places[-1] == ("late.py", 3)
+
+
+def test_entry_points_import_harness_by_the_name_that_it_had(install):
+    folder = install(
+        "its-1.0.dist-info", "[mortarbench.solvers]\nmine = its_own:MINE\n"
+    )
+    of_old = f"from harness import QP{PLUGIN.replace('from __future__', '#')}"
+    (folder / "its_own.py").write_text(of_old + "\nMINE = SOLVERS['mine']")
+    of_user = sys.modules.get("harness")
+
+    assert list(entry_point_plugins().solvers) == ["mine"]
+    assert sys.modules.get("harness") is of_user
 
 
 @pytest.mark.parametrize(

@@ -11,16 +11,16 @@ from contextlib import suppress
 import pytest
 
 import mortarbench as mb
-from harness.files.reading import read_toml
-from harness.files.store import is_stored
-from harness.results.folder import environment_of
-from harness.results.journal import Journal, read_journal
 from mortarbench import reporting
 from mortarbench.cli.main import main
+from mortarbench.harness.files.reading import read_toml
+from mortarbench.harness.files.store import is_stored
+from mortarbench.harness.results.folder import environment_of
+from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.registries import Registries
-from reports.data.evidence import read_evidence
-from reports.folder import compose
-from reports.render.markdown import markdown
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.markdown import markdown
 from tests.support import ROOT, TOY_PROBLEM
 
 pytestmark = pytest.mark.together
@@ -519,7 +519,7 @@ def check_growth(folder, before, measure, **grown):
 KILLED_RUN = """
 import os, signal, sys
 import mortarbench as mb
-from harness.results.journal import Journal
+from mortarbench.harness.results.journal import Journal
 from mortarbench.registries import Registries
 
 suite, out, lines, plugin = sys.argv[1:]

@@ -14,16 +14,16 @@ from pathlib import Path
 
 import pytest
 
-from harness import Verdict
-from harness.files.qpfile import load_qp
-from harness.names import parse
-from harness.processes.reaper import lives
-from harness.registry import SolverSpec, load_plugin
-from harness.results.journal import Journal, read_journal
-from harness.verify.verdicts import new_record
 from mortarbench import progress
 from mortarbench.cli import main as main_module
 from mortarbench.cli.main import main
+from mortarbench.harness import Verdict
+from mortarbench.harness.files.qpfile import load_qp
+from mortarbench.harness.names import parse
+from mortarbench.harness.processes.reaper import lives
+from mortarbench.harness.registry import SolverSpec, load_plugin
+from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.verify.verdicts import new_record
 from mortarbench.progress import shown_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
@@ -247,7 +247,7 @@ def compare(first, others, formats, factor):
 def test_two_folders_end_in_a_verdict_and_the_page_of_what_changed(
     cli, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr("reports.write_comparisons", compare)
+    monkeypatch.setattr("mortarbench.reports.write_comparisons", compare)
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
     argv = ["report", "one", "two", "--factor", "3"]
@@ -595,7 +595,7 @@ SUITE = "solvers = ['exact']\n[[problems]]\nfamily = 'well'\n"
 DEEP = "params = {{ depth = [{}] }}\n"
 DEEPER = """
 from pathlib import Path
-from harness.registry import load_plugin
+from mortarbench.harness.registry import load_plugin
 
 well = load_plugin(Path({!r})).problems["well"]
 

@@ -7,18 +7,18 @@ from importlib.metadata import version
 import pytest
 import yaml
 
-from harness import InputError, kkt_residuals
-from harness.registry import load_plugin
 from mortarbench.case import build
 from mortarbench.cli.list_ import solvers_page
 from mortarbench.cli.main import _parser as command_line_parser
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.registry import load_plugin
 from mortarbench.listing import about
+from mortarbench.problems import elastic
+from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.registries import Registries
-from problems import elastic
-from problems.families.beam_ring import BeamRing
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
 
 
@@ -91,7 +91,7 @@ def test_the_page_of_solvers_tells_the_facts_of_each():
 
 
 def test_every_family_and_suite_that_commands_name_exists():
-    from problems import PROBLEMS
+    from mortarbench.problems import PROBLEMS
 
     pages = [ROOT / "README.md", ROOT / "docs" / "commands.md"]
     text = "".join(page.read_text("utf-8") for page in pages)

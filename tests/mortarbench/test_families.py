@@ -5,10 +5,10 @@ import json
 import pytest
 
 from mortarbench.cli.main import main
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 
 CASES = [
     (name, form)

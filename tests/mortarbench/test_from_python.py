@@ -11,7 +11,7 @@ import pytest
 from scipy.sparse import csc_matrix
 
 import mortarbench as mb
-from harness import plugin
+from mortarbench.harness import plugin
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 

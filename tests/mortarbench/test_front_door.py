@@ -11,12 +11,12 @@ import pandas as pd
 import pytest
 
 import mortarbench as mb
-from harness import Verdict
-from harness.results.journal import read_journal
+from mortarbench.harness import Verdict
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.listing import CATALOGUE, described
 from mortarbench.progress import remaining, shown
 from mortarbench.registries import Registries
-from solvers import SOLVERS
+from mortarbench.solvers import SOLVERS
 from tests.support import ROOT, TOY_PROBLEM
 
 pytestmark = pytest.mark.together
@@ -302,6 +302,9 @@ def test_a_wheel_does_without_the_checkout(tmp_path):
     subprocess.run(
         [sys.executable, "-m", "zipfile", "-e", str(wheel), str(target)], check=True
     )
+    version = wheel.name.split("-")[1]
+    places = {place.name for place in target.iterdir()}
+    assert places == {"mortarbench", f"mortarbench-{version}.dist-info"}
     program = (
         "import sys; sys.path.insert(0, sys.argv[1])\n"
         "import mortarbench as mb, os\n"

@@ -11,12 +11,17 @@ import sys
 import numpy as np
 import pytest
 
-from harness import InputError, Solution, Status
-from harness.files.store import load_history, load_solution, save, save_solution
-from harness.registry import load_plugin
-from harness.results.journal import read_journal
-from harness.verify.measure import measure
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError, Solution, Status
+from mortarbench.harness.files.store import (
+    load_history,
+    load_solution,
+    save,
+    save_solution,
+)
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.verify.measure import measure
 from mortarbench.registries import Registries
 from mortarbench.text import convergence
 from tests.support import HISTORIES, TOY_PROBLEM

@@ -5,12 +5,16 @@ import json
 import pytest
 
 import mortarbench as mb
-from harness import Verdict
-from harness.conformance.manufactured import infeasible, manufactured, unbounded
-from harness.files.qpfile import save_qp
 from mortarbench.cli.main import main as command_line
+from mortarbench.harness import Verdict
+from mortarbench.harness.conformance.manufactured import (
+    infeasible,
+    manufactured,
+    unbounded,
+)
+from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.registries import Registries
-from reports.data.evidence import read_evidence
+from mortarbench.reports.data.evidence import read_evidence
 
 
 def main(argv):

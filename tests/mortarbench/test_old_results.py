@@ -4,9 +4,9 @@ import shutil
 
 import pytest
 
-from harness import Verdict
-from harness.results.journal import read_journal
 from mortarbench.cli.main import main
+from mortarbench.harness import Verdict
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import ROOT
 

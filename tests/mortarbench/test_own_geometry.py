@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import mortarbench as mb
-from harness import kkt_residuals
-from reports.export.vtu import write_vtu
-from solvers import SOLVERS
+from mortarbench.harness import kkt_residuals
+from mortarbench.reports.export.vtu import write_vtu
+from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 
 pytestmark = pytest.mark.together

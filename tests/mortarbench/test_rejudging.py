@@ -9,17 +9,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from harness import Record, Status, Verdict
-from harness.record import VERIFIED_FACTOR
-from harness.results.journal import Journal, read_journal
-from harness.verify.kkt import Residuals, rejudged, verdict
 from mortarbench.cli.main import main
+from mortarbench.harness import Record, Status, Verdict
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.verify.kkt import Residuals, rejudged, verdict
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from reports.data.evidence import read_evidence
-from reports.folder import compose, write_report
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.folder import compose, write_report
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 
 sizes = st.one_of(
     st.floats(0, 1, allow_nan=False),

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness import Verdict
 from mortarbench.answer import remarks
 from mortarbench.cli.main import main
+from mortarbench.harness import Verdict
 from mortarbench.registries import Registries
 from tests.support.gmsh_files import BLOCKS, stacked_blocks
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
-from harness.registry import load_plugin
-from harness.results.journal import read_journal
-from harness.suite.suite import load_suite
 from mortarbench.cli.main import main
+from mortarbench.harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.suite.suite import load_suite
 from mortarbench.registries import Registries
 from mortarbench.validation import Conformance
 from tests.support import TOY_PROBLEM

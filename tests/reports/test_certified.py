@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 from scipy.optimize import isotonic_regression
 
-from harness import InputError, Record, Verdict
-from harness.crossval.discretisation import FILE, Discretisation, Level
-from reports.data.evidence import Evidence, arrange
-from reports.data.time_at_accuracy import isotonic, time_at_accuracy, times_at
-from reports.folder import compose
-from reports.render.markdown import markdown
-from reports.sections.sweeps import certified_picture, certified_sweeps
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.crossval.discretisation import FILE, Discretisation, Level
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.time_at_accuracy import (
+    isotonic,
+    time_at_accuracy,
+    times_at,
+)
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.sections.sweeps import certified_picture, certified_sweeps
 
 TOLS = (1e-2, 1e-4, 1e-6, 1e-8)
 

@@ -4,19 +4,25 @@ import re
 
 import pytest
 
-from harness import Record, Verdict
-from harness.results.journal import Journal
-from reports import write_report
-from reports.data.evidence import Evidence, arrange
-from reports.data.size_series import size_series
-from reports.document.formatting import TIMED, exponent, power, seconds, significant
-from reports.document.layout import Cell, Table
-from reports.figures.scaling import scaling_figure
-from reports.folder import compose
-from reports.render.latex import latex
-from reports.render.markdown import markdown
-from reports.render.saving import draw
-from reports.statistics.intervals import PowerLaw, median_interval
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import write_report
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.size_series import size_series
+from mortarbench.reports.document.formatting import (
+    TIMED,
+    exponent,
+    power,
+    seconds,
+    significant,
+)
+from mortarbench.reports.document.layout import Cell, Table
+from mortarbench.reports.figures.scaling import scaling_figure
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.latex import latex
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.saving import draw
+from mortarbench.reports.statistics.intervals import PowerLaw, median_interval
 
 ELASTIC = {
     "dofs": 20, "equality_rows": 4, "contact_rows": 10, "active": 5,

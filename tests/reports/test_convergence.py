@@ -10,16 +10,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import Record, Solution, Status, Verdict
-from harness.files.store import save_solution
-from harness.results.journal import Journal
-from reports import write_report
-from reports.data.evidence import read_evidence
-from reports.data.histories import MOST, chosen
-from reports.figures import convergence
-from reports.folder import compose
-from reports.render.saving import draw
-from reports.render.writing import write_page
+from mortarbench.harness import Record, Solution, Status, Verdict
+from mortarbench.harness.files.store import save_solution
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import write_report
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.data.histories import MOST, chosen
+from mortarbench.reports.figures import convergence
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.saving import draw
+from mortarbench.reports.render.writing import write_page
 
 KNOWN = {
     "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness import Record, Verdict
-from harness.results.journal import Journal
-from reports import write_report
-from reports.document.formatting import clean
-from reports.export.csv_tables import frame_csv
-from reports.render.latex import escaped as tex
-from reports.render.markdown import escaped as md
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import write_report
+from mortarbench.reports.document.formatting import clean
+from mortarbench.reports.export.csv_tables import frame_csv
+from mortarbench.reports.render.latex import escaped as tex
+from mortarbench.reports.render.markdown import escaped as md
 
 pytestmark = pytest.mark.together  # one report for all of them
 

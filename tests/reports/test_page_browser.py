@@ -9,15 +9,15 @@ import shutil
 import numpy as np
 import pytest
 
-from harness import Record, Verdict
-from harness.results.journal import Journal
-from reports.compare.changes import compare
-from reports.compare.page import compose as comparison
-from reports.data.evidence import read_evidence
-from reports.document.fields import FieldFigure, FieldPanel, Polygons
-from reports.document.layout import Page, Picture, Section
-from reports.folder import compose
-from reports.render.html_page import html
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports.compare.changes import compare
+from mortarbench.reports.compare.page import compose as comparison
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.document.fields import FieldFigure, FieldPanel, Polygons
+from mortarbench.reports.document.layout import Page, Picture, Section
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.html_page import html
 from tests.support.synthetic_results import records as synthetic
 from tests.support.synthetic_results import write
 

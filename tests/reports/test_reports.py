@@ -7,23 +7,28 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from harness import Fields, InputError, Record, Verdict
-from harness.files.store import save_fields
-from harness.results.journal import Journal
-from reports import write_report
-from reports.data.evidence import Evidence, arrange
-from reports.data.quantities import spreads
-from reports.data.size_series import size_series
-from reports.document import layout
-from reports.document.formatting import clean, exponent, seconds, significant
-from reports.folder import compose
-from reports.render.html_page import breakable
-from reports.render.latex import escaped, latex
-from reports.render.markdown import escaped as md_escaped
-from reports.render.markdown import markdown
-from reports.render.writing import write_figures
-from reports.sections.summary import sentences
-from reports.statistics.intervals import power_law
+from mortarbench.harness import Fields, InputError, Record, Verdict
+from mortarbench.harness.files.store import save_fields
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import write_report
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.quantities import spreads
+from mortarbench.reports.data.size_series import size_series
+from mortarbench.reports.document import layout
+from mortarbench.reports.document.formatting import (
+    clean,
+    exponent,
+    seconds,
+    significant,
+)
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.html_page import breakable
+from mortarbench.reports.render.latex import escaped, latex
+from mortarbench.reports.render.markdown import escaped as md_escaped
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.writing import write_figures
+from mortarbench.reports.sections.summary import sentences
+from mortarbench.reports.statistics.intervals import power_law
 
 pytestmark = pytest.mark.together
 
@@ -167,7 +172,7 @@ def test_no_time_is_printed_without_its_uncertainty(measured, evidence):
 
 
 def test_times_read_as_a_physicist_would_write_them():
-    from reports.statistics.intervals import median_interval
+    from mortarbench.reports.statistics.intervals import median_interval
 
     assert seconds(median_interval([0.0119, 0.0123, 0.0140])) == "12.3 ms [11.9, 14.0]"
     assert seconds(median_interval([1.5, 1.25, 100.0])) == "1.50 s [1.25, 100.00]"

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from harness import Record, Verdict
-from reports.data.evidence import Evidence, arrange
-from reports.folder import compose
+from mortarbench.harness import Record, Verdict
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.folder import compose
 
 
 @pytest.fixture

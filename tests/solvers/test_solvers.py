@@ -8,17 +8,21 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array, kron
 
-from harness import QP, Status, kkt_residuals
-from harness.conformance.manufactured import infeasible, one_of_each, unbounded
-from harness.environment.environment import PACKAGES as OWN
-from harness.registry import options_of
-from problems.families.beam_ring import BeamRing
-from solvers import SOLVERS
-from solvers.adapters.cvxpy_ import REFUSED
-from solvers.common.conversion import csc, on_present_bounds
-from solvers.common.libraries import PACKAGES
-from solvers.common.sequence import only_vectors_differ
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Status, kkt_residuals
+from mortarbench.harness.conformance.manufactured import (
+    infeasible,
+    one_of_each,
+    unbounded,
+)
+from mortarbench.harness.environment.environment import PACKAGES as OWN
+from mortarbench.harness.registry import options_of
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.adapters.cvxpy_ import REFUSED
+from mortarbench.solvers.common.conversion import csc, on_present_bounds
+from mortarbench.solvers.common.libraries import PACKAGES
+from mortarbench.solvers.common.sequence import only_vectors_differ
+from mortarbench.solvers.reference.solve import reference_solution
 
 pytestmark = pytest.mark.together
 

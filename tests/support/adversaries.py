@@ -19,11 +19,11 @@ from typing import ClassVar
 import numpy as np
 from scipy.sparse import csr_array
 
-import harness.verify.measure
-from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
-from harness.errors import PastEndError
-from harness.processes import case_worker as generator
-from harness.processes.worker import serve
+from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
+from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.processes import case_worker as generator
+from mortarbench.harness.processes.worker import serve
+from mortarbench.harness.verify import measure as measuring
 
 
 @dataclass(frozen=True)
@@ -265,7 +265,7 @@ class SleepsByPower(Honest):
     def prepare(self, qp, tol):
         if (qp.q != 1).any():  # the warm-up
             self.clock[0] = time.perf_counter()
-            harness.verify.measure.perf_counter = lambda: self.clock[0]
+            measuring.perf_counter = lambda: self.clock[0]
         return lambda: self.act(qp)
 
     def act(self, qp):

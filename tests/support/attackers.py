@@ -26,9 +26,9 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from adversaries import PROBLEMS, Honest, at_the_row
 
-from harness.processes import case_worker as generator
-from harness.processes.reaper import MARK, state
-from harness.processes.worker import serve
+from mortarbench.harness.processes import case_worker as generator
+from mortarbench.harness.processes.reaper import MARK, state
+from mortarbench.harness.processes.worker import serve
 
 
 def trees(of_run):
@@ -247,9 +247,9 @@ class Faults(Honest):
     """Shares the process of the worker, whose code it breaks."""
 
     def act(self, qp):
-        import harness.processes.worker
+        from mortarbench.harness.processes import worker
 
-        harness.processes.worker._write_new = None
+        worker._write_new = None
         return at_the_row(qp)
 
 
@@ -394,9 +394,9 @@ class PatchesTheClock(Honest):
     """2 ms of work, and a clock that goes backwards."""
 
     def act(self, qp):
-        import harness.verify.measure
+        from mortarbench.harness.verify import measure
 
-        harness.verify.measure.perf_counter = iter(np.arange(1e6) * -1e-9).__next__
+        measure.perf_counter = iter(np.arange(1e6) * -1e-9).__next__
         spin(0.002)
         return at_the_row(qp)
 
@@ -405,10 +405,10 @@ class SleepsBehindTheClock(Honest):
     """0.3 s in which another process could have worked; its clock says 3 ms."""
 
     def prepare(self, qp, tol):
-        import harness.verify.measure
+        from mortarbench.harness.verify import measure
 
-        if harness.verify.measure.perf_counter is time.perf_counter:  # in the warm-up
-            harness.verify.measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
+        if measure.perf_counter is time.perf_counter:  # in the warm-up
+            measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
         return super().prepare(qp, tol)
 
     def act(self, qp):

@@ -1,6 +1,6 @@
 """Records of a family "box" that there is not, for reports."""
 
-from harness import Record, Verdict
+from mortarbench.harness import Record, Verdict
 
 
 def box_record(solver, case, seconds=0.01, repeat=0, **changes):

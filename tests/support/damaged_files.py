@@ -9,12 +9,12 @@ import pyarrow.parquet as pq
 from scipy.io import savemat
 from scipy.sparse import csc_array, random_array
 
-from harness import QP, InputError
-from harness.files.matfile import save_mat
-from harness.files.parquetfile import save_parquet
-from harness.files.qpfile import save_qp
-from problems import PROBLEMS
-from problems.fem.gmsh_mesh import read_msh
+from mortarbench.harness import QP, InputError
+from mortarbench.harness.files.matfile import save_mat
+from mortarbench.harness.files.parquetfile import save_parquet
+from mortarbench.harness.files.qpfile import save_qp
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.gmsh_mesh import read_msh
 from tests.support.bounded import bounded
 
 EXTREMES = (

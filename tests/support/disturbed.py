@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from harness import Mechanics, Solution
-from harness.mechanics import Real
+from mortarbench.harness import Mechanics, Solution
+from mortarbench.harness.mechanics import Real
 
 
 def noise(s: Solution, size: float, rng: np.random.Generator) -> Solution:

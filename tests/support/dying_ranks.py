@@ -63,7 +63,7 @@ def main(count, trials, seed):
     from contextlib import redirect_stderr
     from io import StringIO
 
-    from harness.processes.ranks import launch
+    from mortarbench.harness.processes.ranks import launch
 
     wrong, rng = [], random.Random(seed)
     for trial in range(trials):

@@ -12,14 +12,14 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from harness.digest import hex_digest
-from harness.distributed.vectors import Ranks
-from harness.names import parse
-from problems import PROBLEMS
-from problems.feti.emission import OwnSubdomains, subdomains_of
-from problems.feti.torn import Kind
-from solvers.reference.over_ranks import reference_over_ranks
-from solvers.reference.solve import reference_solution
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.feti.emission import OwnSubdomains, subdomains_of
+from mortarbench.problems.feti.torn import Kind
+from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 def probe(n):

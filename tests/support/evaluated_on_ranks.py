@@ -11,16 +11,16 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from harness import certify
-from harness.distributed.vectors import Ranks
-from harness.names import parse
-from harness.verify.certificate import UncertifiableError
-from harness.verify.kkt import kkt_residuals
-from harness.verify.verdicts import evaluated_by_ranks, plain
-from problems import PROBLEMS
-from solvers.reference.over_ranks import reference_over_ranks
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import certify
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.certificate import UncertifiableError
+from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.harness.verify.verdicts import evaluated_by_ranks, plain
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 #: tolerances, and factors of the multipliers: the last answer is wrong by a hundredth
 WRONG = ((1e-4, 1.0), (1e-6, 1.0), (1e-6, 1.01))

@@ -4,7 +4,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from harness import QP
+from mortarbench.harness import QP
 
 
 def is_feasible(qp, relaxed=0):

@@ -10,10 +10,10 @@ import sys
 import numpy as np
 from mpi4py import MPI
 
-from harness.distributed.vectors import Ranks
-from harness.mechanics import Real
-from harness.verify.admissible import UncertifiableError
-from harness.verify.over_ranks import certify_over_ranks
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.harness.mechanics import Real
+from mortarbench.harness.verify.admissible import UncertifiableError
+from mortarbench.harness.verify.over_ranks import certify_over_ranks
 from tests.support.disturbed import disturbed
 from tests.support.exact_solutions import exact_solution
 from tests.support.fooled_on_ranks import posed, problem_of

@@ -19,12 +19,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from harness import Mechanics, Solution, Status
-from harness.mechanics import Real
-from harness.verify.active_set_refinement import CLOSED, LOWER, UPPER, States
-from harness.verify.certificate import Certificate
-from harness.verify.references import reference_point
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Mechanics, Solution, Status
+from mortarbench.harness.mechanics import Real
+from mortarbench.harness.verify.active_set_refinement import (
+    CLOSED,
+    LOWER,
+    UPPER,
+    States,
+)
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.held_by_contact import _eliminated, _loose, _substituted
 
 BITS = 500  #: after the binary point

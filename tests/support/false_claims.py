@@ -8,10 +8,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.sparse import eye_array, tril
 
-from harness import QP, Case, Solution, Status, no_rows
-from harness.conformance.manufactured import membrane
-from solvers.common.conversion import csc
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Case, Solution, Status, no_rows
+from mortarbench.harness.conformance.manufactured import membrane
+from mortarbench.solvers.common.conversion import csc
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 @dataclass(frozen=True)

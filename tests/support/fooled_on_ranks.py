@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from harness import Solution, Status, certify
-from harness.distributed.vectors import Ranks
-from harness.mechanics import Real
-from harness.names import parse
-from harness.verify.admissible import UncertifiableError
-from harness.verify.over_ranks import certify_over_ranks
-from harness.verify.references import reference_point
-from problems import PROBLEMS
-from problems.feti.emission import emitted
-from solvers.reference.over_ranks import reference_over_ranks
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Solution, Status, certify
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.harness.mechanics import Real
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.admissible import UncertifiableError
+from mortarbench.harness.verify.over_ranks import certify_over_ranks
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.feti.emission import emitted
+from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.disturbed import DISTURBANCES
 from tests.support.held_by_contact import disc_between_plates, disc_in_parts
 

@@ -31,8 +31,8 @@ from pathlib import Path
 from threading import Lock
 from types import ModuleType
 
-from harness.limits import ONE_THREAD
-from harness.processes import reaper
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.processes import reaper
 
 LONGEST = 2**20  #: bytes of a request
 LIMITS = [getattr(resource, name) for name in dir(resource) if name[:7] == "RLIMIT_"]
@@ -44,19 +44,20 @@ ROOM = 2**16 * " "  #: for longer ones than the server was started with
 PLUGINS = ("mortarbench.cli.main", "mortarbench.processes")
 #: what is loaded for ``python -P -m mortarbench``, whose solvers and cases are ours
 OURS = (
-    *PLUGINS, "solvers.smalbe.solver", "problems.fem.kernels", "sksparse.cholmod",
+    *PLUGINS, "mortarbench.solvers.smalbe.solver", "mortarbench.problems.fem.kernels",
+    "sksparse.cholmod",
 )  # fmt: skip
 
 #: what is loaded for ``python -P -m dask``, the processes of a cluster
 CLUSTER = (
     *PLUGINS, "dask.__main__", "distributed.cli.dask_scheduler",
-    "distributed.cli.dask_worker", "harness.running.dask_worker",
+    "distributed.cli.dask_worker", "mortarbench.harness.running.dask_worker",
 )  # fmt: skip
 
 #: has a program of its own, such as a notebook's kernel, start its workers as forks
 INSTALL = (
     f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); "
-    "import fork_server; from harness.processes import supervisor; "
+    "import fork_server; from mortarbench.harness.processes import supervisor; "
     "supervisor.subprocess = fork_server.Forks()\n"
 )
 
@@ -240,7 +241,7 @@ def become(request, fds):
     if "program" in request:
         sys.modules["dask"].config.refresh()  # by this environment
         if request["serves"]:
-            supervisor = sys.modules["harness.processes.supervisor"]
+            supervisor = sys.modules["mortarbench.harness.processes.supervisor"]
             supervisor.subprocess = Forks({PLUGINS: Server.as_fork()})
         run(None, request["program"])
     cpu, _, _, *command = request["arguments"]

@@ -12,14 +12,27 @@ from typing import Any
 
 import numpy as np
 
-from harness import Case
-from problems.contact.bodies import ContactPair, assemble, clamped, floating, supported
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.stepping import primal_qp
-from problems.fem.elasticity import Material
-from problems.fem.mesh import Mesh, Nodes, join, nodal_lengths, prefixed, rectangle
+from mortarbench.harness import Case
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    assemble,
+    clamped,
+    floating,
+    supported,
+)
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    join,
+    nodal_lengths,
+    prefixed,
+    rectangle,
+)
 from tests.support.held_by_contact import disc_between_plates
 
 PRESSURE = 1e7  #: mean pressure of the loads, Pa

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from harness import Case, Mechanics
-from harness.mechanics import Extended, Real
-from problems.contact.bodies import (
+from mortarbench.harness import Case, Mechanics
+from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
@@ -23,18 +23,18 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.dualisation import Transformed
-from problems.duality.stepping import primal_qp
-from problems.duality.torn_dual import torn_dual
-from problems.fem.elasticity import Material
-from problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from problems.feti.elastic import in_parts, linearised_by, subdivide, torn
-from problems.feti.emission import ProblemInParts
-from problems.feti.partition import graph_partition
-from problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.dualisation import Transformed
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.torn_dual import torn_dual
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
+from mortarbench.problems.feti.elastic import in_parts, linearised_by, subdivide, torn
+from mortarbench.problems.feti.emission import ProblemInParts
+from mortarbench.problems.feti.partition import graph_partition
+from mortarbench.problems.feti.subdivision import mesh_in_parts
 
 PRESSURE = 1e7  #: Pa
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from harness import Solution, Status
+from mortarbench.harness import Solution, Status
 
 
 @dataclass(frozen=True)

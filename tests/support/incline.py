@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from harness import Case
-from problems.contact.bodies import (
+from mortarbench.harness import Case
+from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
@@ -13,14 +13,14 @@ from problems.contact.bodies import (
     floating,
     supported,
 )
-from problems.contact.friction import FrictionLaw
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.stepping import single_load
-from problems.fem.elasticity import Material
-from problems.fem.mesh import join, prefixed, rectangle
-from solvers.reference.solve import reference_solution
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import join, prefixed, rectangle
+from mortarbench.solvers.reference.solve import reference_solution
 
 WEIGHT = 1e5  #: G, N/m
 

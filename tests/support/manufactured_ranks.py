@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness import Record, Verdict
+from mortarbench.harness import Record, Verdict
 
 WORK, ALIKE = 4e-6, 0.02  #: s for a dof, and of each rank
 SLOWDOWN = 1.25  #: of ranks by one another

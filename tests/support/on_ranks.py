@@ -10,17 +10,21 @@ import numpy as np
 from scipy.sparse import csc_array
 
 import mortarbench as mb
-from harness.distributed import factor
-from harness.distributed.factor import DependentRowsError, local_factor, touched_rows
-from harness.distributed.vectors import (
+from mortarbench.harness.distributed import factor
+from mortarbench.harness.distributed.factor import (
+    DependentRowsError,
+    local_factor,
+    touched_rows,
+)
+from mortarbench.harness.distributed.vectors import (
     DistributedVector,
     Ranks,
     distributed,
     inner_products,
 )
-from solvers.smalbe.rows import equality_rows
-from solvers.smalbe.solver import SMALBE
-from solvers.smalbe.spectrum import lanczos
+from mortarbench.solvers.smalbe.rows import equality_rows
+from mortarbench.solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.smalbe.spectrum import lanczos
 
 TOL = 1e-8
 REFUSED = {

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness import Record, Verdict
+from mortarbench.harness import Record, Verdict
 
 TOL = 1e-6
 CONTACTS = ("nts", "mortar")

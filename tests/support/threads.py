@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from harness.distributed.vectors import Ranks
+from mortarbench.harness.distributed.vectors import Ranks
 
 PATIENCE = 60.0  #: s; a busy machine may stop a thread for seconds
 R = TypeVar("R")

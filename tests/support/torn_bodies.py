@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from problems.contact.bodies import Bodies
-from problems.contact.linearise import linearisation
-from problems.duality.stepping import primal_qp
-from problems.feti.elastic import subdivide, torn
-from problems.feti.tearing import structured_bodies
-from problems.feti.torn import Torn
-from problems.models.beam_ring import model
+from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.feti.elastic import subdivide, torn
+from mortarbench.problems.feti.tearing import structured_bodies
+from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.models.beam_ring import model
 
 
 def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:

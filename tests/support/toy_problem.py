@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.cli.main import main
+from mortarbench.harness import QP, Case, Fields, InputError, Solution, Status, no_rows
 from mortarbench.registries import Registries
 
 FAULTS = {

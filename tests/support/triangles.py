@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from problems.contact.bodies import Bodies, assemble
-from problems.fem.mesh import Mesh
+from mortarbench.problems.contact.bodies import Bodies, assemble
+from mortarbench.problems.fem.mesh import Mesh
 
 
 def halved(mesh: Mesh) -> Mesh:

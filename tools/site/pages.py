@@ -16,7 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from reports.render.formulas import mathml
+from mortarbench.reports.render.formulas import mathml
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig

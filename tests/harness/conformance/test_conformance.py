@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from harness import Solution, Status, kkt_residuals
-from harness.conformance import conformance
-from harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
-from harness.conformance.equivalence import (
+from mortarbench.harness import Solution, Status, kkt_residuals
+from mortarbench.harness.conformance import conformance
+from mortarbench.harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     DeclinedError,
     WeakError,
@@ -22,9 +22,14 @@ from harness.conformance.equivalence import (
     changes_of,
     same_answer,
 )
-from harness.conformance.manufactured import FORMS, SHAPES, manufactured, strings
-from harness.conformance.weaknesses import line_of
-from solvers import SOLVERS
+from mortarbench.harness.conformance.manufactured import (
+    FORMS,
+    SHAPES,
+    manufactured,
+    strings,
+)
+from mortarbench.harness.conformance.weaknesses import line_of
+from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 
 #: backends that stand for the wildcard entries of the registry; the others are slow

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, Solution, Status, kkt_residuals, verdict
-from harness.conformance.equivalence import CHANGES, changes_of
-from harness.conformance.manufactured import FORMS, SHAPES, strings
-from harness.conformance.metamorphic import (
+from mortarbench.harness import QP, Solution, Status, kkt_residuals, verdict
+from mortarbench.harness.conformance.equivalence import CHANGES, changes_of
+from mortarbench.harness.conformance.manufactured import FORMS, SHAPES, strings
+from mortarbench.harness.conformance.metamorphic import (
     change_units,
     duplicate_rows,
     mirror,
@@ -18,7 +18,7 @@ from harness.conformance.metamorphic import (
     scale_rows,
     shift_unknowns,
 )
-from solvers.adapters.piqp_ import PIQP
+from mortarbench.solvers.adapters.piqp_ import PIQP
 
 
 def drawn():

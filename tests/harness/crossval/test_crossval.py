@@ -8,26 +8,26 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from harness import QP, Case, Mechanics, Solution, Status, no_rows
-from harness.crossval.assessment import assess, distances, energy_allowed
-from harness.crossval.comparison import brief, compared
-from harness.crossval.discretisation import read_discretisation
-from harness.crossval.ground_truth import Given, ground_truth_of
-from harness.files.qpfile import qp_digest, save_qp
-from harness.files.store import save_solution, write_point
-from harness.names import parse
-from harness.record import Verdict
-from harness.registry import SolverSpec, load_plugin
-from harness.results.journal import Journal, read_journal
-from harness.verify.references import reference_point
-from harness.verify.verdicts import judged, new_record
 from mortarbench.cli.main import main
+from mortarbench.harness import QP, Case, Mechanics, Solution, Status, no_rows
+from mortarbench.harness.crossval.assessment import assess, distances, energy_allowed
+from mortarbench.harness.crossval.comparison import brief, compared
+from mortarbench.harness.crossval.discretisation import read_discretisation
+from mortarbench.harness.crossval.ground_truth import Given, ground_truth_of
+from mortarbench.harness.files.qpfile import qp_digest, save_qp
+from mortarbench.harness.files.store import save_solution, write_point
+from mortarbench.harness.names import parse
+from mortarbench.harness.record import Verdict
+from mortarbench.harness.registry import SolverSpec, load_plugin
+from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.harness.verify.verdicts import judged, new_record
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from reports.render.markdown import markdown
-from reports.render.writing import write_text
-from reports.validation.report import compose, write_validation
-from solvers.reference.solve import reference_solution
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.writing import write_text
+from mortarbench.reports.validation.report import compose, write_validation
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
 
 pytestmark = pytest.mark.together
@@ -354,7 +354,9 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     def doubtful(*args):
         return ground_truth_of(*args)._replace(doubt=np.inf)
 
-    monkeypatch.setattr("harness.crossval.comparison.ground_truth_of", doubtful)
+    monkeypatch.setattr(
+        "mortarbench.harness.crossval.comparison.ground_truth_of", doubtful
+    )
     case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
     s = pushed((1.5, 0.0))
     answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]

@@ -12,8 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from harness import InputError
-from harness.crossval.discretisation import (
+from mortarbench.harness import InputError
+from mortarbench.harness.crossval.discretisation import (
     FILE,
     MOST_UNKNOWNS,
     Level,
@@ -21,15 +21,19 @@ from harness.crossval.discretisation import (
     estimated,
     read_discretisation,
 )
-from harness.crossval.mesh_refinement import prolongation
-from harness.names import assemble, completed, parse
-from harness.plugin import as_family
-from harness.verify.references import reference_point
-from problems import PROBLEMS
-from problems.models.hertz import halved
-from problems.models.obstacle import exact_energy, exact_height, obstacle_problem
-from reports.document.mesh_errors import mesh_table
-from solvers.reference.solve import reference_solution
+from mortarbench.harness.crossval.mesh_refinement import prolongation
+from mortarbench.harness.names import assemble, completed, parse
+from mortarbench.harness.plugin import as_family
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.models.hertz import halved
+from mortarbench.problems.models.obstacle import (
+    exact_energy,
+    exact_height,
+    obstacle_problem,
+)
+from mortarbench.reports.document.mesh_errors import mesh_table
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
 from tests.support.gmsh_files import stacked_blocks
 

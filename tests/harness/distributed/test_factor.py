@@ -9,8 +9,8 @@ import pytest
 from scipy.linalg import solve_triangular
 from scipy.sparse import csc_array
 
-from harness.distributed import factor
-from harness.distributed.factor import (
+from mortarbench.harness.distributed import factor
+from mortarbench.harness.distributed.factor import (
     FILL,
     DependentRowsError,
     factor_above,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, random_array
 
-from harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed.sparse import CompressedRows
 
 
 @pytest.mark.parametrize("shape", [(7, 4), (4, 9), (1, 1), (0, 3), (3, 0), (5, 5)])

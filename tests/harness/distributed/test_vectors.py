@@ -7,8 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csr_array
 
-from harness.distributed import vectors
-from harness.distributed.vectors import (
+from mortarbench.harness.distributed import vectors
+from mortarbench.harness.distributed.vectors import (
     PARTS,
     DistributedColumns,
     DistributedVector,

@@ -17,15 +17,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.environment.doctor import Level, as_json, examine, render
-from harness.environment.environment import (
+from mortarbench.harness.environment.doctor import Level, as_json, examine, render
+from mortarbench.harness.environment.environment import (
     capture,
     capture_in,
     digest,
     source,
     system_blas,
 )
-from harness.environment.noise import NoiseFloor, noise_floor
+from mortarbench.harness.environment.noise import NoiseFloor, noise_floor
 from tests.support import ROOT
 
 DEBIAN = "/usr/lib/x86_64-linux-gnu"

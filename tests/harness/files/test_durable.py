@@ -13,10 +13,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from harness import InputError
-from harness.errors import FaultError
-from harness.files import durable
-from harness.files.durable import (
+from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files import durable
+from mortarbench.harness.files.durable import (
     full_disk_told,
     keep_private,
     refuse_full_disk,
@@ -24,15 +25,20 @@ from harness.files.durable import (
     replace_file,
     replacing,
 )
-from harness.files.lines import Lines
-from harness.processes import measurement as remote
-from harness.registry import load_plugin
-from harness.results.faults import FAULTS, Fault, in_words, left, read_faults
-from harness.results.folder import Held, refuse_foreign
-from mortarbench.cli.main import main
+from mortarbench.harness.files.lines import Lines
+from mortarbench.harness.processes import measurement as remote
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.results.faults import (
+    FAULTS,
+    Fault,
+    in_words,
+    left,
+    read_faults,
+)
+from mortarbench.harness.results.folder import Held, refuse_foreign
 from mortarbench.registries import Registries
-from reports.data.evidence import read_evidence
-from reports.sections.summary import summary
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.sections.summary import summary
 from tests.support import TOY_PROBLEM
 
 
@@ -358,7 +364,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
             raise FaultError("the worker could not be started")
         return remote.measured(worker, qp, record, request, **limits)
 
-    monkeypatch.setattr("harness.running.executor.measured", measured)
+    monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
     code, out, err = cli("run", "toy.toml", "--out", "d")
     told = "2 measurements could not be made, by no fault of a solver: the worker could"
 
@@ -381,7 +387,7 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
     def measured(*_, **__):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("harness.running.executor.measured", measured)
+    monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
     with pytest.raises(SystemExit) as e:
         cli("run", "toy.toml", "--out", "d")
 

@@ -18,17 +18,17 @@ import pytest
 from scipy.io import savemat
 from scipy.sparse import csc_array, csc_matrix
 
-from harness import QP, InputError, no_rows
-from harness.files.datafile import VARIABLE
-from harness.files.parquetfile import save_parquet
-from harness.files.qpfile import load_qp, save_qp
-from harness.operators import SerialisableOperator
 from mortarbench.cli.main import main
+from mortarbench.harness import QP, InputError, no_rows
+from mortarbench.harness.files.datafile import VARIABLE
+from mortarbench.harness.files.parquetfile import save_parquet
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from problems.fem.gmsh_mesh import read_msh
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.damaged_files import MSH_41, QPS, fuzz, msh_22, tiny_qp
 
 ADDRESS_SPACE = 2**29  #: bytes that refusing may take at most
@@ -114,7 +114,7 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     """A request without a digest: the file may be anybody's."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
-        "import os, sys; from harness.processes.worker import _Bench; "
+        "import os, sys; from mortarbench.harness.processes.worker import _Bench; "
         "qp, out = sys.argv[1:]; "
         "bench = _Bench(None, {'subprocess:call': os.abort}); "
         "bench.answer({'qp': qp, 'out': out}, None)"

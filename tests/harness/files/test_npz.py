@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, InputError, Status, no_rows
-from harness.files.npz import ALIGNMENT, mapped, write_mappable
-from harness.files.qpfile import load_qp, save_qp
-from harness.operators import SerialisableOperator
-from harness.verify.measure import measure
+from mortarbench.harness import QP, InputError, Status, no_rows
+from mortarbench.harness.files.npz import ALIGNMENT, mapped, write_mappable
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.verify.measure import measure
 
 ARRAYS = {
     "vector": np.arange(5.0),

@@ -11,8 +11,8 @@ import pytest
 from scipy.sparse import csc_array, csr_array, eye_array, issparse
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, InputError, no_rows
-from harness.files.parquetfile import load_parquet, save_parquet
+from mortarbench.harness import QP, InputError, no_rows
+from mortarbench.harness.files.parquetfile import load_parquet, save_parquet
 
 P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
 COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub", "name")
@@ -154,7 +154,7 @@ def test_reading_starts_no_threads_that_could_outlive_python(path):
     save_parquet(path, make_qp(), {})
     program = (
         "import os, pathlib, sys; import pyarrow.parquet; "
-        "from harness.files.parquetfile import load_parquet; "
+        "from mortarbench.harness.files.parquetfile import load_parquet; "
         "threads = len(os.listdir('/proc/self/task')); "
         "load_parquet(pathlib.Path(sys.argv[1])); "
         "print(len(os.listdir('/proc/self/task')) - threads)"

@@ -5,8 +5,8 @@ import pytest
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, InputError, no_rows
-from harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness import QP, InputError, no_rows
+from mortarbench.harness.files.qpfile import load_qp, save_qp
 
 P = np.array([[2.0, 1.0, 0.0], [1.0, 3.0, 0.0], [0.0, 0.0, 0.0]])
 

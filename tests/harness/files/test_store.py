@@ -6,8 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import ContactSide, Fields, InputError, Solution, Status
-from harness.files.store import load_fields, load_solution, save_fields, save_solution
+from mortarbench.harness import ContactSide, Fields, InputError, Solution, Status
+from mortarbench.harness.files.store import (
+    load_fields,
+    load_solution,
+    save_fields,
+    save_solution,
+)
 
 
 @pytest.fixture

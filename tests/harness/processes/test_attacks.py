@@ -14,29 +14,38 @@ from pathlib import Path
 
 import pytest
 
-from harness import Verdict
-from harness.errors import FaultError
-from harness.files.qpfile import save_qp
-from harness.names import assemble
-from harness.processes import supervisor
-from harness.processes.measurement import _believed, measured, scratch_folder
-from harness.processes.protocol import (
+from mortarbench.harness import Verdict
+from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.qpfile import save_qp
+from mortarbench.harness.names import assemble
+from mortarbench.harness.processes import supervisor
+from mortarbench.harness.processes.measurement import (
+    _believed,
+    measured,
+    scratch_folder,
+)
+from mortarbench.harness.processes.protocol import (
     ForeignReplyError,
     checked_answer,
     checked_emitted,
     event_of,
 )
-from harness.processes.reaper import lives, state
-from harness.processes.supervisor import REPLACED, Clock, Reply, WorkerProcess
-from harness.registry import SolverSpec, load_plugin, resolve
-from harness.results.journal import read_journal
-from harness.results.work_unit import Commands
-from harness.running.run import run
-from harness.suite.suite import Suite
-from harness.verify.measure import SAMPLE_SECONDS
-from harness.verify.optimum import proves
-from harness.verify.verdicts import new_record
-from solvers.reference.solve import reference_solution
+from mortarbench.harness.processes.reaper import lives, state
+from mortarbench.harness.processes.supervisor import (
+    REPLACED,
+    Clock,
+    Reply,
+    WorkerProcess,
+)
+from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.work_unit import Commands
+from mortarbench.harness.running.run import run
+from mortarbench.harness.suite.suite import Suite
+from mortarbench.harness.verify.measure import SAMPLE_SECONDS
+from mortarbench.harness.verify.optimum import proves
+from mortarbench.harness.verify.verdicts import new_record
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ATTACKERS, ROOT
 from tests.support.waiting import soon
 
@@ -490,7 +499,7 @@ def test_a_qp_that_changed_on_disk_is_a_fault(bench):
 def test_a_full_disk_is_a_fault_and_no_crash(bench):
     limit = (
         "import resource, signal, runpy, sys\n"
-        "import harness.processes.worker as w\n"
+        "import mortarbench.harness.processes.worker as w\n"
         "def full(*_): raise OSError(28, 'No space left on device')\n"
         "w._write_new = full\n"
         f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from harness.processes.case_folder import entry, user_key
+from mortarbench.harness.processes.case_folder import entry, user_key
 
 
 def name(**params):
@@ -87,7 +87,7 @@ def test_an_entry_that_another_user_signed_is_built_again(get, monkeypatch):
     """A folder that was sent could hold another QP under the name of the case."""
     get(name(n=1), content=b"forged")
     monkeypatch.setattr(
-        "harness.processes.case_folder.user_key", lambda: b"of another user"
+        "mortarbench.harness.processes.case_folder.user_key", lambda: b"of another user"
     )
 
     assert get(name(n=1)).qp.read_bytes() == b"content"

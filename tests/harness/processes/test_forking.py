@@ -7,12 +7,12 @@ import sys
 
 import pytest
 
-from harness.limits import ONE_THREAD, VARIABLE
-from harness.names import CaseId
-from harness.processes.case_folder import user_key
-from harness.processes.reaper import MARK, lives
-from harness.processes.supervisor import WorkerProcess
 from mortarbench.cli.main import main
+from mortarbench.harness.limits import ONE_THREAD, VARIABLE
+from mortarbench.harness.names import CaseId
+from mortarbench.harness.processes.case_folder import user_key
+from mortarbench.harness.processes.reaper import MARK, lives
+from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import soon
@@ -24,9 +24,9 @@ import atexit, json, os, signal, subprocess, sys, threading
 from contextlib import suppress
 from math import inf
 from pathlib import Path
-from harness.processes.protocol import answer_requests
-from harness.processes.reaper import descendants
-from harness.processes.supervisor import WorkerProcess
+from mortarbench.harness.processes.protocol import answer_requests
+from mortarbench.harness.processes.reaper import descendants
+from mortarbench.harness.processes.supervisor import WorkerProcess
 
 folder = Path(sys.argv[1])
 COMMAND = [sys.executable, "-S", "-c", """

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 import mortarbench as mb
-from harness.distributed import failures
-from harness.processes import supervisor
+from mortarbench.harness.distributed import failures
+from mortarbench.harness.processes import supervisor
 from tests.support import ROOT, SUPPORT
 from tests.support.waiting import soon
 

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness.distributed import mpi
-from harness.distributed.vectors import EMITTED
-from harness.errors import InputError
-from harness.record import Record
 from mortarbench.cli.main import main
+from mortarbench.harness.distributed import mpi
+from mortarbench.harness.distributed.vectors import EMITTED
+from mortarbench.harness.errors import InputError
+from mortarbench.harness.record import Record
 from mortarbench.registries import Registries
 from tests.support import ROOT, SUPPORT
 from tests.support.press import described

@@ -12,12 +12,16 @@ from types import SimpleNamespace
 
 import pytest
 
-from harness import Verdict
-from harness.files.qpfile import save_qp
-from harness.processes import reaper, supervisor
-from harness.processes.reaper import descendants
-from harness.processes.supervisor import LOG_BYTES, WorkerProcess, out_of_memory
-from harness.registry import load_plugin
+from mortarbench.harness import Verdict
+from mortarbench.harness.files.qpfile import save_qp
+from mortarbench.harness.processes import reaper, supervisor
+from mortarbench.harness.processes.reaper import descendants
+from mortarbench.harness.processes.supervisor import (
+    LOG_BYTES,
+    WorkerProcess,
+    out_of_memory,
+)
+from mortarbench.harness.registry import load_plugin
 from tests.support import ADVERSARIES
 from tests.support.waiting import soon
 
@@ -48,7 +52,7 @@ for line in os.fdopen(requests):
 ASKS = """
 import json, sys
 from pathlib import Path
-from harness.processes.supervisor import WorkerProcess
+from mortarbench.harness.processes.supervisor import WorkerProcess
 command, request, log = map(json.loads, sys.argv[1:])
 WorkerProcess(command, Path(log)).ask(request, time_limit=60, memory_limit=2000)
 """

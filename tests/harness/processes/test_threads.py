@@ -12,9 +12,9 @@ from threading import Event, Thread
 
 import pytest
 
-from harness.processes import reaper
-from harness.processes.supervisor import WorkerProcess
-from harness.processes.turns import Turn
+from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes.supervisor import WorkerProcess
+from mortarbench.harness.processes.turns import Turn
 from tests.harness.processes.test_supervisor import SHOWS
 from tests.support.waiting import soon
 
@@ -27,7 +27,7 @@ import gc, json, os, sys, tempfile
 from pathlib import Path
 from threading import Thread
 import mortarbench as mb
-from harness.processes.reaper import descendants
+from mortarbench.harness.processes.reaper import descendants
 
 threads, times, case, acts = *map(int, sys.argv[1:3]), sys.argv[3], sys.argv[4:]
 suite = Path(tempfile.gettempdir()) / "suite.toml"
@@ -293,7 +293,7 @@ SOLVERS = {"hangs": Hangs()}
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
     """As nohup does with SIGHUP."""
     script = (
-        "import os, signal; from harness.processes.termination import *\n"
+        "import os, signal; from mortarbench.harness.processes.termination import *\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
         "with ended_by_signals():\n"
         "    os.kill(os.getpid(), signal.SIGHUP)\n"
@@ -386,7 +386,7 @@ def test_segments_of_a_worker_go_when_its_parent_is_killed(tmp_path):
     script = SEGMENT.replace("FILE", repr(str(file)))
     asks = (
         "import sys; from pathlib import Path\n"
-        "from harness.processes.supervisor import WorkerProcess\n"
+        "from mortarbench.harness.processes.supervisor import WorkerProcess\n"
         f"worker = WorkerProcess([sys.executable, '-c', {script!r}],"
         " Path(sys.argv[1]))\n"
         "worker.ask({}, time_limit=60, memory_limit=2000)\n"

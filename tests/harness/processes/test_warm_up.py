@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csc_array
 
-from harness import QP, Case, Family, no_rows
-from harness.processes import case_worker
-from harness.processes.case_worker import CaseWorker
+from mortarbench.harness import QP, Case, Family, no_rows
+from mortarbench.harness.processes import case_worker
+from mortarbench.harness.processes.case_worker import CaseWorker
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness import InputError
-from harness.files.lines import Lines
-from harness.results.faults import FAULTS, Fault
-from harness.results.folder import keep_environment
-from harness.results.journal import read_journal
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.files.lines import Lines
+from mortarbench.harness.results.faults import FAULTS, Fault
+from mortarbench.harness.results.folder import keep_environment
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support.bounded import bounded
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import mortarbench as mb
-from harness import InputError
-from harness.files import copies
-from harness.files.copies import Copies, keep_copies
-from harness.plugin import SourceFile
-from harness.results.journal import read_journal
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.files import copies
+from mortarbench.harness.files.copies import Copies, keep_copies
+from mortarbench.harness.plugin import SourceFile
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 
 pytestmark = pytest.mark.together  # one run for all of them

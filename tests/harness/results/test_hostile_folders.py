@@ -5,16 +5,21 @@ import os
 import numpy as np
 import pytest
 
-from harness import InputError, Record, Verdict
-from harness.files.store import load_fields, load_history, load_solution, save
-from harness.results.folder import environment_of
-from harness.results.journal import Journal
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.files.store import (
+    load_fields,
+    load_history,
+    load_solution,
+    save,
+)
+from mortarbench.harness.results.folder import environment_of
+from mortarbench.harness.results.journal import Journal
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from reports import write_report
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.reports import write_report
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.files.test_hostile_files import hostile
 
 SUITE = 'name = "s"\nsolvers = ["clarabel"]\n[[problems]]\nfamily = "file"\n'

@@ -7,12 +7,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from harness import InputError, Record, Verdict
-from harness.names import assemble
-from harness.plugin import as_family
-from harness.registry import SolverSpec
-from harness.results.journal import Journal, read_journal
-from harness.verify.verdicts import new_record
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.names import assemble
+from mortarbench.harness.plugin import as_family
+from mortarbench.harness.registry import SolverSpec
+from mortarbench.harness.results.journal import Journal, read_journal
+from mortarbench.harness.verify.verdicts import new_record
 
 
 def record(run_id, **changes):

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness.files.qpfile import load_qp, save_qp
-from harness.registry import load_plugin
-from harness.results.journal import read_journal
 from mortarbench.cli.main import main
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 

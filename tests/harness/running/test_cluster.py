@@ -16,12 +16,12 @@ from pathlib import Path
 
 import pytest
 
-from harness import InputError
-from harness.environment.environment import capture, digest
-from harness.registry import load_plugin
-from harness.results.folder import environment_of
-from harness.results.journal import read_journal
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.environment.environment import capture, digest
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.results.folder import environment_of
+from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import ROOT, TOY_PROBLEM
 from tests.support.waiting import soon
@@ -242,7 +242,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
 
 
 def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
-    monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
         assert code == 2
@@ -252,7 +252,7 @@ def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
 
 def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeypatch):
     """Not even with --fresh, which forgets what a folder holds."""
-    monkeypatch.setattr("harness.running.cluster.CONNECT_SECONDS", 0.5)
+    monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
 
@@ -272,7 +272,7 @@ def heeded():
 
 @pytest.mark.usefixtures("heeded")
 def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
-    from harness.running.cluster import _interrupted_later
+    from mortarbench.harness.running.cluster import _interrupted_later
 
     start = multiprocessing.get_context("spawn").Process  # as Dask does
     child = start(target=time.sleep, args=(60,))
@@ -350,7 +350,7 @@ def started(*arguments):
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
         "from mortarbench.registries import Registries; "
-        "from harness.plugin import as_family; "
+        "from mortarbench.harness.plugin import as_family; "
         "families = {k: as_family(f) for k, f in toy_problem.PROBLEMS.items()}; "
         "nothing = {'reference': None}; "
         "main(Registries(families=families, solvers=toy_problem.SOLVERS, "
@@ -470,7 +470,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 @pytest.fixture
 def meet():
     """What a parent does with the environment of a node; what it keeps and says."""
-    from harness.running.cluster import Nodes
+    from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []
     here = capture()

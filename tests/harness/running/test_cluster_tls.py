@@ -5,10 +5,10 @@ import sys
 
 import pytest
 
-from harness import InputError, Verdict
-from harness.registry import load_plugin
-from harness.running.cluster import on_cluster
 from mortarbench.cli.main import main
+from mortarbench.harness import InputError, Verdict
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.running.cluster import on_cluster
 from mortarbench.registries import Registries
 from tests.harness.running.test_cluster import Cluster, measured
 from tests.support import TOY_PROBLEM

@@ -6,11 +6,11 @@ from contextlib import ExitStack
 
 import pytest
 
-from harness import InputError
+from mortarbench.harness import InputError
 
 
 def own_cpu(stack):
-    from harness.running.dask_worker import own_cpu  # late: it takes long
+    from mortarbench.harness.running.dask_worker import own_cpu  # late: it takes long
 
     return own_cpu(stack)
 

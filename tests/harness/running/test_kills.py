@@ -13,7 +13,7 @@ from unittest.mock import ANY
 
 import pytest
 
-from harness.results.journal import read_journal
+from mortarbench.harness.results.journal import read_journal
 from tests.support import ADVERSARIES
 from tests.support.fork_server import INSTALL
 
@@ -36,11 +36,11 @@ RUNS = f"""
 import sys
 from pathlib import Path
 from harness import InputError
-from harness.results.work_unit import Commands
+from mortarbench.harness.results.work_unit import Commands
 from mortarbench.progress import shown_on
-from harness.registry import load_plugin, resolve
-from harness.running.run import run
-from harness.suite.suite import load_suite
+from mortarbench.harness.registry import load_plugin, resolve
+from mortarbench.harness.running.run import run
+from mortarbench.harness.suite.suite import load_suite
 
 exec(sys.argv[3])
 start = [sys.executable, "-P", {str(PLUGIN)!r}]

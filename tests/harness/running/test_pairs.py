@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
+from mortarbench.harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 
 #: Student's t of 97.5 %, by degrees of freedom
 STUDENT = {1: 12.706204736, 2: 4.302652730, 3: 3.182446305}

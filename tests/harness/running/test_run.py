@@ -15,20 +15,20 @@ from pathlib import Path
 
 import pytest
 
-from harness import InputError, Status, Verdict
-from harness.errors import FaultError
-from harness.files.store import load_fields, load_solution
-from harness.names import assemble
-from harness.processes import measurement as remote
-from harness.processes import supervisor
-from harness.registry import SolverSpec, load_plugin, resolve
-from harness.results.faults import left, read_faults
-from harness.results.journal import read_journal
-from harness.results.work_unit import Commands
-from harness.running.run import run
-from harness.suite.suite import Suite
-from reports.data.evidence import read_evidence
-from reports.data.size_series import size_series
+from mortarbench.harness import InputError, Status, Verdict
+from mortarbench.harness.errors import FaultError
+from mortarbench.harness.files.store import load_fields, load_solution
+from mortarbench.harness.names import assemble
+from mortarbench.harness.processes import measurement as remote
+from mortarbench.harness.processes import supervisor
+from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
+from mortarbench.harness.results.faults import left, read_faults
+from mortarbench.harness.results.journal import read_journal
+from mortarbench.harness.results.work_unit import Commands
+from mortarbench.harness.running.run import run
+from mortarbench.harness.suite.suite import Suite
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.data.size_series import size_series
 from tests.support import ADVERSARIES
 
 PLUGIN = ADVERSARIES
@@ -657,7 +657,7 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
 ):
     hold = (
         "import sys; from pathlib import Path\n"
-        "from harness.results.folder import locked\n"
+        "from mortarbench.harness.results.folder import locked\n"
         "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
@@ -788,7 +788,7 @@ def faults(monkeypatch):
                 raise FaultError("the worker was killed before its solve")
             return remote.measured(worker, qp, record, request, **limits)
 
-        monkeypatch.setattr("harness.running.executor.measured", measured)
+        monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
 
     return faults
 

@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import Verdict
-from harness.names import assemble
-from harness.plugin import Family
-from harness.registry import SolverSpec
-from harness.running.pairs import paired_ratio, widest
-from harness.running.schedule import Schedule
-from harness.suite.suite import Suite
+from mortarbench.harness import Verdict
+from mortarbench.harness.names import assemble
+from mortarbench.harness.plugin import Family
+from mortarbench.harness.registry import SolverSpec
+from mortarbench.harness.running.pairs import paired_ratio, widest
+from mortarbench.harness.running.schedule import Schedule
+from mortarbench.harness.suite.suite import Suite
 
 
 class Squares(Family):

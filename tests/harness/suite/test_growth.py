@@ -2,7 +2,7 @@
 
 import pytest
 
-from harness.suite.growth import refused
+from mortarbench.harness.suite.growth import refused
 
 SUITE = {
     "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,

@@ -7,9 +7,9 @@ from typing import Any, Literal
 
 import pytest
 
-from harness import InputError
-from harness.registry import SolverSpec, resolve
-from harness.suite.solver_options import (
+from mortarbench.harness import InputError
+from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.harness.suite.solver_options import (
     as_given,
     given_options,
     options_for,

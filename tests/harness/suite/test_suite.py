@@ -6,14 +6,13 @@ from types import SimpleNamespace
 
 import pytest
 
-import problems
-import solvers
-from harness import InputError
-from harness.plugin import as_family
-from harness.registry import SolverSpec
-from harness.suite.overrides import with_overrides
-from harness.suite.suite import load_suite
+from mortarbench import problems, solvers
 from mortarbench.cli.paper import BEYOND
+from mortarbench.harness import InputError
+from mortarbench.harness.plugin import as_family
+from mortarbench.harness.registry import SolverSpec
+from mortarbench.harness.suite.overrides import with_overrides
+from mortarbench.harness.suite.suite import load_suite
 from tests.support import ROOT
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness.mechanics import Exact, Real
-from harness.verify import admissible as module
-from harness.verify.admissible import admissible, inside_at_rows
+from mortarbench.harness.mechanics import Exact, Real
+from mortarbench.harness.verify import admissible as module
+from mortarbench.harness.verify.admissible import admissible, inside_at_rows
 from tests.support.held_by_contact import disc_between_plates
 
 

@@ -9,17 +9,25 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import QP, Mechanics, Solution, Solver, Status, UncertifiableError, certify
-from harness.files.store import write_point
-from harness.mechanics import Extended, Real
-from harness.names import parse
-from harness.processes import case_worker as generator
-from harness.verify.certificate import Certificate
-from harness.verify.references import ReferencePoint, reference_point
-from harness.verify.verdicts import certified, has_point
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import (
+    QP,
+    Mechanics,
+    Solution,
+    Solver,
+    Status,
+    UncertifiableError,
+    certify,
+)
+from mortarbench.harness.files.store import write_point
+from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.names import parse
+from mortarbench.harness.processes import case_worker as generator
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.references import ReferencePoint, reference_point
+from mortarbench.harness.verify.verdicts import certified, has_point
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",

@@ -13,16 +13,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import Case, Mechanics, Solution, Status, certify, kkt_residuals
-from harness.mechanics import Extended, Real
-from harness.names import parse
-from harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
-from harness.verify.certificate import Certificate
-from harness.verify.references import ReferencePoint, reference_point
-from problems import PROBLEMS
-from problems.contact.friction import FrictionLaw
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import (
+    Case,
+    Mechanics,
+    Solution,
+    Status,
+    certify,
+    kkt_residuals,
+)
+from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.references import ReferencePoint, reference_point
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import block_on_incline
 
 INCLINE = "a block that friction alone holds"

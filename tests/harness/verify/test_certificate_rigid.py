@@ -9,18 +9,18 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from harness import Case, Solution, Status, UncertifiableError, certify
-from harness.mechanics import Extended, Mechanics, Real, _cancelling
-from harness.names import parse
-from harness.verify import certificate
-from harness.verify.admissible import _newton, admissible, balanced
-from harness.verify.certificate import Certificate, _charge, _Reach
-from harness.verify.kkt import kkt_residuals
-from harness.verify.references import reference_point
-from harness.verify.substructured import Rounding, Undivided, length
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Case, Solution, Status, UncertifiableError, certify
+from mortarbench.harness.mechanics import Extended, Mechanics, Real, _cancelling
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify import certificate
+from mortarbench.harness.verify.admissible import _newton, admissible, balanced
+from mortarbench.harness.verify.certificate import Certificate, _charge, _Reach
+from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.harness.verify.substructured import Rounding, Undivided, length
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.held_by_contact import disc_between_plates, stored_solution
 
 ROUNDED = 1 + 1e-9

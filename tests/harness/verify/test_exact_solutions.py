@@ -16,13 +16,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from harness import Case, UncertifiableError, certify
-from harness.distributed import mpi
-from harness.names import parse
-from harness.verify.references import reference_point
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Case, UncertifiableError, certify
+from mortarbench.harness.distributed import mpi
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.references import reference_point
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, SUPPORT
 from tests.support.disturbed import disturbed
 from tests.support.exact_solutions import ExactSolution, exact_solution

@@ -7,17 +7,17 @@ from time import monotonic
 import numpy as np
 import pytest
 
-from harness import QP, Solution, Status, Verdict, no_rows
-from harness.conformance.manufactured import (
+from mortarbench.harness import QP, Solution, Status, Verdict, no_rows
+from mortarbench.harness.conformance.manufactured import (
     SHAPES,
     infeasible,
     manufactured,
     unbounded,
 )
-from harness.record import Record
-from harness.verify.infeasibility import infeasibility_margin
-from harness.verify.kkt import rejudged
-from harness.verify.verdicts import judged
+from mortarbench.harness.record import Record
+from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.kkt import rejudged
+from mortarbench.harness.verify.verdicts import judged
 from tests.support.exact_feasibility import is_feasible, nearly_contradicting
 
 INF = np.inf

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import csr_array, vstack
 from scipy.sparse.linalg import LinearOperator, aslinearoperator
 
-from harness import (
+from mortarbench.harness import (
     QP,
     Residuals,
     Solution,
@@ -17,15 +17,15 @@ from harness import (
     no_rows,
     verdict,
 )
-from harness.conformance.manufactured import manufactured
-from harness.operators import SerialisableOperator
-from harness.verify.kkt import energy_at
-from problems.families.beam_ring import BeamRing
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.adapters.osqp_ import OSQP
-from solvers.adapters.proxqp_ import ProxQP
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness.conformance.manufactured import manufactured
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.verify.kkt import energy_at
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.adapters.osqp_ import OSQP
+from mortarbench.solvers.adapters.proxqp_ import ProxQP
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 
 def one_variable(q=1.0, h=0.0):

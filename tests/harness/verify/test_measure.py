@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import harness.verify.measure
-from harness import QP, Solution, Status, needs_matrices, no_rows
-from harness.operators import SerialisableOperator
-from harness.registry import load_plugin
-from harness.verify.measure import measure
+from mortarbench.harness import QP, Solution, Status, needs_matrices, no_rows
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.verify import measure as measuring
+from mortarbench.harness.verify.measure import measure
 from tests.support import ADVERSARIES
 
 PLUGIN = load_plugin(ADVERSARIES)
@@ -170,7 +170,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
             return moving
 
-    clock = sys.modules["harness.verify.measure"]
+    clock = sys.modules["mortarbench.harness.verify.measure"]
     monkeypatch.setattr(clock, "perf_counter", lambda: now[0])
     m = measure(Moves(), qp, 1e-6, sample_seconds=sample_seconds).cost
 
@@ -230,7 +230,7 @@ def test_garbage_is_not_collected_while_the_clock_runs(qp):
 
 
 def test_every_repeat_meets_the_same_qp_in_other_objects(qp, monkeypatch):
-    monkeypatch.setattr(harness.verify.measure, "_inner", lambda *_: 3)
+    monkeypatch.setattr(measuring, "_inner", lambda *_: 3)
     seen = []
 
     class Sees(type(PLUGIN.solvers["honest"])):
@@ -257,7 +257,7 @@ def test_whether_a_solver_takes_a_qp_is_asked_on_the_clock(qp, monkeypatch):
         def declines(self, qp):
             asked.append(next(clock))
 
-    monkeypatch.setattr(harness.verify.measure, "perf_counter", lambda: next(clock))
+    monkeypatch.setattr(measuring, "perf_counter", lambda: next(clock))
     m = measure(Asks(), qp, 1e-6).cost
 
     assert asked == [1]  # the clock had been read once
@@ -299,7 +299,7 @@ def test_a_small_operator_is_multiplied_out_for_who_needs_its_entries(by_product
 
 
 def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
-    monkeypatch.setattr(harness.verify.measure, "MOST_ASSEMBLED", 2)
+    monkeypatch.setattr(measuring, "MOST_ASSEMBLED", 2)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
     assert s.status is Status.DECLINED
@@ -312,7 +312,7 @@ def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
 def test_an_operator_that_memory_does_not_hold_is_not_multiplied_out(
     by_products, monkeypatch
 ):
-    monkeypatch.setattr(harness.verify.measure, "too_large", lambda *_: True)
+    monkeypatch.setattr(measuring, "too_large", lambda *_: True)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
     assert s.status is Status.DECLINED

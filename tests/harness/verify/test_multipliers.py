@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from harness import QP, InputError, kkt_residuals
-from harness.verify import multipliers
-from harness.verify.multipliers import with_multipliers
+from mortarbench.harness import QP, InputError, kkt_residuals
+from mortarbench.harness.verify import multipliers
+from mortarbench.harness.verify.multipliers import with_multipliers
 
 TOL = 1e-8
 

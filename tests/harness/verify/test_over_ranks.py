@@ -8,8 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from harness.distributed import mpi
-from harness.distributed.vectors import EMITTED
+from mortarbench.harness.distributed import mpi
+from mortarbench.harness.distributed.vectors import EMITTED
 from tests.support import ROOT, SUPPORT
 
 pytestmark = pytest.mark.together

@@ -5,7 +5,11 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.sparse import csc_array, csr_array
 
-from harness.verify.products import projected_products, times_columns, times_rows
+from mortarbench.harness.verify.products import (
+    projected_products,
+    times_columns,
+    times_rows,
+)
 
 BEYOND = np.longdouble(2) ** -60  #: what a double beside one cannot hold
 LAPLACIAN = csc_array([[1.0, -1, 0, 0], [-1, 2, -1, 0], [0, -1, 2, -1], [0, 0, -1, 1]])

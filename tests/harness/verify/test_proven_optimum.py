@@ -6,11 +6,19 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from harness import QP, Solution, Status, Verdict, kkt_residuals, no_rows, verdict
-from harness.conformance.hard_qps import KINDS, hard
-from harness.record import Record
-from harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
-from harness.verify.optimum import (
+from mortarbench.harness import (
+    QP,
+    Solution,
+    Status,
+    Verdict,
+    kkt_residuals,
+    no_rows,
+    verdict,
+)
+from mortarbench.harness.conformance.hard_qps import KINDS, hard
+from mortarbench.harness.record import Record
+from mortarbench.harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
+from mortarbench.harness.verify.optimum import (
     decided,
     error_at,
     exact_optimum,
@@ -18,8 +26,8 @@ from harness.verify.optimum import (
     proven_optimum,
     proves,
 )
-from harness.verify.verdicts import judged
-from solvers.reference.solve import reference_solution
+from mortarbench.harness.verify.verdicts import judged
+from mortarbench.solvers.reference.solve import reference_solution
 
 TOL = 1e-8
 INF = np.inf

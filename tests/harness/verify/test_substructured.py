@@ -16,19 +16,19 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag
 
-from harness import Mechanics, Solution, Status, UncertifiableError, certify
-from harness.mechanics import Extended, Real
-from harness.names import parse
-from harness.verify.certificate import Certificate
-from harness.verify.references import ReferencePoint, reference_point
-from harness.verify.substructured import Torn, neighbour
-from problems import PROBLEMS
-from problems.contact.bodies import Bodies
-from problems.feti.elastic import subdivide, torn
-from problems.feti.substructures import LocalProblems
-from problems.models import beam_ring, hertz, patch
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError, certify
+from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.references import ReferencePoint, reference_point
+from mortarbench.harness.verify.substructured import Torn, neighbour
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.feti.elastic import subdivide, torn
+from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.models import beam_ring, hertz, patch
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.disturbed import DISTURBANCES
 
 CASES = (

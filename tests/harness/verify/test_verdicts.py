@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Case, Solution, Status, Verdict
-from harness.distributed.vectors import (
+from mortarbench.harness import QP, Case, Solution, Status, Verdict
+from mortarbench.harness.distributed.vectors import (
     Answered,
     DistributedColumns,
     Emitted,
@@ -18,11 +18,11 @@ from harness.distributed.vectors import (
     Share,
     distributed,
 )
-from harness.names import CaseId
-from harness.operators import SerialisableOperator
-from harness.registry import COPIES, SolverSpec
-from harness.verify.certificate import UncertifiableError
-from harness.verify.verdicts import (
+from mortarbench.harness.names import CaseId
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.registry import COPIES, SolverSpec
+from mortarbench.harness.verify.certificate import UncertifiableError
+from mortarbench.harness.verify.verdicts import (
     certified,
     evaluated_by_ranks,
     judged,
@@ -176,8 +176,10 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
         raise UncertifiableError("no admissible pair")
 
     looks = iter([10.0, 12.0])
-    monkeypatch.setattr("harness.verify.verdicts.certify", certify)
-    monkeypatch.setattr("harness.verify.verdicts.perf_counter", lambda: next(looks))
+    monkeypatch.setattr("mortarbench.harness.verify.verdicts.certify", certify)
+    monkeypatch.setattr(
+        "mortarbench.harness.verify.verdicts.perf_counter", lambda: next(looks)
+    )
     fields, note = certified(case(mechanics=SimpleNamespace(back=lambda s: s)), POINT)
 
     assert fields.pop("certify_seconds") == 2.0
@@ -262,7 +264,9 @@ def test_a_bound_that_ranks_cannot_give_is_a_note(monkeypatch):
     def certify(*mechanics):
         raise UncertifiableError("no admissible pair")
 
-    monkeypatch.setattr("harness.verify.verdicts.certify_over_ranks", certify)
+    monkeypatch.setattr(
+        "mortarbench.harness.verify.verdicts.certify_over_ranks", certify
+    )
     found = on_one_rank(certifiable=())
 
     assert found["bounds"].keys() == {"certify_seconds"}

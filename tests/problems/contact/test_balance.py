@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from harness import InputError
-from problems.contact.balance import check_balance
-from problems.contact.bodies import ContactPair, assemble
-from problems.contact.linearise import linearisation
-from problems.fem.elasticity import Material
-from problems.fem.mesh import join, prefixed, rectangle
+from mortarbench.harness import InputError
+from mortarbench.problems.contact.balance import check_balance
+from mortarbench.problems.contact.bodies import ContactPair, assemble
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 
 
 def blocks(*, fixed, forces, gap=0.0):

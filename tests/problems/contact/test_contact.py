@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from harness import InputError
-from problems.contact import node_to_segment as contact
-from problems.contact.node_to_segment import node_to_segment
-from problems.contact.polyline import polyline
-from problems.contact.segment_search import Reach
+from mortarbench.harness import InputError
+from mortarbench.problems.contact import node_to_segment as contact
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.polyline import polyline
+from mortarbench.problems.contact.segment_search import Reach
 
 #: a master below the slave: body under the chain means the chain runs right to left
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])

@@ -6,10 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from problems.contact.mortar import _dual, cast_rays, mortar, overlaps
-from problems.contact.node_to_segment import closest_points, node_to_segment
-from problems.contact.polyline import polyline
-from problems.contact.segment_search import Reach
+from mortarbench.problems.contact.mortar import _dual, cast_rays, mortar, overlaps
+from mortarbench.problems.contact.node_to_segment import closest_points, node_to_segment
+from mortarbench.problems.contact.polyline import polyline
+from mortarbench.problems.contact.segment_search import Reach
 
 quick = settings(derandomize=True, max_examples=40, deadline=None)
 

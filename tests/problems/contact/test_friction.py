@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import Friction, InputError
-from harness.errors import PastEndError
-from harness.mechanics import NO_FRICTION
-from problems.contact.friction import (
+from mortarbench.harness import Friction, InputError
+from mortarbench.harness.errors import PastEndError
+from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.problems.contact.friction import (
     FrictionLaw,
     forces_at_nodes,
     friction_of,

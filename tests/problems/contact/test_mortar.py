@@ -3,12 +3,18 @@
 import numpy as np
 import pytest
 
-from harness import InputError
-from problems.contact import mortar as module
-from problems.contact.mortar import cast_rays, integrate, mortar, overlaps, project
-from problems.contact.polyline import polyline
-from problems.contact.segment_search import Reach
-from problems.models.beam_ring import model
+from mortarbench.harness import InputError
+from mortarbench.problems.contact import mortar as module
+from mortarbench.problems.contact.mortar import (
+    cast_rays,
+    integrate,
+    mortar,
+    overlaps,
+    project,
+)
+from mortarbench.problems.contact.polyline import polyline
+from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.models.beam_ring import model
 
 BASES = ["dual", "standard"]
 ANY_ANGLE = Reach(cosine=1.0)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from harness import InputError
-from problems.contact import segment_search as search
-from problems.contact.polyline import polyline
-from problems.contact.segment_search import Reach, facing, nearest
+from mortarbench.harness import InputError
+from mortarbench.problems.contact import segment_search as search
+from mortarbench.problems.contact.polyline import polyline
+from mortarbench.problems.contact.segment_search import Reach, facing, nearest
 
 
 def all_pairs(x, chain):

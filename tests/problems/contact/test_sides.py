@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from harness import Solution, Status
-from problems.contact.bodies import ContactPair
-from problems.contact.linearise import linearisation
-from problems.contact.sides import contact_sides, rows_of_pairs
-from problems.duality.stepping import primal_qp
-from problems.families.hertz import HertzPlane
-from problems.families.patch import ContactPatch
-from problems.fem.mesh import nodal_lengths
-from problems.models.patch import PRESSURE, model
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Solution, Status
+from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.sides import contact_sides, rows_of_pairs
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.families.hertz import HertzPlane
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.mesh import nodal_lengths
+from mortarbench.problems.models.patch import PRESSURE, model
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.held_by_contact import PRESSURE as PRESS
 from tests.support.held_by_contact import disc_between_plates
 

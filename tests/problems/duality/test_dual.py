@@ -7,18 +7,27 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csc_array, csr_array
 
-from harness import QP, Solution, Status, kkt_residuals, no_rows
-from problems import PROBLEMS
-from problems.contact.linearise import linearisation
-from problems.duality.dualisation import dual_bounds, dualise
-from problems.duality.stepping import LoadPath
-from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
-from problems.fem.inverse import Interface, floating_inverse, regular_inverse
-from problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from problems.models.beam_ring import _clamped, _floating, model
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    rigid_modes,
+    stiffness,
+)
+from mortarbench.problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
+from mortarbench.problems.fem.inverse import (
+    Interface,
+    floating_inverse,
+    regular_inverse,
+)
+from mortarbench.problems.fem.mesh import dofs_of, half_ring, join, rectangle
+from mortarbench.problems.models.beam_ring import _clamped, _floating, model
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
 
 D = elasticity_matrix(Material(E=2e3, nu=0.3), "strain")
 BEAM = rectangle((0, 0.5), (2, 0.25), (24, 3))

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, eye_array
 
-from harness import InputError
-from problems.contact.node_to_segment import geometric_stiffness, node_to_segment
-from problems.duality import newton
-from problems.families.beam_ring import BeamRing
-from problems.families.hertz import HertzPlane
-from problems.families.patch import ContactPatch
-from problems.models import beam_ring, hertz, patch
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import InputError
+from mortarbench.problems.contact.node_to_segment import (
+    geometric_stiffness,
+    node_to_segment,
+)
+from mortarbench.problems.duality import newton
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.families.hertz import HertzPlane
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.models import beam_ring, hertz, patch
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 def ring_path(steps=2, contact_stiffness="geometric", contact="nts", size=2):

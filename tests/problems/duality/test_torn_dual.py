@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import kkt_residuals
-from harness.mechanics import NO_FRICTION
-from problems.contact.bodies import floating
-from problems.contact.friction import FrictionLaw, friction_of
-from problems.contact.linearise import linearisation
-from problems.duality.dualisation import dualise
-from problems.duality.stepping import primal_qp
-from problems.duality.torn_dual import torn_dual
-from problems.feti.elastic import subdivide, torn
-from problems.feti.tearing import blocks
-from problems.models.beam_ring import model
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import kkt_residuals
+from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.problems.contact.bodies import floating
+from mortarbench.problems.contact.friction import FrictionLaw, friction_of
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.torn_dual import torn_dual
+from mortarbench.problems.feti.elastic import subdivide, torn
+from mortarbench.problems.feti.tearing import blocks
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.reference.solve import reference_solution
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")

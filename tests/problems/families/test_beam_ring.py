@@ -5,21 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import InputError, kkt_residuals
-from harness.suite.suite import load_suite
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.suite.suite import load_suite
+from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.models.beam_ring import _path, model
 from mortarbench.registries import suites_folder
-from problems.contact.bodies import clamped, floating
-from problems.contact.node_to_segment import node_to_segment
-from problems.duality.dualisation import dual_bounds, dualise
-from problems.duality.stepping import primal_qp
-from problems.families.beam_ring import BeamRing
-from problems.models.beam_ring import _path, model
-from solvers import SOLVERS
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.adapters.osqp_ import OSQP
-from solvers.adapters.proxqp_ import ProxQP
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.adapters.osqp_ import OSQP
+from mortarbench.solvers.adapters.proxqp_ import ProxQP
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = BeamRing()
 

@@ -8,13 +8,13 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import mortarbench as mb
-from harness import InputError, no_rows
-from problems.contact.bodies import assemble, clamped
-from problems.contact.node_to_segment import ContactRows
-from problems.duality.newton_case import newton_path
-from problems.fem.elasticity import Material
-from problems.fem.mesh import dofs_of, rectangle
-from problems.models.cantilever import beam, elastica
+from mortarbench.harness import InputError, no_rows
+from mortarbench.problems.contact.bodies import assemble, clamped
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.duality.newton_case import newton_path
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import dofs_of, rectangle
+from mortarbench.problems.models.cantilever import beam, elastica
 
 
 @pytest.mark.parametrize(

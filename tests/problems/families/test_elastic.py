@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import InputError
-from problems import PROBLEMS
-from problems.elastic import FrictionLaw, one_step
-from problems.models.patch import model
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.elastic import FrictionLaw, one_step
+from mortarbench.problems.models.patch import model
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 PATCH = PROBLEMS["contact-patch"]
 STRETCHED = dict(lower=3, upper=2, ratio=3.0)

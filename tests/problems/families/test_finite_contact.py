@@ -6,20 +6,20 @@ from functools import cache
 import numpy as np
 import pytest
 
-import problems
-from harness import InputError, certify, kkt_residuals
-from harness.names import parse
-from problems.families.beam_ring import BeamRing
-from problems.families.hertz import HertzPlane
-from problems.families.patch import ContactPatch
-from problems.fem.elasticity import Material
-from problems.fem.hyperelastic import hyperelastic
-from problems.models.patch import E_UPPER, NU, homogeneous, pressed_by
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.adapters.osqp_ import OSQP
-from solvers.adapters.piqp_ import PIQP
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench import problems
+from mortarbench.harness import InputError, certify, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems.families.beam_ring import BeamRing
+from mortarbench.problems.families.hertz import HertzPlane
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.hyperelastic import hyperelastic
+from mortarbench.problems.models.patch import E_UPPER, NU, homogeneous, pressed_by
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.adapters.osqp_ import OSQP
+from mortarbench.solvers.adapters.piqp_ import PIQP
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 

@@ -6,19 +6,23 @@ import numpy as np
 import pytest
 from scipy.sparse import vstack
 
-from harness import InputError, kkt_residuals
-from harness.names import parse
-from problems import PROBLEMS
-from problems.contact.balance import check_balance
-from problems.contact.bodies import ContactPair, assemble, clamped
-from problems.contact.friction import FrictionLaw
-from problems.contact.linearise import linearisation
-from problems.contact.node_to_segment import ContactRows, rows_along, tangent
-from problems.duality.stepping import LoadPath
-from problems.fem.elasticity import Material
-from problems.fem.mesh import dofs_of, rectangle
-from problems.models.patch import model
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.balance import check_balance
+from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped
+from mortarbench.problems.contact.friction import FrictionLaw
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.node_to_segment import (
+    ContactRows,
+    rows_along,
+    tangent,
+)
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import dofs_of, rectangle
+from mortarbench.problems.models.patch import model
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.incline import WEIGHT, block_on_incline, incline
 
 pytestmark = pytest.mark.together

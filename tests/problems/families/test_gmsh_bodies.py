@@ -9,16 +9,16 @@ import meshio
 import numpy as np
 import pytest
 
-from harness import InputError
-from harness.names import parse
-from problems import PROBLEMS
-from problems.contact.bodies import assembled
-from problems.fem.gmsh_mesh import read_msh
-from problems.fem.mesh import Mesh, nodal_lengths
-from problems.models.beam_ring import model
-from problems.models.description import described_bodies
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import InputError
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.bodies import assembled
+from mortarbench.problems.fem.gmsh_mesh import read_msh
+from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.models.description import described_bodies
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
 from tests.support.gmsh_files import msh22, square
 from tests.support.triangles import halved

@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import InputError, kkt_residuals
-from harness.names import parse
-from problems import PROBLEMS
-from problems.families.greco import Greco
-from problems.models.greco import PUBLISHED
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.families.greco import Greco
+from mortarbench.problems.models.greco import PUBLISHED
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 

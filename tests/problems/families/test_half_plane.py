@@ -6,15 +6,21 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from harness import InputError, kkt_residuals
-from harness.names import parse
-from problems import PROBLEMS
-from problems.families.half_plane import HalfPlane
-from problems.models.half_plane import EXACT, MU, Elements, displacement, self_energy
-from problems.models.line_contact import TangentialContact
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.families.half_plane import HalfPlane
+from mortarbench.problems.models.half_plane import (
+    EXACT,
+    MU,
+    Elements,
+    displacement,
+    self_energy,
+)
+from mortarbench.problems.models.line_contact import TangentialContact
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = HalfPlane()
 TOL = 1e-9

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from harness import InputError, kkt_residuals
-from harness.names import parse
-from problems import PROBLEMS
-from problems.families.hertz import HertzCylinder, HertzPlane
-from problems.models.hertz import sheared, two_cylinders
-from problems.models.line_contact import LineContact
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.families.hertz import HertzCylinder, HertzPlane
+from mortarbench.problems.models.hertz import sheared, two_cylinders
+from mortarbench.problems.models.line_contact import LineContact
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 

@@ -7,13 +7,13 @@ import pytest
 from scipy.linalg import block_diag
 from scipy.sparse import issparse
 
-from harness import InputError, Solution, Status, kkt_residuals
-from harness.files.matfile import read_mat, save_mat
-from problems import PROBLEMS
-from problems.fem.laplacian import grid_stiffness
-from problems.models.membranes import shares
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, Solution, Status, kkt_residuals
+from mortarbench.harness.files.matfile import read_mat, save_mat
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.laplacian import grid_stiffness
+from mortarbench.problems.models.membranes import shares
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = PROBLEMS["membranes"]
 #: (1/H, H/h) and torn unknowns, multipliers, contact rows, subdomains

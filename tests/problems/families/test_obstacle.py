@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from harness import InputError, kkt_residuals
-from problems.families.obstacle import Obstacle
-from problems.models.obstacle import (
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.problems.families.obstacle import Obstacle
+from mortarbench.problems.models.obstacle import (
     LIFT_OFF,
     exact_energy,
     exact_height,
     obstacle_height,
     obstacle_problem,
 )
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = Obstacle()
 TOL = 1e-11

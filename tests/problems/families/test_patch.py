@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from harness import InputError, kkt_residuals
-from problems.families.patch import ContactPatch
-from problems.fem.mesh import as_vectors
-from problems.models.patch import model
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.mesh import as_vectors
+from mortarbench.problems.models.patch import model
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 FAMILY = ContactPatch()
 SOLVERS = {"dual": (SMALBE(), 1e-13), "primal": (Clarabel(), 1e-11)}

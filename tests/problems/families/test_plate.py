@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from harness import Case, InputError
-from problems.families.plate import Plate
-from problems.models.plate import dual_quantities, model
-from solvers.baselines.feti import FETI
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import Case, InputError
+from mortarbench.problems.families.plate import Plate
+from mortarbench.problems.models.plate import dual_quantities, model
+from mortarbench.solvers.baselines.feti import FETI
+from mortarbench.solvers.reference.solve import reference_solution
 
 FAMILY = Plate()
 #: a test of MSolve (Papagiannakis 2011): E of the left column is 1/1000 of the others'

@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from harness import InputError, Status, kkt_residuals
-from harness.names import parse
-from harness.verify.verdicts import certified
-from problems import PROBLEMS
-from problems.models import beam_ring
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import InputError, Status, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.harness.verify.verdicts import certified
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.models import beam_ring
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.press import described
 
 pytestmark = pytest.mark.together

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from harness import InputError, kkt_residuals
-from problems.families.variational import JournalBearing, String, Torsion
-from solvers.adapters.clarabel_ import Clarabel
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.problems.families.variational import JournalBearing, String, Torsion
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = 1e-9
 

@@ -6,7 +6,7 @@ from scipy.sparse.linalg import spsolve
 from skfem import Basis, ElementQuad1, ElementVector, MeshQuad
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from problems.fem.elasticity import (
+from mortarbench.problems.fem.elasticity import (
     CORNERS,
     GAUSS,
     Material,
@@ -17,8 +17,19 @@ from problems.fem.elasticity import (
     stiffness,
     strain_matrix,
 )
-from problems.fem.mesh import as_vectors, dofs_of, half_disc, half_ring, rectangle
-from problems.fem.stress import centre_stress, gauss_stress, recover, von_mises
+from mortarbench.problems.fem.mesh import (
+    as_vectors,
+    dofs_of,
+    half_disc,
+    half_ring,
+    rectangle,
+)
+from mortarbench.problems.fem.stress import (
+    centre_stress,
+    gauss_stress,
+    recover,
+    von_mises,
+)
 
 STEEL = Material(E=200e9, nu=0.3)
 

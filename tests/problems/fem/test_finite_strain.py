@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from problems.fem.elasticity import Material, elasticity_matrix, stiffness
-from problems.fem.finite_strain import (
+from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
+from mortarbench.problems.fem.finite_strain import (
     NEARLY_INCOMPRESSIBLE,
     InvertedCellError,
     assemble,
@@ -19,8 +19,8 @@ from problems.fem.finite_strain import (
     evaluate,
     strain_energy,
 )
-from problems.fem.hyperelastic import MATERIALS, hyperelastic
-from problems.fem.mesh import half_disc, join, rectangle
+from mortarbench.problems.fem.hyperelastic import MATERIALS, hyperelastic
+from mortarbench.problems.fem.mesh import half_disc, join, rectangle
 
 SOFT = Material(E=1.0, nu=0.3)
 NEARLY = Material(E=1.0, nu=0.49)

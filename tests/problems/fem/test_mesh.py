@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from problems.fem.gmsh_mesh import halved, read_msh
-from problems.fem.mesh import (
+from mortarbench.problems.fem.gmsh_mesh import halved, read_msh
+from mortarbench.problems.fem.mesh import (
     half_disc,
     half_ring,
     join,
@@ -12,7 +12,7 @@ from problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from problems.models.beam_ring import model
+from mortarbench.problems.models.beam_ring import model
 from tests.support import ROOT
 
 

@@ -7,14 +7,14 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import diags_array
 
-from problems.contact.bodies import ContactPair, assemble, clamped, floating
-from problems.contact.linearise import linearisation
-from problems.contact.results import quantities
-from problems.duality.case_forms import contact_case
-from problems.duality.stepping import LoadPath
-from problems.models.beam_ring import model
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import SMALBE
+from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped, floating
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.results import quantities
+from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 pytestmark = pytest.mark.together
 

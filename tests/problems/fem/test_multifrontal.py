@@ -5,10 +5,10 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csc_array, eye_array
 
-from problems.fem.dissection import dissect
-from problems.fem.elasticity import Material, elasticity_matrix, stiffness
-from problems.fem.mesh import dofs_of, half_disc, half_ring, join, rectangle
-from problems.fem.multifrontal import multifrontal
+from mortarbench.problems.fem.dissection import dissect
+from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
+from mortarbench.problems.fem.mesh import dofs_of, half_disc, half_ring, join, rectangle
+from mortarbench.problems.fem.multifrontal import multifrontal
 
 D = elasticity_matrix(Material(E=2e3, nu=0.3), "stress")
 MESHES = {

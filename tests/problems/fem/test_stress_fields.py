@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from harness import Solution, Status
-from problems.contact.node_to_segment import node_to_segment
-from problems.contact.results import fields, nodal_stresses
-from problems.duality.stepping import primal_qp
-from problems.fem.elasticity import elasticity_matrix
-from problems.models.beam_ring import model
+from mortarbench.harness import Solution, Status
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.results import fields, nodal_stresses
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.fem.elasticity import elasticity_matrix
+from mortarbench.problems.models.beam_ring import model
 
 STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
 

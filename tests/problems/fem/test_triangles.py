@@ -6,11 +6,16 @@ from scipy.sparse.linalg import spsolve
 from skfem import Basis, ElementTriP1, ElementVector, MeshTri
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
-from problems.contact.linearise import linearisation
-from problems.duality.stepping import primal_qp
-from problems.families.patch import ContactPatch
-from problems.fem.elasticity import Material, elasticity_matrix, rigid_modes, stiffness
-from problems.fem.mesh import (
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.families.patch import ContactPatch
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    rigid_modes,
+    stiffness,
+)
+from mortarbench.problems.fem.mesh import (
     as_vectors,
     boundary_edges,
     dofs_of,
@@ -18,9 +23,9 @@ from problems.fem.mesh import (
     rectangle,
     triangular,
 )
-from problems.fem.stress import centre_stress, recover
-from problems.models.patch import PRESSURE, model
-from solvers.adapters.clarabel_ import Clarabel
+from mortarbench.problems.fem.stress import centre_stress, recover
+from mortarbench.problems.models.patch import PRESSURE, model
+from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from tests.support.triangles import halved, of_triangles
 
 STEEL = Material(E=200e9, nu=0.3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from problems.feti.blocks import multiply
+from mortarbench.problems.feti.blocks import multiply
 
 
 @pytest.mark.parametrize("n", [1, 3, 4, 7, 256, 257, 600])

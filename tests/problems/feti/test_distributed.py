@@ -8,11 +8,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import csc_array, csr_array
 
-from harness import QP, InputError, Solution, Status, no_rows
-from harness.distributed import factor
-from harness.distributed.factor import touched_rows
-from problems.feti import distributed as over_ranks
-from problems.feti.distributed import (
+from mortarbench.harness import QP, InputError, Solution, Status, no_rows
+from mortarbench.harness.distributed import factor
+from mortarbench.harness.distributed.factor import touched_rows
+from mortarbench.problems.feti import distributed as over_ranks
+from mortarbench.problems.feti.distributed import (
     AFTER_FACTOR,
     Forming,
     Halo,
@@ -24,8 +24,8 @@ from problems.feti.distributed import (
     partition,
     shared,
 )
-from problems.feti.operators import DualOperator, dual_operator
-from problems.models.membranes import Membranes
+from mortarbench.problems.feti.operators import DualOperator, dual_operator
+from mortarbench.problems.models.membranes import Membranes
 from tests.support.threads import on_threads, without_lock
 from tests.support.torn_bodies import torn_pair
 

@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from harness.distributed import mpi
-from harness.names import parse
-from problems import PROBLEMS
+from mortarbench.harness.distributed import mpi
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
 from tests.support import ROOT, SUPPORT, press
 
 pytestmark = pytest.mark.together

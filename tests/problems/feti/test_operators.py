@@ -8,17 +8,17 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 from scipy.sparse import csc_array, csr_array, eye_array
 
-from harness import QP, no_rows
-from harness.files.qpfile import load_qp, save_qp
-from harness.operators import Preconditioned
-from problems import OPERATORS
-from problems.contact.linearise import linearisation
-from problems.duality.stepping import primal_qp
-from problems.feti.elastic import subdivide, torn
-from problems.feti.operators import dual_operator, inverted_blocks, made
-from problems.feti.tearing import blocks
-from problems.models.beam_ring import model
-from problems.models.membranes import Membranes
+from mortarbench.harness import QP, no_rows
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.harness.operators import Preconditioned
+from mortarbench.problems import OPERATORS
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.feti.elastic import subdivide, torn
+from mortarbench.problems.feti.operators import dual_operator, inverted_blocks, made
+from mortarbench.problems.feti.tearing import blocks
+from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.models.membranes import Membranes
 
 pytestmark = pytest.mark.together
 
@@ -131,7 +131,7 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     ]  # fmt: skip
     assert len(set(sizes)) > 1
     room = 16 * (np.square(sizes).sum() - 1) / 2**20
-    monkeypatch.setattr("problems.feti.operators.EXPLICIT_MIB", room)
+    monkeypatch.setattr("mortarbench.problems.feti.operators.EXPLICIT_MIB", room)
 
     explicit = operator_of(pair).arrays["explicit"]
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components
 
-from harness import InputError
-from problems.fem.mesh import half_disc, join, rectangle
-from problems.feti import partition
-from problems.feti.partition import graph_partition, neighbours
+from mortarbench.harness import InputError
+from mortarbench.problems.fem.mesh import half_disc, join, rectangle
+from mortarbench.problems.feti import partition
+from mortarbench.problems.feti.partition import graph_partition, neighbours
 
 
 def disc_and_block():

@@ -8,14 +8,14 @@ from numpy.testing import assert_allclose
 from scipy.linalg import null_space, orth
 from scipy.sparse import csr_array, eye_array
 
-from harness import QP, Vector, no_rows
-from problems.contact.linearise import linearisation
-from problems.duality.stepping import primal_qp
-from problems.feti import spectrum as module
-from problems.feti.distributed import shared
-from problems.feti.elastic import torn
-from problems.feti.operators import DualOperator, dual_operator
-from problems.feti.spectrum import (
+from mortarbench.harness import QP, Vector, no_rows
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.feti import spectrum as module
+from mortarbench.problems.feti.distributed import shared
+from mortarbench.problems.feti.elastic import torn
+from mortarbench.problems.feti.operators import DualOperator, dual_operator
+from mortarbench.problems.feti.spectrum import (
     Spectrum,
     projector,
     ritz_bounds,
@@ -23,8 +23,8 @@ from problems.feti.spectrum import (
     spectra_over_ranks,
     spectrum,
 )
-from problems.models.beam_ring import model, subdivided
-from problems.models.membranes import Membranes
+from mortarbench.problems.models.beam_ring import model, subdivided
+from mortarbench.problems.models.membranes import Membranes
 from tests.support.threads import on_threads, without_lock
 from tests.support.torn_bodies import torn_pair
 

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from harness.names import parse
-from problems import PROBLEMS
-from problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
-from problems.feti.emission import subdomains_of
-from problems.feti.structured import Layout
-from problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
-from problems.feti.tearing import (
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
+from mortarbench.problems.feti.emission import subdomains_of
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
+from mortarbench.problems.feti.tearing import (
     compact_blocks,
     decompose,
     labelled,

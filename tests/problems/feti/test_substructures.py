@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
-from problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.substructures import LocalProblems
 from tests.support.torn_bodies import torn_pair
 
 

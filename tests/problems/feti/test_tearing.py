@@ -5,11 +5,11 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
-from problems.fem.elasticity import Material, elasticity_matrix
-from problems.fem.mesh import rectangle
-from problems.feti.elastic import elastic_kind
-from problems.feti.gluing import glue, without_supports
-from problems.feti.tearing import (
+from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
+from mortarbench.problems.fem.mesh import rectangle
+from mortarbench.problems.feti.elastic import elastic_kind
+from mortarbench.problems.feti.gluing import glue, without_supports
+from mortarbench.problems.feti.tearing import (
     blocks,
     compact_blocks,
     decompose,

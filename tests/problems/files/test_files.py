@@ -18,18 +18,18 @@ from scipy.sparse import (
     vstack,
 )
 
-from harness import QP, InputError, kkt_residuals
-from harness.files.qpfile import explicit_matrices, load_qp, save_qp
-from harness.names import assemble, parse
-from harness.registry import SolverSpec, resolve
 from mortarbench.cli.main import main
+from mortarbench.harness import QP, InputError, kkt_residuals
+from mortarbench.harness.files.qpfile import explicit_matrices, load_qp, save_qp
+from mortarbench.harness.names import assemble, parse
+from mortarbench.harness.registry import SolverSpec, resolve
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.files.qps import parse_qps, save_qps
+from mortarbench.problems.files.readers import read
+from mortarbench.problems.files.two_sided import one_sided
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from problems.files.qps import parse_qps, save_qps
-from problems.files.readers import read
-from problems.files.two_sided import one_sided
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 
 #: the example of Maros and Mészáros's report, with every kind of row, range and bound
 QPS = """\

@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness import InputError, Record, Verdict
-from harness.results.folder import times_compare
-from harness.results.journal import Journal
-from harness.results.merge import merge
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.results.folder import times_compare
+from mortarbench.harness.results.journal import Journal
+from mortarbench.harness.results.merge import merge
 from mortarbench.reporting import report
-from reports import write_comparison
-from reports.compare.changes import (
+from mortarbench.reports import write_comparison
+from mortarbench.reports.compare.changes import (
     Mean,
     compare,
     mean_of,
@@ -22,10 +22,10 @@ from reports.compare.changes import (
     relative_ratio,
     side,
 )
-from reports.compare.conclusions import change_word, verdict_lines
-from reports.compare.page import compose
-from reports.data.evidence import Evidence, arrange, read_evidence
-from reports.render.markdown import markdown
+from mortarbench.reports.compare.conclusions import change_word, verdict_lines
+from mortarbench.reports.compare.page import compose
+from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
+from mortarbench.reports.render.markdown import markdown
 
 SOLVERS = ("one", "two", "three")
 

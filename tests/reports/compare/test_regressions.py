@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.special import bdtrc
 
-from harness import Record, Verdict
-from reports.compare.changes import compare
-from reports.compare.conclusions import verdict_lines
-from reports.compare.regressions import CELLS, regressions
-from reports.data.evidence import Evidence, arrange
+from mortarbench.harness import Record, Verdict
+from mortarbench.reports.compare.changes import compare
+from mortarbench.reports.compare.conclusions import verdict_lines
+from mortarbench.reports.compare.regressions import CELLS, regressions
+from mortarbench.reports.data.evidence import Evidence, arrange
 
 SOLVERS = ("one", "two", "three")
 

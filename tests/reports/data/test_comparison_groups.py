@@ -6,19 +6,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import Verdict
-from harness.results.journal import Journal
-from harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
-from reports import write_report
-from reports.data.aggregation import ranking_of
-from reports.data.comparison_groups import comparison_groups
-from reports.data.evidence import Evidence, arrange, read_evidence
-from reports.export.csv_tables import comparison_tables, csv_tables
-from reports.figures.profiles import ROW, pairwise_figure, profile_figure, rows_of
-from reports.figures.style import look
-from reports.folder import compose
-from reports.render.markdown import markdown
-from reports.render.saving import draw
+from mortarbench.harness import Verdict
+from mortarbench.harness.results.journal import Journal
+from mortarbench.harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
+from mortarbench.reports import write_report
+from mortarbench.reports.data.aggregation import ranking_of
+from mortarbench.reports.data.comparison_groups import comparison_groups
+from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
+from mortarbench.reports.export.csv_tables import comparison_tables, csv_tables
+from mortarbench.reports.figures.profiles import (
+    ROW,
+    pairwise_figure,
+    profile_figure,
+    rows_of,
+)
+from mortarbench.reports.figures.style import look
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.render.saving import draw
 from tests.support.box_records import box_record
 
 LIMIT = 20.0

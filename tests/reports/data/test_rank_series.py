@@ -4,20 +4,20 @@ from pathlib import Path
 
 import pytest
 
-from harness import Verdict
-from reports.data.evidence import Evidence, arrange
-from reports.data.rank_series import (
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.rank_series import (
     rank_counts,
     rank_memory,
     rank_parts,
     strong_series,
     weak_series,
 )
-from reports.data.size_series import size_series
-from reports.document.figure import Area, Series
-from reports.folder import compose
-from reports.sections.ranks import predicted, ranks
-from reports.statistics.cost_model import CostModel
+from mortarbench.reports.data.size_series import size_series
+from mortarbench.reports.document.figure import Area, Series
+from mortarbench.reports.folder import compose
+from mortarbench.reports.sections.ranks import predicted, ranks
+from mortarbench.reports.statistics.cost_model import CostModel
 from tests.support.manufactured_ranks import (
     ALIKE,
     BYTE,

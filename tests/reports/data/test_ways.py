@@ -6,15 +6,15 @@ from functools import partial
 import numpy as np
 import pytest
 
-from harness import Verdict
-from harness.results.journal import Journal
 from mortarbench.cli.main import main
+from mortarbench.harness import Verdict
+from mortarbench.harness.results.journal import Journal
 from mortarbench.registries import Registries
-from reports import answer, write_report
-from reports.data.evidence import Evidence, arrange
-from reports.data.fastest import Finding
-from reports.data.ways import compare_ways
-from reports.folder import compose
+from mortarbench.reports import answer, write_report
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.fastest import Finding
+from mortarbench.reports.data.ways import compare_ways
+from mortarbench.reports.folder import compose
 from tests.support.box_records import box_record
 
 DUALISING = 1e-3  #: s on the smallest problem

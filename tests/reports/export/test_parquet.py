@@ -8,10 +8,10 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from harness import Record, Verdict
-from harness.record import journal_name
-from harness.results.journal import Journal
-from reports import write_report
+from mortarbench.harness import Record, Verdict
+from mortarbench.harness.record import journal_name
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import write_report
 
 NESTED = {"params", "sizes", "options", "counts", "reported", "quantities"}
 

@@ -8,16 +8,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from harness import ContactSide, Fields, InputError
-from harness.files.qpfile import save_qp
-from harness.files.store import load_fields, save_fields
-from harness.names import parse
 from mortarbench.cli.main import main
+from mortarbench.harness import ContactSide, Fields, InputError
+from mortarbench.harness.files.qpfile import save_qp
+from mortarbench.harness.files.store import load_fields, save_fields
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
 from mortarbench.registries import Registries
-from problems import PROBLEMS
-from reports.export.vtu import write_series, write_vtu
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.reports.export.vtu import write_series, write_vtu
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 
 FIELDS = Fields(
     points=np.array([[0.0, 0], [1, 0], [1, 1], [0, 1], [0, 2], [1, 2], [1, 3], [0, 3]]),

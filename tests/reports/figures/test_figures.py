@@ -8,19 +8,27 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from harness import Verdict
-from reports.compare.changes import compare
-from reports.compare.figure import ratios_figure
-from reports.data.evidence import Evidence, arrange
-from reports.data.size_series import size_series
-from reports.document.figure import Axis, Figure, Panel, Row, Series, Text, fitted
-from reports.figures.accuracy import accuracy_figure
-from reports.figures.scaling import scaling_figure
-from reports.figures.style import GUIDE
-from reports.figures.sweeps import certified_figure, sweep_figure
-from reports.folder import compose
-from reports.render.saving import draw, draw_svg
-from reports.validation.error_figure import error_figure
+from mortarbench.harness import Verdict
+from mortarbench.reports.compare.changes import compare
+from mortarbench.reports.compare.figure import ratios_figure
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.size_series import size_series
+from mortarbench.reports.document.figure import (
+    Axis,
+    Figure,
+    Panel,
+    Row,
+    Series,
+    Text,
+    fitted,
+)
+from mortarbench.reports.figures.accuracy import accuracy_figure
+from mortarbench.reports.figures.scaling import scaling_figure
+from mortarbench.reports.figures.style import GUIDE
+from mortarbench.reports.figures.sweeps import certified_figure, sweep_figure
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.saving import draw, draw_svg
+from mortarbench.reports.validation.error_figure import error_figure
 from tests.support.synthetic_results import records
 
 pytestmark = pytest.mark.together
@@ -236,7 +244,9 @@ def test_what_is_drawn_of_a_solver_bears_its_name(campaign):
 def test_putting_a_report_together_loads_no_matplotlib():
     """It takes a second, which only those who draw should pay."""
     code = (
-        "import sys, reports.folder, reports.paper.report, reports.validation.report;"
+        "import sys; from mortarbench.reports import folder; "
+        "from mortarbench.reports.paper import report; "
+        "from mortarbench.reports.validation import report; "
         "sys.exit('matplotlib' in sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -6,7 +6,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from reports.document.figure import (
+from mortarbench.reports.document.figure import (
     Axis,
     Figure,
     Key,
@@ -16,9 +16,9 @@ from reports.document.figure import (
     Series,
     limits,
 )
-from reports.figures.style import COLOURS, look
-from reports.render.drawing import draw_curves
-from reports.render.plots import panels
+from mortarbench.reports.figures.style import COLOURS, look
+from mortarbench.reports.render.drawing import draw_curves
+from mortarbench.reports.render.plots import panels
 
 #: Machado, Oliveira, Fernandes 2009, severity 1, on linear RGB
 SIGHTS = {

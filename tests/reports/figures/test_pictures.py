@@ -10,8 +10,8 @@ from matplotlib.collections import TriMesh
 from matplotlib.figure import Figure as Canvas
 from matplotlib.quiver import Quiver
 
-from harness import ContactSide, Fields, InputError
-from reports.document.fields import (
+from mortarbench.harness import ContactSide, Fields, InputError
+from mortarbench.reports.document.fields import (
     ColourField,
     FieldFigure,
     FieldPanel,
@@ -20,9 +20,9 @@ from reports.document.fields import (
     Strokes,
     Vectors,
 )
-from reports.document.figure import Axis, Figure, Panel, Row, Series
-from reports.document.layout import Page, Picture, Section
-from reports.figures.deformed import (
+from mortarbench.reports.document.figure import Axis, Figure, Panel, Row, Series
+from mortarbench.reports.document.layout import Page, Picture, Section
+from mortarbench.reports.figures.deformed import (
     FRICTION,
     automatic_scale,
     deformed_figure,
@@ -30,10 +30,10 @@ from reports.figures.deformed import (
     outlines,
     triangles,
 )
-from reports.figures.style import look
-from reports.render.saving import ENDINGS, draw, save, save_all
-from reports.render.svg import inline
-from reports.render.writing import write_page
+from mortarbench.reports.figures.style import look
+from mortarbench.reports.render.saving import ENDINGS, draw, save, save_all
+from mortarbench.reports.render.svg import inline
+from mortarbench.reports.render.writing import write_page
 
 LOWER, UPPER = 3, 6  # columns of cells
 

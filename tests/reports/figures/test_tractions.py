@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from problems import PROBLEMS
-from reports.figures.tractions import LOOKS, places, traction_figure
-from solvers.reference.solve import reference_solution
+from mortarbench.problems import PROBLEMS
+from mortarbench.reports.figures.tractions import LOOKS, places, traction_figure
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 def solved(family, form="dual", **given):

@@ -12,31 +12,40 @@ import numpy as np
 import pytest
 from matplotlib import image
 
-from harness import InputError, Record, Verdict
-from harness.files.experiment import Experiment, load_experiment, save_experiment
-from harness.results.journal import Journal
-from problems.experiments import QUICK, paper_experiment
-from problems.experiments.analysis import WAYS, analyse
-from problems.experiments.clock import Rounds, Stopwatch, race, whole
-from problems.experiments.physics import stepping
-from problems.fem.elasticity import elasticity_matrix, stiffness
-from problems.fem.inverse import Factorised
-from problems.fem.mesh import half_ring
-from problems.fem.triplets import stiffness_by_triplets
-from problems.models.beam_ring import BEAM
-from reports.data.evidence import Evidence, arrange, read_evidence
-from reports.paper.contact import active
-from reports.paper.fleet import certified_table, fleet_figure, fleet_table, totals_table
-from reports.paper.geometry import dimensions
-from reports.paper.page import compose
-from reports.paper.report import write_paper
-from reports.paper.samples import curve, fit, medians
-from reports.paper.stepping import errors, order
-from reports.paper.stress import extent
-from reports.paper.tables import PARTS
-from reports.render.saving import save_all
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.solver import PAPER, SMALBE
+from mortarbench.harness import InputError, Record, Verdict
+from mortarbench.harness.files.experiment import (
+    Experiment,
+    load_experiment,
+    save_experiment,
+)
+from mortarbench.harness.results.journal import Journal
+from mortarbench.problems.experiments import QUICK, paper_experiment
+from mortarbench.problems.experiments.analysis import WAYS, analyse
+from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, whole
+from mortarbench.problems.experiments.physics import stepping
+from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
+from mortarbench.problems.fem.inverse import Factorised
+from mortarbench.problems.fem.mesh import half_ring
+from mortarbench.problems.fem.triplets import stiffness_by_triplets
+from mortarbench.problems.models.beam_ring import BEAM
+from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
+from mortarbench.reports.paper.contact import active
+from mortarbench.reports.paper.fleet import (
+    certified_table,
+    fleet_figure,
+    fleet_table,
+    totals_table,
+)
+from mortarbench.reports.paper.geometry import dimensions
+from mortarbench.reports.paper.page import compose
+from mortarbench.reports.paper.report import write_paper
+from mortarbench.reports.paper.samples import curve, fit, medians
+from mortarbench.reports.paper.stepping import errors, order
+from mortarbench.reports.paper.stress import extent
+from mortarbench.reports.paper.tables import PARTS
+from mortarbench.reports.render.saving import save_all
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.solver import PAPER, SMALBE
 
 #: it measures and draws once: one process has all of it
 pytestmark = pytest.mark.together
@@ -521,7 +530,9 @@ def test_rounds_end_when_time_is_spent_but_not_before_the_least():
 
 def test_a_stopwatch_sums_the_laps_of_a_part(monkeypatch):
     times = iter([0.0, 1.0, 3.0, 6.0])
-    monkeypatch.setattr("problems.experiments.clock.perf_counter", lambda: next(times))
+    monkeypatch.setattr(
+        "mortarbench.problems.experiments.clock.perf_counter", lambda: next(times)
+    )
     watch = Stopwatch()
     for part in "aba":
         watch.lap(part)

@@ -4,12 +4,12 @@ import re
 
 import pytest
 
-from reports.document.layout import Page, Section
-from reports.render.formulas import mathml, split
-from reports.render.html_page import html
-from reports.render.markdown import markdown
-from reports.sections.settings import definitions
-from reports.validation.report import _RULES
+from mortarbench.reports.document.layout import Page, Section
+from mortarbench.reports.render.formulas import mathml, split
+from mortarbench.reports.render.html_page import html
+from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.sections.settings import definitions
+from mortarbench.reports.validation.report import _RULES
 
 RULES = Section(name="rules", title="Rules", points=_RULES)
 

@@ -6,9 +6,9 @@ import subprocess
 
 import pytest
 
-from reports.document.layout import Cell, Statement, Table
-from reports.folder import write_report
-from reports.render.latex import ROWS, escaped, latex
+from mortarbench.reports.document.layout import Cell, Statement, Table
+from mortarbench.reports.folder import write_report
+from mortarbench.reports.render.latex import ROWS, escaped, latex
 from tests.support.synthetic_results import write
 
 NASTY = r"\input{x}_^$#&%~{}[1] ‖u − û‖ ≤ 1e-8, µ½λ 'a' `b` --- <c> |d| 漢"

@@ -6,8 +6,8 @@ import pickle
 import numpy as np
 import pytest
 
-from harness import Record, Verdict
-from reports.document.figure import (
+from mortarbench.harness import Record, Verdict
+from mortarbench.reports.document.figure import (
     Area,
     Axis,
     ColourBar,
@@ -26,12 +26,12 @@ from reports.document.figure import (
     fitted,
     in_rows,
 )
-from reports.document.layout import Cell, Table, named
-from reports.figures.style import COLOURS, legible, look
-from reports.render.embedded import cell, rows_of, script, spans, table
-from reports.render.mathtext import plain
-from reports.render.plots import MOST, panels
-from reports.render.saving import draw
+from mortarbench.reports.document.layout import Cell, Table, named
+from mortarbench.reports.figures.style import COLOURS, legible, look
+from mortarbench.reports.render.embedded import cell, rows_of, script, spans, table
+from mortarbench.reports.render.mathtext import plain
+from mortarbench.reports.render.plots import MOST, panels
+from mortarbench.reports.render.saving import draw
 
 SOLVERS = {"a $b": 0, "b": 1, "b2": 2}
 LOG = Axis(log=True)

@@ -6,17 +6,17 @@ from functools import partial
 import numpy as np
 import pytest
 
-from harness import InputError, Verdict
-from harness.results.journal import Journal
-from reports import answer, write_report
-from reports.data.comparison_groups import all_groups
-from reports.data.evidence import Evidence, arrange
-from reports.data.fastest import Finding, answers_of, fastest_solvers
-from reports.figures.fastest import fastest_figure
-from reports.folder import compose
-from reports.render.html_page import html
-from reports.render.latex import latex
-from reports.render.markdown import markdown
+from mortarbench.harness import InputError, Verdict
+from mortarbench.harness.results.journal import Journal
+from mortarbench.reports import answer, write_report
+from mortarbench.reports.data.comparison_groups import all_groups
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.data.fastest import Finding, answers_of, fastest_solvers
+from mortarbench.reports.figures.fastest import fastest_figure
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.html_page import html
+from mortarbench.reports.render.latex import latex
+from mortarbench.reports.render.markdown import markdown
 from tests.support.box_records import box_record
 
 LIMIT = 5.0

@@ -4,10 +4,10 @@ from functools import partial
 
 import pytest
 
-from harness import Verdict
-from reports.data.evidence import Evidence, arrange
-from reports.folder import compose
-from reports.render.markdown import markdown
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.folder import compose
+from mortarbench.reports.render.markdown import markdown
 from tests.support.box_records import box_record
 
 

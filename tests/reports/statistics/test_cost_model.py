@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from reports.statistics.cost_model import Communication, cost_model, growth
+from mortarbench.reports.statistics.cost_model import Communication, cost_model, growth
 
 SENT = Communication(
     ranks=2, reductions=300, messages=120, sent=4e6,

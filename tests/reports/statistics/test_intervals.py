@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reports.statistics.intervals import median_interval, power_law
+from mortarbench.reports.statistics.intervals import median_interval, power_law
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from reports.data.aggregation import (
+from mortarbench.reports.data.aggregation import (
     EVERY,
     USUAL,
     Convention,
@@ -15,11 +15,16 @@ from reports.data.aggregation import (
     ranking_of,
     ranks,
 )
-from reports.data.comparison_groups import ComparisonGroup, Kind
-from reports.statistics.censoring import restricted_mean
-from reports.statistics.growth import Trend, growth_of
-from reports.statistics.profiles import curve, performance_ratios, share, solved_within
-from reports.statistics.resampling import (
+from mortarbench.reports.data.comparison_groups import ComparisonGroup, Kind
+from mortarbench.reports.statistics.censoring import restricted_mean
+from mortarbench.reports.statistics.growth import Trend, growth_of
+from mortarbench.reports.statistics.profiles import (
+    curve,
+    performance_ratios,
+    share,
+    solved_within,
+)
+from mortarbench.reports.statistics.resampling import (
     firsts,
     limits,
     symmetric_interval,

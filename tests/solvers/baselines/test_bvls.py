@@ -7,9 +7,9 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers.baselines import bvls
-from solvers.baselines.bvls import BVLS
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers.baselines import bvls
+from mortarbench.solvers.baselines.bvls import BVLS
 
 
 def boxed(P, q, lb=-np.inf, ub=np.inf):

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Status, kkt_residuals, no_rows
-from problems import PROBLEMS
-from solvers.baselines.feti import FETI
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.baselines.feti import FETI
+from mortarbench.solvers.reference.solve import reference_solution
 
 #: the clamped beam of 2 m × 0.25 m with a point load, in 8 × 1 and 16 × 2 subdomains
 BEAM = dict(width=2.0, height=0.25, load="point")

@@ -7,12 +7,15 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, Status, kkt_residuals, no_rows
-from harness.names import parse
-from problems import PROBLEMS
-from solvers.baselines.infeasibility_certificate import contradicts, descends
-from solvers.baselines.pdas import PDAS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.baselines.infeasibility_certificate import (
+    contradicts,
+    descends,
+)
+from mortarbench.solvers.baselines.pdas import PDAS
+from mortarbench.solvers.reference.solve import reference_solution
 
 
 def quadratic(

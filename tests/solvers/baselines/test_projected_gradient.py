@@ -7,8 +7,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers.baselines.projected_gradient import ProjectedGradient
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
 
 
 def boxed(P, q, lb=-np.inf, ub=np.inf):

@@ -4,9 +4,13 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, no_rows
-from harness.distributed.vectors import DistributedColumns, Ranks, distributed
-from solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.harness import QP, no_rows
+from mortarbench.harness.distributed.vectors import (
+    DistributedColumns,
+    Ranks,
+    distributed,
+)
+from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 
 mpi = pytest.importorskip("mpi4py.MPI")
 

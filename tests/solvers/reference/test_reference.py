@@ -9,8 +9,8 @@ import pytest
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import aslinearoperator
 
-from harness import QP, kkt_residuals, no_rows
-from harness.conformance.manufactured import (
+from mortarbench.harness import QP, kkt_residuals, no_rows
+from mortarbench.harness.conformance.manufactured import (
     SHAPES,
     infeasible,
     manufactured,
@@ -18,12 +18,12 @@ from harness.conformance.manufactured import (
     one_of_each,
     unbounded,
 )
-from harness.names import completed
-from problems import PROBLEMS
-from solvers.reference.equilibrate import equilibrated
-from solvers.reference.interior import interior_point
-from solvers.reference.polish import polished
-from solvers.reference.solve import reference_solution
+from mortarbench.harness.names import completed
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.equilibrate import equilibrated
+from mortarbench.solvers.reference.interior import interior_point
+from mortarbench.solvers.reference.polish import polished
+from mortarbench.solvers.reference.solve import reference_solution
 
 EPS = np.finfo(float).eps
 
@@ -179,7 +179,8 @@ def test_the_multipliers_of_repeated_constraints_share_the_force():
 
 CASES = [
     ("beam-ring", dict(Nr=4, Nh=3, step=1), ("dual-bounds", "dual", "primal"), 1e-11),
-    ("beam-ring", dict(Nr=4, Nh=3, contact="mortar"), ("dual-bounds", "primal"), 1e-12),
+    # u·κ(K) = 8e-11 for both; how much of it shows depends on the processor's BLAS
+    ("beam-ring", dict(Nr=4, Nh=3, contact="mortar"), ("dual-bounds", "primal"), 1e-11),
     ("contact-patch", dict(contact="nts"), ("dual", "primal"), 1e-14),
     ("contact-patch", dict(ratio=1e-3), ("dual", "primal"), 1e-11),
     ("hertz-plane", dict(n=5), ("dual", "primal"), 1e-12),
@@ -402,16 +403,17 @@ def test_nothing_to_decide_is_decided():
 
 ALONE = """
 import sys, types
+import mortarbench  # which imports the package itself
 bare = types.ModuleType("solvers")  # solvers/__init__.py names every solver under test
 bare.__path__ = [sys.argv[1]]
-sys.modules["solvers"] = bare
-from harness.conformance.manufactured import manufactured
-from solvers.reference.solve import reference_solution
+sys.modules["mortarbench.solvers"] = bare
+from mortarbench.harness.conformance.manufactured import manufactured
+from mortarbench.solvers.reference.solve import reference_solution
 for shape in ("everything", "singular", "bounds"):
     for dense in (False, True):
         reference_solution(manufactured(shape, dense=dense)[0])
 print(*sorted({m.split(".")[0] for m in sys.modules}))
-print(*sorted(m for m in sys.modules if m.startswith("solvers.")))
+print(*sorted(m for m in sys.modules if m.startswith("mortarbench.solvers.")))
 """
 FOREIGN = {
     "clarabel", "cvxopt", "cvxpy", "daqp", "highspy", "osqp", "piqp", "proxsuite",
@@ -420,7 +422,7 @@ FOREIGN = {
 
 
 def test_no_solver_under_test_and_no_foreign_one_takes_part():
-    folder = sys.modules["solvers"].__path__[0]
+    folder = sys.modules["mortarbench.solvers"].__path__[0]
     run = subprocess.run(
         [sys.executable, "-c", ALONE, folder], capture_output=True, text=True
     )
@@ -429,9 +431,10 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
     packages, ours = (line.split() for line in run.stdout.splitlines())
     assert not FOREIGN & set(packages)
     assert ours == [
-        "solvers.reference", "solvers.reference.equilibrate",
-        "solvers.reference.interior", "solvers.reference.polish",
-        "solvers.reference.saddle", "solvers.reference.solve",
+        "mortarbench.solvers.reference", "mortarbench.solvers.reference.equilibrate",
+        "mortarbench.solvers.reference.interior",
+        "mortarbench.solvers.reference.polish",
+        "mortarbench.solvers.reference.saddle", "mortarbench.solvers.reference.solve",
     ]  # fmt: skip
 
 

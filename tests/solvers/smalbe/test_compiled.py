@@ -7,14 +7,18 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Status, kkt_residuals, no_rows
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe import compiled, driver
-from solvers.smalbe.driver import outer_loop, recovered
-from solvers.smalbe.outer_loop import first_iterate
-from solvers.smalbe.projected import by_lanczos, prepared_problem, projected_problem
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe import compiled, driver
+from mortarbench.solvers.smalbe.driver import outer_loop, recovered
+from mortarbench.solvers.smalbe.outer_loop import first_iterate
+from mortarbench.solvers.smalbe.projected import (
+    by_lanczos,
+    prepared_problem,
+    projected_problem,
+)
 
 pytestmark = pytest.mark.together
 

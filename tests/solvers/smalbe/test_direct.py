@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers import SOLVERS
-from solvers.smalbe.direct import LARGEST
-from solvers.smalbe.faces import Faces
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.smalbe.direct import LARGEST
+from mortarbench.solvers.smalbe.faces import Faces
 
 DIRECT = SOLVERS["smalbe-direct"]
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.sparse import bsr_array, coo_array, csr_array, dia_array
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.elimination import eliminate_free
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.elimination import eliminate_free
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 EXACT = SMALBE(eliminate="never")
 

@@ -7,13 +7,13 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness import Status, kkt_residuals
-from harness.names import parse
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe import driver
-from solvers.smalbe.driver import outer_loop
+from mortarbench.harness import Status, kkt_residuals
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe import driver
+from mortarbench.solvers.smalbe.driver import outer_loop
 
 pytestmark = pytest.mark.together
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers import SOLVERS
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers import SOLVERS
 
 TOLERANCES = (1e-6, 1e-9, 1e-12)
 

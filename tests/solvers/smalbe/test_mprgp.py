@@ -8,10 +8,17 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from solvers.smalbe import kernels
-from solvers.smalbe.model import Model
-from solvers.smalbe.mprgp import EXPANSIONS, Directions, Point, Rules, mprgp, split
-from solvers.smalbe.spectrum import power_method
+from mortarbench.solvers.smalbe import kernels
+from mortarbench.solvers.smalbe.model import Model
+from mortarbench.solvers.smalbe.mprgp import (
+    EXPANSIONS,
+    Directions,
+    Point,
+    Rules,
+    mprgp,
+    split,
+)
+from mortarbench.solvers.smalbe.spectrum import power_method
 
 MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 

@@ -6,9 +6,9 @@ from functools import partial
 import numpy as np
 import pytest
 
-from harness import QP, Status, no_rows
-from solvers.smalbe.mprgp import Rules
-from solvers.smalbe.outer_loop import (
+from mortarbench.harness import QP, Status, no_rows
+from mortarbench.solvers.smalbe.mprgp import Rules
+from mortarbench.solvers.smalbe.outer_loop import (
     Constants,
     InnerSolver,
     Iterate,
@@ -17,8 +17,8 @@ from solvers.smalbe.outer_loop import (
     infeasible,
     smalbe,
 )
-from solvers.smalbe.projected import by_lanczos, projected_problem
-from solvers.smalbe.rows import orthonormal_rows
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
+from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
 
 def drawn(seed, n=60, condition=1e3):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from harness import QP, Status, Structure, kkt_residuals, no_rows
-from harness.files.qpfile import load_qp, save_qp
-from problems import PROBLEMS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe.preconditioner import face_preconditioner
-from solvers.smalbe.projected import by_lanczos, projected_problem
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import QP, Status, Structure, kkt_residuals, no_rows
+from mortarbench.harness.files.qpfile import load_qp, save_qp
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe.preconditioner import face_preconditioner
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 

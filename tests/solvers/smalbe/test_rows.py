@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, random_array
 
-from harness import QP, Status, kkt_residuals, no_rows
-from solvers.smalbe import rows as module
-from solvers.smalbe.rows import (
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.solvers.smalbe import rows as module
+from mortarbench.solvers.smalbe.rows import (
     DenseRows,
     SparseRows,
     equality_rows,
     orthonormal_rows,
     sparse_rows,
 )
-from solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.smalbe.solver import SMALBE
 
 SEED = 20210805
 

@@ -7,17 +7,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from harness import QP, Status, kkt_residuals, no_rows
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe import driver
-from solvers.smalbe.mprgp import Rules
-from solvers.smalbe.outer_loop import Constants, InnerSolver, first_iterate, smalbe
-from solvers.smalbe.projected import by_lanczos, projected_problem
-from solvers.smalbe.rows import orthonormal_rows
-from solvers.smalbe.solver import SMALBE
-from solvers.smalbe.spectrum import lanczos, power_method
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe import driver
+from mortarbench.solvers.smalbe.mprgp import Rules
+from mortarbench.solvers.smalbe.outer_loop import (
+    Constants,
+    InnerSolver,
+    first_iterate,
+    smalbe,
+)
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
+from mortarbench.solvers.smalbe.rows import orthonormal_rows
+from mortarbench.solvers.smalbe.solver import SMALBE
+from mortarbench.solvers.smalbe.spectrum import lanczos, power_method
 
 INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from solvers.smalbe import kernels
+from mortarbench.solvers.smalbe import kernels
 
 
 def test_lengths_by_hand():

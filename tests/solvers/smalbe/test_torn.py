@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from harness import Status, kkt_residuals
-from problems import PROBLEMS
-from solvers.reference.solve import reference_solution
-from solvers.smalbe import rows as rows_module
-from solvers.smalbe.rows import SparseRows, equality_rows
-from solvers.smalbe.solver import SMALBE
+from mortarbench.harness import Status, kkt_residuals
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.solve import reference_solution
+from mortarbench.solvers.smalbe import rows as rows_module
+from mortarbench.solvers.smalbe.rows import SparseRows, equality_rows
+from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.held_by_contact import torn_disc_between_plates
 
 pytestmark = pytest.mark.together

@@ -10,11 +10,11 @@ import pytest
 from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import spsolve
 
-from harness import QP, Status, kkt_residuals, no_rows
-from harness.record import VERIFIED_FACTOR
-from problems import PROBLEMS
-from solvers import SOLVERS
-from solvers.reference.solve import reference_solution
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness.record import VERIFIED_FACTOR
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.generated_bodies import generated_case
 
 PRESETS = ("smalbe-permon", "smalbe-espreso")

@@ -1,0 +1,33 @@
+from .answer import Answer as Answer
+from .answer import Multipliers as Multipliers
+from .answer import Verification as Verification
+from .answer import solve as solve
+from .answer import verify as verify
+from .case import build as build
+from .case import export as export
+from .harness.errors import InputError as InputError
+from .harness.plugin import Case as Case
+from .harness.plugin import Family as Family
+from .harness.qp import QP as QP
+from .harness.record import Verdict as Verdict
+from .harness.solution import Solution as Solution
+from .harness.solution import Status as Status
+from .listing import Listing as Listing
+from .listing import problems as problems
+from .listing import solvers as solvers
+from .listing import suites as suites
+from .progress import Event as Event
+from .replaying import Replay as Replay
+from .replaying import replay as replay
+from .reporting import Report as Report
+from .reporting import report as report
+from .results import Results as Results
+from .results import load as load
+from .results import merge as merge
+from .results import run as run
+from .validation import Conformance as Conformance
+from .validation import Validation as Validation
+from .validation import test_solver as test_solver
+from .validation import validate as validate
+
+__version__: str

@@ -1,0 +1,77 @@
+"""One package: files of the user's that bear the names of its folders do not matter."""
+
+import subprocess
+import sys
+
+import pytest
+
+PLUGIN = """
+from dataclasses import dataclass
+import numpy as np
+from harness import QP, Solution, Status
+from solvers import FACTOR
+
+@dataclass(frozen=True)
+class Exact:
+    def declines(self, qp: QP):
+        return "has rows" if qp.b.size or qp.h.size else None
+    def prepare(self, qp, tol):
+        from harness import no_rows
+        x = np.clip(-FACTOR * qp.q / qp.P.diagonal(), qp.lb, qp.ub)
+        z_box = -qp.P @ x - qp.q
+        none = np.zeros(0)
+        return lambda: Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=z_box)
+
+SOLVERS = {"exact": Exact()}
+"""
+PROGRAM = """
+import mortarbench as mb
+
+qp = mb.QP.from_arrays([[2.0, 0], [0, 1]], [-2.0, 3.0], lb=[0, 0])
+by_plugin = mb.solve(qp, "exact", plugins=["mine/plug.py"])
+assert by_plugin.verdict is mb.Verdict.VERIFIED, by_plugin
+assert by_plugin.solution.x.tolist() == [1, 0]
+suite = {
+    "name": "own", "tolerances": [1e-6], "repeats": 1, "solvers": ["smalbe"],
+    "problems": [{"family": "string", "forms": ["primal"], "params": {"n": [8]}}],
+}
+results = mb.run(suite, out="out", fresh=True)
+assert list(results.df.status) == ["verified"], results.df
+import harness, problems, reports, solvers
+assert {m.OF_USER for m in (harness, problems, reports, solvers)} == {True}
+from mortarbench.solvers.smalbe.solver import SMALBE
+from mortarbench.problems import PROBLEMS
+assert "smalbe" in mb.solvers().names and set(PROBLEMS) <= set(mb.problems().names)
+"""
+
+
+@pytest.fixture
+def folder_of_user(tmp_path):
+    for name in ("harness", "problems", "solvers", "reports/__init__"):
+        file = tmp_path / f"{name}.py"
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("OF_USER = True\n")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "plug.py").write_text(PLUGIN)
+    (tmp_path / "mine" / "solvers.py").write_text("FACTOR = 1.0\n")
+    (tmp_path / "script.py").write_text(PROGRAM)
+    return tmp_path
+
+
+@pytest.mark.parametrize("command", [["script.py"], ["-c", PROGRAM]])
+def test_a_folder_with_the_names_of_ours_is_a_place_to_work_in(folder_of_user, command):
+    done = subprocess.run(
+        [sys.executable, *command], cwd=folder_of_user, capture_output=True, text=True
+    )
+
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("name", ["harness", "problems.fem.mesh", "solvers", "reports"])
+def test_nothing_of_ours_is_imported_under_a_name_of_its_own(name, folder_of_user):
+    program = (
+        "import sys, mortarbench.cli.main, mortarbench.processes, "
+        "mortarbench.reports.folder, mortarbench.solvers.smalbe.solver; "
+        f"sys.exit({name!r} in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", program], cwd=folder_of_user, check=True)
