@@ -387,7 +387,9 @@ def copy_of_the_project(folder: Path) -> None:
         for path in paths if path.suffix == ".pyx"
         for library in path.parent.glob(f"{path.stem}.*.so")
     ]  # fmt: skip
-    for path in filter(Path.is_file, paths + compiled):
+    for path in paths + compiled:
+        if not path.is_file() and not path.is_symlink():
+            continue
         copy = folder / path.relative_to(ROOT)
         copy.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(path, copy, follow_symlinks=False)
