@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from importlib.util import LazyLoader, find_spec, module_from_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias
 
@@ -91,6 +92,24 @@ def one_thread() -> Iterator[None]:
     del linalg, cholmod
     with TURN, threadpool_limits(limits=1):
         yield
+
+
+def defer_parts_of_numpy() -> None:
+    """Execute modules of numpy that scipy imports only when their names are used.
+
+    Nothing here uses them, and they take a quarter of the time in which a process that
+    solves starts: `scipy._lib.array_api_compat.numpy` asks for every name of numpy.
+    """
+    import numpy
+
+    for part in ("f2py", "testing"):
+        spec = find_spec(f"numpy.{part}")
+        if spec is None or spec.loader is None or spec.name in sys.modules:
+            continue
+        spec.loader = LazyLoader(spec.loader)
+        module = sys.modules[spec.name] = module_from_spec(spec)
+        spec.loader.exec_module(module)
+        setattr(numpy, part, module)  # or numpy would ask for it again
 
 
 def reference(qp: QP) -> Solution:

@@ -22,11 +22,10 @@ from pathlib import Path
 from typing import NoReturn
 
 from mortarbench.arguments import FORMATS, GATES
-from mortarbench.cli.numpy_parts import defer_parts_of_numpy
 from mortarbench.harness.errors import InputError, one_line
 from mortarbench.harness.processes.termination import TerminatedError, ended_by_signals
 from mortarbench.harness.registry import PluginFile
-from mortarbench.registries import Registries, installed
+from mortarbench.registries import Registries, defer_parts_of_numpy, installed
 
 _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 

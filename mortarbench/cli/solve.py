@@ -10,13 +10,12 @@ from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
-from mortarbench.cli.numpy_parts import defer_parts_of_numpy
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.names import assemble, emitted_by_ranks, parse
 from mortarbench.harness.registry import check_name
 from mortarbench.harness.suite.solver_options import options_for
-from mortarbench.registries import Registries
+from mortarbench.registries import Registries, defer_parts_of_numpy
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -285,7 +285,9 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         best = min(best, worst)
         if at.status is not Status.SOLVED or waited == PATIENCE:
             break
-        tighter *= min(0.5, max(0.01, CLAIM * tol / worst))
+        # by much where the last one changed little: multipliers may converge so slowly
+        # that one outer iteration meets a tolerance of nearly the same size
+        tighter *= 0.01 if waited else min(0.5, max(0.01, CLAIM * tol / worst))
         at = _refreshed(problem, at, _penalty(task.rho, tighter * tol))
     message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:

@@ -114,12 +114,13 @@ def factors(ranks):
     for whole, M in ((full, A), (full.shifted(0.5, own @ own.T), 1.5 * A - less)):
         a, b = (whole.forward(rows.additive(v[k])) for v in (t, s))
         y = np.linalg.solve(M, t)
+        size, work = np.abs(y).max(), np.abs(s) @ np.abs(y)
         errors += [
-            np.abs(whole(rows.additive(t[k])) - y[k]).max(),
-            np.abs(whole.backward(a) - y[k]).max(),
-            abs(a @ b - s @ y),
-            abs(rows.additive(s[k]) @ whole.backward(a) - s @ y),
-            abs(whole.norm(rows.additive(t[k])) ** 2 - t @ y),
+            np.abs(whole(rows.additive(t[k])) - y[k]).max() / size,
+            np.abs(whole.backward(a) - y[k]).max() / size,
+            abs(a @ b - s @ y) / work,
+            abs(rows.additive(s[k]) @ whole.backward(a) - s @ y) / work,
+            abs(whole.norm(rows.additive(t[k])) ** 2 - t @ y) / (np.abs(t) @ np.abs(y)),
         ]
     bad = part.toarray()
     if ranks.rank == 0:
