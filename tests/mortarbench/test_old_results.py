@@ -1,9 +1,11 @@
-"""A result folder of November 2026 reads as it did; schema 2, journal and vectors."""
+"""Result folders of earlier code are read, continued and made again."""
 
+import json
 import shutil
 
 import pytest
 
+import mortarbench as mb
 from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
 from mortarbench.harness.results.journal import read_journal
@@ -54,3 +56,72 @@ def test_what_another_environment_measured_is_left_alone(old, capsys):
     assert command("run", old / "suite.toml", "--out", old, "--repeats", 2) == 2
     assert "was measured in another environment" in capsys.readouterr().err
     assert read_journal(old) == before
+
+
+# folders of code that imported its packages by names of their own (e247e1f)
+
+PLUGINS = ROOT / "tests/data/results-e247e1f-plugins"
+SMOKE = ROOT / "tests/data/results-e247e1f-smoke"
+PLUGIN = PLUGINS / "plug.py"  #: imports `harness`, and a module beside it
+
+
+class There(Registries):
+    """The machine and the code that measured a folder before."""
+
+    def environment(self):
+        stored = json.loads((self.folder / "environment.json").read_text())
+        del stored["digest"]
+        return stored
+
+
+@pytest.fixture(params=[SMOKE, PLUGINS], ids=["smoke", "plugins"])
+def before_namespace(request, tmp_path, monkeypatch):
+    folder = shutil.copytree(request.param, tmp_path / "old")
+    monkeypatch.setattr(There, "folder", folder, raising=False)
+    return folder, ([PLUGIN] if request.param is PLUGINS else [])
+
+
+@pytest.mark.usefixtures("only_svg")
+def test_a_folder_of_before_the_namespace_is_continued(before_namespace):
+    folder, plugins = before_namespace
+    before = {r.run_id: r for r in read_journal(folder)}
+    most = max(r.repeat for r in before.values()) + 1
+
+    results = mb.run(
+        folder / "suite.toml", out=folder, repeats=most + 1, plugins=plugins,
+        registries=There().with_files(plugins),
+    )  # fmt: skip
+
+    after = read_journal(folder)
+    declined = {(r.case, r.solver) for r in before.values() if r.verdict == "declined"}
+    cells = {(r.case, r.solver) for r in before.values()} - declined
+    assert {r.run_id: r for r in after if r.run_id in before} == before
+    new = [r for r in after if r.run_id not in before]
+    assert {(r.case, r.solver, r.repeat) for r in new} == {(*c, most) for c in cells}
+    assert {r.environment for r in new} == {r.environment for r in before.values()}
+    assert len(results) == len(after)
+    results.report(formats=["md"])
+    assert "smalbe" in (folder / "report/report.md").read_text()
+
+
+def test_records_of_before_the_namespace_are_made_again(before_namespace):
+    """With the same verdict and nearly the same count of products."""
+    folder, plugins = before_namespace
+    records = [r for r in read_journal(folder) if r.repeat == 0]
+
+    for solver in {r.solver for r in records}:
+        record = next(
+            r for r in records if r.solver == solver and r.verdict.is_verified
+        )
+        again = mb.replay(folder, record.run_id, plugins=plugins)
+        assert (again.then, again.now.verdict) == (record, record.verdict)
+        products = record.counts.get("P_products", 0)
+        assert again.now.counts.get("P_products", 0) == pytest.approx(
+            products, rel=0.03, abs=2
+        )
+
+
+def test_folders_of_before_the_namespace_merge(tmp_path):
+    merged = mb.merge(SMOKE, PLUGINS, out=tmp_path / "both")
+
+    assert len(merged) == len(read_journal(SMOKE)) + len(read_journal(PLUGINS))
