@@ -31,7 +31,12 @@ class ReferenceOverRanks(Protocol):
 
 
 class Solver(Protocol):
-    """A QP solver; in practice a frozen dataclass whose fields are its options."""
+    """A QP solver; in practice a frozen dataclass whose fields are its options.
+
+    A class attribute ``accepts``, a tuple of classes of `mortarbench.harness.sets`,
+    declares the convex sets that it can take. Without it a solver accepts bounds alone
+    (``(Box,)``), and declines QPs with other sets before `declines` is called.
+    """
 
     def declines(self, qp: QP) -> str | None:
         """Give the reason why this solver cannot take `qp`, or None if it can."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
 from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.sets import Box, ConvexSet
+from mortarbench.harness.sets import Vector as Vector
 
-Vector = NDArray[np.float64]
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
@@ -32,7 +33,7 @@ class Structure:
     fixed: NDArray[np.int64]  #: components that K⁺ leaves at zero
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True, init=False)
 class QP:
     """A convex quadratic program.
 
@@ -44,15 +45,23 @@ class QP:
                     lb ≤ x ≤ ub      multiplier z_box, ≤ 0 at lb and ≥ 0 at ub
 
     so that at a solution  P x + q + Aᵀy + Gᵀz + z_box = 0  (qpsolvers' convention).
+    Blocks of variables may have further convex sets, to which z_box is normal.
 
     Absent constraints have zero rows, absent bounds are ±inf; nothing is None. All
     arrays are made read-only: a solver that scales its input in place fails loudly.
 
+    Parameters
+    ----------
+    P, q, A, b, G, h, structure : the attributes of these names
+    lb, ub : (n,) bounds, -inf and inf where there are none
+    sets : sets of further blocks; in place of lb and ub, the first may be a `Box`
+
     Raises
     ------
     ValueError
-        When shapes disagree, bounds cross, or a vector holds NaN (or inf where none
-        may be); the message gives what was got and what was expected.
+        When shapes disagree, bounds cross, a vector holds NaN (or inf where none may
+        be), or sets share a variable; the message gives what was got and what was
+        expected.
 
     """
 
@@ -62,29 +71,61 @@ class QP:
     b: Vector  #: (m,)
     G: Matrix  #: (p, n)
     h: Vector  #: (p,)
-    lb: Vector  #: (n,) may hold -inf
-    ub: Vector  #: (n,) may hold +inf
+    sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then those of other blocks
     structure: Structure | None = None  #: what a solver may use and none must need
 
-    def __post_init__(self) -> None:
-        n, m, p = self.q.size, self.b.size, self.h.size
-        expected = {
-            "P": (n, n), "q": (n,), "A": (m, n), "b": (m,),
-            "G": (p, n), "h": (p,), "lb": (n,), "ub": (n,),
-        }  # fmt: skip
-        for name, shape in expected.items():
-            got = getattr(self, name).shape
-            if got != shape:
-                raise ValueError(f"QP.{name} has shape {got}, expected {shape}")
+    def __init__(
+        self,
+        *,
+        P: Matrix,
+        q: Vector,
+        A: Matrix,
+        b: Vector,
+        G: Matrix,
+        h: Vector,
+        lb: Vector | None = None,
+        ub: Vector | None = None,
+        sets: Sequence[ConvexSet] = (),
+        structure: Structure | None = None,
+    ) -> None:
+        given = tuple(sets)
+        has_box = bool(given) and isinstance(given[0], Box)
+        box = given[0] if has_box else Box.unbounded(q.size)
+        assert isinstance(box, Box)
+        if lb is not None or ub is not None:
+            box = Box(box.lower if lb is None else lb, box.upper if ub is None else ub)
+        arrays = {"P": P, "q": q, "A": A, "b": b, "G": G, "h": h}
+        values = {**arrays, "sets": (box, *given[has_box:]), "structure": structure}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        n, m, p = q.size, b.size, h.size
+        shapes = ((n, n), (n,), (m, n), (m,), (p, n), (p,))
+        for (name, array), shape in zip(arrays.items(), shapes, strict=True):
+            if array.shape != shape:
+                raise ValueError(f"QP.{name} has shape {array.shape}, expected {shape}")
         for name in ("q", "b", "h"):
-            if not np.isfinite(getattr(self, name)).all():
+            if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
-        if not (self.lb < np.inf).all() or not (self.ub > -np.inf).all():
-            raise ValueError("QP bounds hold NaN, lb = +inf or ub = -inf")
-        if (self.lb > self.ub).any():
-            raise ValueError("QP bounds cross: lb > ub in some component")
-        for name in expected:
-            _freeze(getattr(self, name))
+        _check_sets(self.sets, n)
+        for array in (*arrays.values(), *_arrays_of(self.sets).values()):
+            _freeze(array)
+
+    @property
+    def box(self) -> Box:
+        """The bounds as a set, `sets[0]`."""
+        box = self.sets[0]
+        assert isinstance(box, Box)
+        return box
+
+    @property
+    def lb(self) -> Vector:
+        """Lower bounds (n,), may hold -inf."""
+        return self.box.lower
+
+    @property
+    def ub(self) -> Vector:
+        """Upper bounds (n,), may hold +inf."""
+        return self.box.upper
 
     @classmethod
     def from_arrays(
@@ -97,7 +138,7 @@ class QP:
         b: ArrayLike | None = None,
         lb: ArrayLike | None = None,
         ub: ArrayLike | None = None,
-        sets: tuple[Any, ...] = (),
+        sets: Sequence[ConvexSet] = (),
     ) -> QP:
         """Check and copy the arrays of a QP; the arguments stay as they are.
 
@@ -112,7 +153,7 @@ class QP:
         G, h : (p, n) and (p,) of G x ≤ h
         A, b : (m, n) and (m,) of A x = b
         lb, ub : (n,) bounds, -inf and inf where there are none
-        sets : reserved for constraints on blocks of variables; empty
+        sets : convex sets of further blocks of variables
 
         Raises
         ------
@@ -121,10 +162,12 @@ class QP:
             bounds cross, or P is not symmetric or not convex (see `check_convex`).
 
         """
-        if not isinstance(sets, tuple | list) or sets:
+        if not isinstance(sets, tuple | list) or not all(
+            isinstance(one, ConvexSet) and not isinstance(one, Box) for one in sets
+        ):
             raise InputError(
-                f"sets = {shown(sets)}; discs and cones are not supported yet; "
-                "expected sets=()"
+                f"sets = {shown(sets)}; expected a tuple of convex sets, beside lb and "
+                "ub for bounds"
             )
         for M, rhs, name, side in ((G, h, "G", "h"), (A, b, "A", "b")):
             if (M is None) != (rhs is None):
@@ -141,6 +184,7 @@ class QP:
                 **_rows("G", G, "h", h, n),
                 lb=_bound("lb", lb, -np.inf, n),
                 ub=_bound("ub", ub, np.inf, n),
+                sets=sets,
             )
             check_symmetric(found.P)
         except ValueError as e:
@@ -177,6 +221,10 @@ class QP:
             "bounds": int(bounds),
         }
 
+    def with_bounds(self, lb: Vector, ub: Vector) -> QP:
+        """Exchange the bounds (n,)."""
+        return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
+
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
         """Convert the sparse matrices among P, A and G; dense ones and operators stay.
 
@@ -189,6 +237,27 @@ class QP:
     def objective(self, x: Vector) -> float:
         """Evaluate ½ xᵀP x + qᵀx."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x)
+
+
+def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
+    """Raise ValueError where a set does not fit n variables, or two share one."""
+    taken = np.zeros(n, dtype=bool)
+    for one in sets:
+        one.check(n)
+        if len(sets) == 1:
+            return
+        shared = one.block[taken[one.block]]
+        if shared.size:
+            raise ValueError(
+                f"QP.sets: variable {shared[0]} is in two sets, or in one and bounded; "
+                "expected blocks without common variables"
+            )
+        taken[one.block] = True
+
+
+def _arrays_of(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
+    """Return the arrays of all sets by their names in files."""
+    return {name: array for one in sets for name, array in one.arrays().items()}
 
 
 def no_rows(n: int) -> Matrix:

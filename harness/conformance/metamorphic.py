@@ -131,12 +131,11 @@ def _unknowns(
     U.data = 1 / T.data
     a = np.zeros(qp.q.size) if origin is None else origin
     Pa = qp.P @ a
-    ends = [U.T @ (bound - a) for bound in (qp.lb, qp.ub)]
     new = replace(
         qp, P=_sorted(T.T @ qp.P @ T * t), q=T.T @ (Pa + qp.q) * t,
         A=_sorted(qp.A @ T), b=qp.b - qp.A @ a,
         G=_sorted(qp.G @ T), h=qp.h - qp.G @ a,
-        lb=np.minimum(*ends), ub=np.maximum(*ends),
+        sets=tuple(one.substituted(T, a) for one in qp.sets),
         structure=_structure(qp.structure, T, t),
     )  # fmt: skip
 

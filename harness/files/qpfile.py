@@ -60,6 +60,8 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
 
     """
     P = qp.P
+    if other := [type(one).__name__ for one in qp.sets[1:]]:
+        raise InputError(f"no file holds sets of the kind {other[0]}; expected bounds")
     if not qp.is_explicit:
         n = qp.q.size
         check_size(f"P, an operator, as a dense matrix of {n} rows", 8 * n**2)
@@ -157,7 +159,7 @@ def load_qp(
         raise InputError(f"{path}: {', '.join(lacking)} missing")
     try:
         meta = _meta(arrays["meta"])
-        vectors = {name: _vector(arrays, name) for name in _VECTORS}
+        vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
         dense = listed_dense(meta)
         if not own:

@@ -57,6 +57,7 @@ from mortarbench.harness.operators import Maker, SerialisableOperator
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.qp import QP, no_rows
+from mortarbench.harness.sets import Box
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import memory_mib
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks
@@ -337,6 +338,11 @@ class OnRanks:
     def end(self) -> None:
         """Let the others end."""
         self._order(None)
+
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        """The convex sets that the solver declares."""
+        return getattr(self._solver, "accepts", (Box,))
 
     def declines(self, qp: QP) -> str | None:
         """Decline what cannot be shared, besides what the solver declines."""

@@ -25,6 +25,7 @@ from mortarbench.harness.operators import SerialisableOperator, assembled
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.qp import NEEDS_MATRICES, QP, Matrix, Vector
 from mortarbench.harness.record import Measurement
+from mortarbench.harness.sets import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
@@ -135,12 +136,19 @@ class ReasonError(Exception):
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     """Return the reason why `solver` does not take `qp`, or None if it does.
 
+    A set of a kind that the solver does not declare in `accepts` is one: without a
+    declaration it accepts bounds alone.
+
     Raises
     ------
     ReasonError
         When `declines` returns anything else, such as False.
 
     """
+    accepted = getattr(solver, "accepts", (Box,))
+    for one in qp.sets:
+        if not isinstance(one, accepted):
+            return f"does not accept sets of the kind {type(one).__name__}"
     reason: object = solver.declines(qp)
     if reason is None or isinstance(reason, str):
         return reason

@@ -33,6 +33,7 @@ from scipy.sparse import coo_array, csr_array
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.sets import Box
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
     EXCUSED,
@@ -339,7 +340,7 @@ def _with_others(qp: QP, s: Solution, held: NDArray[np.bool_]) -> ExactOptimum |
     P = csr_array(qp.P)
     part = replace(
         qp, P=P[held][:, held], q=qp.q[held], A=csr_array(qp.A)[:, held],
-        G=csr_array(qp.G)[:, held], lb=qp.lb[held], ub=qp.ub[held],
+        G=csr_array(qp.G)[:, held], sets=(Box(qp.lb[held], qp.ub[held]),),
     )  # fmt: skip
     found = exact_optimum(part, replace(s, x=s.x[held], z_box=s.z_box[held]))
     if found is None:

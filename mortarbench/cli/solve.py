@@ -109,7 +109,8 @@ def _hint(answer: Answer) -> str:
 
     qp = case.made.qp
     n = qp.q.size
-    like_dual = replace(qp, G=no_rows(n), h=qp.h[:0], lb=0 * qp.q, ub=0 * qp.q + np.inf)
+    without_rows = replace(qp, G=no_rows(n), h=qp.h[:0])
+    like_dual = without_rows.with_bounds(0 * qp.q, 0 * qp.q + np.inf)
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name

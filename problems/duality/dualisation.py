@@ -153,8 +153,8 @@ def bounded(dual: QP, friction: Friction) -> QP:
     if not g.size:
         return dual
     contact = slice(0, -g.size)
-    return replace(
-        dual, lb=np.append(dual.lb[contact], -g), ub=np.append(dual.ub[contact], g)
+    return dual.with_bounds(
+        np.append(dual.lb[contact], -g), np.append(dual.ub[contact], g)
     )
 
 

@@ -475,8 +475,7 @@ def _fixed_point(
     contacts = dual.scale.size - coulomb.friction.bound.size
 
     def normal(friction: Friction) -> Vector:
-        lower, upper = dual.bounds(friction.bound)
-        bounded = replace(qp, lb=lower, ub=upper)
+        bounded = qp.with_bounds(*dual.bounds(friction.bound))
         found[:] = [reference(bounded, found[0] if found else None)]
         z = contact_multipliers(dual.own, dual.at, dual.scale, found[0])
         return z[:contacts]

@@ -133,11 +133,10 @@ def _tamed(qp: QP, near: NDArray[np.bool_]) -> QP:
     near : (p,) rows to keep
     """
     most = _most(qp)
-    return replace(
-        qp, q=np.clip(qp.q, -most, most), G=qp.G[near], h=qp.h[near],
-        lb=np.where(qp.lb < -most, -np.inf, qp.lb),
-        ub=np.where(qp.ub > most, np.inf, qp.ub),
-    )  # fmt: skip
+    tamed = replace(qp, q=np.clip(qp.q, -most, most), G=qp.G[near], h=qp.h[near])
+    return tamed.with_bounds(
+        np.where(qp.lb < -most, -np.inf, qp.lb), np.where(qp.ub > most, np.inf, qp.ub)
+    )
 
 
 def _is_nonnegative(qp: QP) -> bool:

@@ -108,7 +108,7 @@ WHOLE = r"stored whole here: expected both triangles, P \+ P.T - diag\(diag\(P\)
         ({"lb": np.nan}, "bounds hold NaN"),
         ({"lb": 1, "ub": 0}, "bounds cross: lb > ub"),
         ({"lb": "low"}, "lb is of type <U3"),
-        ({"sets": (1,)}, r"discs and cones are not supported yet; expected sets=\(\)"),
+        ({"sets": (1,)}, "expected a tuple of convex sets, beside lb and"),
     ],
 )
 def test_what_is_no_qp_is_refused_in_one_line(changes, message):

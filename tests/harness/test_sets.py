@@ -1,0 +1,184 @@
+"""Operations of convex sets, against what defines them; and QPs that have several."""
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array
+
+from mortarbench.harness import QP, Box, InputError, Solution, Status, save_qp
+from mortarbench.harness.verify.measure import reason_to_decline
+from tests.support.balls import Balls
+
+N = 8
+RNG = np.random.default_rng(7)
+INF = np.inf
+BOX = Box(
+    np.array([-1, 0, -INF, -INF, 2, 0, -3, -INF]),
+    np.array([1, INF, 0, INF, 2, 5, INF, 7]),
+)
+BALLS = Balls(np.array([[1, 4], [6, 2]]), np.array([2.0, 0.5]))
+SETS = [BOX, BALLS]
+names = pytest.mark.parametrize("one", SETS, ids=["box", "balls"])
+
+
+def points(count=200, size=4.0):
+    return size * RNG.standard_normal((count, N))
+
+
+@names
+def test_the_projection_is_the_nearest_point(one):
+    members = [one.project(x) for x in points()]
+    for x in points(50):
+        nearest = one.project(x)
+        assert all((x - nearest) @ (y - nearest) <= 1e-12 for y in members)
+        assert one.project(nearest) == pytest.approx(nearest, abs=1e-15)
+        assert min(limit.slack.min() for limit in one.limits(nearest)) >= -1e-15
+
+
+@names
+def test_what_projection_removes_is_normal(one):
+    """Moreau: z = v − Π(v) is normal at x = Π(v), so that σ(z) = zᵀx."""
+    for v in points(100):
+        x = one.project(v)
+        z = v - x
+        assert one.admissible(z).tolist() == z.tolist()
+        gaps = one.support_gaps(x, z, one.limits(x))
+        assert max(np.abs(gap.value).max() for gap in gaps) <= 1e-14
+        assert one.support(z).value == pytest.approx(z @ x, abs=1e-13)
+
+
+@names
+def test_the_support_function_bounds_the_work_on_every_member(one):
+    members = [one.project(x) for x in points()]
+    for z in points(50):
+        z = one.admissible(z)
+        sigma = one.support(z)
+        assert all(z @ y <= sigma.value + 1e-12 for y in members)
+        assert abs(sigma.value) <= sigma.terms
+        for y in members[:20]:
+            gaps = one.support_gaps(y, z, one.limits(y))
+            total = sum(gap.value.sum() for gap in gaps)
+            assert total == pytest.approx(sigma.value - z @ y, abs=1e-12)
+            assert all((np.abs(g.value) <= g.terms + 1e-15).all() for g in gaps)
+
+
+@names
+def test_what_is_not_admissible_has_no_bounded_work(one):
+    """σ(e) = ∞ for each component that is left out of e."""
+    e = np.eye(N)
+    for z in (*e, *-e):
+        if not one.admissible(z).any():
+            reached = max(z @ one.project(1e9 * z + x) for x in points(5))
+            assert reached > 1e8
+
+
+@names
+def test_the_hull_is_the_smallest_box_around_a_set(one):
+    lower, upper = one.hull(N)
+    for j in range(N):
+        for bound, sign in ((lower[j], -1), (upper[j], 1)):
+            far = one.project(sign * 1e9 * np.eye(N)[j])[j]
+            assert far == pytest.approx(max(min(bound, 1e9), -1e9))
+
+
+@names
+def test_slack_is_compared_with_the_size_of_its_terms(one):
+    for x in points(20):
+        for limit in one.limits(x):
+            assert (np.abs(limit.slack) <= limit.size + limit.terms + 1e-15).all()
+            assert limit.sized(np.abs(x)) == pytest.approx(limit.terms)
+
+
+def test_a_box_is_substituted_with_its_variables():
+    order, factors = RNG.permutation(N), RNG.choice([-2.0, 0.5, 4.0], N)
+    T = csr_array((factors, (np.arange(N), order)), shape=(N, N))
+    a = RNG.standard_normal(N)
+    other = BOX.substituted(T, a)
+    for x in points(50):
+        assert T @ other.project(x) + a == pytest.approx(BOX.project(T @ x + a))
+
+
+# QPs
+
+
+def qp_with(*sets, **parts):
+    none = np.zeros(0)
+    rows = np.zeros((0, N))
+    return QP(
+        P=np.eye(N), q=np.ones(N), A=rows, b=none, G=rows, h=none, sets=sets, **parts
+    )
+
+
+FREE = Box.unbounded(N)
+
+
+def test_the_first_set_is_the_box_of_the_bounds():
+    given = qp_with(lb=BOX.lower, ub=BOX.upper)
+    assert isinstance(given.sets[0], Box)
+    assert given.sets[0].lower is given.lb is BOX.lower
+    assert qp_with(BOX).ub is BOX.upper
+    assert np.isinf(qp_with().lb).all()
+    assert not given.lb.flags.writeable
+
+
+def test_bounds_are_exchanged_and_other_sets_kept():
+    qp = qp_with(FREE, BALLS)
+    bounded = replace(qp, lb=np.where(np.arange(N) == 0, 0.0, -INF))
+    assert bounded.lb[0] == 0
+    assert bounded.ub is qp.ub
+    assert bounded.sets[1] is BALLS
+    assert replace(qp, q=2 * qp.q).sets == qp.sets
+    assert qp.with_bounds(bounded.lb, qp.ub).sets[1] is BALLS
+
+
+@pytest.mark.parametrize(
+    ("sets", "message"),
+    [
+        ((BALLS, BALLS), "QP.sets: variable 1 is in two sets"),
+        ((BOX, BALLS), "QP.sets: variable 1 is in two sets, or in one and bounded"),
+        ((Balls(np.array([[0, N]]), np.ones(1)),), "an index too large"),
+        ((Box(-np.ones(3), np.ones(3)),), r"QP.lb has shape \(3,\), expected \(8,\)"),
+    ],
+)
+def test_sets_that_do_not_fit_are_refused(sets, message):
+    with pytest.raises(ValueError, match=message):
+        qp_with(*sets)
+
+
+def test_a_box_beside_bounds_is_refused():
+    arrays = dict(P=np.eye(N), q=np.ones(N))
+    with pytest.raises(InputError, match="expected a tuple of convex sets, beside lb"):
+        QP.from_arrays(**arrays, sets=(BOX,))
+    assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
+
+
+@dataclass(frozen=True)
+class Careless:
+    """Says of every QP that it can take it."""
+
+    def declines(self, qp):
+        return None
+
+    def prepare(self, qp, tol):
+        x = np.zeros(qp.q.size)
+        none = np.zeros(0)
+        return lambda: Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=x)
+
+
+class Conic(Careless):
+    accepts = (Box, Balls)
+
+
+def test_a_solver_that_declares_nothing_accepts_bounds_alone():
+    qp = qp_with(FREE, BALLS)
+    assert reason_to_decline(Careless(), qp) == "does not accept sets of the kind Balls"
+    assert reason_to_decline(Careless(), qp_with(BOX)) is None
+    assert reason_to_decline(Conic(), qp) is None
+
+
+def test_files_refuse_sets_that_they_cannot_hold(tmp_path):
+    with pytest.raises(InputError, match=re.escape("no file holds sets of the kind")):
+        save_qp(tmp_path / "a.npz", qp_with(FREE, BALLS))
+    assert not list(tmp_path.iterdir())

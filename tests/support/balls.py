@@ -1,0 +1,62 @@
+"""A convex set that the project lacks: balls ‖x_I‖ ≤ r on blocks of variables."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mortarbench.harness.sets import Limits, Sum
+
+
+@dataclass(frozen=True, eq=False)
+class Balls:
+    """‖x[index[i]]‖ ≤ radius[i], for blocks of one size without common variables."""
+
+    index: np.ndarray  #: (k, d)
+    radius: np.ndarray  #: (k,)
+
+    @property
+    def block(self):
+        return np.sort(self.index.ravel())
+
+    def check(self, n):
+        if self.radius.min() < 0 or self.index.max() >= n:
+            raise ValueError("QP.sets: a radius is negative, or an index too large")
+
+    def hull(self, n):
+        size = np.full(n, np.inf)
+        size[self.index] = self.radius[:, None]
+        return -size, size
+
+    def _norms(self, x):
+        return np.linalg.norm(x[self.index], axis=1)
+
+    def project(self, x):
+        x, norms = x.copy(), self._norms(x)
+        outside = norms > self.radius
+        factor = self.radius[outside] / norms[outside]
+        x[self.index[outside]] *= factor[:, None]
+        return x
+
+    def limits(self, x):
+        norms = self._norms(x)
+        return [Limits(self.radius - norms, self.radius, norms, self._norms)]
+
+    def admissible(self, z):
+        borne = np.zeros_like(z)
+        borne[self.index] = z[self.index]
+        return borne
+
+    def support(self, z):
+        value = self.radius @ self._norms(z)
+        return Sum(value, value)
+
+    def support_gaps(self, x, z, limits):
+        work = (z * x)[self.index]
+        value = self.radius * self._norms(z)
+        return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
+
+    def substituted(self, T, a):
+        raise NotImplementedError
+
+    def arrays(self):
+        return {"ball_index": self.index, "ball_radius": self.radius}
