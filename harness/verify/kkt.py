@@ -1,11 +1,11 @@
-"""Optimality of a primal-dual point, measured by us and never by the solver.
+"""Optimality of a primal-dual point, measured independently of the solver.
 
 Every residual is scale-free: multiplying the objective, a constraint row or the unit of
 a variable by a constant changes none of them, so that one threshold means the same for
 every problem. All four are zero exactly at a KKT point, which is a solution if P is
-positive semidefinite; that is taken on trust. What small residuals prove of the
-objective, and what they cannot, is in docs/verdicts.md; where they cannot,
-`harness.verify.optimum` compares with a proven optimum.
+positive semidefinite; positive semidefiniteness is not examined. docs/verdicts.md
+states what small residuals prove about the objective, and what they cannot prove; in
+these cases `harness.verify.optimum` compares with a proven optimum.
 """
 
 from __future__ import annotations
@@ -23,17 +23,39 @@ from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
 from mortarbench.harness.solution import Solution, Status
 
-ROUNDING = 8 * float(np.finfo(float).eps)  #: of a sum of terms, relative to their sizes
-EXCUSED = 2e-4  #: of its scale: more of a residual is never called rounding
-CANCELLED = 1e4  #: terms may exceed their sum by so much before the sum counts alone
-SHARE = 1e-2  #: of a natural energy: the least scale of energy
-VANISHING = 1e-6  #: of a natural energy: a point with less has none of its own
-NOISE = 1e-26  #: of the largest natural energy: smaller ones come of rounding in q
-OWN = 10.0  #: times its own terms: the size of a row
-ROUNDED = 1e-9  #: of a row's scale: more of a violation is never called rounding
-TOLD = 1e-12  #: of a row's own terms: a right-hand side below may be rounding
-SMALL = 1e-9  #: of the energies that are known: a point's energy below tells nothing
-INFLATED = 1e3  #: lengths that the energy knows of: x counts for no more
+#: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow
+#: like √k·2⁻⁵³, so that this covers k = 256. A row of zero fails without it
+#: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
+ROUNDING = 8 * float(np.finfo(float).eps)
+#: Share of a scale that three digits leave open, and the most of it that may be called
+#: rounding: beside the 5e-4 that `MAX_CANCELLATION` allows at tol 1e-8, twice this, of
+#: doubt and of rounding, keeps the error of the objective below 1e-3. With 2e-3,
+#: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9, the
+#: rounded solutions of `test_what_is_left_when_terms_cancel_is_known_exactly`.
+NEGLIGIBLE = 2e-4
+#: Largest ratio of the terms of the objective to itself that counts: 10·tol of the
+#: terms is then 1e-3 of the objective at tol 1e-8, three digits. Without it,
+#: `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails.
+MAX_CANCELLATION = 1e4
+#: Least scale of energy, relative to a natural energy. A solution with more than this
+#: share of it has an energy of its own; the errors of one that vanishes are divided by
+#: this: `test_rounding_errors_about_a_zero_solution_are_small` fails with 1e-3.
+LEAST_ENERGY = 1e-2
+#: Rounding in a load, relative to the largest: 400 terms of 2⁻⁵² each. Without it,
+#: loads of 1e-17 count (`test_a_right_point_is_verified_by_its_residuals`, case 11).
+LOAD_ROUNDING = 1e-13
+#: Violations, and errors of the objective, are compared with this times their terms: an
+#: answer is wrong beyond 100·tol of its terms, and residuals are allowed 10·tol. With
+#: 100, `test_a_narrow_box_lends_no_length_to_a_row` fails.
+TERMS_FACTOR = 10.0
+#: Largest size of a variable, in lengths over which the energy changes by all of it.
+#: `test_a_wrong_point_is_refuted_by_its_residuals` (case 15) fails with 1e5,
+#: `test_a_row_between_variables_that_are_long_is_met_to_their_digits` with 10.
+MAX_LENGTHS = 1e3
+#: Passes over the rows that give a size to variables without curvature and cost, each
+#: to the neighbours of those before: a limit of time.
+#: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails with 3.
+MAX_PASSES = 100
 
 
 class Residuals(NamedTuple):
@@ -51,14 +73,14 @@ class Residuals(NamedTuple):
 
 
 class Scales(NamedTuple):
-    """What errors of a point are compared with."""
+    """Units in which the errors of a point are measured."""
 
     energy: float  #: E
     x: Vector  #: Xⱼ (n,), size of each variable
 
 
 class _Constraints(NamedTuple):
-    """Rows of A or G, or the lower or upper bounds that there are, at a point."""
+    """Rows of A or of G, or the finite lower or upper bounds, at a point."""
 
     slack: Vector  #: b − Ax, h − Gx, x − lb or ub − x
     rhs: Vector  #: |b|, |h|, |lb| or |ub|
@@ -68,17 +90,17 @@ class _Constraints(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Terms:
-    """Products of the QP with a point, and the sizes of what was summed."""
+    """Products of the QP with a point, and sums of the absolute terms in them."""
 
     x: Vector  #: |x|
     constraints: dict[str, _Constraints]  #: by the name of the QP's field
     Px: Vector
     Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
-    curvature: Vector  #: Pᵢᵢ, zero where P does not tell
-    told: bool  #: whether P tells its diagonal
+    curvature: Vector  #: Pᵢᵢ, zero for an operator without diagonal
+    has_diagonal: bool  #: False for an operator without diagonal
     forces: Vector  #: Aᵀy + Gᵀz + z_box
     forces_size: Vector
-    residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, without what no bound can bear
+    residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, less multipliers of absent bounds
     energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + bounds
     energies_size: float
 
@@ -90,8 +112,8 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     With the scale of energy E and the sizes Xⱼ of the variables (`scales_at`), and
     r = Px + q + Aᵀy + Gᵀz⁺ + z_box less multipliers of absent bounds:
 
-    * primal: violation of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, relative to |bᵢ| + Σ|aᵢⱼ|Xⱼ,
-      and 1e-4 times that relative to |bᵢ| + Σ|aᵢⱼxⱼ| alone
+    * primal: violation of aᵢx = bᵢ, gᵢx ≤ hᵢ or a bound, relative to |bᵢ| + Σ|aᵢⱼ|Xⱼ;
+      where bᵢ ≠ 0, also relative to ten times its own terms (`own_sizes`)
     * dual: |rᵢ| relative to S, the largest of ‖Px‖∞, ‖q‖∞, ‖Aᵀy + Gᵀz + z_box‖∞ and
       √(E·min Pⱼⱼ), and relative to its own |Px|ᵢ, |qᵢ|, |Aᵀy + Gᵀz + z_box|ᵢ unless
       |rᵢ|Dᵢ/E is smaller; zᵢ⁻‖gᵢ‖∞/S
@@ -99,34 +121,38 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     * gap: |xᵀPx + qᵀx + bᵀy + hᵀz + lbᵀz_box⁻ + ubᵀz_box⁺|/E
 
     Dᵢ is the larger of |xᵢ| and the step |rᵢ|/Pᵢᵢ to the minimum along i (Xᵢ for a
-    variable without curvature and cost), but no longer than the way to the bounds. From
-    each residual is taken first what rounding to double precision explains: 8·2⁻⁵² of
-    the sum of its absolute terms, but never more than 2e-4 of its scale.
+    variable without curvature and cost), but no longer than the distance to the bound
+    in that direction. Rounding, `ROUNDING` times the sum of its absolute terms but at
+    most `NEGLIGIBLE` of its scale, is first subtracted from each residual.
 
-    generous : with the largest scale of energy that can be justified, and all rounding
-        of energies forgiven
+    generous : use the largest scale of energy that can be justified, and subtract all
+        rounding from energies
     """
-    t, excused = _terms(qp, s), np.inf if generous else EXCUSED
-    E, X = _scales(qp, s.x, _energy(qp, t, generous), t.curvature, told=t.told)
+    t, most_rounding = _terms(qp, s), np.inf if generous else NEGLIGIBLE
+    E, X = _scales(
+        qp, s.x, _energy(qp, t, generous), t.curvature, has_diagonal=t.has_diagonal
+    )
+    own = TERMS_FACTOR * (t.x + _shifts(s.x, t.Px, t.curvature))
     return Residuals(
-        _violation(t.constraints, X, OWN * (t.x + _pushed(s.x, t.Px, t.curvature))),
+        _violation(t.constraints, X, own),
         _dual(qp, s, t, E, X),
-        _complementarity(qp, s, t.constraints, E, excused),
-        _excess(t.energies.sum(keepdims=True), t.energies_size, E, excused),
+        _complementarity(qp, s, t.constraints, E, most_rounding),
+        _excess(t.energies.sum(keepdims=True), t.energies_size, E, most_rounding),
     )
 
 
 def _terms(qp: QP, s: Solution) -> _Terms:
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
     x, z_lb, z_ub = np.abs(s.x), np.maximum(-s.z_box, 0), np.maximum(s.z_box, 0)
-    d, told = _curvature(qp)
+    d, has_diagonal = _curvature(qp)
     root, A_size, G_size = np.sqrt(d), _abs(qp.A), _abs(qp.G)
     Px = qp.P @ s.x
-    Px_size = root * (root @ x) if told else 0 * x + _sup(Px)
+    # |Pᵢⱼ| ≤ √(PᵢᵢPⱼⱼ), as P is positive semidefinite
+    Px_size = root * (root @ x) if has_diagonal else 0 * x + _sup(Px)
     rows = _combined(qp.A, s.y) + _combined(qp.G, np.maximum(s.z, 0))
     borne = np.where(upper, z_ub, 0) - np.where(lower, z_lb, 0)
-    held = qp.b @ s.y + qp.h @ s.z
-    held += qp.ub[upper] @ z_ub[upper] - qp.lb[lower] @ z_lb[lower]
+    work = qp.b @ s.y + qp.h @ s.z
+    work += qp.ub[upper] @ z_ub[upper] - qp.lb[lower] @ z_lb[lower]
     sizes = (
         x @ np.abs(Px), np.abs(qp.q) @ x, np.abs(qp.b) @ np.abs(s.y),
         np.abs(qp.h) @ np.abs(s.z), np.abs(qp.ub[upper]) @ z_ub[upper],
@@ -134,12 +160,12 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     )  # fmt: skip
     return _Terms(
         x=x, constraints=_constraints(qp, s.x, A_size, G_size),
-        Px=Px, Px_size=Px_size, curvature=d, told=told,
+        Px=Px, Px_size=Px_size, curvature=d, has_diagonal=has_diagonal,
         forces=rows + _combined(qp.G, np.minimum(s.z, 0)) + s.z_box,
         forces_size=_combined(A_size, np.abs(s.y)) + _combined(G_size, np.abs(s.z))
         + np.abs(s.z_box),
         residual=Px + qp.q + rows + borne,
-        energies=np.array([s.x @ Px, qp.q @ s.x, held]),
+        energies=np.array([s.x @ Px, qp.q @ s.x, work]),
         energies_size=float(np.sum(sizes)),
     )  # fmt: skip
 
@@ -152,32 +178,33 @@ def _combined(M: Matrix, z: Vector) -> Vector | float:
 def _constraints(
     qp: QP, x: Vector, A_size: Matrix, G_size: Matrix
 ) -> dict[str, _Constraints]:
-    """Measure the constraints at x (n,), kind by kind, of each kind that there is.
+    """Evaluate the constraints at x (n,), by kind; absent kinds are left out.
 
     A_size, G_size : |A| and |G|
     """
-    size, found = np.abs(x), dict[str, _Constraints]()
+    size, constraints = np.abs(x), dict[str, _Constraints]()
     for name, M, rhs, sizes in (
         ("A", qp.A, qp.b, A_size), ("G", qp.G, qp.h, G_size),
     ):  # fmt: skip
         if M.shape[0]:
-            found[name] = _Constraints(
+            constraints[name] = _Constraints(
                 rhs - M @ x, np.abs(rhs), sizes @ size, sizes.__matmul__
             )
     for name, bound, sign in (("lb", qp.lb, 1), ("ub", qp.ub, -1)):
-        told = np.isfinite(bound)
-        if told.any():
-            at = bound[told]
-            found[name] = _Constraints(
-                sign * (x[told] - at), np.abs(at), size[told], partial(_where, told)
-            )
-    return found
+        is_finite = np.isfinite(bound)
+        if is_finite.any():
+            at = bound[is_finite]
+            constraints[name] = _Constraints(
+                sign * (x[is_finite] - at), np.abs(at), size[is_finite],
+                partial(_where, is_finite),
+            )  # fmt: skip
+    return constraints
 
 
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
-    """Measure the worst violation of a row or bound, as `kkt_residuals` says.
+    """Measure the worst violation of a row or bound as in `kkt_residuals`.
 
-    X : (n,) sizes of the variables that the energy knows of
+    X : (n,) sizes of the variables from the scale of energy
     own : (n,) sizes of the variables themselves (`own_sizes`)
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
@@ -197,31 +224,27 @@ def _violation(constraints: dict[str, _Constraints], X: Vector, own: Vector) -> 
 
 
 def _violated(
-    error: Vector, rhs: Vector, terms: Vector, known: Vector, own: Vector
+    error: Vector, rhs: Vector, terms: Vector, sizes: Vector, own: Vector
 ) -> float:
-    """Compare with |bᵢ| + Σ|aᵢⱼ|Xⱼ, and where bᵢ is a size of its own with its row."""
-    felt = _excess(error, rhs + terms, rhs + known, ROUNDED)
-    size = OWN * rhs + own
-    told = rhs > TOLD * size
-    if not told.any():
-        return felt
-    return _largest(
-        felt, _excess(error[told], (rhs + terms)[told], size[told], ROUNDED)
-    )
+    """Divide by |bᵢ| + Σ|aᵢⱼ|Xⱼ or, where bᵢ ≠ 0, by own terms that are smaller."""
+    scale = rhs + sizes
+    own_scale = np.where(rhs > 0, TERMS_FACTOR * rhs + own, np.inf)
+    return _excess(error, rhs + terms, np.minimum(scale, own_scale))
 
 
 def own_sizes(qp: QP, x: Vector) -> Vector:
-    """Give the sizes of variables at a solution x (n,), without any scale of energy.
+    """Return sizes (n,) of the variables at a solution x (n,), without any energy.
 
-    Ten times |xⱼ|, or as far as the others push variable j, |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j,
-    if that is further.
+    The larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other variables
+    shift the minimum along j.
     """
-    return np.maximum(OWN * np.abs(x), _pushed(x, qp.P @ x, _curvature(qp)[0]))
+    return np.maximum(TERMS_FACTOR * np.abs(x), _shifts(x, qp.P @ x, _curvature(qp)[0]))
 
 
-def _pushed(x: Vector, Px: Vector, d: Vector) -> Vector:
-    bends = d > 0
-    return np.where(bends, np.abs(Px - d * x) / np.where(bends, d, 1), 0)
+def _shifts(x: Vector, Px: Vector, d: Vector) -> Vector:
+    """Return |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j; 0 without curvature."""
+    is_curved = d > 0
+    return np.where(is_curved, np.abs(Px - d * x) / np.where(is_curved, d, 1), 0)
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
@@ -232,16 +255,16 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
     own_r = np.maximum(r - ROUNDING * size, 0)
-    # what neither bends nor costs is as long as it is
+    # the minimum along a variable without curvature and cost is undetermined: Xᵢ
     is_idle = (t.curvature == 0) & (qp.q == 0)
-    # an operator may not tell Pᵢᵢ: x tells one curvature of it, but for x = 0
-    step = _over(r, t.curvature if t.told else _rayleigh(s.x, t.Px))
+    # an operator without diagonal: x gives one curvature of it, unless x is zero
+    step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
-    way = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
-    step = np.minimum(np.maximum(t.x, step), np.maximum(way, 0))
+    room = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
+    step = np.minimum(np.maximum(t.x, step), np.maximum(room, 0))
     gain = np.where(own_r > 0, own_r * step, 0.0)
     lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    signed = (s.z >= 0).all()  # NaN is not
+    signed = (s.z >= 0).all()  # False where z holds NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
@@ -253,15 +276,19 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
 
 
 def _rayleigh(x: Vector, Px: Vector) -> Vector:
-    """Give xᵀPx/xᵀx for each variable (n,), 0 where x is zero."""
+    """Return xᵀPx/xᵀx for each variable (n,), 0 where x is zero."""
     squared = float(x @ x)
     return float(x @ Px) / squared + 0 * x if squared > 0 else 0 * x
 
 
 def _complementarity(
-    qp: QP, s: Solution, constraints: dict[str, _Constraints], E: float, excused: float
+    qp: QP,
+    s: Solution,
+    constraints: dict[str, _Constraints],
+    E: float,
+    most_rounding: float,
 ) -> float:
-    found = [0.0]
+    worst = [0.0]
     for name, c in constraints.items():
         match name:
             case "A":
@@ -272,99 +299,105 @@ def _complementarity(
                 z = np.maximum(-s.z_box, 0)[np.isfinite(qp.lb)]
             case _:
                 z = np.maximum(s.z_box, 0)[np.isfinite(qp.ub)]
-        found.append(_excess(z * c.slack, np.abs(z) * (c.terms + c.rhs), E, excused))
-    return _largest(*found)
+        size = np.abs(z) * (c.terms + c.rhs)
+        worst.append(_excess(z * c.slack, size, E, most_rounding))
+    return _largest(*worst)
 
 
 def energy_at(qp: QP, s: Solution, *, generous: bool = False) -> float:
-    """Find the scale of energy at a point, see `_energy`."""
+    """Return the scale of energy at a point, see `_energy`."""
     return _energy(qp, _terms(qp, s), generous)
 
 
 def _energy(qp: QP, t: _Terms, generous: bool) -> float:
-    """Find the scale of energy E at a point.
+    """Return the scale of energy E at a point.
 
     The largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + bounds|: sums, since multipliers that
-    cancel could make their parts as large as one likes; but no more than 1e4 times
-    their own sum, the objective, or than 1e-4 of itself where the objective vanishes.
-    At least a hundredth of the smallest natural energy of a variable (`_alone`).
+    cancel could make their parts arbitrarily large; but at most `MAX_CANCELLATION`
+    times the objective, or 1/`MAX_CANCELLATION` of itself where the objective vanishes.
+    At least `LEAST_ENERGY` times the smallest natural energy of a variable
+    (`_natural_energies`).
 
-    generous : cancellation is forgiven, and the median of natural energies counts, all
-        of it where the point has no energy of its own
+    generous : ignore cancellation, and return at least the median of natural energies
     """
     terms = _sup(t.energies)
-    value = abs(float(t.energies[0] / 2 + t.energies[1]))
-    capped = min(terms, max(CANCELLED * value, terms / CANCELLED))
-    E, pick = (terms, _middle) if generous else (capped, _least)
     if np.isnan(terms):
         return terms
-    known = _sup(qp.b), _sup(qp.h), _finite_sup(qp.lb), _finite_sup(qp.ub)
-    is_tiny = E <= SMALL * _sup(t.curvature) * np.square(max(known))
-    by_length = is_tiny or not qp.q.any()
-    alone = pick(_alone(qp, t.curvature, (qp.lb, qp.ub), by_length=by_length))
-    if E < SHARE * alone:  # seldom, and tightening costs more
-        alone = pick(_alone(qp, t.curvature, tightened(qp), by_length=True))
-    if not alone < np.inf:
-        return E
-    vanishes = generous and E <= VANISHING * alone
-    return alone if vanishes else max(E, SHARE * alone)
+    value = abs(float(t.energies[0] / 2 + t.energies[1]))
+    if generous:
+        E, share, pick = terms, 1.0, _median
+    else:
+        E = min(terms, max(MAX_CANCELLATION * value, terms / MAX_CANCELLATION))
+        share, pick = LEAST_ENERGY, _least
+    longest = max(_sup(qp.b), _sup(qp.h), _finite_sup(qp.lb), _finite_sup(qp.ub))
+    by_length = _sup(qp.q) <= LOAD_ROUNDING * _sup(t.curvature) * longest
+    energies = _natural_energies(
+        qp, t.curvature, (qp.lb, qp.ub), by_length=by_length or not qp.q.any()
+    )
+    natural = pick(energies)
+    if E < share * natural:  # rare; tightening bounds is expensive
+        energies = _natural_energies(qp, t.curvature, tightened(qp), by_length=True)
+        natural = pick(energies)
+    return max(E, share * natural) if natural < np.inf else E
 
 
 def _least(values: Vector) -> float:
-    """Give the least value, over all ranks of a distributed vector; inf without any."""
+    """Return the least value, over all ranks of a distributed vector; inf if empty."""
     return float(values.min(initial=np.inf))
 
 
-def _middle(values: Vector) -> float:
+def _median(values: Vector) -> float:
+    """Return the lower median; inf if empty."""
     return float(np.sort(values)[(values.size - 1) // 2]) if values.size else np.inf
 
 
-def _alone(
+def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """List natural energies: what a variable alone can gain, of each that tells one.
+    """List what each variable alone can gain, for those where this is determined.
 
     Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
-    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ over its feasible width, if that is less.
+    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ with the feasible width wᵢ, if that is less.
 
     bounds : lower and upper (n,) each, tightened by rows or not
-    by_length : without curvature at most |qᵢ|lᵢ, and where q is rounding Pᵢᵢlᵢ², of the
-        least length lᵢ that a row or bound knows, 1 if none does
+    by_length : without curvature at most |qᵢ|lᵢ, and Pᵢᵢlᵢ² where q is rounding, with
+        the least length lᵢ from a row or bound (`_lengths`), 1 without any length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)
     least = np.clip(-np.sign(qp.q) * _over(q, d), lb, ub)
     own = np.abs(d / 2 * least**2 + qp.q * least)
-    told = (q > 0) & (least != 0) & np.isfinite(own)
-    gain = np.where(told, np.where(gain > 0, np.minimum(own, gain), own), gain)
+    has_own = (q > 0) & (least != 0) & np.isfinite(own)
+    gain = np.where(has_own, np.where(gain > 0, np.minimum(own, gain), own), gain)
     lengths = _lengths(qp) if by_length else np.full(q.size, np.inf)
     if by_length and not np.isfinite(lengths).any():
         lengths = np.ones(q.size)
     flat = (d == 0) & np.isfinite(lengths)
     gain = np.where(flat, np.minimum(gain, q * lengths), gain)
     gain = np.where(np.isfinite(gain), gain, 0)
-    gain = gain[gain > NOISE * gain.max(initial=0)]
+    # energies are quadratic in q
+    gain = gain[gain > LOAD_ROUNDING**2 * gain.max(initial=0)]
     bend: Vector = (d * lengths**2)[(d > 0) & np.isfinite(lengths)]
-    if bend.size and gain.max(initial=0) <= NOISE * bend.min():
+    if bend.size and gain.max(initial=0) <= LOAD_ROUNDING**2 * bend.min():
         return bend
-    found: Vector = gain
-    return found
+    energies: Vector = gain
+    return energies
 
 
 def _lengths(qp: QP) -> Vector:
-    """Give the least |bᵢ/aᵢⱼ| or |bound| of each variable, of those that are not 0."""
+    """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| of each variable, or inf."""
     least = np.full(qp.q.size, np.inf)
     for bound in (qp.lb, qp.ub):
-        told = np.isfinite(bound) & (bound != 0)
-        least[told] = np.minimum(least[told], np.abs(bound[told]))
+        has_length = np.isfinite(bound) & (bound != 0)
+        least[has_length] = np.minimum(least[has_length], np.abs(bound[has_length]))
     for i, j, a, rhs in _entries(qp):
-        told = rhs[i] != 0
-        np.minimum.at(least, j[told], np.abs(rhs[i][told] / a[told]))
+        has_length = rhs[i] != 0
+        np.minimum.at(least, j[has_length], np.abs(rhs[i][has_length] / a[has_length]))
     return least
 
 
 def tightened(qp: QP) -> tuple[Vector, Vector]:
-    """Give lower and upper bounds (n,) each, tightened by what single rows allow."""
+    """Return lower and upper bounds (n,) each, tightened by single rows."""
     lb, ub = qp.lb.copy(), qp.ub.copy()
     for k, (i, j, a, rhs) in enumerate(_entries(qp)):
         for sign in (1, -1) if k == 0 else (1,):  # aᵢx = bᵢ is also −aᵢx ≤ −bᵢ
@@ -375,65 +408,76 @@ def tightened(qp: QP) -> tuple[Vector, Vector]:
             count = np.bincount(i, endless, rhs.size)
             others = np.where(endless, total[i], total[i] - least)
             room = (sign * rhs[i] - others) / c
-            known = count[i] == endless
-            up, down = known & (c > 0), known & (c < 0)
+            is_bounded = count[i] == endless
+            up, down = is_bounded & (c > 0), is_bounded & (c < 0)
             np.minimum.at(ub, j[up], room[up])
             np.maximum.at(lb, j[down], room[down])
     return lb, ub
 
 
 def _entries(qp: QP) -> Iterator[tuple[Vector, Vector, Vector, Vector]]:
-    """Give rows, columns and values of A, then of G, with the right-hand side."""
+    """Yield rows, columns and values of A, then of G, with the right-hand side."""
     for M, rhs in ((qp.A, qp.b), (qp.G, qp.h)):
         at = csr_array(M).tocoo()
-        told = at.data != 0
-        yield at.row[told], at.col[told], at.data[told], rhs
+        is_entry = at.data != 0
+        yield at.row[is_entry], at.col[is_entry], at.data[is_entry], rhs
 
 
 def scales_at(qp: QP, x: Vector, E: float) -> Scales:
-    """Give the sizes of variables that a scale of energy knows of.
+    """Return the sizes of the variables that follow from a scale of energy.
 
     The energy changes by E over the length lⱼ, the least of √(E/Pⱼⱼ) and E/|qⱼ|: Xⱼ is
-    the larger of lⱼ and |xⱼ|, but at most 1e3·lⱼ: along a direction that costs nothing,
-    an answer could make x as long as it likes. A variable without curvature and cost is
-    as long as its active rows know from the others.
+    the larger of lⱼ and |xⱼ|, but at most `MAX_LENGTHS`·lⱼ: along a direction that
+    costs nothing, an answer could make x arbitrarily long. The size of a variable
+    without curvature and cost follows from its active rows.
     """
-    d, told = _curvature(qp)
-    return _scales(qp, x, E, d, told=told)
+    d, has_diagonal = _curvature(qp)
+    return _scales(qp, x, E, d, has_diagonal=has_diagonal)
 
 
-def _scales(qp: QP, x: Vector, E: float, d: Vector, *, told: bool) -> Scales:
+def _scales(qp: QP, x: Vector, E: float, d: Vector, *, has_diagonal: bool) -> Scales:
     x, E = x.astype(float), float(E)
     size = np.abs(x)
     length = np.minimum(np.sqrt(_over(E, d)), _over(E, np.abs(qp.q)))
-    felt = np.isfinite(length)
-    X = np.where(felt, np.maximum(np.minimum(size, INFLATED * length), length), 0)
-    if not told:
+    has_length = np.isfinite(length)
+    X = np.maximum(np.minimum(size, MAX_LENGTHS * length), length)
+    X = np.where(has_length, X, 0)
+    if not has_diagonal:
         X = np.minimum(X, np.maximum(size, _sup(x)))
-    if not felt.all():
-        X = _told_by_rows(qp, x, X, felt)
+    if not has_length.all():
+        X = _sizes_from_rows(qp, x, X, has_length)
     return Scales(E, X)
 
 
-def _told_by_rows(qp: QP, x: Vector, X: Vector, felt: NDArray[np.bool_]) -> Vector:
-    """Fill in the sizes of variables that no energy feels, row by active row."""
-    size, known = np.abs(x), felt.copy()
+def _sizes_from_rows(
+    qp: QP, x: Vector, X: Vector, has_size: NDArray[np.bool_]
+) -> Vector:
+    """Complete the sizes of variables without curvature and cost by active rows.
+
+    A row of G is active where its slack is negligible. Others are left out: a far one
+    would excuse the violation of another row
+    (`test_a_row_that_is_far_away_excuses_no_violation`).
+    """
+    size, has_size = np.abs(x), has_size.copy()
     rows = [
-        (i, j, np.abs(a), np.abs(rhs), M @ x - rhs, _abs(M) @ size + np.abs(rhs))
-        for (i, j, a, rhs), M in zip(_entries(qp), (qp.A, qp.G), strict=True)
+        (i, j, np.abs(a), np.abs(rhs), slack, _abs(M) @ size + np.abs(rhs))
+        for (i, j, a, rhs), M, slack in zip(
+            _entries(qp), (qp.A, qp.G), (0 * qp.b, qp.h - qp.G @ x), strict=True
+        )
     ]
-    for _ in range(3):  # rows of rows
-        told = np.zeros(x.size)
-        for i, j, a, rhs, error, terms in rows:
-            total = rhs + np.bincount(i, a * np.where(known, X, 0)[j], rhs.size)
-            use = (~known[j]) & (error[i] >= -1e-6 * terms[i])
-            np.maximum.at(told, j[use], (total[i] / a)[use])
-        new = ~known & (told > 0)
+    for _ in range(MAX_PASSES):
+        added = np.zeros(x.size)
+        for i, j, a, rhs, slack, terms in rows:
+            total = rhs + np.bincount(i, a * np.where(has_size, X, 0)[j], rhs.size)
+            active = slack <= NEGLIGIBLE * np.maximum(terms, total)
+            use = ~has_size[j] & active[i]
+            np.maximum.at(added, j[use], (total[i] / a)[use])
+        new = ~has_size & (added > 0)
         if not new.any():
             break
-        X = np.where(new, told, X)
-        known |= new
-    return np.where(known, X, size)
+        X = np.where(new, added, X)
+        has_size |= new
+    return np.where(has_size, X, size)
 
 
 def allowed(tol: float, factor: float = VERIFIED_FACTOR) -> float:
@@ -450,16 +494,16 @@ def verdict(
     error: float | None = None,
     infeasible: bool = False,
 ) -> Verdict:
-    """Judge a point by its residuals; the claim decides only how a failure is called.
+    """Judge a point by its residuals; the claim decides only the name of a failure.
 
-    Verified: every residual ≤ factor·tol, whatever was claimed; where an error against
-    a proven optimum is known, it stands for all of them. A refuted claim of
-    success is `inaccurate` while at least half of the digits asked for are there (worst
-    residual ≤ √(factor·tol)), and `wrong` beyond. A residual above 0.1 verifies
-    nothing, whatever the tolerance.
+    Verified: every residual ≤ factor·tol, whatever was claimed; an error against a
+    proven optimum replaces all four residuals. A refuted claim of success is
+    `inaccurate` if the point has at least half of the requested digits (worst residual
+    ≤ √(factor·tol)), and `wrong` otherwise. With a residual above 0.1, no point is
+    verified at any tolerance.
 
-    infeasible : whether the QP is proven to have no feasible point; a claim of that is
-        verified, whatever point comes with it
+    infeasible : the QP is proven to have no feasible point, which verifies a claim of
+        infeasibility whatever point comes with it
     """
     most = allowed(tol, factor)
     worst = residuals.worst if error is None else error
@@ -480,12 +524,12 @@ def verdict(
 
 
 def rejudged(record: Record, factor: float) -> Verdict:
-    """Judge a stored measurement anew, at factor·tol instead of 10·tol.
+    """Judge a stored measurement again, at factor·tol instead of 10·tol.
 
-    Claim and residuals decide, or the error against a proven optimum where it did
-    (`Record.decided_by`). Where they do not explain the stored status (a limit, a
-    crash, a sequence that had ended before, a proof of infeasibility, which knows no
-    tolerance), it was decided by something else, and stands.
+    Claim and residuals decide, or the error against a proven optimum if that decided
+    before (`Record.decided_by`). A stored verdict that does not follow from them (a
+    limit, a crash, a sequence that had ended before, a proof of infeasibility, which
+    has no tolerance) is returned unchanged.
     """
     if record.claimed is None:
         return record.verdict
@@ -499,7 +543,7 @@ def rejudged(record: Record, factor: float) -> Verdict:
 
 
 def _curvature(qp: QP) -> tuple[Vector, bool]:
-    """Give Pᵢᵢ, and whether P tells it; zeros where it does not."""
+    """Return Pᵢᵢ and True; zeros and False for an operator without diagonal."""
     diagonal = qp.diagonal()
     if diagonal is None:
         return np.zeros(qp.q.size), False
@@ -528,12 +572,12 @@ def _over(a: Vector | float, b: Vector) -> Vector:
 
 
 def _largest(*values: float) -> float:
-    """Give the largest value; NaN is larger than every number."""
+    """Return the largest value; NaN counts as larger than every number."""
     return max(values, key=lambda value: np.inf if np.isnan(value) else value)
 
 
 def _ratios(error: Vector, scale: Vector | float) -> Vector:
-    """|error|/scale, where 0/0 = 0; a scale that overflowed tells nothing."""
+    """Return |error|/scale with 0/0 = 0; inf where the scale overflowed."""
     error = np.abs(error)
     safe = np.where(error == 0, 1.0, scale)
     return np.where(np.isinf(safe), np.inf, error / safe)
@@ -549,13 +593,14 @@ def _excess(
     error: Vector,
     size: Vector | float,
     scale: Vector | float,
-    excused: float = EXCUSED,
+    most_rounding: float = NEGLIGIBLE,
 ) -> float:
-    """Largest ratio to the scale of what rounding of terms of that size leaves open.
+    """Return the largest ratio of error to scale, after rounding is subtracted.
 
-    excused : of the scale, what is called rounding at most
+    size : sum of the absolute terms of the error
+    most_rounding : largest share of the scale that is subtracted as rounding
     """
-    rounding = np.minimum(ROUNDING * size, excused * scale)
+    rounding = np.minimum(ROUNDING * size, most_rounding * scale)
     rounding = np.where(np.isfinite(rounding), rounding, 0)
     return _ratio(np.maximum(np.abs(error) - rounding, 0), scale)
 

@@ -1,21 +1,22 @@
-"""The proven optimum of a small QP, which decides where residuals cannot.
+"""Proof of the optimal value of a small QP, for points that residuals cannot decide.
 
-Residuals bound the error of the objective only through quantities that they do not
-know: how far the solution is, and how large the true multipliers are. A reference solve
-that is none of the solvers under test gives a point x̂ with multipliers λ̂ ≥ 0; it is
-believed no more than they are. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian
-L, convexity gives for the solution x*
+Residuals bound the error of the objective only through two quantities that they do not
+contain: the distance of the solution, and the size of the true multipliers. A reference
+solve, independent of the solvers under test, returns a point x̂ with multipliers λ̂ ≥ 0,
+which is not trusted either. With r̂ = Px̂ + q + Aᵀŷ + Gᵀẑ + ẑ_box and the Lagrangian L,
+convexity implies for the solution x*
 
     f(x*) ≥ L(x̂, λ̂) − Σ|r̂ᵢ||x*ᵢ − x̂ᵢ|,
 
-evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for the
-point x̃ that meets the active rows exactly, off x̂ by rounding; L(x̃, λ̂) − L(x̂, λ̂) is
-r̂ᵀ(x̃ − x̂) and a square of rounding. So L(x̂, λ̂) is f* up to the sum above. What is
-taken on trust: the bound of |x*ᵢ − x̂ᵢ| (`FAR`), and that x̃ is as near as that.
+evaluated in extended precision. From above, f* is at most f(x̃) = L(x̃, λ̂) for a point
+x̃ that satisfies the active rows exactly and differs from x̂ by rounding; L(x̃, λ̂) −
+L(x̂, λ̂) is r̂ᵀ(x̃ − x̂) and a square of rounding. So L(x̂, λ̂) is f* up to the sum above.
+Two assumptions are not proven: the bound of |x*ᵢ − x̂ᵢ| (`MAX_DISTANCE`), and that x̃ is
+as close as that.
 
-Where the sum tells too little, since the objective cancels, the KKT equations of the
-rows that carry a multiplier are solved in rational arithmetic. If that point satisfies
-all KKT conditions, without any rounding, its value is f*, and nothing is on trust.
+Where the objective cancels, so that the sum determines too little of f*, the KKT
+equations of the rows with a multiplier are solved in rational arithmetic. If that point
+satisfies all KKT conditions exactly, its value is f*, without any assumption.
 """
 
 from __future__ import annotations
@@ -36,8 +37,10 @@ from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.sets import Box
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
-    EXCUSED,
+    MAX_CANCELLATION,
+    NEGLIGIBLE,
     ROUNDING,
+    TERMS_FACTOR,
     Residuals,
     allowed,
     energy_at,
@@ -49,29 +52,36 @@ from mortarbench.harness.verify.kkt import (
 )
 from mortarbench.harness.verify.rational import rational, solutions
 
-LARGEST = 400  #: coupled variables, and rows, of a QP that is cheap to solve once more
-MOST_APART = 4000  #: variables, the others coupled to none
-MULTIPLIED = 800  #: variables and rows of a QP whose operator P is multiplied out
-CLOSE = 1e-14  #: KKT residual, beyond rounding, of a point that may be an optimum
-FAR = 2.0  #: lengths over which the energy changes by all of it: x*ⱼ is no further
+#: Coupled variables and rows of a QP that is solved once more; the dense reference
+#: solve takes a few times as long as that of a solver.
+MAX_COUPLED = 400
+#: Variables of such a QP, the others coupled to none: each costs one division.
+MAX_VARIABLES = 4000
+#: Variables and rows of a QP whose operator P is assembled, by one product a variable.
+MAX_ASSEMBLED = 800
+#: Unknowns of equations that are solved in rational arithmetic, whose cost grows faster
+#: than with the cube.
+MAX_RATIONAL = 40
+#: Lengths over which the energy changes by all of it: x*ⱼ is assumed no farther from
+#: x̂ⱼ. The quadratic term alone gains E over √2 lengths from its minimum.
+#: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails with 0, and
+#: with no limit.
+MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
-SPARED = 10.0  #: the objective adds up what residuals say of single rows
-MOST = 0.5  #: of the terms of f*: a larger error is not verified at any tolerance
-SMALLEST = 500.0  #: terms may exceed f* by so much before f* counts alone
-NEEDLESS = 1e4  #: an optimum whose terms exceed another's by so much tells no rounding
-STEPS = 20  #: of active sets, to find an optimum that no reference finds
-RATIONAL = 40  #: unknowns of equations that are solved in rational arithmetic
+#: KKT residual of a reference point, beyond rounding: x̃ is assumed as close to x̂ as
+#: that. The reference solve refines no further. With 1e-8,
+#: `test_residuals_refute_no_point_between_nearly_parallel_rows` fails.
+MAX_RESIDUAL = 1e-14
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Optimum:
-    """The optimal value of a QP, and what errors against it are compared with."""
+    """The optimal value of a QP, and the scales of errors against it."""
 
-    qp: QP  #: what it is the optimum of, with P as a matrix
+    qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
-    doubt: float  #: by how much f* may be off, with the rounding of a right answer
+    doubt: float  #: bound of the error of f*, plus the rounding of a right answer
     energy: float  #: scale of errors of the objective
-    terms: float  #: of f* itself, and what the least variable alone is worth
     x: Vector  #: (n,) sizes of the variables
     own: Vector  #: (n,) the same without any energy, see `own_sizes`
 
@@ -88,55 +98,54 @@ def decided(
 ) -> float | None:
     """Measure a point against the proven optimum; None where residuals decide.
 
-    They do where they exceed 10·tol even against the most generous scales, where the QP
-    is large or its P an operator, or where nothing could be proven.
+    They decide where they exceed 10·tol even against the most generous scales, where
+    the QP is large, or where nothing could be proven.
 
-    prove : finds the optimum, see `proves`
+    prove : returns the optimum, see `proves`
 
     Returns
     -------
-    the larger of |f(x) − f*| and of the violation, relative to the scales of the
-    optimum; the first to 10 times the smaller of its terms and 500·|f*|. Where it
-    exceeds half of the terms that f* itself is the sum of, relative to these
+    the larger of the error |f(x) − f*| and of the violation, relative to the scales of
+    the optimum: for the error, 10 times the smaller of the terms of f* and 500·|f*|
 
     """
     if not is_small(qp):
         return None
     most = allowed(tol)
-    if not qp.is_explicit:  # which knows no rounding of its products
-        found = prove(qp)
-        if found is None:
+    if not qp.is_explicit:  # the rounding of its products is unknown
+        optimum = prove(qp)
+        if optimum is None:
             return None
-        qp = found.qp
+        qp = optimum.qp
         residuals = kkt_residuals(qp, s)
     if not (
         residuals.worst <= most or kkt_residuals(qp, s, generous=True).worst <= most
     ):
         return None
-    found = prove(qp)
-    return None if found is None else error_at(s, found)
+    optimum = prove(qp)
+    return None if optimum is None else error_at(s, optimum)
 
 
 def is_small(qp: QP) -> bool:
-    """Return True if a QP is cheap to solve once more, or its P to multiply out."""
+    """Return True if solving a QP once more, or assembling its P, is cheap."""
     n, rows = qp.q.size, qp.b.size + qp.h.size
     if not qp.is_explicit:
-        return n + rows <= MULTIPLIED
-    if n > MOST_APART:
+        return n + rows <= MAX_ASSEMBLED
+    if n > MAX_VARIABLES:
         return False
-    return n + rows <= LARGEST or int(coupled(qp).sum()) + rows <= LARGEST
+    return n + rows <= MAX_COUPLED or int(coupled(qp).sum()) + rows <= MAX_COUPLED
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Mark the variables (n,) that P, a matrix, couples to others, or a row holds."""
-    found = np.zeros(qp.q.size, dtype=bool)
+    """Mark the variables (n,) that P, a matrix, or a row couples to others."""
+    is_coupled = np.zeros(qp.q.size, dtype=bool)
     P = coo_array(qp.P)
     for j in (P.row, P.col):
-        found[j[(P.row != P.col) & (P.data != 0)]] = True
+        is_coupled[j[(P.row != P.col) & (P.data != 0)]] = True
     for M in (qp.A, qp.G):
         rows = coo_array(M)
-        found[rows.col[rows.data != 0]] = True
-    return found
+        is_coupled[rows.col[rows.data != 0]] = True
+    return is_coupled
 
 
 @np.errstate(all="ignore")
@@ -144,9 +153,8 @@ def error_at(s: Solution, optimum: Optimum) -> float:
     """Compare a point with the optimum; see `decided`."""
     qp, x = optimum.qp, s.x.astype(np.longdouble)
     off = abs(float(_objective(qp, x) - np.longdouble(optimum.value))) - optimum.doubt
-    scale = optimum.energy if off <= MOST * optimum.terms else optimum.terms
     return max(
-        max(off, 0.0) / scale,
+        max(off, 0.0) / optimum.energy,
         violation(qp, s.x, optimum.x, np.minimum(own_sizes(qp, s.x), optimum.own)),
     )
 
@@ -154,7 +162,7 @@ def error_at(s: Solution, optimum: Optimum) -> float:
 def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
     """Solve a QP by the reference, and prove its optimal value; None if that fails.
 
-    And where it turns out, once an operator P is multiplied out, that it is not small.
+    An operator P is assembled first; returns None if the QP is then not small.
     """
     if not qp.is_explicit:
         qp = replace(qp, P=assembled(qp.P))
@@ -165,106 +173,109 @@ def proven_optimum(qp: QP, solve: Reference) -> Optimum | None:
 def _proven(qp: QP, solve: Reference) -> Optimum | None:
     s = _reference_point(qp, solve)
     if s is None:
-        anew = exact_optimum_anew(qp)
-        if anew is None:
+        exact = exact_optimum_without_guess(qp)
+        if exact is None:
             return None
-        s = anew.solution
+        s = exact.solution
     f = _objective(qp, s.x)
     bound = np.where(s.z_box < 0, qp.lb, qp.ub)
     pulls = s.z_box[s.z_box != 0] * (s.x - bound)[s.z_box != 0]
     value = f + s.y @ (qp.A @ s.x - qp.b) + s.z @ (qp.G @ s.x - qp.h) + pulls.sum()
     r = np.abs(qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box)
-    terms = energy_at(qp, s, generous=True)
-    X = scales_at(qp, s.x.astype(float), terms).x
+    generous = energy_at(qp, s, generous=True)
+    X = scales_at(qp, s.x.astype(float), generous).x
     lb, ub = tightened(qp)
-    doubt = float(r @ np.minimum(np.maximum(ub - lb, 0), FAR * X))
+    doubt = float(r @ np.minimum(np.maximum(ub - lb, 0), MAX_DISTANCE * X))
     size = _size(qp, s)
-    if not EPS * size <= EXCUSED * abs(value):
+    if not EPS * size <= NEGLIGIBLE * abs(value):
         size = min(size, _size(qp, _least_multipliers(qp, s)))
-    if not doubt + EPS * size <= EXCUSED * abs(value):
+    if not doubt + EPS * size <= NEGLIGIBLE * abs(value):
         exact = exact_optimum(qp, s)
         if exact is not None:
-            value, doubt = np.longdouble(exact.value), 0.0
-            shorter = _size(qp, exact.solution)
-            if shorter < size / NEEDLESS:
-                s, size = exact.solution, shorter
-    # f* cannot be told more accurately than rounding x moves f
-    told = max(abs(float(value)), (doubt + EPS * size) / EXCUSED)
+            value, doubt, s = np.longdouble(exact.value), 0.0, exact.solution
+            size = min(size, _size(qp, s))
+    # rounding x moves f by EPS·size, which limits the accuracy of f*
+    told = max(abs(float(value)), (doubt + EPS * size) / NEGLIGIBLE)
     work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
-    if abs(value) > ROUNDING * terms + doubt:
-        known = min(terms, SMALLEST * told, work)
-    else:
-        known = told = terms
-    rounding = min(ROUNDING * size, EXCUSED * told)
-    if not (known > 0 and doubt <= EXCUSED * known):  # f* = 0 of nothing has no scale
+    least = energy_at(qp, s)
+    if abs(value) > ROUNDING * max(work, least) + doubt:
+        # off by 100·tol of this, f has half of the error that `kkt_residuals` allows
+        known = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * told, work)
+    elif work > NEGLIGIBLE * least:  # f* vanishes
+        known = told = work
+    else:  # x* vanishes
+        known = told = generous
+    rounding = min(ROUNDING * size, NEGLIGIBLE * told)
+    if not (known > 0 and doubt <= NEGLIGIBLE * known):  # no scale where all are zero
         return None
     return Optimum(
-        qp=qp, value=float(value), doubt=doubt + rounding, energy=SPARED * known,
-        terms=max(energy_at(qp, s), work),
+        qp=qp, value=float(value), doubt=doubt + rounding, energy=TERMS_FACTOR * known,
         x=scales_at(qp, s.x.astype(float), known).x,
         own=own_sizes(qp, s.x.astype(float)),
     )  # fmt: skip
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
-    """Solve by the reference; None where that is no optimum to the last digits."""
+    """Solve by the reference; None if that is not an optimum to the last digits."""
     try:
-        found = solve(qp)
+        point = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError):
         return None
     s = replace(
-        found,
-        x=found.x.astype(np.longdouble), y=found.y.astype(np.longdouble),
-        z=np.maximum(found.z, 0).astype(np.longdouble),
-        z_box=np.where(found.z_box < 0, np.where(np.isfinite(qp.lb), found.z_box, 0),
-                       np.where(np.isfinite(qp.ub), found.z_box, 0)
+        point,
+        x=point.x.astype(np.longdouble), y=point.y.astype(np.longdouble),
+        z=np.maximum(point.z, 0).astype(np.longdouble),
+        z_box=np.where(point.z_box < 0, np.where(np.isfinite(qp.lb), point.z_box, 0),
+                       np.where(np.isfinite(qp.ub), point.z_box, 0)
                        ).astype(np.longdouble),
     )  # fmt: skip
-    return s if kkt_residuals(qp, s, generous=True).worst <= CLOSE else None
+    return s if kkt_residuals(qp, s, generous=True).worst <= MAX_RESIDUAL else None
 
 
 class ExactOptimum(NamedTuple):
-    """An optimum known without rounding."""
+    """An optimum without rounding."""
 
     value: Fraction  #: f*
     solution: Solution  #: rounded to double precision
 
 
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
-    """Find an optimum in rational arithmetic; None where none is proven.
+    """Compute an optimum in rational arithmetic; None where none is proven.
 
-    The rows that carry a multiplier in `s` are taken as equations. What these leave
-    open is zero; where that is no optimum, multipliers are near the least ones
-    (`_least_multipliers`), and where that is none, all is as in `s`. The point that
-    solves them has to satisfy the KKT conditions of all rows exactly.
+    The rows with a multiplier in `s` become equations. Unknowns that these leave
+    undetermined are set to zero; if that is not an optimum, multipliers close to the
+    least ones (`_least_multipliers`) are tried, and then all values of `s`. The
+    solution of the equations has to satisfy the KKT conditions of all rows exactly.
     """
-    if qp.q.size > RATIONAL and not (held := coupled(qp)).all():
-        return _with_others(qp, s, held)
+    if qp.q.size > MAX_RATIONAL and not (is_coupled := coupled(qp)).all():
+        return _with_others(qp, s, is_coupled)
     for point in _exact_points(qp, s):
         if not any(fault.any() for fault in _faults(qp, point)):
             return _exact(qp, s, point)
     return None
 
 
-def exact_optimum_anew(qp: QP) -> ExactOptimum | None:
-    """Find an optimum in rational arithmetic without any guess; None where it is not.
+def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
+    """Compute an optimum in rational arithmetic by primal-dual active-set steps.
 
-    By primal-dual active-set steps: rows with multipliers of the wrong sign are left
-    out, violated ones are taken in, `STEPS` times at most.
+    Rows with multipliers of the wrong sign leave the set, violated ones enter it.
+    Returns None when a set recurs, since the same sets would follow for ever.
     """
     s = Solution.without_point(qp, Status.FAILED)
     s = replace(s, x=0 * qp.q, y=0 * qp.b, z=0 * qp.h, z_box=0 * qp.q)
-    for _ in range(STEPS):
+    visited = set[bytes]()
+    while (state := np.append(s.z, s.z_box).tobytes()) not in visited:
+        visited.add(state)
         point = next(_exact_points(qp, s), None)
         if point is None:
             return None
         over, under, above, pulling, wrong = _faults(qp, point)
         if not any(fault.any() for fault in (over, under, above, pulling, wrong)):
             return _exact(qp, s, point)
-        z_box = np.where(wrong, 0, s.z_box)
+        z_box = np.where(wrong, 0.0, s.z_box)
         s = replace(
-            s, z=np.where(over, 1, np.where(pulling, 0, s.z)),
-            z_box=np.where(under, -1, np.where(above, 1, z_box)),
+            s, z=np.where(over, 1.0, np.where(pulling, 0.0, s.z)),
+            z_box=np.where(under, -1.0, np.where(above, 1.0, z_box)),
         )  # fmt: skip
     return None
 
@@ -279,17 +290,18 @@ class _ExactPoint(NamedTuple):
 
 
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
-    """Solve the KKT equations of the rows that carry a multiplier, from three guesses.
+    """Solve the KKT equations of the rows with a multiplier, for three guesses.
 
-    Of what they leave open: zero; the least multipliers; all as in `s`.
+    Undetermined unknowns are zero; close to the least multipliers; or as in `s`.
     """
     lower = (s.z_box < 0) & np.isfinite(qp.lb)
     upper = (s.z_box > 0) & np.isfinite(qp.ub)
-    n, pressed, held = qp.q.size, s.z > 0, lower | upper
-    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(n)[held]])
-    if n + len(B) > RATIONAL:
+    n, pressed, at_bound = qp.q.size, s.z > 0, lower | upper
+    if n + qp.b.size + int(pressed.sum() + at_bound.sum()) > MAX_RATIONAL:
         return
-    c = np.concatenate([qp.b, qp.h[pressed], np.where(lower, qp.lb, qp.ub)[held]])
+    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(n)[at_bound]])
+    bounds = np.where(lower, qp.lb, qp.ub)[at_bound]
+    c = np.concatenate([qp.b, qp.h[pressed], bounds])
     equations = np.block([[_dense(qp.P), B.T], [B, np.zeros((len(B), len(B)))]])
     solve = solutions(rational(equations), rational(np.concatenate([-qp.q, c])))
     if solve is None:
@@ -300,20 +312,20 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
         guess[:n] = x
         if multipliers is not None:
             guess[n:] = np.concatenate([
-                multipliers.y, multipliers.z[pressed], multipliers.z_box[held]
+                multipliers.y, multipliers.z[pressed], multipliers.z_box[at_bound]
             ])  # fmt: skip
         at = np.cumsum([n, qp.b.size, int(pressed.sum())])
-        found, y, z_pressed, z_held = np.split(solve(rational(guess)), at)
+        exact_x, y, z_pressed, z_bound = np.split(solve(rational(guess)), at)
         z, z_box = rational(0 * qp.h), rational(0 * qp.q)
-        z[pressed], z_box[held] = z_pressed, z_held
-        yield _ExactPoint(found, y, z, z_box)
+        z[pressed], z_box[at_bound] = z_pressed, z_bound
+        yield _ExactPoint(exact_x, y, z, z_box)
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Mark where a point breaks the KKT conditions that its equations leave open.
+    """Mark the KKT conditions that a solution of its equations violates.
 
-    Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) that pushes where
-    no bound is, or at the other one.
+    Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a bound that is
+    absent or not active.
     """
     below, above = np.isfinite(qp.lb), np.isfinite(qp.ub)
     under, over = np.zeros(qp.q.size, dtype=bool), np.zeros(qp.q.size, dtype=bool)
@@ -335,21 +347,25 @@ def _exact(qp: QP, s: Solution, point: _ExactPoint) -> ExactOptimum:
     return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
 
 
-def _with_others(qp: QP, s: Solution, held: NDArray[np.bool_]) -> ExactOptimum | None:
-    """Find the exact optimum of the coupled variables, and of each other one alone."""
+def _with_others(
+    qp: QP, s: Solution, is_coupled: NDArray[np.bool_]
+) -> ExactOptimum | None:
+    """Compute the exact optimum of the coupled variables, and of each other alone."""
     P = csr_array(qp.P)
     part = replace(
-        qp, P=P[held][:, held], q=qp.q[held], A=csr_array(qp.A)[:, held],
-        G=csr_array(qp.G)[:, held], sets=(Box(qp.lb[held], qp.ub[held]),),
+        qp, P=P[is_coupled][:, is_coupled], q=qp.q[is_coupled],
+        A=csr_array(qp.A)[:, is_coupled], G=csr_array(qp.G)[:, is_coupled],
+        sets=(Box(qp.lb[is_coupled], qp.ub[is_coupled]),),
     )  # fmt: skip
-    found = exact_optimum(part, replace(s, x=s.x[held], z_box=s.z_box[held]))
-    if found is None:
+    s = replace(s, x=s.x[is_coupled], z_box=s.z_box[is_coupled])
+    exact = exact_optimum(part, s)
+    if exact is None:
         return None
-    value, x, z_box = found.value, 0.0 * qp.q, 0.0 * qp.q
-    x[held], z_box[held] = found.solution.x, found.solution.z_box
-    bends = P.diagonal()
-    for j in np.flatnonzero(~held):
-        d, q = Fraction(bends[j]), Fraction(qp.q[j])
+    value, x, z_box = exact.value, 0.0 * qp.q, 0.0 * qp.q
+    x[is_coupled], z_box[is_coupled] = exact.solution.x, exact.solution.z_box
+    curvature = P.diagonal()
+    for j in np.flatnonzero(~is_coupled):
+        d, q = Fraction(curvature[j]), Fraction(qp.q[j])
         free: Fraction | float = Fraction(0)
         if q != 0:
             free = -q / d if d > 0 else -copysign(inf, q)
@@ -359,7 +375,7 @@ def _with_others(qp: QP, s: Solution, held: NDArray[np.bool_]) -> ExactOptimum |
         best = Fraction(least)
         value += d / 2 * best**2 + q * best
         x[j], z_box[j] = float(best), -float(d * best + q)
-    return ExactOptimum(value, replace(found.solution, x=x, z_box=z_box))
+    return ExactOptimum(value, replace(exact.solution, x=x, z_box=z_box))
 
 
 def _dense(M: Any) -> Any:
@@ -367,13 +383,13 @@ def _dense(M: Any) -> Any:
 
 
 def proves(solve: Reference) -> Proves:
-    """Prove the optimum of every QP, told by identity, only once."""
-    known: dict[int, tuple[QP, Optimum | None]] = {}
+    """Return a function that proves the optimum of each QP object once."""
+    optima: dict[int, tuple[QP, Optimum | None]] = {}
 
     def once(qp: QP) -> Optimum | None:
-        if id(qp) not in known:  # the QP is kept, or another could get its id
-            known[id(qp)] = qp, proven_optimum(qp, solve)
-        return known[id(qp)][1]
+        if id(qp) not in optima:  # the QP is kept, or another could get its id
+            optima[id(qp)] = qp, proven_optimum(qp, solve)
+        return optima[id(qp)][1]
 
     return once
 
@@ -383,43 +399,44 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 
 
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
-    """Give the multipliers that do the least work, where several balance the gradient.
+    """Return the least multipliers, where several balance the gradient.
 
-    Those of rows that carry one in `s`, with the least sum of squares of λᵢ times the
-    terms of row i; rows whose sign that would turn carry none. As they were, where
-    nothing is left that balances.
+    For the rows with a multiplier in `s`, those with the least sum of squares of λᵢ
+    times the terms of row i; rows whose sign would change get none. Returns `s` if the
+    remaining rows do not balance the gradient, up to a negligible part.
     """
     x, is_fixed = np.abs(s.x).astype(float), qp.lb == qp.ub
-    pressed, held = s.z > 0, (s.z_box != 0) | is_fixed
-    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(x.size)[held]])
-    c = np.concatenate([qp.b, qp.h[pressed], x[held]])
-    sign = np.where(is_fixed, 0, np.sign(s.z_box.astype(float)))[held]
+    pressed, at_bound = s.z > 0, (s.z_box != 0) | is_fixed
+    B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(x.size)[at_bound]])
+    c = np.concatenate([qp.b, qp.h[pressed], x[at_bound]])
+    sign = np.where(is_fixed, 0, np.sign(s.z_box.astype(float)))[at_bound]
     sign = np.concatenate([np.zeros(qp.b.size), np.ones(int(pressed.sum())), sign])
     weight = np.abs(B) @ x + np.abs(c)
     weight = np.where(weight > 0, weight, 1.0)
     gradient = (qp.P @ s.x + qp.q).astype(float)
-    found, on = np.zeros(sign.size), np.ones(sign.size, dtype=bool)
+    least, on = np.zeros(sign.size), np.ones(sign.size, dtype=bool)
     for _ in range(sign.size + 1):
         scaled = (B[on] / weight[on, None]).T
-        found[:] = 0
-        found[on] = np.linalg.lstsq(scaled, -gradient, rcond=1e-12)[0] / weight[on]
-        turned = on & (found * sign < 0)
+        least[:] = 0
+        least[on] = np.linalg.lstsq(scaled, -gradient, rcond=None)[0] / weight[on]
+        turned = on & (least * sign < 0)
         if not turned.any():
             break
         on &= ~turned
-    left = np.abs(gradient + B.T @ found)
-    if not (left <= 1e-6 * (np.abs(gradient) + np.abs(B).T @ np.abs(found))).all():
+    left = np.abs(gradient + B.T @ least)
+    size = np.abs(gradient) + np.abs(B).T @ np.abs(least)
+    if not (left <= NEGLIGIBLE * size).all():
         return s
-    y, z_pressed, z_held = np.split(found, np.cumsum([qp.b.size, int(pressed.sum())]))
+    y, z_pressed, z_bound = np.split(least, np.cumsum([qp.b.size, int(pressed.sum())]))
     z, z_box = np.zeros(s.z.size), np.zeros(s.z_box.size)
-    z[pressed], z_box[held] = z_pressed, z_held
+    z[pressed], z_box[at_bound] = z_pressed, z_bound
     return replace(s, y=y, z=z, z_box=z_box)
 
 
 def _size(qp: QP, s: Solution) -> float:
-    """Add up what rounding of x to double precision moves: f itself, and λᵀ(Bx − c)."""
+    """Sum the absolute terms of f and of λᵀ(Bx − c), which rounding of x changes."""
     x = np.abs(s.x)
     rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
-    held = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)
-    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + held + 2 * np.abs(s.z_box) @ x
+    work = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)
+    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + work + 2 * np.abs(s.z_box) @ x
     return float(total)

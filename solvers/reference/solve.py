@@ -25,12 +25,11 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
 from mortarbench.harness import QP, Solution, Status, kkt_residuals
 from mortarbench.harness.operators import assembled
-from mortarbench.harness.verify.optimum import is_small
+from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
 from mortarbench.solvers.reference.equilibrate import equilibrated
 from mortarbench.solvers.reference.interior import interior_point
 from mortarbench.solvers.reference.polish import polished
 
-ENOUGH = 1e-14  #: KKT residual that is not refined any more
 NEAR = 1e-3  #: KKT residual of a start: from farther off refinement ends, where the
 #: solutions are many, at one that is far off, and other starts are tried
 ACCEPTED = 1e-9  #: KKT residual of what is called a solution
@@ -68,7 +67,7 @@ def reference_solution(qp: QP) -> Solution:
             if worst <= least:
                 best, least = point, worst
         is_near = residuals[0] <= NEAR
-        if is_near and least <= (ENOUGH if is_small(qp) else ACCEPTED):
+        if is_near and least <= (MAX_RESIDUAL if is_small(qp) else ACCEPTED):
             return best
     if least <= ACCEPTED:
         return best
@@ -89,7 +88,7 @@ def _candidates(qp: QP) -> Iterator[Solution]:
     if _is_nonnegative(qp):
         with suppress(np.linalg.LinAlgError, RuntimeError):  # singular; steps ran out
             yield (point := _nonnegative(qp))
-            if _residual(qp, point) <= ENOUGH:
+            if _residual(qp, point) <= MAX_RESIDUAL:
                 return
     scaled = equilibrated(qp)
     start = interior_point(scaled.qp)

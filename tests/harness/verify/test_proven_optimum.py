@@ -5,6 +5,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from scipy.sparse import eye_array
 
 from mortarbench.harness import (
     QP,
@@ -22,6 +23,7 @@ from mortarbench.harness.verify.optimum import (
     decided,
     error_at,
     exact_optimum,
+    exact_optimum_without_guess,
     is_small,
     proven_optimum,
     proves,
@@ -338,6 +340,18 @@ def test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy(unit):
     assert optimum.value == -MANY * 3 / 8 * unit
 
 
+def test_active_sets_that_recur_prove_nothing():
+    """The sets 111, 101, 110 of the rows follow each other for ever."""
+    P = [[16, 1, -7, 6], [1, 8, 1, 0], [-7, 1, 6, -4], [6, 0, -4, 7]]
+    G = [[3, -2, -3, 1], [-1, -3, 0, 2], [-3, 0, -2, 1]]
+    qp = qp_of(P, [3, 3, 3, -2], G=G, h=[1, 1, 2], lb=-1)
+
+    assert exact_optimum_without_guess(qp) is None
+    known = exact_optimum(qp, reference_solution(qp))
+    assert known is not None
+    assert known.value < 0
+
+
 @pytest.mark.parametrize("sign", [1, -1])
 def test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point(sign):
     """x₁ + x₂ = 2, twice, and x₁ = x₂; of all multipliers the least ones count."""
@@ -361,6 +375,26 @@ def test_a_qp_is_small_up_to_400_variables_and_rows(rows, expected):
     qp = qp_of([1] * 400, [0] * 400, A=np.ones((rows, 400)), b=[0] * rows)
 
     assert is_small(qp) is expected
+
+
+@pytest.mark.parametrize(("n", "expected"), [(4000, True), (4001, False)])
+def test_variables_that_are_coupled_to_none_may_be_ten_times_as_many(n, expected):
+    assert is_small(replace(qp_of([1], [0]), **vectors(n), P=eye_array(n))) is expected
+
+
+@pytest.mark.parametrize(("n", "expected"), [(799, True), (800, False)])
+def test_an_operator_is_small_up_to_800_variables_and_rows(n, expected):
+    row = dict(A=np.ones((1, n)), b=np.zeros(1))
+    qp = replace(qp_of([1], [0]), P=Products(eye_array(n)), **vectors(n) | row)
+
+    assert is_small(qp) is expected
+
+
+def vectors(n):
+    return dict(
+        q=np.zeros(n), A=no_rows(n), G=no_rows(n), lb=np.full(n, -INF),
+        ub=np.full(n, INF),
+    )  # fmt: skip
 
 
 def test_a_reference_that_is_needlessly_far_out_excuses_no_error():
@@ -766,6 +800,100 @@ def test_a_narrow_box_lends_no_length_to_a_row(count):
     assert judge(qp, at(wrong + row, [-1]), TOL) is Verdict.VERIFIED
 
 
+def judge_decided(qp, s, tol=TOL):
+    """Judge by residuals, or by the proven optimum where that decides."""
+    residuals = kkt_residuals(qp, s)
+    error = decided(qp, s, residuals, tol, proves(reference_solution))
+    return verdict(Status.SOLVED, residuals, tol, error=error)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("count", [0, 400])
+def test_a_row_that_is_far_away_excuses_no_violation(sign, count):
+    """min ½x₁² − x₁, x₁ = x₂ ≤ ½, x₂ ≥ −1e12: x* = (½, ½)."""
+    bends, q, row, far, right, wrong, pulls = idle_beside(
+        [1, 0], [-1, 0], [sign, -sign], [0, -1], [0.5, 0.5], [1, 0.5], [0, 0.5],
+        count=count,
+    )  # fmt: skip
+    ub = np.where(np.arange(q.size) == 1, 0.5, INF)
+    qp = qp_of(bends, q, A=[row], b=[0], G=[far], h=[1e12], ub=ub)
+
+    assert judge(qp, at(wrong, [0], [0]), 1e-4) is Verdict.WRONG
+    assert judge(qp, at(right, [0.5 * sign], [0], z_box=pulls)) is Verdict.VERIFIED
+
+
+@pytest.mark.parametrize("off", [1e-9, -1e-9])
+@pytest.mark.parametrize("rows", ["A", "-A", "G", "-G"])
+def test_a_chain_of_idle_variables_is_as_long_as_its_first_row(rows, off):
+    """min ½x₁² − x₁, x₁ − x₂ = 1, x₂ = x₃ = … = x₈: x* = (1, 0, …, 0), f* = −½."""
+    sign, n, b = -1 if rows[0] == "-" else 1, 8, np.eye(7)[0]
+    M = sign * (np.eye(n - 1, n) - np.eye(n - 1, n, 1))
+    is_equal = rows[-1] == "A"
+    stated = dict(A=M, b=sign * b) if is_equal else dict(G=M, h=sign * b)
+    qp = qp_of(np.eye(n)[0], -np.eye(n)[0], **stated)
+    none = np.zeros(n - 1)
+
+    for j in range(1, n):
+        x = np.eye(n)[0] + off * np.eye(n)[j]
+        s = at(x, none) if is_equal else at(x, z=none)
+        assert judge(qp, s) is Verdict.VERIFIED
+        far = replace(s, x=s.x + 1e7 * off * np.eye(n)[j])
+        if is_equal or (M[j - 1, j] * off > 0):  # beyond the row
+            assert judge(qp, far) is Verdict.WRONG
+
+
+def test_a_row_between_variables_that_are_long_is_met_to_their_digits():
+    """x* = (512, −512), 256 lengths over which the energy changes by its whole."""
+    soft = 2.0**-18  # along (1, −1), where x is long
+    P = np.array([[1 + soft, 1 - soft], [1 - soft, 1 + soft]])
+    x, off = np.array([512.0, -512.0]), 2.0**-17
+    qp = qp_of(P, -(P @ x), A=[[1, 1]], b=[0])  # y* = 0
+    s = at(x + off, [-2 * off])
+
+    exact, near = ([Fraction(v) for v in point] for point in (x, s.x))
+    error = objective(qp, near) - objective(qp, exact)
+    assert 0 < error <= Fraction(TOL) * 2  # of the terms, 4
+    assert sum(near) <= Fraction(2 * TOL) * 1024  # of its own terms
+    assert sum(near) > Fraction(10 * TOL) * 4 * 10  # of ten lengths
+    assert judge(qp, s) is Verdict.VERIFIED
+    assert judge(qp, at(x + 100 * off, [-200 * off])) is not Verdict.VERIFIED
+
+
+def objective(qp, x):
+    """Evaluate the objective in fractions."""
+    P, q = [[Fraction(v) for v in row] for row in qp.P], map(Fraction, qp.q)
+    bend = sum(a * P[i][j] * b for i, a in enumerate(x) for j, b in enumerate(x))
+    return bend / 2 + sum(c * a for c, a in zip(q, x, strict=True))
+
+
+@pytest.mark.parametrize("cost", [1e6, 1e9, 1e12])
+def test_costs_on_bounds_do_not_excuse_an_objective_that_vanishes(cost):
+    """x* = (0, 0, 0, 1, 1), f* = 0, of terms 1 and ½; the costs could gain C² each."""
+    qp = qp_of(
+        [1, 1, 1, 1, 0], [cost] * 3 + [-1, 0.5],
+        lb=[0, 0, 0, -INF, 1], ub=[INF] * 4 + [1],
+    )  # fmt: skip
+    pulls = [-cost] * 3 + [0, -0.5]
+
+    def judged_at(x, tol):
+        return judge_decided(qp, at([0, 0, 0, x, 1], z_box=pulls), tol)
+
+    assert judged_at(1, TOL) is Verdict.VERIFIED
+    assert judged_at(1 - 1e-9, TOL) is Verdict.VERIFIED
+    for tol in (TOL, 1e-4):
+        assert judged_at(0, tol) is Verdict.WRONG  # ½ for 0
+        assert judged_at(1 - 2 * np.sqrt(100 * tol), tol) is not Verdict.VERIFIED
+
+
+def test_a_tiny_cost_beside_others_is_no_unit_of_a_solution_that_vanishes():
+    """min ½‖x‖² + x₁ + x₂ + 1e-9·x₃, x ≥ 0: x* = 0."""
+    qp = qp_of([1] * 3, [1, 1, 1e-9], lb=0)
+    pulls = [-1, -1, -1e-9]
+
+    assert judge_decided(qp, at([1e-11] * 3, z_box=pulls)) is Verdict.VERIFIED
+    assert judge_decided(qp, at([1e-2] * 3, z_box=pulls)) is Verdict.WRONG
+
+
 @pytest.mark.parametrize(
     ("n", "with_row"), [(1, False), (3, False), (403, False), (1, True), (3, True)]
 )
@@ -780,6 +908,4 @@ def test_a_point_at_rounding_of_zero_is_right_where_all_data_are_of_order_one(
     for point, expected in (
         (s, Verdict.VERIFIED), (replace(s, x=s.x + 1e-2), Verdict.WRONG),
     ):  # fmt: skip
-        residuals = kkt_residuals(qp, point)
-        error = decided(qp, point, residuals, TOL, proves(reference_solution))
-        assert verdict(Status.SOLVED, residuals, TOL, error=error) is expected
+        assert judge_decided(qp, point) is expected
