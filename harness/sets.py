@@ -174,5 +174,14 @@ class Box:
                 yield bound[is_finite], np.maximum(sign * z, 0)[is_finite], sign
 
 
+def hull(sets: Sequence[ConvexSet], n: int) -> tuple[Vector, Vector]:
+    """Return the smallest box (n,), (n,) that contains the product of sets."""
+    lower, upper = sets[0].hull(n)
+    for one in sets[1:]:
+        low, high = one.hull(n)
+        lower, upper = np.maximum(lower, low), np.minimum(upper, high)
+    return lower, upper
+
+
 def _taken(mask: NDArray[np.bool_], v: Vector) -> Vector:
     return v[mask]

@@ -21,6 +21,7 @@ units of rows and variables.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
@@ -30,6 +31,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, hstack, vstack
 
 from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.sets import Box, hull
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.rational import (
     nonnegative_solution,
@@ -72,7 +74,9 @@ def infeasibility_margin(qp: QP, s: Solution) -> float | None:
     """Return the margin of a proof that `qp` has no feasible point; None without one.
 
     The multipliers of `s`, which claims infeasibility, are tried first. Where these
-    prove nothing, others are searched for, once for each QP.
+    prove nothing, others are searched for, once for each QP. Sets other than bounds are
+    replaced by the smallest box around them: without a point in it there is none in
+    them.
 
     Returns
     -------
@@ -87,12 +91,13 @@ def infeasibility_margin(qp: QP, s: Solution) -> float | None:
         return None
     M.eliminate_zeros()
     row, column = _equilibrated(M)
+    boxed = replace(qp, sets=(Box(*hull(qp.sets, qp.q.size)),))
     margin = None
     if np.isfinite(told).all() and told.any():
-        margin = _margin_near(qp, M, column, told)
+        margin = _margin_near(boxed, M, column, told)
     if margin is None:
         if qp not in _MARGINS:
-            _MARGINS[qp] = _searched(qp, M, row, column)
+            _MARGINS[qp] = _searched(boxed, M, row, column)
         margin = _MARGINS[qp]
     return margin
 

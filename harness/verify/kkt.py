@@ -10,9 +10,8 @@ these cases `harness.verify.optimum` compares with a proven optimum.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +20,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
+from mortarbench.harness.sets import Limits, Sum, hull
 from mortarbench.harness.solution import Solution, Status
 
 #: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow
@@ -80,12 +80,18 @@ class Scales(NamedTuple):
 
 
 class _Constraints(NamedTuple):
-    """Rows of A or of G, or the finite lower or upper bounds, at a point."""
+    """Slacks of all constraints at a point: b − Ax, h − Gx, and of the sets."""
 
-    slack: Vector  #: b − Ax, h − Gx, x − lb or ub − x
-    rhs: Vector  #: |b|, |h|, |lb| or |ub|
-    terms: Vector  #: Σ|aᵢⱼ||xⱼ|
-    sized: Callable[[Vector], Vector]  #: X (n,) ↦ Σ|aᵢⱼ|Xⱼ
+    equalities: Limits
+    inequalities: Limits
+    sets: list[Sequence[Limits]]  #: of each set of the QP
+
+    def all(self) -> Iterator[Limits]:
+        """Yield equality rows, inequality rows, then the limits of the sets."""
+        yield self.equalities
+        yield self.inequalities
+        for limits in self.sets:
+            yield from limits
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +99,7 @@ class _Terms:
     """Products of the QP with a point, and sums of the absolute terms in them."""
 
     x: Vector  #: |x|
-    constraints: dict[str, _Constraints]  #: by the name of the QP's field
+    constraints: _Constraints
     Px: Vector
     Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
     curvature: Vector  #: Pᵢᵢ, zero for an operator without diagonal
@@ -142,21 +148,20 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
 
 
 def _terms(qp: QP, s: Solution) -> _Terms:
-    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    x, z_lb, z_ub = np.abs(s.x), np.maximum(-s.z_box, 0), np.maximum(s.z_box, 0)
+    x = np.abs(s.x)
     d, has_diagonal = _curvature(qp)
     root, A_size, G_size = np.sqrt(d), _abs(qp.A), _abs(qp.G)
     Px = qp.P @ s.x
     # |Pᵢⱼ| ≤ √(PᵢᵢPⱼⱼ), as P is positive semidefinite
     Px_size = root * (root @ x) if has_diagonal else 0 * x + _sup(Px)
     rows = _combined(qp.A, s.y) + _combined(qp.G, np.maximum(s.z, 0))
-    borne = np.where(upper, z_ub, 0) - np.where(lower, z_lb, 0)
+    supports = [one.support(s.z_box) for one in qp.sets]
     work = qp.b @ s.y + qp.h @ s.z
-    work += qp.ub[upper] @ z_ub[upper] - qp.lb[lower] @ z_lb[lower]
+    for support in supports:
+        work += support.value
     sizes = (
         x @ np.abs(Px), np.abs(qp.q) @ x, np.abs(qp.b) @ np.abs(s.y),
-        np.abs(qp.h) @ np.abs(s.z), np.abs(qp.ub[upper]) @ z_ub[upper],
-        np.abs(qp.lb[lower]) @ z_lb[lower],
+        np.abs(qp.h) @ np.abs(s.z), *(support.terms for support in supports),
     )  # fmt: skip
     return _Terms(
         x=x, constraints=_constraints(qp, s.x, A_size, G_size),
@@ -164,10 +169,18 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         forces=rows + _combined(qp.G, np.minimum(s.z, 0)) + s.z_box,
         forces_size=_combined(A_size, np.abs(s.y)) + _combined(G_size, np.abs(s.z))
         + np.abs(s.z_box),
-        residual=Px + qp.q + rows + borne,
+        residual=Px + qp.q + rows + _admissible(qp, s.z_box),
         energies=np.array([s.x @ Px, qp.q @ s.x, work]),
         energies_size=float(np.sum(sizes)),
     )  # fmt: skip
+
+
+def _admissible(qp: QP, z: Vector) -> Vector:
+    """Return z (n,) without components that are normal to no set."""
+    borne, *others = (one.admissible(z) for one in qp.sets)
+    for other in others:
+        borne = borne + other
+    return borne
 
 
 def _combined(M: Matrix, z: Vector) -> Vector | float:
@@ -175,30 +188,17 @@ def _combined(M: Matrix, z: Vector) -> Vector | float:
     return M.T @ z if M.shape[0] else 0.0
 
 
-def _constraints(
-    qp: QP, x: Vector, A_size: Matrix, G_size: Matrix
-) -> dict[str, _Constraints]:
-    """Evaluate the constraints at x (n,), by kind; absent kinds are left out.
+def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constraints:
+    """Evaluate the constraints at x (n,).
 
     A_size, G_size : |A| and |G|
     """
-    size, constraints = np.abs(x), dict[str, _Constraints]()
-    for name, M, rhs, sizes in (
-        ("A", qp.A, qp.b, A_size), ("G", qp.G, qp.h, G_size),
-    ):  # fmt: skip
-        if M.shape[0]:
-            constraints[name] = _Constraints(
-                rhs - M @ x, np.abs(rhs), sizes @ size, sizes.__matmul__
-            )
-    for name, bound, sign in (("lb", qp.lb, 1), ("ub", qp.ub, -1)):
-        is_finite = np.isfinite(bound)
-        if is_finite.any():
-            at = bound[is_finite]
-            constraints[name] = _Constraints(
-                sign * (x[is_finite] - at), np.abs(at), size[is_finite],
-                partial(_where, is_finite),
-            )  # fmt: skip
-    return constraints
+    size = np.abs(x)
+    equalities, inequalities = (
+        Limits(rhs - M @ x, np.abs(rhs), sizes @ size, sizes.__matmul__)
+        for M, rhs, sizes in ((qp.A, qp.b, A_size), (qp.G, qp.h, G_size))
+    )
+    return _Constraints(equalities, inequalities, [one.limits(x) for one in qp.sets])
 
 
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
@@ -210,17 +210,17 @@ def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
 
 
-def _violation(constraints: dict[str, _Constraints], X: Vector, own: Vector) -> float:
+def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
+    equalities, *others = constraints.all()
+    outside = [(c, np.minimum(c.slack, 0)) for c in others]
     return _largest(
         0.0,
         *(
-            _violated(
-                c.slack if name == "A" else np.minimum(c.slack, 0),
-                c.rhs, c.terms, c.sized(X), c.sized(own),
-            )
-            for name, c in constraints.items()
+            _violated(error, c.size, c.terms, c.sized(X), c.sized(own))
+            for c, error in ((equalities, equalities.slack), *outside)
+            if c.size.size
         ),
-    )  # fmt: skip
+    )
 
 
 def _violated(
@@ -260,18 +260,17 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     # an operator without diagonal: x gives one curvature of it, unless x is zero
     step = _over(r, t.curvature if t.has_diagonal else _rayleigh(s.x, t.Px))
     step = np.where(is_idle, np.maximum(t.x, X), step)
-    room = np.where(t.residual > 0, s.x - qp.lb, qp.ub - s.x)  # downhill
+    lower, upper = hull(qp.sets, qp.q.size)
+    room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # downhill
     step = np.minimum(np.maximum(t.x, step), np.maximum(room, 0))
     gain = np.where(own_r > 0, own_r * step, 0.0)
-    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
     signed = (s.z >= 0).all()  # False where z holds NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
         _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
         pulling,
-        _ratio(np.minimum(s.z_box, 0)[~lower], S),
-        _ratio(np.maximum(s.z_box, 0)[~upper], S),
+        _ratio(s.z_box - _admissible(qp, s.z_box), S),
     )
 
 
@@ -282,26 +281,14 @@ def _rayleigh(x: Vector, Px: Vector) -> Vector:
 
 
 def _complementarity(
-    qp: QP,
-    s: Solution,
-    constraints: dict[str, _Constraints],
-    E: float,
-    most_rounding: float,
+    qp: QP, s: Solution, constraints: _Constraints, E: float, most_rounding: float
 ) -> float:
-    worst = [0.0]
-    for name, c in constraints.items():
-        match name:
-            case "A":
-                continue
-            case "G":
-                z = s.z
-            case "lb":
-                z = np.maximum(-s.z_box, 0)[np.isfinite(qp.lb)]
-            case _:
-                z = np.maximum(s.z_box, 0)[np.isfinite(qp.ub)]
-        size = np.abs(z) * (c.terms + c.rhs)
-        worst.append(_excess(z * c.slack, size, E, most_rounding))
-    return _largest(*worst)
+    c = constraints.inequalities
+    gaps = [Sum(s.z * c.slack, np.abs(s.z) * (c.terms + c.size))]
+    for one, limits in zip(qp.sets, constraints.sets, strict=True):
+        gaps += one.support_gaps(s.x, s.z_box, limits)
+    worst = (_excess(gap.value, gap.terms, E, most_rounding) for gap in gaps)
+    return _largest(0.0, *worst)
 
 
 def energy_at(qp: QP, s: Solution, *, generous: bool = False) -> float:
@@ -329,10 +316,11 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     else:
         E = min(terms, max(MAX_CANCELLATION * value, terms / MAX_CANCELLATION))
         share, pick = LEAST_ENERGY, _least
-    longest = max(_sup(qp.b), _sup(qp.h), _finite_sup(qp.lb), _finite_sup(qp.ub))
+    bounds = hull(qp.sets, qp.q.size)
+    longest = max(_sup(qp.b), _sup(qp.h), *map(_finite_sup, bounds))
     by_length = _sup(qp.q) <= LOAD_ROUNDING * _sup(t.curvature) * longest
     energies = _natural_energies(
-        qp, t.curvature, (qp.lb, qp.ub), by_length=by_length or not qp.q.any()
+        qp, t.curvature, bounds, by_length=by_length or not qp.q.any()
     )
     natural = pick(energies)
     if E < share * natural:  # rare; tightening bounds is expensive
@@ -387,7 +375,7 @@ def _natural_energies(
 def _lengths(qp: QP) -> Vector:
     """Return the least nonzero |bᵢ/aᵢⱼ| or |bound| of each variable, or inf."""
     least = np.full(qp.q.size, np.inf)
-    for bound in (qp.lb, qp.ub):
+    for bound in hull(qp.sets, qp.q.size):
         has_length = np.isfinite(bound) & (bound != 0)
         least[has_length] = np.minimum(least[has_length], np.abs(bound[has_length]))
     for i, j, a, rhs in _entries(qp):
@@ -398,11 +386,12 @@ def _lengths(qp: QP) -> Vector:
 
 def tightened(qp: QP) -> tuple[Vector, Vector]:
     """Return lower and upper bounds (n,) each, tightened by single rows."""
-    lb, ub = qp.lb.copy(), qp.ub.copy()
+    lower, upper = hull(qp.sets, qp.q.size)
+    lb, ub = lower.copy(), upper.copy()
     for k, (i, j, a, rhs) in enumerate(_entries(qp)):
         for sign in (1, -1) if k == 0 else (1,):  # aᵢx = bᵢ is also −aᵢx ≤ −bᵢ
             c = sign * a
-            least = np.where(c > 0, c * qp.lb[j], c * qp.ub[j])
+            least = np.where(c > 0, c * lower[j], c * upper[j])
             endless = np.isinf(least)
             total = np.bincount(i, np.where(endless, 0, least), rhs.size)
             count = np.bincount(i, endless, rhs.size)
@@ -556,10 +545,6 @@ def _sup(v: Vector) -> float:
 
 def _finite_sup(v: Vector) -> float:
     return _sup(v[np.isfinite(v)])
-
-
-def _where(mask: NDArray[np.bool_], v: Vector) -> Vector:
-    return v[mask]
 
 
 def _abs(M: Matrix) -> Matrix:

@@ -14,7 +14,7 @@ from pathlib import Path
 from time import perf_counter
 from traceback import walk_tb
 from types import FunctionType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.sparse import issparse
@@ -23,11 +23,12 @@ from mortarbench.harness.errors import shortened, shown
 from mortarbench.harness.limits import too_large
 from mortarbench.harness.operators import SerialisableOperator, assembled
 from mortarbench.harness.plugin import Solver
-from mortarbench.harness.qp import NEEDS_MATRICES, QP, Matrix, Vector
+from mortarbench.harness.qp import NEEDS_MATRICES, QP, Vector
 from mortarbench.harness.record import Measurement
 from mortarbench.harness.sets import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
+T = TypeVar("T")
 SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
 MOST_INNER = 100
 MOST_ASSEMBLED = 3000  #: rows of an operator P that is multiplied out
@@ -82,7 +83,9 @@ def measure(
             first = sum(seconds)
             inner = _inner(first, sample_seconds)
             if inner > 1:
-                again = [_timed(ask, _anew(qp), peaks=False)[1] for _ in range(inner)]
+                again = [
+                    _timed(ask, _fresh_copy(qp), peaks=False)[1] for _ in range(inner)
+                ]
                 seconds = tuple(
                     sum(phase) / inner for phase in zip(*again, strict=True)
                 )
@@ -191,10 +194,12 @@ def _timed(
     return answer, (ready - start, end - again), (prepare_peak, solve_peak)
 
 
-def _anew(qp: QP) -> QP:
-    """Give the same QP as objects of its own; the numbers are shared."""
+def _fresh_copy(qp: QP) -> QP:
+    """Return the same QP in objects of its own; the numbers are shared."""
 
-    def other(M: Matrix) -> Matrix:
+    def other(M: Any) -> Any:
+        if isinstance(M, tuple):
+            return tuple(_with_parts(one, other) for one in M)
         if isinstance(M, np.ndarray):
             return M.view()
         if issparse(M) and hasattr(M, "indptr"):
@@ -204,8 +209,13 @@ def _anew(qp: QP) -> QP:
             )  # fmt: skip
         return M
 
-    new = copy(qp)  # not checked once more: that takes longer than a small solve
-    vars(new).update({name: other(part) for name, part in vars(qp).items()})
+    return _with_parts(qp, other)
+
+
+def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
+    """Copy a dataclass, each attribute replaced by `other` of it."""
+    new = copy(whole)  # not checked once more: that takes longer than a small solve
+    vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
 

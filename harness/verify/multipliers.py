@@ -54,9 +54,15 @@ def with_multipliers(
     Raises
     ------
     InputError
-        When the least-squares problem would have more than `MAX_ENTRIES` entries.
+        When the least-squares problem would have more than `MAX_ENTRIES` entries, or
+        `qp` has sets other than bounds.
 
     """
+    if z_box is None and (others := [type(one).__name__ for one in qp.sets[1:]]):
+        raise InputError(
+            f"z_box cannot be computed for sets of the kind {others[0]}; expected it "
+            "beside x"
+        )
     given = {"y": (y, qp.b), "z": (z, qp.h), "z_box": (z_box, qp.q)}
     unknown = {name for name, (v, like) in given.items() if v is None and like.size}
     s = Solution(

@@ -99,7 +99,7 @@ def decided(
     """Measure a point against the proven optimum; None where residuals decide.
 
     They decide where they exceed 10·tol even against the most generous scales, where
-    the QP is large, or where nothing could be proven.
+    the QP is large or has other sets than bounds, or where nothing could be proven.
 
     prove : returns the optimum, see `proves`
 
@@ -109,7 +109,7 @@ def decided(
     the optimum: for the error, 10 times the smaller of the terms of f* and 500·|f*|
 
     """
-    if not is_small(qp):
+    if len(qp.sets) > 1 or not is_small(qp):
         return None
     most = allowed(tol)
     if not qp.is_explicit:  # the rounding of its products is unknown

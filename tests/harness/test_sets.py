@@ -8,7 +8,11 @@ import pytest
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Box, InputError, Solution, Status, save_qp
+from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import reason_to_decline
+from mortarbench.harness.verify.multipliers import with_multipliers
+from mortarbench.harness.verify.optimum import decided
 from tests.support.balls import Balls
 
 N = 8
@@ -152,6 +156,112 @@ def test_a_box_beside_bounds_is_refused():
     with pytest.raises(InputError, match="expected a tuple of convex sets, beside lb"):
         QP.from_arrays(**arrays, sets=(BOX,))
     assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
+
+
+def planted(seed, radius=None):
+    """A QP with bounds, rows and balls, and its solution, strictly complementary.
+
+    Balls 0, 2, … are active, with z = c·x; 1, 3, … are not.
+    """
+    rng = np.random.default_rng(seed)
+    k, d, m = 5, int(rng.integers(1, 4)), 2
+    n = k * d + 6
+    index = rng.permutation(n)[: k * d].reshape(k, d)
+    radius = rng.exponential(size=k) + 0.1 if radius is None else radius
+    x, z = rng.standard_normal((2, n))
+    z *= 0
+    for i, (block, r) in enumerate(zip(index, radius, strict=True)):
+        direction = rng.standard_normal(d)
+        direction /= np.linalg.norm(direction)
+        x[block] = direction * r * (1 if i % 2 == 0 else rng.uniform(0, 0.9))
+        z[block] = direction * (rng.exponential() + 0.1) * (i % 2 == 0)
+    alone = np.setdiff1d(np.arange(n), index)
+    lb, ub = np.full(n, -INF), np.full(n, INF)
+    lb[alone[:2]], z[alone[:2]] = x[alone[:2]], -1.0
+    M = rng.standard_normal((n, n))
+    P, A, G = M @ M.T / n + 0.1 * np.eye(n), *rng.standard_normal((2, m, n))
+    y, mu = rng.standard_normal(m), np.array([0.7, 0.0])
+    q = -(P @ x + A.T @ y + G.T @ mu + z)
+    qp = QP(
+        P=P, q=q, A=A, b=A @ x, G=G, h=G @ x + [0, 1], lb=lb, ub=ub,
+        sets=(Balls(index, radius),),
+    )  # fmt: skip
+    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=mu, z_box=z)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_planted_solution_has_no_residual_and_others_have(seed):
+    qp, s = planted(seed)
+    index, radius = qp.sets[1].index, qp.sets[1].radius
+
+    assert kkt_residuals(qp, s).worst <= 1e-14
+    first = index[0]
+    wrong_sign = s.z_box.copy()
+    wrong_sign[first] *= -1
+    assert kkt_residuals(qp, replace(s, z_box=wrong_sign)).worst > 1e-2
+    inside = s.z_box.copy()
+    inside[index[1]] = 0.3 * np.linalg.norm(s.z_box[first])
+    q = qp.q - inside + s.z_box  # so that it is stationary
+    r = kkt_residuals(replace(qp, q=q), replace(s, z_box=inside))
+    assert r.complementarity > 1e-5
+    assert r.dual <= 1e-14
+    outside = s.x.copy()
+    outside[first] *= 1.01
+    assert kkt_residuals(qp, replace(s, x=outside)).primal > 1e-5
+    assert radius[0] == pytest.approx(np.linalg.norm(s.x[first]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("factor", [1e-6, 1e6])
+def test_units_change_no_residual_of_sets(seed, factor):
+    qp, s = planted(seed)
+    near = replace(s, x=s.x * (1 + 1e-3), z_box=s.z_box * (1 - 1e-3))
+    balls = qp.sets[1]
+    other = QP(
+        P=qp.P / factor**2, q=qp.q / factor, A=qp.A, b=qp.b * factor, G=qp.G,
+        h=qp.h * factor, lb=qp.lb * factor, ub=qp.ub * factor,
+        sets=(Balls(balls.index, balls.radius * factor),),
+    )  # fmt: skip
+    there = replace(
+        near, x=near.x * factor, y=s.y / factor, z=s.z / factor,
+        z_box=near.z_box / factor,
+    )  # fmt: skip
+
+    before, after = kkt_residuals(qp, near), kkt_residuals(other, there)
+    assert after == pytest.approx(before, rel=1e-6)
+
+
+def test_any_vector_is_normal_to_a_point():
+    qp, s = planted(3, radius=np.zeros(5))
+    z = s.z_box.copy()
+    z[qp.sets[1].index] = RNG.standard_normal(qp.sets[1].index.shape)
+    moved = replace(qp, q=qp.q + s.z_box - z)
+
+    assert kkt_residuals(moved, replace(s, z_box=z)).worst <= 1e-14
+
+
+def test_other_sets_are_left_to_the_residuals():
+    """No reference is asked: it knows bounds alone."""
+    qp, s = planted(0)
+    residuals = kkt_residuals(qp, s)
+
+    assert decided(qp, s, residuals, 1e-8, lambda _: pytest.fail("asked")) is None
+    with pytest.raises(InputError, match="expected it beside x"):
+        with_multipliers(qp, s.x)
+
+
+def test_a_ball_without_a_point_beyond_a_row_is_infeasible():
+    """x₁ + x₂ ≥ 3 over ‖x‖ ≤ 1; with √2 at most, even its box proves that."""
+    balls = Balls(np.array([[0, 1]]), np.ones(1))
+    qp = QP(
+        P=np.eye(2), q=np.zeros(2), A=np.zeros((0, 2)), b=np.zeros(0),
+        G=-np.ones((1, 2)), h=np.array([-3.0]), sets=(balls,),
+    )  # fmt: skip
+    claim = Solution.without_point(qp, Status.INFEASIBLE)
+
+    assert infeasibility_margin(qp, claim) > 0.1
+    feasible = replace(qp, h=np.array([-1.4]))
+    assert infeasibility_margin(feasible, claim) is None
 
 
 @dataclass(frozen=True)
