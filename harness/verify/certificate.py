@@ -308,6 +308,9 @@ def proven(
     ))  # fmt: skip
     held, _ = held_and_loose(G, relative(exact.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
+    theta = at_u.theta
+    if u_u < d_d:  # û is nearer to zero, for which θ = 0, than to what loads deform
+        theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
     apart, left = _root(d_d), near.left + length(split, noise)
     total, nearest = apart + left, max(apart - left, 0.0)
     square = total * total + 2 * work
@@ -316,7 +319,7 @@ def proven(
     unbalanced = np.abs(held.T @ near.unbalanced[:p])
     scattered = np.abs(held.T) @ split.scattered(noise)[:p]
     pull = (unbalanced + scattered).astype(np.float64)
-    rounding = _charge(reach, known, pull, at_u.theta, square)
+    rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
             "the answer is too far off: along rigid motions that large, rounding of "
@@ -327,10 +330,8 @@ def proven(
     pair = _root(2 * gap)
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
     further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
-    in_K = known.stored(
-        from_middle + around, reach.within(2 * gap) + further, at_u.theta
-    )
-    stretch = _root(1 + at_u.theta)
+    in_K = known.stored(from_middle + around, reach.within(2 * gap) + further, theta)
+    stretch = _root(1 + theta)
     norms = _root(u_u), _root(u_u - 2 * u_d + d_d), _root(u_u - u_d + 0.25 * d_d)
     least = max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)
     found = Certificate(

@@ -449,6 +449,9 @@ class _OnRanks:
         found[self._own.held] = 0
         return np.asarray(found)
 
+    def averaged(self, v: Extended) -> Extended:
+        return self.joined(self._sharing.part * self._sharing.matched(v))
+
     def product(self, v: Extended) -> Extended:
         return self._own.parts.product(v)
 

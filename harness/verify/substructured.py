@@ -84,6 +84,9 @@ class Split(Protocol):
     def joined(self, b: Extended) -> Extended:
         """Return Tᵀb (n,)."""
 
+    def averaged(self, v: Extended) -> Extended:
+        """Average copies v (N,) of components (n,), subdomains moved to agree most."""
+
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
 
@@ -254,6 +257,10 @@ class Undivided(_Stored):
         """Return b where no support holds."""
         return self.free(b.copy())
 
+    def averaged(self, v: Extended) -> Extended:
+        """Return v where no support holds."""
+        return self.free(v.copy())
+
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
         K = csc_array(self.mechanics.primal.P)
@@ -309,6 +316,10 @@ class Torn(_Stored):
         """Return Tᵀb where no support holds."""
         T = self._rows  # by rows, its transpose by columns
         return self.free(times_columns(T.data, T.indices, T.indptr, b, T.shape[1]))
+
+    def averaged(self, v: Extended) -> Extended:
+        """Average copies in subdomains that are moved rigidly to agree most."""
+        return self.joined(self.sharing.part * self.sharing.matched(v))
 
     def product(self, v: Extended) -> Extended:
         """Apply K_T, exactly zero along the motions of subdomains."""
@@ -400,7 +411,8 @@ class Sharing:
         squares.data = squares.data**2
         self._squares = squares
         total = among.completed(squares.T @ parts.weight)
-        self._part = parts.weight / (squares @ total)
+        #: (N,) shares D of copies in their components, which add up to one: TᵀDT = 1
+        self.part = parts.weight / (squares @ total)
         jointly = among.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
         jointly[held] = True
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
@@ -432,12 +444,24 @@ class Sharing:
     def __call__(self, rho: Vector) -> Vector:
         """Return b (N,) with Tᵀb = ρ (n,) on the components that nothing holds."""
         parts, among = self._parts, self._among
-        b = self._part * (parts.spread @ rho)
+        b = self.part * (parts.spread @ rho)
         for _ in range(2):  # the second time for the digits that the first one lost
             mu = among.own(self._coarse(among.gathered(parts.kernel.T @ b)))
             jumps = self._inverse * among.completed(self._TWR @ mu, self._at)
             b[self._rows] -= self._WR @ mu - self._w * (self._T @ jumps)
         return np.asarray(b)
+
+    def matched(self, v: Extended) -> Extended:
+        """Move subdomains rigidly until the copies v (N,) differ least, as Z weighs.
+
+        α with RᵀZ(v − Rα) = 0, as forces are balanced; copies that a support holds
+        differ from zero.
+        """
+        x, among = v[self._rows].astype(np.float64), self._among
+        pulls = among.completed(self._T.T @ (self._w * x), self._at)
+        apart = x - self._T @ (self._inverse * pulls)
+        alpha = among.own(self._coarse(among.gathered(self._WR.T @ apart)))
+        return np.asarray(v - self._parts.kernel @ alpha)
 
 
 def scaled_rows(M: csr_array, scale: Vector) -> csr_array:

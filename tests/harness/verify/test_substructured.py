@@ -21,7 +21,7 @@ from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import Torn, neighbour
+from mortarbench.harness.verify.substructured import Torn, neighbour, still
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.feti.elastic import subdivide, torn
@@ -243,6 +243,19 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     )
     assert np.abs(parts.kernel.T @ b).max() < 1e-11 * size
     assert near.left**2 < 1e-18 * (near.d @ b)
+
+
+@pytest.mark.parametrize("name", [CASES[0], "contact-patch/ratio=0.1"])
+def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
+    mechanics, rng = known(name).mechanics, np.random.default_rng(8)
+    split, parts = Torn(mechanics), known(name).mechanics.substructures
+    u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
+    u[mechanics.exact.held] = 0
+    apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
+    together = split.averaged(split.spread(u) + 100 * apart)
+    left = still(split, together - u)  # contact alone holds a body of the patch
+
+    assert np.abs(left).max() < 1e-9
 
 
 def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
