@@ -344,7 +344,7 @@ class Mechanics:
         felt = turned[:, :p]
         KR = np.zeros(felt.shape, dtype=Real)
         if p:
-            KR = _cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
+            KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
             KR[exact.held] = 0
         return RigidMotions(
             felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
@@ -386,7 +386,7 @@ def _largest(R: Any) -> Any:
     return found
 
 
-def _cancelling(K: csr_array, R: Extended) -> Extended:
+def cancelling(K: csr_array, R: Extended) -> Extended:
     """Return KR (n, r) to twice the digits of doubles, though its terms cancel.
 
     The leading parts of both have so few bits that their products add up exactly.

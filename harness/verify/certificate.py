@@ -48,7 +48,7 @@ by what contact allows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -179,26 +179,36 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
     split = Undivided(mechanics) if mechanics.tear is None else Torn(mechanics)
-    best = sharpest(_certificates(split, s))
+    best = sharpest(_certificates(split, s), lambda: _at_rest(split, s))
     if best.least >= best.error or mechanics.tear is not None:
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
 
 
-def sharpest(tried: Iterator[Certificate | str]) -> Certificate:
+def sharpest(
+    tried: Iterator[Certificate | str], at_rest: Callable[[], Certificate | str]
+) -> Certificate:
     """Return the certificate with the smallest bound.
+
+    Parameters
+    ----------
+    tried : certificates by pairs near the answer, or reasons why there is none
+    at_rest : evaluates the pair near zero, where no other one proves anything
 
     Raises
     ------
     UncertifiableError
-        When there is none, with the first reason.
+        When none of these pairs proves anything, with the first reason.
 
     """
     proven = list(tried)
     found = [c for c in proven if isinstance(c, Certificate)]
-    if not found:
-        raise UncertifiableError(f"no admissible pair near the answer: {proven[0]}")
-    return min(found, key=lambda c: c.error)
+    if found:
+        return min(found, key=lambda c: c.error)
+    last = at_rest()
+    if isinstance(last, Certificate):
+        return last
+    raise UncertifiableError(f"no admissible pair near the answer: {proven[0]}")
 
 
 def _least_norm(split: Undivided | Torn) -> float:
@@ -234,6 +244,13 @@ def _certificates(split: Undivided | Torn, s: Solution) -> Iterator[Certificate 
     if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
         yield _proved(split, s.x, v, mu, states == CLOSED)
+
+
+def _at_rest(split: Undivided | Torn, s: Solution) -> Certificate | str:
+    """Evaluate the proof for the pair near u = 0, λ = 0."""
+    exact = split.mechanics.exact
+    u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
+    return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
 
 
 def _proved(split: Undivided | Torn, *pair: Any) -> Certificate | str:
@@ -308,9 +325,10 @@ def proven(
     ))  # fmt: skip
     held, _ = held_and_loose(G, relative(exact.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
-    theta = at_u.theta
-    if u_u < d_d:  # û is nearer to zero, for which θ = 0, than to what loads deform
+    theta, off = at_u.theta, None
+    if u_u < 4 * d_d:  # û may be zero, for which θ = 0, and far from the answer
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
+        off = split.excess(drift)
     apart, left = _root(d_d), near.left + length(split, noise)
     total, nearest = apart + left, max(apart - left, 0.0)
     square = total * total + 2 * work
@@ -330,7 +348,12 @@ def proven(
     pair = _root(2 * gap)
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
     further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
-    in_K = known.stored(from_middle + around, reach.within(2 * gap) + further, theta)
+    gamma = reach.within(2 * gap) + further
+    in_K = known.stored(from_middle + around, gamma, theta)
+    if off is not None:  # K_T does not feel bodies that move with their supports
+        turned = np.abs(held.T @ split.along(off[0])[:p]).astype(np.float64)
+        excess = off[1] + 2 * (pair * length(split, off[0]) + gamma @ turned)
+        in_K = float(np.hypot(in_K, np.sqrt(excess)))
     stretch = _root(1 + theta)
     norms = _root(u_u), _root(u_u - 2 * u_d + d_d), _root(u_u - u_d + 0.25 * d_d)
     least = max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)

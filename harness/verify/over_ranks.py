@@ -202,6 +202,7 @@ class AmongRanks:
         return csr_array(whole - S_all.T @ scaled_rows(S_all, np.max(weights, axis=0)))
 
 
+@np.errstate(all="ignore")  # as `harness.verify.certificate.certify`
 def certify_over_ranks(
     own: OwnBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
@@ -236,25 +237,33 @@ def certify_over_ranks(
     raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
     states = suggested(exact, trace, raw)
     tidied = at_bounds(exact, states, raw), states == CLOSED
+    none = np.zeros(raw.size, dtype=bool)
+
+    def proved(
+        u: Extended, trace: Extended, lam: Extended, closed: NDArray[np.bool_]
+    ) -> Certificate | str:
+        try:
+            mended, feasible, forces = _mended(
+                own, exact, rigid, (at, softness, trace), u, lam, closed
+            )
+            return proven(
+                split, exact, rigid.balance.G, claimed=claimed, u=feasible,
+                at_rows=mended, multipliers=forces,
+            )  # fmt: skip
+        except UncertifiableError as e:
+            return str(e)
 
     def certificates() -> Iterator[Certificate | str]:
-        for lam, closed in (tidied, (raw, np.zeros(raw.size, dtype=bool))):
-            found: Certificate | str
-            try:
-                mended, feasible, forces = _mended(
-                    own, exact, rigid, (at, softness, trace), u, lam, closed
-                )
-                found = proven(
-                    split, exact, rigid.balance.G, claimed=claimed, u=feasible,
-                    at_rows=mended, multipliers=forces,
-                )  # fmt: skip
-            except UncertifiableError as e:
-                found = str(e)
+        for lam, closed in (tidied, (raw, none)):
+            found = proved(u, trace, lam, closed)
             yield found
             if is_sharp(found):
                 return
 
-    return sharpest(certificates())
+    def at_rest() -> Certificate | str:
+        return proved(0 * u, 0 * trace, 0 * raw, none)
+
+    return sharpest(certificates(), at_rest)
 
 
 def _mended(
@@ -470,6 +479,13 @@ class _OnRanks:
         found = sample(variances, u, self._own.components, np.float64)
         found[self._own.held] = 0
         return found
+
+    def excess(self, w: Extended) -> tuple[Extended, float]:
+        variances = self._sharing.variances(self.spread(w))
+        off = sample(variances, w, self._own.components, np.float64)
+        square = self._own.among.along(csr_array(w[:, None] ** 2), off**2)[0]
+        off[self._own.held] = 0
+        return off, float(np.sqrt(square))
 
     def rounding(self, held: NDArray[np.float64]) -> Rounding:
         h, p = held.shape[1], held.shape[0]

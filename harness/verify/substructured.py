@@ -30,6 +30,7 @@ supports that a solver may have found are not looked at.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
@@ -40,7 +41,13 @@ from scipy.linalg import qr
 from scipy.sparse import csc_array, csc_matrix, csr_array, hstack
 from scipy.sparse.linalg import splu
 
-from mortarbench.harness.mechanics import Extended, Mechanics, Real, Substructures
+from mortarbench.harness.mechanics import (
+    Extended,
+    Mechanics,
+    Real,
+    Substructures,
+    cancelling,
+)
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.verify.products import times_columns, times_rows
 
@@ -98,6 +105,9 @@ class Split(Protocol):
 
     def rounding(self, held: NDArray[np.float64]) -> Rounding:
         """Return what E does along the motions `held` (p, h), felt by contact."""
+
+    def excess(self, w: Extended) -> tuple[Extended, float]:
+        """Return Ew (n,) and |wᵀEw| for w, not zero at supports, without motion R."""
 
     def scattered(self, v: Extended) -> Extended:
         """Return √((R∘R)ᵀ(v∘v)) (r,): Rᵀv for v (n,) with random signs."""
@@ -196,13 +206,22 @@ def sample(
     return np.asarray(sign * (np.finfo(real).eps * sizes))
 
 
-class _Stored:
+class _Stored(ABC):
     """Bodies in one process: the stored K, and R."""
 
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
         motions = mechanics.motions
         self.R = csr_array(hstack([motions.felt, motions.free]))
+
+    @abstractmethod
+    def spread(self, u: Extended) -> Extended: ...
+
+    @abstractmethod
+    def joined(self, b: Extended) -> Extended: ...
+
+    @abstractmethod
+    def product(self, v: Extended) -> Extended: ...
 
     def along(self, v: Extended) -> Extended:
         return np.asarray(self.R.T @ v) if self.R.shape[1] else v[:0]
@@ -232,6 +251,15 @@ class _Stored:
         at = np.unique(self.mechanics.rows.indices)
         found[at] = self.mechanics.exact.B[:, at].T @ multipliers
         return self.free(found)
+
+    def excess(self, w: Extended) -> tuple[Extended, float]:
+        """Return Kw − TᵀK_T Tw on free components, and the difference of energies.
+
+        Bodies that w moves far with their supports leave Kw as sums that cancel.
+        """
+        K, v = csr_array(self.mechanics.primal.P), self.spread(w)
+        Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
+        return self.free(Kw - self.joined(Kv)), abs(float(w @ Kw - v @ Kv))
 
     def total(self, *numbers: float) -> list[float]:
         return list(numbers)

@@ -136,9 +136,13 @@ class ExactSolution:
         return Solution(status=Status.SOLVED, x=u, y=none, z=z, z_box=0 * u)
 
     def exceeded(self, found: Certificate, s: Solution, u: Any) -> tuple[float, float]:
-        """Return the relative error of û (n,) and the answer, and over the bound."""
-        error = max(self.error(s.x), self.error(u)) / self.norm
-        return error, error / found.bound if error else 0.0
+        """Return the relative error of û (n,) and the answer, and over the bound.
+
+        The bound may be infinite where that of the absolute error is not.
+        """
+        error = max(self.error(s.x), self.error(u))
+        within = min(found.error, found.bound * self.norm)
+        return error / self.norm, error / within if error else 0.0
 
 
 def exact_solution(mechanics: Mechanics) -> ExactSolution:
