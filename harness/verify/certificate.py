@@ -168,7 +168,9 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     as with an interior point, whose multipliers and gaps are all positive, a pair with
     the complementarity that the answer suggests proves more, and if contact alone holds
     a body, the solution for the rows that it suggests are closed: only where the answer
-    has been proved near, or that would speak of another one. The best one counts.
+    has been proved near, or that would speak of another one. The best one counts. If
+    none of them proves anything, as for answers that are very far off, the pair near
+    zero is left, which does not depend on the answer.
 
     Raises
     ------

@@ -208,6 +208,8 @@ def certify_over_ranks(
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which get the same bound.
 
+    Pairs are those of `harness.verify.certificate.certify`, without exchanged rows.
+
     Parameters
     ----------
     claimed : (n,) displacement of own components, the same of copies on several ranks
