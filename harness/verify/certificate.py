@@ -26,8 +26,8 @@ says that  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²,  hence
 
 where no more than √(2g) is left of the right-hand side if u is û or u_λ.
 
-Errors are relative to ‖u*‖, of which the pair gives a lower bound, ‖û‖ − √(2g) or a
-like one. That differs from ‖û‖ only for answers that are as far off as they are large.
+Errors are relative to ‖u*‖, of which (3) gives a lower bound, ‖M‖ less the root. That
+differs from ‖û‖ only for answers that are as far off as they are large.
 
 Where contact alone holds a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
 its rigid motions R, or D(λ̂) = −∞; ‖·‖ is a seminorm then, that of v − RRᵀv, and of the
@@ -347,20 +347,19 @@ def proven(
         )
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
-    pair = _root(2 * gap)
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
     further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
     if off is not None:  # K_T does not feel bodies that move with their supports
         turned = np.abs(held.T @ split.along(off[0])[:p]).astype(np.float64)
-        excess = off[1] + 2 * (pair * length(split, off[0]) + gamma @ turned)
-        in_K = float(np.hypot(in_K, np.sqrt(excess)))
+        pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
+        in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
-    norms = _root(u_u), _root(u_u - 2 * u_d + d_d), _root(u_u - u_d + 0.25 * d_d)
-    least = max(norms[0] - pair, norms[1] - left - pair, norms[2] - around)
+    # ‖M‖ − around: never below ‖û‖ − √(2g) or ‖u_λ‖ − √(2g), but for what was left
+    least = _root(u_u - u_d + 0.25 * d_d) - around
     found = Certificate(
-        u=u, multipliers=lam, off=near.d, norm=norms[0], distance=total, work=work,
+        u=u, multipliers=lam, off=near.d, norm=_root(u_u), distance=total, work=work,
         sliding=float(works[~exact.contact].sum()), rounding=rounding, claimed=in_K,
         stretch=stretch, least=least / stretch, moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,

@@ -239,6 +239,7 @@ def test_answers_beyond_all_numbers_have_no_certificate_or_an_honest_one(name, s
         except UncertifiableError:
             continue
         assert found.bound >= 1
+        assert np.isfinite(found.error)
 
 
 @pytest.mark.parametrize("name", CASES)

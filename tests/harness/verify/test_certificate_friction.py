@@ -23,6 +23,7 @@ from mortarbench.harness import (
 )
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
+from mortarbench.harness.verify import certificate
 from mortarbench.harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
@@ -244,6 +245,28 @@ def test_what_solvers_return_is_bounded_in_every_form(name):
                 assert holds(problem, back, c)
                 found.append(c.bound)
     assert max(found) < 0.3
+
+
+@pytest.mark.parametrize("far", [-1.0, 1.0])
+def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypatch):
+    """On an incline, where its friction sticks; not counting errors of the pair."""
+    problem, seen = known(INCLINE), []
+    mechanics, reach = problem.mechanics, certificate._reach
+
+    def recorded(split, exact, G, held, *others):
+        seen.append((held, reach(split, exact, G, held, *others)))
+        return seen[-1][1]
+
+    monkeypatch.setattr(certificate, "_reach", recorded)
+    s = problem.solution()
+    along = np.where(np.arange(s.x.size) % 2 == 0, far * np.abs(s.x).max(), 0)
+    of_block = mechanics.kernel @ (mechanics.kernel.T @ along)
+    certify(mechanics, replace(s, x=s.x + of_block.astype(np.float64)))
+    held, allowed = seen[0]  # by the pair that has slid as far
+    off = np.abs(held.T @ (mechanics.motions.felt.T @ of_block))
+
+    assert off.max() > 0
+    assert (off <= allowed.gaps * (1 + 1e-6)).all()
 
 
 def test_work_of_friction_has_its_own_part():

@@ -452,6 +452,34 @@ def test_the_solution_is_as_large_as_its_distance_from_the_midpoint_leaves(name,
     assert found.least <= norm * ROUNDED
 
 
+def test_what_a_solve_leaves_undone_widens_the_ball_around_the_midpoint(monkeypatch):
+    """And the distance of u_λ; no body of this case moves rigidly."""
+    mechanics, u, lam, norm = known("beam-ring/Nr=2/Nh=2/step=5")
+    solved, left = certificate.neighbour, 1e-3 * norm
+    monkeypatch.setattr(
+        certificate, "neighbour", lambda *args: solved(*args)._replace(left=left)
+    )
+    s = _noise(mechanics, answer(u, lam), 1e-3, np.random.default_rng(0))
+    found = certify(mechanics, s)
+    apart, middle = mechanics.norm(found.off), found.u - found.off / 2
+    around = np.sqrt(found.gap - 0.25 * (apart - left) ** 2) + left / 2
+
+    assert found.distance == pytest.approx(apart + left, rel=1e-9)
+    assert found.claimed == pytest.approx(mechanics.norm(s.x - middle) + around)
+    assert found.least == pytest.approx(mechanics.norm(middle) - around)
+    assert found.norm == pytest.approx(mechanics.norm(found.u), rel=1e-9)
+    assert not found.seminorm
+
+
+def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
+    mechanics = named("hertz-cylinder/n=2/m=2").mechanics
+    zero = np.zeros(mechanics.exact.f.size)
+    s = answer(zero, np.zeros(mechanics.exact.c.size))
+
+    assert mechanics.kernel.shape[1] == 1
+    assert certify(mechanics, s).seminorm
+
+
 @pytest.mark.parametrize(
     ("name", "bound", "count"),
     [
