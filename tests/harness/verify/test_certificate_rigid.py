@@ -471,6 +471,38 @@ def test_what_a_solve_leaves_undone_widens_the_ball_around_the_midpoint(monkeypa
     assert not found.seminorm
 
 
+def test_what_subdomains_do_not_feel_joins_the_error_of_the_answer(monkeypatch):
+    mechanics, u, lam, norm = known("beam-ring/Nr=2/Nh=2/step=5")
+    s, force = answer(0 * u, lam), mechanics.exact.f / 10
+    least = certify(mechanics, s).claimed
+    monkeypatch.setattr(Undivided, "excess", lambda self, w: (force, 3 * norm**2))
+    found = certify(mechanics, s)
+    joined = 3 * norm**2 + 2 * found.pair * length(Undivided(mechanics), force)
+
+    assert found.claimed**2 == pytest.approx(least**2 + joined)
+
+
+def test_rounding_counts_as_far_as_the_answer_moves_rigidly(monkeypatch):
+    """Beside a pair that is where the solution is: γ = 0."""
+    mechanics = named("hertz-cylinder/n=2/m=2").mechanics
+    point = reference_point(mechanics, reference_solution)
+    R, far = mechanics.motions.felt.toarray()[:, 0], 1e3 * np.abs(point.u).max()
+    s = answer(point.u - far * R, point.multipliers)
+    monkeypatch.setattr(certificate, "_reach", lambda *args: _Reach(*np.zeros((3, 1))))
+
+    def claimed(strain):
+        known = Rounding(np.array([strain]), np.zeros((1, 1)))
+        monkeypatch.setattr(Undivided, "rounding", lambda *args: known)
+        found = certify(mechanics, s)
+        return found.claimed, abs(float(R @ (s.x - found.u)))
+
+    strain = 0.1 * point.norm / float(far)
+    (plain, moved), (strained, _) = claimed(0.0), claimed(strain)
+
+    assert moved > 0.1 * far
+    assert strained**2 == pytest.approx(plain**2 + 2 * plain * moved * strain)
+
+
 def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
     mechanics = named("hertz-cylinder/n=2/m=2").mechanics
     zero = np.zeros(mechanics.exact.f.size)
