@@ -195,22 +195,22 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
             value, doubt, s = np.longdouble(exact.value), 0.0, exact.solution
             size = min(size, _size(qp, s))
     # rounding x moves f by EPS·size, which limits the accuracy of f*
-    told = max(abs(float(value)), (doubt + EPS * size) / NEGLIGIBLE)
+    magnitude = max(abs(float(value)), (doubt + EPS * size) / NEGLIGIBLE)
     work = float(max(abs(s.x @ (qp.P @ s.x)), np.abs(qp.q) @ np.abs(s.x)))
     least = energy_at(qp, s)
     if abs(value) > ROUNDING * max(work, least) + doubt:
         # off by 100·tol of this, f has half of the error that `kkt_residuals` allows
-        known = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * told, work)
+        scale = min(generous, MAX_CANCELLATION / (2 * TERMS_FACTOR) * magnitude, work)
     elif work > NEGLIGIBLE * least:  # f* vanishes
-        known = told = work
+        scale = magnitude = work
     else:  # x* vanishes
-        known = told = generous
-    rounding = min(ROUNDING * size, NEGLIGIBLE * told)
-    if not (known > 0 and doubt <= NEGLIGIBLE * known):  # no scale where all are zero
+        scale = magnitude = generous
+    rounding = min(ROUNDING * size, NEGLIGIBLE * magnitude)
+    if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # no scale where all are zero
         return None
     return Optimum(
-        qp=qp, value=float(value), doubt=doubt + rounding, energy=TERMS_FACTOR * known,
-        x=scales_at(qp, s.x.astype(float), known).x,
+        qp=qp, value=float(value), doubt=doubt + rounding, energy=TERMS_FACTOR * scale,
+        x=scales_at(qp, s.x.astype(float), scale).x,
         own=own_sizes(qp, s.x.astype(float)),
     )  # fmt: skip
 
