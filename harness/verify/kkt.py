@@ -107,6 +107,7 @@ class _Terms:
     forces: Vector  #: Aᵀy + Gᵀz + z_box
     forces_size: Vector
     residual: Vector  #: Px + q + Aᵀy + Gᵀz⁺ + z_box, less multipliers of absent bounds
+    excess: Vector  #: z_box less its admissible part, such as on absent bounds
     energies: Vector  #: xᵀPx, qᵀx, bᵀy + hᵀz + bounds
     energies_size: float
 
@@ -155,6 +156,7 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     # |Pᵢⱼ| ≤ √(PᵢᵢPⱼⱼ), as P is positive semidefinite
     Px_size = root * (root @ x) if has_diagonal else 0 * x + _sup(Px)
     rows = _combined(qp.A, s.y) + _combined(qp.G, np.maximum(s.z, 0))
+    borne = _admissible(qp, s.z_box)
     supports = [one.support(s.z_box) for one in qp.sets]
     work = qp.b @ s.y + qp.h @ s.z
     for support in supports:
@@ -169,7 +171,7 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         forces=rows + _combined(qp.G, np.minimum(s.z, 0)) + s.z_box,
         forces_size=_combined(A_size, np.abs(s.y)) + _combined(G_size, np.abs(s.z))
         + np.abs(s.z_box),
-        residual=Px + qp.q + rows + _admissible(qp, s.z_box),
+        residual=Px + qp.q + rows + borne, excess=s.z_box - borne,
         energies=np.array([s.x @ Px, qp.q @ s.x, work]),
         energies_size=float(np.sum(sizes)),
     )  # fmt: skip
@@ -270,7 +272,7 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
         _excess(r, size, S),
         _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
         pulling,
-        _ratio(s.z_box - _admissible(qp, s.z_box), S),
+        _ratio(t.excess, S),
     )
 
 
