@@ -183,5 +183,13 @@ def hull(sets: Sequence[ConvexSet], n: int) -> tuple[Vector, Vector]:
     return lower, upper
 
 
+def admissible(sets: Sequence[ConvexSet], z: Vector) -> Vector:
+    """Return z (n,) without components that are normal to no set of a product."""
+    total, *others = (one.admissible(z) for one in sets)
+    for other in others:
+        total = total + other
+    return total
+
+
 def _taken(mask: NDArray[np.bool_], v: Vector) -> Vector:
     return v[mask]

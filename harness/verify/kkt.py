@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
-from mortarbench.harness.sets import Limits, Sum, hull
+from mortarbench.harness.sets import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
 
 #: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow
@@ -156,7 +156,7 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     # |Pᵢⱼ| ≤ √(PᵢᵢPⱼⱼ), as P is positive semidefinite
     Px_size = root * (root @ x) if has_diagonal else 0 * x + _sup(Px)
     rows = _combined(qp.A, s.y) + _combined(qp.G, np.maximum(s.z, 0))
-    borne = _admissible(qp, s.z_box)
+    borne = admissible(qp.sets, s.z_box)
     supports = [one.support(s.z_box) for one in qp.sets]
     work = qp.b @ s.y + qp.h @ s.z
     for support in supports:
@@ -175,14 +175,6 @@ def _terms(qp: QP, s: Solution) -> _Terms:
         energies=np.array([s.x @ Px, qp.q @ s.x, work]),
         energies_size=float(np.sum(sizes)),
     )  # fmt: skip
-
-
-def _admissible(qp: QP, z: Vector) -> Vector:
-    """Return z (n,) without components that are normal to no set."""
-    borne, *others = (one.admissible(z) for one in qp.sets)
-    for other in others:
-        borne = borne + other
-    return borne
 
 
 def _combined(M: Matrix, z: Vector) -> Vector | float:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, eye_array, vstack
 
 from mortarbench.harness import QP, Matrix, Solution, Vector, needs_matrices, too_large
+from mortarbench.harness.sets import admissible
 
 NEGLIGIBLE = 1e-14  #: an absolute tolerance where a solver's test adds it to a relative
 DIVERGED = 1e12  #: an ‖x‖∞ beyond which relative residuals mean nothing
@@ -123,12 +124,11 @@ def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
 
 
 def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
-    """Zero the multipliers (n,) of absent bounds, where solvers leave round-off.
+    """Zero multipliers (n,) that no bound or set bears, where solvers leave round-off.
 
     What is dropped here stays visible to the harness as a stationarity residual.
     """
-    z_box = np.where(np.isfinite(qp.lb), z_box, np.maximum(z_box, 0.0))
-    return np.where(np.isfinite(qp.ub), z_box, np.minimum(z_box, 0.0))
+    return admissible(qp.sets, z_box)
 
 
 def one_of(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
