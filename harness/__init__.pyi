@@ -24,7 +24,7 @@ from .qp import needs_matrices as needs_matrices
 from .qp import no_rows as no_rows
 from .record import Record as Record
 from .record import Verdict as Verdict
-from .sets import Box as Box
+from .sets.box import Box as Box
 from .solution import Solution as Solution
 from .solution import Status as Status
 from .verify.certificate import Certificate as Certificate

@@ -33,7 +33,7 @@ class ReferenceOverRanks(Protocol):
 class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options.
 
-    A class attribute ``accepts``, a tuple of classes of `mortarbench.harness.sets`,
+    A class attribute ``accepts``, a tuple of classes of `harness.sets`,
     declares the convex sets that it can take. Without it a solver accepts bounds alone
     (``(Box,)``), and declines QPs with other sets before `declines` is called.
     """

@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.sets import Box, ConvexSet
-from mortarbench.harness.sets import Vector as Vector
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import ConvexSet
+from mortarbench.harness.sets.convex import Vector as Vector
 
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator

@@ -10,7 +10,7 @@ from .harness.plugin import Case as Case
 from .harness.plugin import Family as Family
 from .harness.qp import QP as QP
 from .harness.record import Verdict as Verdict
-from .harness.sets import Box as Box
+from .harness.sets.box import Box as Box
 from .harness.solution import Solution as Solution
 from .harness.solution import Status as Status
 from .listing import Listing as Listing

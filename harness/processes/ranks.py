@@ -57,7 +57,7 @@ from mortarbench.harness.operators import Maker, SerialisableOperator
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.qp import QP, no_rows
-from mortarbench.harness.sets import Box
+from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import memory_mib
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks

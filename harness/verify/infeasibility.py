@@ -31,7 +31,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array, diags_array, eye_array, hstack, vstack
 
 from mortarbench.harness.qp import QP, Vector
-from mortarbench.harness.sets import Box, hull
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.rational import (
     nonnegative_solution,

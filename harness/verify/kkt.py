@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
-from mortarbench.harness.sets import Limits, Sum, admissible, hull
+from mortarbench.harness.sets.convex import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
 
 #: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow

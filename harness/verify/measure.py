@@ -25,7 +25,7 @@ from mortarbench.harness.operators import SerialisableOperator, assembled
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.qp import NEEDS_MATRICES, QP, Vector
 from mortarbench.harness.record import Measurement
-from mortarbench.harness.sets import Box
+from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")

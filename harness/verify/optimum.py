@@ -34,7 +34,7 @@ from scipy.sparse import coo_array, csr_array
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, Vector
-from mortarbench.harness.sets import Box
+from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
     MAX_CANCELLATION,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_matrix, eye_array, vstack
 
 from mortarbench.harness import QP, Matrix, Solution, Vector, needs_matrices, too_large
-from mortarbench.harness.sets import admissible
+from mortarbench.harness.sets.convex import admissible
 
 NEGLIGIBLE = 1e-14  #: an absolute tolerance where a solver's test adds it to a relative
 DIVERGED = 1e12  #: an ‖x‖∞ beyond which relative residuals mean nothing

@@ -158,7 +158,7 @@ def test_a_box_beside_bounds_is_refused():
     assert QP.from_arrays(**arrays, sets=(BALLS,)).sets[1] is BALLS
 
 
-def planted(seed, radius=None):
+def with_solution(seed, radius=None):
     """A QP with bounds, rows and balls, and its solution, strictly complementary.
 
     Balls 0, 2, … are active, with z = c·x; 1, 3, … are not.
@@ -191,7 +191,7 @@ def planted(seed, radius=None):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_planted_solution_has_no_residual_and_others_have(seed):
-    qp, s = planted(seed)
+    qp, s = with_solution(seed)
     index, radius = qp.sets[1].index, qp.sets[1].radius
 
     assert kkt_residuals(qp, s).worst <= 1e-14
@@ -214,7 +214,7 @@ def test_a_planted_solution_has_no_residual_and_others_have(seed):
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("factor", [1e-6, 1e6])
 def test_units_change_no_residual_of_sets(seed, factor):
-    qp, s = planted(seed)
+    qp, s = with_solution(seed)
     near = replace(s, x=s.x * (1 + 1e-3), z_box=s.z_box * (1 - 1e-3))
     balls = qp.sets[1]
     other = QP(
@@ -232,7 +232,7 @@ def test_units_change_no_residual_of_sets(seed, factor):
 
 
 def test_any_vector_is_normal_to_a_point():
-    qp, s = planted(3, radius=np.zeros(5))
+    qp, s = with_solution(3, radius=np.zeros(5))
     z = s.z_box.copy()
     z[qp.sets[1].index] = RNG.standard_normal(qp.sets[1].index.shape)
     moved = replace(qp, q=qp.q + s.z_box - z)
@@ -242,7 +242,7 @@ def test_any_vector_is_normal_to_a_point():
 
 def test_other_sets_are_left_to_the_residuals():
     """No reference is asked: it knows bounds alone."""
-    qp, s = planted(0)
+    qp, s = with_solution(0)
     residuals = kkt_residuals(qp, s)
 
     assert decided(qp, s, residuals, 1e-8, lambda _: pytest.fail("asked")) is None

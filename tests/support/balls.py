@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mortarbench.harness.sets import Limits, Sum
+from mortarbench.harness.sets.convex import Limits, Sum
 
 
 @dataclass(frozen=True, eq=False)

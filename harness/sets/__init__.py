@@ -1,0 +1,1 @@
+"""Convex sets that constrain the variables of a QP."""
