@@ -61,7 +61,7 @@ def _extension(name: str, flags: list[str]) -> Extension:
     return Extension(
         name,
         [str(source)],
-        depends=[str(header) for header in source.parent.glob("*.h")],
+        depends=[str(p) for p in source.parent.iterdir() if p.suffix in (".h", ".pxi")],
         include_dirs=[str(source.parent)],
         extra_compile_args=FLAGS + flags,
     )

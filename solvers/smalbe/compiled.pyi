@@ -4,28 +4,41 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Matrix, Vector
+from mortarbench.harness.distributed.vectors import Ranks
+from mortarbench.solvers.smalbe import rows as orthonormal_rows
 from mortarbench.solvers.smalbe.options import Options
-from mortarbench.solvers.smalbe.outer_loop import Iterate
-from mortarbench.solvers.smalbe.projected import Projected
+from mortarbench.solvers.smalbe.projected import Iterate, Projected
 
 Array = NDArray[np.float64]
 Kept = NDArray[np.int32]
 
+class Reduction:
+    def __init__(
+        self,
+        ranks: Ranks | None = None,
+        as_slice: Callable[[Array, Ranks], Vector] | None = None,
+    ) -> None: ...
+
 class Product:
     count: int
-    def __init__(self, P: Matrix, n: int) -> None: ...
+    def __init__(self, P: Matrix, n: int, over: Reduction | None = None) -> None: ...
     def __call__(self, v: Vector) -> Vector: ...
 
-class Solver:
+class Rows:
+    given: orthonormal_rows.Rows
+    def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
+    def met(self, nu: Vector, tol: float, least: float) -> bool: ...
+
+class SMALBE:
     def __init__(
         self,
         problem: Projected,
-        F: Product,
         options: Options,
         preconditioned: bool,
+        M: Callable[[Vector], Vector] | None = None,
     ) -> None: ...
     def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
-    def smalbe(
+    def solve(
         self,
         options: Options,
         tol: float,
@@ -63,12 +76,11 @@ def orthonormal(
     tuple[Array, Array, Array, float, float, Vector, bool], tuple[Array, Kept, Vector]
 ]: ...
 def lanczos(
-    F: Product, C: Array, start: Vector, steps: int
+    F: Product, C: Rows, start: Vector, steps: int
 ) -> tuple[Vector, Vector, Array, float]: ...
 def homogenised(
     F: Product,
-    C: Array,
-    x_tilde: Vector,
+    C: Rows,
     q: Vector,
     lb: Vector,
     ub: Vector,

@@ -29,8 +29,8 @@ from mortarbench.solvers.common.conversion import dense, needs_dense, positive
 from mortarbench.solvers.smalbe.compiled import residual_bound
 from mortarbench.solvers.smalbe.driver import CLAIM, PATIENCE
 from mortarbench.solvers.smalbe.faces import Faces
-from mortarbench.solvers.smalbe.outer_loop import infeasible
-from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, prepared_rows
+from mortarbench.solvers.smalbe.infeasibility import infeasible
+from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
 LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
 RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
@@ -73,7 +73,7 @@ class Direct:
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         P = qp.P if isinstance(qp.P, np.ndarray) else dense(qp.P)
         P = P if P.flags.c_contiguous else P.T  # it is symmetric
-        rows = prepared_rows(qp.A, qp.b)
+        rows = orthonormal_rows(qp.A, qp.b)
         if not rows.consistent:
             message = "the equality rows contradict each other"
             return partial(Solution.without_point, qp, Status.INFEASIBLE, message)

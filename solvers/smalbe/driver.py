@@ -10,37 +10,24 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import issparse
 
 from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
-from mortarbench.solvers.smalbe.mprgp import Face, Point, Rules, Watch, split
+from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.options import Options
-from mortarbench.solvers.smalbe.outer_loop import (
-    Constants,
-    InnerSolver,
+from mortarbench.solvers.smalbe.preconditioner import chosen, offered, structural
+from mortarbench.solvers.smalbe.projected import (
     Iterate,
     OuterIteration,
-    first_iterate,
-    infeasible,
-    smalbe,
-)
-from mortarbench.solvers.smalbe.preconditioner import (
-    chosen,
-    face_preconditioner,
-    offered,
-)
-from mortarbench.solvers.smalbe.projected import (
     Projected,
     Spectrum,
     by_lanczos,
     by_power,
-    prepared_problem,
     projected_problem,
+    times_projected,
 )
-from mortarbench.solvers.smalbe.rows import DenseRows, Rows, is_sparse
 from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
@@ -53,7 +40,6 @@ RHO = 1e4  #: penalty where none is given
 #: where P offers a preconditioner: the face preconditioner knows what ρ does there, and
 #: fewer outer iterations interrupt CG
 TORN_RHO = 1e6
-KEPT = 200  #: directions of CG on a face
 PATIENCE = 3  #: tightenings in a row that need not halve the residuals
 WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
 
@@ -69,6 +55,8 @@ class Carry(NamedTuple):
 
 
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
+#: letter of a step, x and g after it
+Note = Callable[[str, Vector, Vector], None]
 
 
 class _Task(NamedTuple):
@@ -78,8 +66,7 @@ class _Task(NamedTuple):
     problem: Projected
     options: Options
     rho: float  #: penalty ρ
-    solve: Callable[[float, Iterate], Iterate]  #: the outer loop, to a tolerance
-    solver: compiled.Solver | None  #: None where nothing is compiled
+    loop: OuterLoop
     history: History | None
     start: Iterate
 
@@ -104,11 +91,11 @@ def prepared(
     if eliminated is not None and eliminated.columns:
         problem.F.count += eliminated.columns
         problem.counts["factorised_columns"] += eliminated.columns
-    solve, solver = outer_loop(problem, inner, options, history)
+    loop = outer_loop(problem, inner, options, history)
     task = _Task(
         qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
-        rho=rho, solve=solve, solver=solver, history=history,
-        start=_start(problem, options.M, _penalty(rho, tol), carry, solver),
+        rho=rho, loop=loop, history=history,
+        start=_start(problem, loop, options.M, _penalty(rho, tol), carry),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -127,8 +114,6 @@ def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | No
 
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
-    if carry is None and options.norm == "lanczos" and not is_sparse(qp.A):
-        return prepared_problem(qp, _lanczos_steps(options, qp))
     steps = _lanczos_steps(options, qp)
     return projected_problem(qp, partial(_find, options, steps, carry))
 
@@ -137,8 +122,8 @@ def _find(
     options: Options,
     steps: int,
     carry: Carry | None,
-    PFP: Callable[[Vector], Vector],
-    rows: Rows,
+    F: compiled.Product,
+    C: compiled.Rows,
 ) -> Spectrum:
     """Look at the spectrum, or take over that of the problem before.
 
@@ -147,14 +132,14 @@ def _find(
     which notice where it is wrong.
     """
     if options.norm == "power":
-        return by_power(PFP, rows)
+        return by_power(F, C)
     if carry is not None and options.expansion == "model":
-        known = carry.spectrum.ritz
+        known, rows = carry.spectrum.ritz, C.given
         v = rows.project(random_start(rows.x_tilde.size))
-        now = float(v @ PFP(v)) / float(v @ v or 1.0)
+        now = float(v @ times_projected(F, rows, v)) / float(v @ v or 1.0)
         if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
             return carry.spectrum.orthogonal_to(rows)
-    return by_lanczos(PFP, rows, steps=steps)
+    return by_lanczos(F, C, steps=steps)
 
 
 def _lanczos_steps(options: Options, qp: QP) -> int:
@@ -168,11 +153,7 @@ def _lanczos_steps(options: Options, qp: QP) -> int:
 
 
 def _start(
-    problem: Projected,
-    M: float,
-    rho: float,
-    carry: Carry | None,
-    solver: compiled.Solver | None,
+    problem: Projected, loop: OuterLoop, M: float, rho: float, carry: Carry | None
 ) -> Iterate:
     """Start from zero, or from where the problem before ended.
 
@@ -186,9 +167,7 @@ def _start(
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
         x = np.where(np.isfinite(x), x, carry.x)
         mu = C @ carry.force / problem.spectrum.norm
-    if solver is None:
-        return first_iterate(problem, x, mu, M=M, rho=rho)
-    return Iterate(*solver.begin(x, mu, rho), mu, M, rho)
+    return loop.first(x, mu, M=M, rho=rho)
 
 
 def _penalty(rho: float, tol: float) -> float:
@@ -196,81 +175,53 @@ def _penalty(rho: float, tol: float) -> float:
     return min(rho, max(1.0, tol / (10 * EPS)))
 
 
+@dataclass(eq=False)
+class OuterLoop:
+    """The outer loop on one projected problem."""
+
+    solver: compiled.SMALBE
+    problem: Projected
+    options: Options
+    #: makes the observer of outer iteration k with that right-hand side
+    watch: Callable[[int, Vector], Note] | None
+
+    def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
+        """Start from x, moved into the bounds, and μ; one product, none for x = 0."""
+        return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
+
+    def solve(self, tol: float, at: Iterate) -> Iterate:
+        """Run the outer loop on from `at`, to a tolerance."""
+        problem = self.problem
+        nu, g, mu, M, rho, done, status = self.solver.solve(
+            self.options, tol, at, partial(infeasible, problem.rows, problem.bounds),
+            self.watch,
+        )  # fmt: skip
+        outer = at.outer + tuple(map(OuterIteration._make, done))
+        return Iterate(nu, g, mu, M, rho, outer, Status(status))
+
+    def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
+        """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product."""
+        found = self.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+        return found or recovered(self.problem, qp, at)
+
+
 def outer_loop(
-    problem: Projected,
-    qp: QP,
-    options: Options,
-    history: History | None = None,
-    *,
-    is_compiled: bool = True,
-) -> tuple[Callable[[float, Iterate], Iterate], compiled.Solver | None]:
-    """Choose what runs the outer loop: compiled where it can be, or as it is written.
-
-    Where preconditioners need more than products, or rows are sparse, it is not.
-    """
-    watch = None if history is None else partial(history.watch, problem)
+    problem: Projected, qp: QP, options: Options, history: History | None = None
+) -> OuterLoop:
+    """Prepare the outer loop, with the preconditioner that is asked for."""
     kind = chosen(qp, options.preconditioner)
-    F = problem.F
-    is_compiled = is_compiled and isinstance(problem.rows, DenseRows)
-    if is_compiled and isinstance(F, compiled.Product) and kind in WITHOUT_P:
-        solver = compiled.Solver(problem, F, options, kind == "model")
-        return partial(_compiled_loop, solver, problem, options, watch), solver
-    rules = Rules(
-        options.Gamma, options.expansion, options.proportioning, options.reduced,
-        options.alpha, kept=_kept(options, qp),
-    )  # fmt: skip
-    constants = Constants(
-        options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
-        options.energy,
-    )  # fmt: skip
-    plain = partial(problem.plain_model, alpha=options.alpha)
-    inner = InnerSolver(
-        rules=rules,
-        model=problem.model if options.expansion == "model" else plain,
-        precondition=face_preconditioner(problem, qp, kind),
-        watch=watch,
-    )
-    return partial(smalbe, problem, constants, inner), None
-
-
-def _kept(options: Options, qp: QP) -> int:
-    """Say how many directions of CG to keep: none where a product costs less."""
-    return KEPT if options.recycle and not issparse(qp.P) else 0
-
-
-def _compiled_loop(
-    solver: compiled.Solver,
-    problem: Projected,
-    options: Options,
-    watch: Callable[[int, Vector], Watch] | None,
-    tol: float,
-    at: Iterate,
-) -> Iterate:
-    nu, g, mu, M, rho, done, status = solver.smalbe(
-        options, tol, at, partial(infeasible, problem.rows, problem.bounds),
-        watch and partial(_observer, watch, problem),
-    )  # fmt: skip
-    outer = at.outer + tuple(map(OuterIteration._make, done))
-    return Iterate(nu, g, mu, M, rho, outer, Status(status))
-
-
-def _observer(
-    watch: Callable[[int, Vector], Watch], problem: Projected, outer: int, rhs: Vector
-) -> Callable[[str, Vector, Vector], None]:
-    note = watch(outer, rhs)
-
-    def told(letter: str, x: Vector, g: Vector) -> None:
-        note(letter, Point(x, g), split(Point(x, g), problem.bounds))
-
-    return told
+    M = structural(qp, kind)
+    solver = compiled.SMALBE(problem, options, kind != "none", M)
+    watch = None if history is None else partial(history.watch, problem)
+    return OuterLoop(solver, problem, options, watch)
 
 
 def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | None]]:
     """Tighten the tolerance until the original problem's KKT residuals agree."""
-    options, problem, at = task.options, task.problem, task.start
+    options, at = task.options, task.start
     tighter, best, waited = 1.0, np.inf, 0
     while True:
-        at = task.solve(tighter * tol, at)
+        at = task.loop.solve(tighter * tol, at)
         if at.status is Status.INFEASIBLE:
             message = "no point within the bounds meets the equality rows"
             return Solution.without_point(task.qp, at.status, message), _nothing
@@ -288,7 +239,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         # by much where the last one changed little: multipliers may converge so slowly
         # that one outer iteration meets a tolerance of nearly the same size
         tighter *= 0.01 if waited else min(0.5, max(0.01, CLAIM * tol / worst))
-        at = _refreshed(problem, at, _penalty(task.rho, tighter * tol))
+        at = _refreshed(task, at, _penalty(task.rho, tighter * tol))
     message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
@@ -296,12 +247,11 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
     return _counted(task, point), _nothing
 
 
-def _refreshed(problem: Projected, at: Iterate, rho: float) -> Iterate:
+def _refreshed(task: _Task, at: Iterate, rho: float) -> Iterate:
     """Compute the gradient anew, which the steps only carried along; one product."""
-    x = problem.rows.x_tilde + at.nu
-    fresh = first_iterate(problem, x, at.mu, M=at.M, rho=min(at.rho, rho))
-    same = fresh.rho == at.rho
-    return fresh._replace(outer=at.outer, directions=at.directions if same else None)
+    x = task.problem.rows.x_tilde + at.nu
+    fresh = task.loop.first(x, at.mu, M=at.M, rho=min(at.rho, rho))
+    return fresh._replace(outer=at.outer)
 
 
 def _nothing() -> None:
@@ -326,8 +276,7 @@ def _carry(task: _Task, at: Iterate) -> Carry:
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     """Return to the problem as given; the product of what was solved with its x."""
     qp, problem = task.inner, task.problem
-    found = task.solver and task.solver.point(at.nu, at.mu, qp.lb, qp.ub)
-    x, a, z_box, Fx = found or recovered(problem, qp, at)
+    x, a, z_box, Fx = task.loop.recovered(qp, at)
     letters = at.steps
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
@@ -375,7 +324,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
-    if task.solver is not None:
+    if isinstance(G, np.ndarray):
         bound = compiled.residual_bound(
             qp.q, diagonal, point.x, point.y, point.z_box, Fx,
             qp.lb, qp.ub, qp.b, G,
@@ -455,7 +404,7 @@ class History:
     began: float = field(default_factory=perf_counter)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
-    def watch(self, problem: Projected, outer: int, rhs: Vector) -> Watch:
+    def watch(self, problem: Projected, outer: int, rhs: Vector) -> Note:
         """Make the observer of one inner run, whose right-hand side is `rhs`."""
         C, x_tilde = problem.rows.C, problem.rows.x_tilde
         size = float(np.linalg.norm(x_tilde))
@@ -463,15 +412,18 @@ class History:
         between = np.isfinite(lower) & np.isfinite(upper) & (lower < upper)
         boxes = bool(between.any())
 
-        def note(letter: str, at: Point, face: Face) -> None:
-            error = np.linalg.norm(C @ at.x) if len(C) else 0.0
+        def note(letter: str, x: Vector, g: Vector) -> None:
+            error = np.linalg.norm(C @ x) if len(C) else 0.0
+            free = (x > lower) & (x < upper)
+            leads = ((g < 0) & (x < upper)) | ((g > 0) & (x > lower))
             self.rows.append((
                 letter, outer, problem.F.count,
-                np.linalg.norm(face.phi), np.linalg.norm(face.beta),
-                error / (size or np.linalg.norm(at.x) or 1.0),
-                np.count_nonzero(~face.free),
-                np.count_nonzero(between & ~face.free) if boxes else None,
-                0.5 * at.x @ (at.g - rhs), perf_counter() - self.began,
+                np.linalg.norm(np.where(free, g, 0.0)),
+                np.linalg.norm(np.where(leads & ~free, g, 0.0)),
+                error / (size or np.linalg.norm(x) or 1.0),
+                np.count_nonzero(~free),
+                np.count_nonzero(between & ~free) if boxes else None,
+                0.5 * x @ (g - rhs), perf_counter() - self.began,
             ))  # fmt: skip
 
         return note

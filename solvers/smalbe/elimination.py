@@ -27,7 +27,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs, dtrtrs
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
-from mortarbench.solvers.smalbe.rows import prepared_rows
+from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
 #: singular values of orthonormal rows, cut to E, are zero below and good above these;
 #: rows that hardly meet E would make the reduced matrix as large as they are small
@@ -90,7 +90,7 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
     free = np.isinf(qp.lb) & np.isinf(qp.ub)
     if free.all() or not free.any() or not qp.is_explicit or qp.h.size:
         return None
-    rows = prepared_rows(qp.A, qp.b)
+    rows = orthonormal_rows(qp.A, qp.b)
     block = _factorised(_block(qp.P, free, free), known)
     if block is None or not rows.consistent:
         return None

@@ -8,14 +8,20 @@ from typing import Literal, get_args
 import numpy as np
 
 from mortarbench.solvers.common.conversion import positive
-from mortarbench.solvers.smalbe.mprgp import (
-    EXPANSIONS,
-    PROPORTIONINGS,
-    Expansion,
-    Proportioning,
-)
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
+#: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
+#: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
+#: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
+#: model: where CG leads, projected in the metric of the model (ours; 2 products, 1
+#: where the CG step as far as it is feasible was all; one for each step beyond the box,
+#: one more where it gained less than gradient projection must)
+Expansion = Literal["std", "projcg", "mixed", "model"]
+#: cg: minimise along −β, as far as feasible (the book's; 1 product)
+#: model: a step of the model; for B = I/ᾱ a projected gradient step (1 product); else
+#: cg where from one to the next twice in a row ‖β‖² was not halved
+Proportioning = Literal["cg", "model"]
+EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 Norm = Literal["lanczos", "power"]
 Eliminate = Literal["never", "sequences", "always"]
 
@@ -24,7 +30,7 @@ Eliminate = Literal["never", "sequences", "always"]
 class Options:
     """What one can choose."""
 
-    expansion: Expansion = "model"  #: see `solvers.smalbe.mprgp`
+    expansion: Expansion = "model"  #: see `solvers.smalbe.options`
     proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, and 1e6 where P offers a preconditioner

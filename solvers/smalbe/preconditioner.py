@@ -1,7 +1,7 @@
 """Preconditioners of the CG steps in a face F of the box.
 
 All are masked: z_F = (M φ_F)_F with one M for every face, but for `model`, which is
-inverted in the face. The structural ones, for a dual with F = BK⁺Bᵀ, are
+inverted in the face (model.pxi). The structural ones, for a dual with F = BK⁺Bᵀ, are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
@@ -25,7 +25,6 @@ instead, which mixes free components with held ones, would undo what a large ρ 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -33,14 +32,13 @@ from scipy.sparse import csc_matrix, diags_array
 
 from mortarbench.harness import QP, Structure, Vector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
-from mortarbench.solvers.smalbe import kernels
-from mortarbench.solvers.smalbe.kernels import Mask
-from mortarbench.solvers.smalbe.mprgp import Operator, Precondition
-from mortarbench.solvers.smalbe.projected import Projected
+from mortarbench.solvers.smalbe.rows import Mask
 
+Operator = Callable[[Vector], Vector]
 Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
 PRECONDITIONERS = get_args(Preconditioner)
-LEAST_RHO = 10.0  #: of the model of the penalty: with less, nothing is projected
+#: those with a matrix M of their own
+STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 
@@ -68,32 +66,10 @@ def lacking(qp: QP, kind: Preconditioner) -> str | None:
     return None
 
 
-def face_preconditioner(
-    problem: Projected, qp: QP, kind: Preconditioner
-) -> Callable[[float], Precondition | None]:
-    """Set up once; the result makes, for each ρ, what `mprgp` takes."""
-    if kind == "none":
-        return lambda rho: None
-    if kind == "model":
-        return lambda rho: problem.model(rho).inverse_in
-    M = _whole(qp, kind)
-
-    def in_face(free: Mask, rho: float) -> Operator:
-        of_penalty = problem.penalty(max(rho, LEAST_RHO)).inverse_in(free)
-
-        def apply(v: Vector) -> Vector:
-            problem.counts["preconditioner_applies"] += 1
-            Pv = of_penalty(v)
-            rest = kernels.combined(problem.spectrum.norm, M(Pv), -1.0, Pv)
-            return of_penalty(rest) + Pv
-
-        return apply
-
-    return lambda rho: partial(in_face, rho=rho)
-
-
-def _whole(qp: QP, kind: Preconditioner) -> Operator:
-    """Return M as a function."""
+def structural(qp: QP, kind: Preconditioner) -> Operator | None:
+    """Return M as a function; None for kinds that need none."""
+    if kind not in STRUCTURAL:
+        return None
     diagonal = qp.diagonal()
     if kind == "diagonal" and diagonal is not None:
         inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
@@ -102,10 +78,10 @@ def _whole(qp: QP, kind: Preconditioner) -> Operator:
         return operator.preconditioner(kind, "stiffness")
     if qp.structure is None:
         raise ValueError(lacking(qp, kind))
-    return _structural(qp.structure, _lumped if kind == "lumped" else _schur)
+    return _of_stiffness(qp.structure, _lumped if kind == "lumped" else _schur)
 
 
-def _structural(
+def _of_stiffness(
     structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
 ) -> Operator:
     """Return B_D S B_Dᵀ with the stiffness S of the interface."""

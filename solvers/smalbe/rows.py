@@ -7,11 +7,10 @@ divided by their norms, and
     GGᵀ = LLᵀ,   C = L⁻¹G,   𝒫 = I − CᵀC = I − Gᵀ(GGᵀ)⁻¹G
 
 are applied by products with G and solves with L (`SparseRows`); they must be
-independent. A model of the penalty ρCᵀC for steps over the box comes with each:
-`solvers.smalbe.model.Model` holds C as it is, `PenaltyModel` needs solves with
-G_F G_Fᵀ + κGGᵀ on a face F. These differ from (1 + κ)GGᵀ in rows that bounded
-components touch, and in contact few subdomains have any: with those rows c last, only
-the Schur complement of GGᵀ on them is factorised anew (`_Bordered`).
+independent. A model of the penalty ρCᵀC (model.pxi) needs solves with G_F G_Fᵀ + κGGᵀ
+on a face F. These differ from (1 + κ)GGᵀ in rows that bounded components touch, and in
+contact few subdomains have any: with those rows c last, only the Schur complement of
+GGᵀ on them is factorised anew (`_Bordered`).
 
 On several ranks this is the *coarse problem*, with a row for each rigid mode of all
 subdomains. Each rank eliminates the rows of its own (`_OverRanks`), unless it shares
@@ -28,7 +27,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, qr, solve_triangular
+from scipy.linalg import cho_solve
 from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
@@ -49,15 +48,13 @@ from mortarbench.harness.distributed.vectors import (
     Ranks,
     distributed,
 )
-from mortarbench.solvers.smalbe import compiled, kernels
-from mortarbench.solvers.smalbe.kernels import Mask
-from mortarbench.solvers.smalbe.model import BoxModel, Model, Tilted, minimised
+from mortarbench.solvers.smalbe import compiled
 
+Mask: TypeAlias = NDArray[np.bool_]
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
 INCONSISTENT = 1e-8  #: of x̃ and e, by which rows with a solution may be missed
 RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
-NO_SHIFT = 1e-13  #: x̃ of this size relative to ν is rounding of e = 0
 FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
 MOST_BORDER = 2000  #: rows that bounded components touch, whose block is dense
 MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
@@ -90,46 +87,18 @@ class Rows(ABC):
     consistent: bool  #: whether there is one
     multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
 
-    def met(self, nu: Vector, tol: float, least: float) -> bool:
-        """Whether ‖Cν‖ ≤ tol‖x̃‖ and ‖Gν‖ ≤ tol‖e‖.
-
-        For e = 0, or x̃ no more than rounding of ν, ‖Cν‖ ≤ tol·max(‖ν‖, `least`).
-        """
-        Cnu, nu_size = self.C @ nu, float(np.linalg.norm(nu))
-        size = float(np.linalg.norm(self.x_tilde))
-        if self.e_size == 0 or size <= NO_SHIFT * nu_size:
-            return bool(np.linalg.norm(Cnu) <= tol * max(nu_size, least))
-        return bool(
-            np.linalg.norm(Cnu) <= tol * size
-            and np.linalg.norm(self.error(nu, Cnu)) <= tol * self.e_size
-        )
-
-    def violation(self, nu: Vector) -> float:
-        """Return ‖Cν‖."""
-        return float(np.linalg.norm(self.C @ nu))
-
     def project(self, v: Vector) -> Vector:
         """Apply 𝒫 = I − CᵀC."""
         return self.combined(1.0, v, -1.0, self.C @ v)
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         """Return sv + tCᵀa."""
-        return kernels.combined(s, v, t, self.C.T @ a)
+        return s * v + t * (self.C.T @ a)
 
     @property
     def no_multipliers(self) -> Vector:
         """Multipliers a (r,) of Cx = Cx̃ that are zero."""
         return np.zeros(len(self.C))
-
-    @abstractmethod
-    def error(self, nu: Vector, Cnu: Vector) -> Vector:
-        """Return Gν (m,), from Cν where that is less work."""
-
-    @abstractmethod
-    def model(
-        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
-    ) -> BoxModel:
-        """Model τI + Σ (aboveᵢ − τ)uᵢuᵢᵀ + (ρ − τ)CᵀC, without what is not above τ."""
 
     @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
@@ -142,15 +111,6 @@ class DenseRows(Rows):
 
     C: NDArray[np.float64]
     GC: NDArray[np.float64]  #: GCᵀ (m, r), so that Gx − e = GCᵀ C(x − x̃)
-
-    def error(self, nu: Vector, Cnu: Vector) -> Vector:
-        return np.asarray(self.GC @ Cnu)
-
-    def model(
-        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
-    ) -> Model:
-        w = np.append(above, np.full(len(self.C), rho))
-        return Model(0.0, np.vstack([U, self.C]), w).with_tail(tau)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
         a, *_ = np.linalg.lstsq(self.C.T[free], -r[free], rcond=FREE_RANK)
@@ -166,29 +126,25 @@ class SparseRows(Rows):
     bounded: NDArray[np.int64]  #: (b,) components that have a bound
     of_bounded: SparseColumns  #: (r, b) the columns of `unit` of these
 
-    def violation(self, nu: Vector) -> float:
-        return self.gram.norm(self.unit @ nu)
-
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         y, unit = self.gram.backward(a), self.unit
         if isinstance(unit, _LocalRows):
             return unit.T.combined(s, v, t, y)
-        return kernels.combined(s, v, t, unit.T @ y)
+        return np.asarray(s * v + t * np.asarray(unit.T @ y))
+
+    def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
+        """Return v − Gᵀy of the normalised rows G, times weights."""
+        if isinstance(self.unit, _LocalRows):
+            return self.unit.T.weighted_difference(v, y, weights)
+        return np.asarray((v - np.asarray(self.unit.T @ y)) * weights)
 
     @property
     def no_multipliers(self) -> Vector:
         return self.C @ np.zeros_like(self.x_tilde)
 
-    def error(self, nu: Vector, Cnu: Vector) -> Vector:
+    def error(self, nu: Vector) -> Vector:
+        """Return Gν (m,)."""
         return np.asarray(self.G @ nu)
-
-    def model(
-        self, tau: float, above: Vector, U: NDArray[np.float64], rho: float
-    ) -> BoxModel:
-        # many rows come of many subdomains, and there no eigenvalue stands apart
-        if rho <= tau:
-            return Model.of_norm(tau, self.x_tilde.size)
-        return PenaltyModel(tau, self, rho - tau)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
         solve = self.gram.in_face(free, FREE_RANK)
@@ -204,9 +160,6 @@ class GramFactor(Protocol):
 
     def forward(self, t: Vector) -> Vector:
         """Return L⁻¹t."""
-
-    def norm(self, t: Vector) -> float:
-        """Return ‖L⁻¹t‖."""
 
     def backward(self, a: Vector) -> Vector:
         """Return L⁻ᵀa."""
@@ -230,9 +183,6 @@ class _Whole:
     def forward(self, t: Vector) -> Vector:
         t = self.factor.apply_P(t)
         return np.asarray(self.factor.solve_L(t, use_LDLt_decomposition=False))
-
-    def norm(self, t: Vector) -> float:
-        return float(np.linalg.norm(self.forward(t)))
 
     def backward(self, a: Vector) -> Vector:
         x = self.factor.solve_Lt(a, use_LDLt_decomposition=False)
@@ -298,9 +248,6 @@ class _OverRanks:
 
     def forward(self, t: Vector) -> Vector:
         return self.factor.forward(t)
-
-    def norm(self, t: Vector) -> float:
-        return self.factor.norm(t)
 
     def backward(self, a: Vector) -> Vector:
         return self.factor.backward(a)
@@ -408,82 +355,6 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
             order, factor, L_cc, lambda held: touching.gram(held).toarray()
         )
     return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
-
-
-@dataclass(frozen=True, eq=False)
-class PenaltyModel:
-    """B = τI + w Gᵀ(GGᵀ)⁻¹G, which is τI + wCᵀC."""
-
-    tau: float
-    rows: SparseRows
-    w: float  #: positive
-
-    has_directions = True
-
-    def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:
-        """Return s = argmin gᵀs + ½sᵀBs subject to l ≤ x + s ≤ u.
-
-        As `Model.step`, with the multiplier y = w(GGᵀ)⁻¹Gs of t = Gs: the gradient of
-        the dual function is Gs(y) − GGᵀy/w. Of components without bounds s is
-        −(g + Gᵀy)/τ, so that only those with bounds, b, are looked at for each y:
-
-            Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
-        """
-        rows, gram, tau, w = self.rows, self.rows.gram, self.tau, self.w
-        b, G_b = rows.bounded, rows.of_bounded
-        x_b, g_b, box = x[b], g[b], (bounds[0][b], bounds[1][b])
-        Gg = rows.unit @ g
-
-        def at(y: Vector) -> Tilted:
-            tilt = g_b + G_b.T @ y
-            s_b, piece = kernels.tilted_step(x_b, tilt, tau, *box)
-            held = G_b @ kernels.combined(1 / tau, tilt, 1.0, s_b)
-            shift = kernels.combined(1 / tau, Gg, 1 / tau + 1 / w, gram.product(y))
-            return Tilted(s_b, piece, held - shift)
-
-        def newton(slope: Vector, free: Mask) -> Vector:
-            of_all = np.ones(x.size, dtype=bool)
-            of_all[b] = free
-            return tau * gram.in_face(of_all, tau / w)(slope)
-
-        found = minimised(at, newton, rows.unit.shape[0])
-        if found is None:
-            return Model.of_norm(tau + w, x.size).step(x, g, bounds)
-        y, there = found
-        s: Vector = kernels.combined(-1 / tau, g, -1 / tau, rows.unit.T @ y)
-        s[b] = there.s
-        return s
-
-    def raised(self, s: Vector, sHs: float) -> BoxModel:
-        """As `Model.raised`."""
-        Cs = self.rows.C @ s
-        part, square = float(Cs @ Cs), float(s @ s)
-        rest = square - part
-        missing = sHs - self.tau * square - self.w * part
-        tau = self.tau + missing / rest if rest > 0 else np.inf
-        tau = min(max(tau, self.tau), 10 * self.tau)
-        w = self.w + self.tau - tau
-        if w <= 0:
-            return Model.of_norm(tau, s.size)
-        return PenaltyModel(tau, self.rows, w)
-
-    def relaxed(self, factor: float) -> PenaltyModel:
-        """As `Model.relaxed`."""
-        return replace(self, tau=self.tau / factor)
-
-    def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:
-        """Return v → B_FF⁻¹v_F, zero off the face F."""
-        G, solve = self.rows.unit, self.rows.gram.in_face(free, self.tau / self.w)
-        inverse = np.where(free, 1 / self.tau, 0.0)
-
-        def apply(v: Vector) -> Vector:
-            v = np.where(free, v, 0.0)
-            y = solve(G @ v)
-            if isinstance(G, _LocalRows):
-                return G.T.weighted_difference(v, y, inverse)
-            return kernels.weighted_difference(v, G.T @ y, inverse)
-
-        return apply
 
 
 @dataclass(frozen=True, eq=False)
@@ -679,25 +550,6 @@ def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
     """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
-    dense = as_dense(G)
-    size = np.linalg.norm(dense, axis=1)
-    size[size == 0] = 1.0
-    Q, R, pivot = qr((dense / size[:, None]).T, mode="economic", pivoting=True)
-    rank = int((np.abs(np.diag(R)) > RANK).sum())
-    C, R, kept = Q[:, :rank].T, R[:rank, :rank], pivot[:rank]
-    x_tilde = C.T @ solve_triangular(R, (e / size)[kept], trans="T")
-    triangle = np.ascontiguousarray(R), kept.astype(np.int32), size
-    multipliers = partial(compiled.multipliers, e.size, *triangle)
-    consistent = _consistent((dense @ x_tilde - e) / size, x_tilde, e / size)
-    C, e_size = np.ascontiguousarray(C), float(np.linalg.norm(e))
-    pivot_size = float(np.abs(np.diag(R)).min(initial=1.0))
-    return DenseRows(
-        dense, C, e_size, pivot_size, x_tilde, consistent, multipliers, dense @ C.T
-    )
-
-
-def prepared_rows(G: Matrix, e: Vector) -> DenseRows:
-    """Do what `orthonormal_rows` does, compiled."""
     if not e.size:
         return _no_rows(G.shape[1])
     found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))

@@ -7,13 +7,13 @@ reference [3], Chapter 6; equation (2) of the paper).
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
-4. The outer loop (`solvers.smalbe.outer_loop`) over MPRGP (`solvers.smalbe.mprgp`).
-   Without equalities one run of MPRGP is left.
+4. The outer loop (outer.pxi) over MPRGP (mprgp.pxi). Without equalities one run of
+   MPRGP is left.
 
 What is ours: the Lanczos process that finds the norm finds the upper Ritz pairs too.
-With them and with C it gives a model of H (`solvers.smalbe.model`), which serves three
-times: for steps that change the face, as preconditioner in the face, and to make a
-large ρ harmless. The presets are the methods as others run them.
+With them and with C it gives a model of H (model.pxi), which serves three times: for
+steps that change the face, as preconditioner in the face, and to make a large ρ
+harmless. The presets are the methods as others run them.
 """
 
 from __future__ import annotations

@@ -8,12 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
 
 from mortarbench.harness import Vector
-
-FEW = 5  #: steps after which a flat spectrum shows
-FLAT = 10.0  #: ratio of Ritz values of one size
 
 
 class Ritz(NamedTuple):
@@ -37,48 +33,6 @@ def random_start(n: int) -> Vector:
     start = np.random.default_rng(19640229).standard_normal(n)
     start.flags.writeable = False
     return start
-
-
-def size(v: Vector) -> int:
-    """Count the components of a vector; of one over ranks, those of all."""
-    return int((np.zeros_like(v) + 1).sum())
-
-
-def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
-    """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
-
-    What three terms leave is of the size of the next vector, so that one pass over all
-    vectors makes it orthogonal to them to rounding. The residual of the pair (θ, Vᵀs)
-    is |β s_k| with the last off-diagonal entry β. A start vector from an invariant
-    subspace keeps the process there. It ends after FEW steps where all Ritz values are
-    of one size: conjugate gradients need few steps there, and no model.
-    """
-    basis = np.zeros((min(steps, size(start)), start.size))
-    diagonal: list[float] = []
-    off: list[float] = []
-    v, beta = start, float(np.linalg.norm(start))
-    for k in range(len(basis) if beta else 0):
-        basis[k] = v / beta
-        v = H(basis[k])
-        diagonal.append(float(basis[k] @ v))
-        v = v - diagonal[-1] * basis[k]
-        if k:
-            v = v - beta * basis[k - 1]
-        v = v - basis[: k + 1].T @ (basis[: k + 1] @ v)
-        beta = float(np.linalg.norm(v))
-        off.append(beta)
-        if beta <= 1e-12 * max(map(abs, diagonal)):
-            break
-        if k + 1 == FEW:
-            values = eigvalsh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
-            if values[0] >= values[-1] / FLAT:
-                break
-    if not diagonal:
-        return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)), 0.0)
-    theta, S = eigh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
-    vectors = S.T @ basis[: len(theta)]
-    residuals = off[-1] * np.abs(S[-1, ::-1])
-    return Ritz(theta[::-1], residuals, vectors[::-1], diagonal[0])
 
 
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:

@@ -495,6 +495,28 @@ INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, i
     told[1] = feasible;
 }
 
+INLINE double first_of_blocks(in x, in p, in lower, in upper, double least, Py_ssize_t n)
+{
+    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
+        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
+        if (upper)
+            least = lengths_block(x + i, NULL, p + i, NULL, lower + i, upper + i, size,
+                                  least, NULL);
+        else
+            least = lengths_block(x + i, NULL, p + i, NULL, lower + i, NULL, size, least,
+                                  NULL);
+    }
+    return least;
+}
+
+/* The α at which x - αp meets its first bound; inf where it meets none.
+
+   upper : NULL where no component has a bound above */
+TWICE static double first_bound(in x, in p, in lower, in upper, Py_ssize_t n)
+{
+    return first_of_blocks(x, p, lower, upper, INFINITY, n);
+}
+
 /* α of x - αp: told = the minimising, the largest feasible where that is less, else inf,
    gᵀp, pᵀHp.
 
@@ -507,16 +529,8 @@ TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_
         slope += g[i] * p[i];
         curvature += p[i] * Hp[i];
     }
-    told[0] = feasible = curvature > 0 ? slope / curvature : INFINITY;
-    for (Py_ssize_t i = 0; i < n; i += BLOCK) {
-        Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
-        if (upper)
-            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, upper + i, size,
-                                     feasible, NULL);
-        else
-            feasible = lengths_block(x + i, NULL, p + i, NULL, lower + i, NULL, size,
-                                     feasible, NULL);
-    }
+    told[0] = curvature > 0 ? slope / curvature : INFINITY;
+    feasible = first_of_blocks(x, p, lower, upper, told[0], n);
     told[1] = feasible < told[0] ? feasible : INFINITY;
     told[2] = slope;
     told[3] = curvature;

@@ -24,7 +24,8 @@ from mortarbench.harness.distributed.vectors import (
 )
 from mortarbench.solvers.smalbe.rows import equality_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
-from mortarbench.solvers.smalbe.spectrum import lanczos
+from tests.support.textbook.projected import lanczos
+from tests.support.textbook.rows import model_of
 
 TOL = 1e-8
 REFUSED = {
@@ -141,7 +142,8 @@ def projected(qp, most):
     factor.FILL = kept
     v = qp.q + rows.x_tilde
     free = np.isinf(qp.lb) | (v > 0)
-    apply = rows.model(1.0, np.zeros(0), np.zeros((0, v.size)), 100.0).inverse_in(free)
+    penalty = model_of(rows, 1.0, np.zeros(0), np.zeros((0, v.size)), 100.0)
+    apply = penalty.inverse_in(free)
     return np.asarray(rows.project(v) + apply(v) + rows.C.T @ rows.fitted(free, v))
 
 

@@ -13,12 +13,11 @@ from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import compiled, driver
 from mortarbench.solvers.smalbe.driver import outer_loop, recovered
-from mortarbench.solvers.smalbe.outer_loop import first_iterate
-from mortarbench.solvers.smalbe.projected import (
-    by_lanczos,
-    prepared_problem,
-    projected_problem,
-)
+from mortarbench.solvers.smalbe.projected import by_lanczos as compiled_by_lanczos
+from mortarbench.solvers.smalbe.projected import projected_problem as compiled_problem
+from tests.support.textbook import loop
+from tests.support.textbook.outer_loop import first_iterate
+from tests.support.textbook.projected import by_lanczos, projected_problem
 
 pytestmark = pytest.mark.together
 
@@ -121,12 +120,15 @@ def test_a_product_with_any_layout(order):
     assert compiled.Product(half, 9)(v[:9]) == pytest.approx(half @ v[:9], rel=1e-13)
 
 
+def prepared_problem(qp, steps):
+    return compiled_problem(qp, partial(compiled_by_lanczos, steps=steps))
+
+
 @pytest.mark.parametrize("seed", range(40))
 def test_preparation_is_as_it_is_written(seed):
     qp = random_qp(seed)
-    fast, slow = prepared_problem(qp, 12), projected_problem(
-        qp, partial(by_lanczos, steps=12)
-    )  # fmt: skip
+    fast = prepared_problem(qp, 12)
+    slow = projected_problem(qp, partial(by_lanczos, steps=12))
 
     assert fast.F.count == slow.F.count
     assert fast.rows.consistent == slow.rows.consistent
@@ -162,13 +164,12 @@ def they_agree(qp, options):
     runs = []
     for written in (False, True):
         problem = projected_problem(qp, partial(by_lanczos, steps=12))
-        solve, solver = outer_loop(problem, qp, options, is_compiled=not written)
-        assert (solver is None) == written
+        run = (loop.outer_loop if written else outer_loop)(problem, qp, options)
         start = first_iterate(
             problem, problem.rows.x_tilde * 0, np.zeros(len(problem.rows.C)),
             M=options.M, rho=options.rho or 1e4,
         )  # fmt: skip
-        end = solve(1e-6, start)
+        end = run.solve(1e-6, start)
         runs.append((end, problem.F.count))
     (fast, products), (slow, also) = runs
 
@@ -210,11 +211,11 @@ def test_steps_beyond_the_box_are_those_that_are_written():
         for written in (False, True):
             problem = projected_problem(qp, partial(by_lanczos, steps=5))
             options = replace(SOLVERS["smalbe"], max_steps=150)
-            solve, _ = outer_loop(problem, qp, options, is_compiled=not written)
+            run = (loop.outer_loop if written else outer_loop)(problem, qp, options)
             start = first_iterate(
                 problem, problem.rows.x_tilde * 0, np.zeros(0), M=1.0, rho=1e4
             )
-            runs.append((solve(1e-6, start), problem.F.count))
+            runs.append((run.solve(1e-6, start), problem.F.count))
         (fast, products), (slow, also) = runs
         letters += slow.steps
 
@@ -229,7 +230,7 @@ def test_steps_beyond_the_box_are_those_that_are_written():
 def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypatch):
     """Rounding may cost a few without a preconditioner."""
     fast = SOLVERS[name].prepare(contact, 1e-6)()
-    monkeypatch.setattr(driver, "outer_loop", partial(outer_loop, is_compiled=False))
+    monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
     slow = SOLVERS[name].prepare(contact, 1e-6)()
     apart = 2 if name == "smalbe" else 25
 
@@ -244,12 +245,10 @@ def test_on_contact_it_takes_as_many_products_as_written(contact, name, monkeypa
 def test_the_way_back_is_as_it_is_written(seed):
     qp, options = random_qp(seed), SOLVERS["smalbe"]
     problem = prepared_problem(qp, 12)
-    solve, solver = outer_loop(problem, qp, options)
-    start = first_iterate(
-        problem, 0 * qp.q, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4
-    )
-    at = solve(1e-8, start)
-    found = solver.point(at.nu, at.mu, qp.lb, qp.ub)
+    run = outer_loop(problem, qp, options)
+    start = run.first(0 * qp.q, np.zeros(len(problem.rows.C)), M=1.0, rho=1e4)
+    at = run.solve(1e-8, start)
+    found = run.solver.point(at.nu, at.mu, qp.lb, qp.ub)
     also_x, also_a, also_z, _ = recovered(problem, qp, at)
 
     free = (at.nu > problem.bounds[0]) & (at.nu < problem.bounds[1])

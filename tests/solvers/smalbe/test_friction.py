@@ -1,7 +1,7 @@
 """SMALBE on duals with friction: boxes on both sides, sticking and slipping rows."""
 
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +13,7 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import driver
-from mortarbench.solvers.smalbe.driver import outer_loop
+from tests.support.textbook import loop
 
 pytestmark = pytest.mark.together
 
@@ -69,8 +69,7 @@ def test_compiled_and_written_steps_are_the_same(
             SOLVERS[solver], recycle=recycle, max_steps=steps, history=True
         )
         if not compiled:
-            written = partial(outer_loop, is_compiled=False)
-            monkeypatch.setattr(driver, "outer_loop", written)
+            monkeypatch.setattr(driver, "outer_loop", loop.outer_loop)
         runs.append(options.prepare(qp, TOL)())
 
     assert list(runs[0].history["step"]) == list(runs[1].history["step"])

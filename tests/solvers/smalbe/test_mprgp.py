@@ -8,17 +8,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mortarbench.solvers.smalbe import kernels
-from mortarbench.solvers.smalbe.model import Model
-from mortarbench.solvers.smalbe.mprgp import (
-    EXPANSIONS,
-    Directions,
-    Point,
-    Rules,
-    mprgp,
-    split,
-)
+from mortarbench.solvers.smalbe.options import EXPANSIONS
 from mortarbench.solvers.smalbe.spectrum import power_method
+from tests.support.textbook import kernels
+from tests.support.textbook.model import Model
+from tests.support.textbook.mprgp import Directions, Point, Rules, mprgp, split
 
 MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 

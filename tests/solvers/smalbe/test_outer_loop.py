@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import QP, Status, no_rows
-from mortarbench.solvers.smalbe.mprgp import Rules
-from mortarbench.solvers.smalbe.outer_loop import (
+from mortarbench.solvers.smalbe.infeasibility import infeasible
+from mortarbench.solvers.smalbe.rows import orthonormal_rows
+from tests.support.textbook.mprgp import Rules
+from tests.support.textbook.outer_loop import (
     Constants,
     InnerSolver,
     Iterate,
     _after_stall,
     first_iterate,
-    infeasible,
     smalbe,
 )
-from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
-from mortarbench.solvers.smalbe.rows import orthonormal_rows
+from tests.support.textbook.projected import by_lanczos, projected_problem
 
 
 def drawn(seed, n=60, condition=1e3):

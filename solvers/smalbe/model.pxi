@@ -1,0 +1,530 @@
+# A quadratic model of the operator, minimised over the set without products with it.
+
+
+cdef enum:
+    NEWTON_STEPS = 100
+    SEARCH_STEPS = 60
+
+
+cdef class Model:
+    """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis.
+
+    U holds the directions in which H is large, with w + τ their eigenvalues, and τ
+    stands for H on all others. Where B is above H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and
+    the minimum of the right side over the set is a gradient projection step in the
+    metric of B. Without U it is the ordinary one, x ← P(x − g/τ), whose length is
+    dictated by ‖H‖; with a few directions taken out, by the rest of the spectrum. That B
+    is above H is tested by the product that each step needs anyway: where it is not, τ
+    is raised.
+    """
+
+    cdef double tau
+    cdef Py_ssize_t n, k
+    cdef Basis basis  # None for B = τI
+    cdef Room room
+    cdef double *w  # (k,)
+    cdef double *root  # of w, and zeros, as many as a row of `DenseBasis.gram` is long
+
+    @staticmethod
+    cdef Model of_norm(double norm, Py_ssize_t n):
+        """B = norm·I: what is known of an H of which only the norm is known."""
+        cdef Model B = Model.__new__(Model)
+        B.tau, B.n = norm, n
+        return B
+
+    cdef Model with_tail(self, double tau):
+        """Change τ and leave w + τ as it is, where that is above τ."""
+        if self.basis is None:
+            return Model.of_norm(tau, self.n)
+        return self.basis.model(self.k, self.w, self.tau - tau, tau)
+
+    cdef int step(self, const double *x, const double *g, Box box, double *s) except -1:
+        """s ← argmin gᵀs + ½sᵀBs, x + s in the set.
+
+        With y = WUs as multiplier, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
+        and y maximises a concave, piecewise quadratic function of k variables whose
+        gradient is Us(y) − W⁻¹y: Newton's method with a line search ends on the right
+        piece.
+        """
+        cdef Basis U = self.basis
+        cdef Py_ssize_t i, newton, search, k = self.k
+        cdef double *y
+        cdef double *dy
+        cdef double *there
+        cdef double begun, now, low, high, at_low, at_high, t, share
+        if U is None:
+            box.minimise(x, g, self.tau, s, NULL)
+            return 0
+        y, dy, there = U.y, U.dy, U.y_there
+        U.begin(self, x, g, box, s)
+        for newton in range(NEWTON_STEPS):
+            U.newton(self)
+            for i in range(k):
+                there[i] = y[i] + dy[i]
+            begun = U.over_dual.total(dot(U.slope, dy, k))
+            U.tilt(self, x, g, box, s)
+            if not U.over.any(not same(U.piece, U.piece_there, U.places)):
+                U.finish(self, x, g, box, s)  # Newton's method is exact there
+                return 0
+            U.find_slope(self, s)
+            now = U.over_dual.total(dot(U.slope_there, dy, k))
+            low, high, at_low, at_high, t = 0.0, 1.0, begun, now, 1.0
+            for search in range(SEARCH_STEPS):
+                if fabs(now) <= 0.1 * begun or (now > 0 and t == 1) or at_low <= at_high:
+                    break
+                share = at_low / (at_low - at_high)  # regula falsi, kept off the ends
+                t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
+                for i in range(k):
+                    there[i] = y[i] + t * dy[i]
+                U.tilt(self, x, g, box, s)
+                U.find_slope(self, s)
+                now = U.over_dual.total(dot(U.slope_there, dy, k))
+                if now > 0:
+                    low, at_low = t, now
+                else:
+                    high, at_high = t, now
+            memcpy(y, there, k * sizeof(double))
+            memcpy(U.slope, U.slope_there, k * sizeof(double))
+            memcpy(U.piece, U.piece_there, U.places * sizeof(double))
+        return Model.of_norm(self.tau + U.largest(self), self.n).step(x, g, box, s)
+
+    cdef Model raised(self, const double *s, double square, double sHs):
+        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is.
+
+        square : ‖s‖²
+        """
+        cdef double missing = sHs - self.tau * square, rest = square, tau
+        if self.basis is not None:
+            self.basis.leave_out(self, s, &missing, &rest)
+        if missing <= 0:
+            return self
+        tau = self.tau + missing / rest if rest > 0 else INFINITY
+        return self.with_tail(fmin(tau, 10 * self.tau))
+
+    cdef int enter(self, const double *free) except -1:
+        """Prepare `inverse` for the face where `free` is 1, elsewhere 0."""
+        if self.basis is not None:
+            self.basis.enter(self, free)
+        return 0
+
+    cdef double inverse(self, const double *free, const double *v, const double *along,
+                        double *z) except? -1:
+        """z ← B_FF⁻¹v for v that is zero off the face F; returns this process' zᵀ`along`.
+        """
+        if self.basis is not None:
+            return self.basis.inverse(self, free, v, along, z)
+        copy_scaled(1 / self.tau, v, z, self.n)
+        return dot(z, along, self.n)
+
+
+cdef class Basis:
+    """Orthonormal rows U (k, n) of models, and the room for their multipliers.
+
+    `slope`, `piece` and `y` belong to where Newton's method is, those `_there` to where
+    it looks.
+    """
+
+    cdef Py_ssize_t n, k
+    cdef Py_ssize_t places  # components whose pieces are looked at
+    cdef Reduction over  # the processes that share vectors (n,)
+    cdef Reduction over_dual  # those that share multipliers (k,)
+    cdef Room dual
+    cdef double *y
+    cdef double *dy
+    cdef double *y_there
+    cdef double *slope
+    cdef double *slope_there
+    cdef double *piece
+    cdef double *piece_there
+
+    cdef int make_room(self, Py_ssize_t stride) except -1:
+        """Make room for multipliers of so many numbers each."""
+        self.dual = Room(5 * stride + 2 * self.places)
+        self.y, self.dy = self.dual.at, self.dual.at + stride
+        self.y_there, self.slope = self.dy + stride, self.dy + 2 * stride
+        self.slope_there = self.slope + stride
+        self.piece = self.slope_there + stride
+        self.piece_there = self.piece + self.places
+        return 0
+
+    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
+        """Return a model with w + shift (k,) for the first rows, where that is positive.
+        """
+        raise NotImplementedError
+
+    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+                   double *s) except -1:
+        """Find s, piece and slope for y = 0."""
+        raise NotImplementedError
+
+    cdef int newton(self, Model B) except -1:
+        """Find the step dy from `slope` and `piece`."""
+        raise NotImplementedError
+
+    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+                  double *s) except -1:
+        """Find s(y) and its piece at `y_there`, of the places."""
+        raise NotImplementedError
+
+    cdef int find_slope(self, Model B, const double *s) except -1:
+        """Find Us(y) − W⁻¹y at `y_there`, after `tilt`."""
+        raise NotImplementedError
+
+    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+                    double *s) except -1:
+        """Complete s(y) at `y_there`, of all components."""
+        raise NotImplementedError
+
+    cdef double largest(self, Model B) except? -1:
+        """Return the largest w."""
+        raise NotImplementedError
+
+    cdef int leave_out(self, Model B, const double *s, double *sBs,
+                       double *square) except -1:
+        """Subtract Σ wᵢ(uᵢᵀs)² from sᵀBs, and ‖Us‖² from ‖s‖²."""
+        raise NotImplementedError
+
+    cdef int enter(self, Model B, const double *free) except -1:
+        raise NotImplementedError
+
+    cdef double inverse(self, Model B, const double *free, const double *v,
+                        const double *along, double *z) except? -1:
+        raise NotImplementedError
+
+
+cdef class DenseBasis(Basis):
+    """An array U (k, n), and U_F U_Fᵀ of the face F for which it was asked last.
+
+    Only components from `first` on, `size` of them, have bounds, and are looked at in a
+    face; all others are free in each.
+    """
+
+    cdef Py_ssize_t stride, first, size, flips
+    cdef bint is_split
+    cdef Room room
+    cdef int *where  # (size + 3,)
+    cdef double *U
+    cdef double *bounded  # (k, size) the columns of those with bounds
+    cdef double *columns  # the same by columns (size, stride)
+    cdef double *others  # U_f U_fᵀ of the others; as `gram` by rows of `stride` numbers
+    cdef double *gram  # (k, k) upper triangle
+    cdef double *held
+    cdef double *core  # τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², factorised
+    cdef double *pivots  # their inverses
+    cdef double *c
+    cdef double *fixed
+    cdef double *t  # (n,)
+
+    @staticmethod
+    cdef DenseBasis zeros(Py_ssize_t k, Py_ssize_t n, Py_ssize_t first, Py_ssize_t size):
+        cdef DenseBasis made = DenseBasis.__new__(DenseBasis)
+        cdef Py_ssize_t stride = (k + 3) & ~3
+        made.k, made.n, made.stride, made.first, made.size = k, n, stride, first, size
+        made.places, made.flips = size, size + 1
+        made.over = made.over_dual = Reduction()
+        made.room = Room(
+            (k + 1) * n + k * size + stride * (3 * stride + size + 3) + 2 * size + 2
+        )
+        made.U = made.room.at
+        made.bounded = made.U + k * n
+        made.columns = made.bounded + k * size
+        made.others = made.columns + stride * size
+        made.gram = made.others + stride * stride
+        made.core = made.gram + stride * stride
+        made.pivots = made.core + stride * stride
+        made.c, made.fixed = made.pivots + stride, made.pivots + 2 * stride
+        made.t = made.fixed + stride
+        made.held = made.t + n
+        made.where = <int *> (made.held + size)
+        made.make_room(stride)
+        return made
+
+    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
+        # the rows that are left out are the last as a rule, and the basis serves as it is
+        cdef Model B = Model.__new__(Model)
+        cdef Py_ssize_t i, kept = 0, last = -1, n = self.n
+        cdef DenseBasis chosen = self
+        for i in range(k):
+            if w[i] + shift > 0:
+                kept, last = kept + 1, i
+        if not kept:
+            return Model.of_norm(tau, self.n)
+        if last >= kept:
+            chosen, kept = DenseBasis.zeros(kept, n, self.first, self.size), 0
+            for i in range(k):
+                if w[i] + shift > 0:
+                    memcpy(chosen.U + kept * n, self.U + i * n, n * sizeof(double))
+                    kept += 1
+        B.room = Room(kept + chosen.stride)
+        B.w, B.root = B.room.at, B.room.at + kept
+        B.basis, B.tau, B.n, B.k, kept = chosen, tau, n, kept, 0
+        for i in range(k):
+            if w[i] + shift > 0:
+                B.w[kept] = w[i] + shift
+                B.root[kept] = sqrt(B.w[kept])
+                kept += 1
+        return B
+
+    cdef void split(self) noexcept:
+        """Find what belongs to the components with bounds, and to the others."""
+        cdef Py_ssize_t i, j, stride = self.stride
+        if self.is_split:
+            return
+        self.is_split = True
+        for j in range(self.k):
+            memcpy(self.bounded + j * self.size, self.U + j * self.n + self.first,
+                   self.size * sizeof(double))
+        transposed(self.bounded, self.columns, self.k, self.size, stride)
+        if self.size == self.n:
+            return
+        for j in range(self.k):
+            self.others[j * stride + j] = 1.0
+        for i in range(self.size):
+            self.where[i], self.held[i] = i, 1.0
+        self.change(self.size, self.others)
+        for i in range(self.k):
+            for j in range(i):
+                self.others[i * stride + j] = self.others[j * stride + i]
+
+    cdef void change(self, Py_ssize_t count, double *gram) noexcept:
+        """Take the components in `where` that are held now from it, add the others."""
+        cdef Py_ssize_t c, q
+        cdef double sign[4]
+        for c in range(0, count, 4):
+            for q in range(4):
+                sign[q] = 0.0
+                if c + q < count:
+                    sign[q] = 1 - 2 * self.held[self.where[c + q]]
+                else:
+                    self.where[c + q] = 0
+            add_gram(sign, self.columns, self.where + c, gram, self.stride)
+
+    cdef void face(self, const double *piece) noexcept:
+        """Bring `gram` to the face where `piece` (size,) is zero.
+
+        The rows are orthonormal, so that it is I less what is held; after as many
+        changes as there are components it is summed up anew, by what is held or by
+        what is not, whichever is less.
+        """
+        cdef Py_ssize_t i, count, stride = self.stride
+        cdef bint is_held
+        self.split()
+        if self.flips > self.size:
+            self.flips = count = 0
+            for i in range(self.size):
+                count += piece[i] != 0
+            is_held = 2 * count > self.size
+            memcpy(self.gram, self.others, stride * stride * sizeof(double))
+            if not is_held:
+                memset(self.gram, 0, stride * stride * sizeof(double))
+                for i in range(self.k):
+                    self.gram[i * stride + i] = 1.0
+            for i in range(self.size):
+                self.held[i] = is_held
+        count = changed(piece, self.held, self.size, self.where)
+        self.flips += count
+        self.change(count, self.gram)
+
+    cdef int factor(self, Model B, const double *piece) except -1:
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` (size,) is zero.
+
+        It is not below τI, however large W is.
+        """
+        self.face(piece)
+        scaled(B.root, self.gram, B.tau, self.core, B.k, self.stride)
+        if not eliminated(self.core, self.pivots, B.k, self.stride):
+            raise ArithmeticError("the core of a model is not positive definite")
+        return 0
+
+    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+                   double *s) except -1:
+        cdef Py_ssize_t i, n = self.n, k = B.k
+        self.split()
+        memset(self.y, 0, self.stride * sizeof(double))
+        memset(self.y_there, 0, self.stride * sizeof(double))
+        box.minimise(x, g, B.tau, s, NULL)
+        box.minimise_part(self.first, self.size, x, g + self.first, B.tau, s, self.piece)
+        rows_times(self.U, s, self.slope, k, n)
+        if self.size < n:
+            rows_times(self.bounded, s + self.first, self.fixed, k, self.size)
+            for i in range(k):
+                self.fixed[i] = self.slope[i] - self.fixed[i]
+        return 0
+
+    cdef int newton(self, Model B) except -1:
+        cdef Py_ssize_t i
+        self.factor(B, self.piece)
+        for i in range(B.k):
+            self.dy[i] = B.root[i] * self.slope[i]
+        solve(self.core, self.pivots, self.dy, self.stride)
+        for i in range(B.k):
+            self.dy[i] *= B.root[i] * B.tau
+        return 0
+
+    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+                  double *s) except -1:
+        cdef Py_ssize_t o = self.first
+        combination(1.0, self.bounded, self.y_there, g + o, self.t, B.k, self.size)
+        box.minimise_part(o, self.size, x, self.t, B.tau, s, self.piece_there)
+        return 0
+
+    cdef int find_slope(self, Model B, const double *s) except -1:
+        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` is U times the first
+        # part of it
+        cdef Py_ssize_t i
+        rows_times(self.bounded, s + self.first, self.slope_there, B.k, self.size)
+        for i in range(B.k):
+            self.slope_there[i] -= self.y_there[i] / B.w[i]
+        if self.size < self.n:
+            rows_times(self.others, self.y_there, self.c, B.k, self.stride)
+            for i in range(B.k):
+                self.slope_there[i] += self.fixed[i] - self.c[i] / B.tau
+        return 0
+
+    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+                    double *s) except -1:
+        if self.size < self.n:
+            combination(1.0, self.U, self.y_there, g, self.t, B.k, self.n)
+            box.minimise(x, self.t, B.tau, s, NULL)
+        return 0
+
+    cdef double largest(self, Model B) except? -1:
+        cdef Py_ssize_t i
+        cdef double most = 0.0
+        for i in range(B.k):
+            most = fmax(most, B.w[i])
+        return most
+
+    cdef int leave_out(self, Model B, const double *s, double *sBs,
+                       double *square) except -1:
+        cdef Py_ssize_t i
+        rows_times(self.U, s, self.c, B.k, self.n)
+        for i in range(B.k):
+            square[0] -= self.c[i] * self.c[i]
+            sBs[0] -= B.w[i] * self.c[i] * self.c[i]
+        return 0
+
+    cdef int enter(self, Model B, const double *free) except -1:
+        cdef Py_ssize_t i
+        for i in range(self.size):
+            self.piece[i] = 1 - free[self.first + i]
+        return self.factor(B, self.piece)
+
+    cdef double inverse(self, Model B, const double *free, const double *v,
+                        const double *along, double *z) except? -1:
+        # B_FF⁻¹ = (I − U_FᵀW¹ᐟ²(τI + W¹ᐟ²U_FU_FᵀW¹ᐟ²)⁻¹W¹ᐟ²U_F)/τ (Sherman, Morrison
+        # and Woodbury)
+        cdef Py_ssize_t i
+        rows_times(self.U, v, self.c, B.k, self.n)
+        for i in range(B.k):
+            self.c[i] *= B.root[i]
+        solve(self.core, self.pivots, self.c, self.stride)
+        for i in range(B.k):
+            self.c[i] *= B.root[i]
+        combination(-1.0, self.U, self.c, v, z, B.k, self.n)
+        return scale_free(1 / B.tau, free, along, z, self.n)
+
+
+cdef class FactoredBasis(Basis):
+    """C = L⁻¹G of sparse rows, which a model has with one weight w: the penalty's.
+
+    B = τI + w Gᵀ(GGᵀ)⁻¹G, and its multipliers are y = w(GGᵀ)⁻¹Gs: the gradient of the
+    dual function is Gs(y) − GGᵀy/w. Of components without bounds s is −(g + Gᵀy)/τ, so
+    that only those with bounds, b, are looked at for each y:
+
+        Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
+
+    given : a `solvers.smalbe.rows.SparseRows`
+    """
+
+    cdef Rows rows
+    cdef object given, solve
+    cdef object x_b, g_b, low_b, high_b, tilted_b, s_b, Gg, weights
+
+    @staticmethod
+    cdef FactoredBasis of(Rows rows):
+        cdef FactoredBasis made = FactoredBasis.__new__(FactoredBasis)
+        made.rows, made.given, made.n = rows, rows.given, rows.n
+        made.over, made.over_dual = rows.over, rows.over_rows
+        made.k, made.places = rows.given.unit.shape[0], rows.given.bounded.size
+        made.make_room(made.k)
+        made.s_b = np.empty(made.places)
+        return made
+
+    cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
+        cdef Model B
+        if w[0] + shift <= 0:
+            return Model.of_norm(tau, self.n)
+        B = Model.__new__(Model)
+        B.basis, B.tau, B.n, B.k, B.room = self, tau, self.n, self.k, Room(1)
+        B.w, B.w[0] = B.room.at, w[0] + shift
+        return B
+
+    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+                   double *s) except -1:
+        b, n = self.given.bounded, self.n
+        self.x_b, self.g_b = seen(x, n)[b], seen(g, n)[b]
+        self.low_b, self.high_b = seen(box.lower, n)[b], seen(box.upper, n)[b]
+        self.Gg = np.asarray(self.given.unit @ seen(g, n))
+        memset(self.y_there, 0, self.k * sizeof(double))
+        self.tilt(B, x, g, box, s)
+        self.find_slope(B, s)
+        memset(self.y, 0, self.k * sizeof(double))
+        memcpy(self.slope, self.slope_there, self.k * sizeof(double))
+        memcpy(self.piece, self.piece_there, self.places * sizeof(double))
+        return 0
+
+    cdef int newton(self, Model B) except -1:
+        free = np.ones(self.n, dtype=bool)
+        free[self.given.bounded] = seen(self.piece, self.places) == 0
+        solve = self.given.gram.in_face(free, B.tau / B.w[0])
+        take(B.tau * np.asarray(solve(seen(self.slope, self.k))), self.k, self.dy, "dy")
+        return 0
+
+    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+                  double *s) except -1:
+        y = seen(self.y_there, self.k)
+        self.tilted_b = self.g_b + np.asarray(self.given.of_bounded.T @ y)
+        tilted(numbers(self.x_b), numbers(self.tilted_b), B.tau, numbers(self.low_b),
+               numbers(self.high_b), numbers(self.s_b), self.piece_there, self.places)
+        return 0
+
+    cdef int find_slope(self, Model B, const double *s) except -1:
+        held = self.given.of_bounded @ (self.tilted_b / B.tau + self.s_b)
+        GGy = np.asarray(self.given.gram.product(seen(self.y_there, self.k)))
+        shift = self.Gg / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy
+        take(np.asarray(held) - shift, self.k, self.slope_there, "slope")
+        return 0
+
+    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+                    double *s) except -1:
+        tilt = np.asarray(self.given.unit.T @ seen(self.y_there, self.k))
+        step = -(seen(g, self.n) + tilt) / B.tau
+        step[self.given.bounded] = self.s_b
+        return take(step, self.n, s, "s")
+
+    cdef double largest(self, Model B) except? -1:
+        return B.w[0]
+
+    cdef int leave_out(self, Model B, const double *s, double *sBs,
+                       double *square) except -1:
+        cdef Room Cs = Room(self.rows.r)
+        cdef double part
+        self.rows.times(s, Cs.at)
+        part = self.rows.size(Cs.at) ** 2
+        square[0] -= part
+        sBs[0] -= B.w[0] * part
+        return 0
+
+    cdef int enter(self, Model B, const double *free) except -1:
+        is_free = seen(free, self.n) > 0
+        self.solve = self.given.gram.in_face(is_free, B.tau / B.w[0])
+        self.weights = seen(free, self.n) / B.tau
+        return 0
+
+    cdef double inverse(self, Model B, const double *free, const double *v,
+                        const double *along, double *z) except? -1:
+        y = self.solve(self.given.unit @ seen(v, self.n))
+        found = self.given.weighted_difference(seen(v, self.n), y, self.weights)
+        take(found, self.n, z, "z")
+        return dot(z, along, self.n)

@@ -1,0 +1,430 @@
+# The outer loop, and the way back to the problem as given.
+
+
+cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
+cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
+cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
+cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
+cdef double LEAST_RHO = 10.0  # of the model of the penalty: with less, nothing is projected
+
+
+cdef class SMALBE(MPRGP):
+    """Semimonotonic augmented Lagrangians: the outer loop over MPRGP.
+
+    Minimises ½νᵀHν − bᵀν subject to Cν = 0 and a set, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ with
+    Q = CᵀC, 𝒫 = I − Q and orthonormal rows C (Dostál 2009, the paper's reference [3],
+    Algorithm 6.1).
+
+    problem : a `solvers.smalbe.projected.Projected`
+    options : a `solvers.smalbe.options.Options`
+    M : None, or v → Mv of a structural preconditioner
+    preconditioned : whether the model, or M, preconditions in the face
+    """
+
+    cdef double norm, tail, b_size
+    cdef bint plain, preconditioned
+    cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
+    cdef list held  # the arrays that are read
+    cdef Basis basis  # these directions, None where there are none
+    cdef Room above  # (found,) their eigenvalues above the tail
+    cdef const double *b
+    cdef const double *q
+    cdef const double *diagonal  # NULL where an operator does not tell
+    cdef Model known
+    cdef double known_rho
+    cdef double M_now, tol, energy, small_gradient, coarse_gradient
+    cdef long most_products  # where the energy error may still cost something
+
+    def __init__(self, problem, options, bint preconditioned, M=None):
+        cdef const double *lower
+        cdef const double *upper
+        spectrum, bounds = problem.spectrum, problem.bounds
+        self.F, self.M, self.counts = problem.F, M, problem.counts
+        self.n, self.over = self.F.n, self.F.over
+        self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
+        self.M_scale = spectrum.norm
+        self.held, self.rows = [], problem.C
+        self.b, self.q = read(problem.b, self.held), read(problem.q, self.held)
+        lower, upper = read(bounds[0], self.held), read(bounds[1], self.held)
+        self.set = Box.of(lower, upper, self.n, self.over)
+        if len(problem.diagonal):
+            self.diagonal = read(problem.diagonal, self.held)
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.reduced = options.reduced
+        self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.proportions_by_model = options.proportioning == "model"
+        self.plain = options.expansion != "model"
+        self.preconditioned = preconditioned
+        kept = KEPT if options.recycle and not issparse(self.F.matrix) else 0
+        self.directions = Directions(self.n, kept, self.over)
+        self.find_directions(spectrum.ritz)
+        self.make_room()
+
+    # the model
+
+    cdef int find_directions(self, ritz) except -1:
+        """Choose the directions of models, and the tail.
+
+        The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
+        what the Ritz vectors before it leave (the last, where the process came to its
+        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
+        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
+        a short process finds not even the first eigenvector, and Ritz vectors that are
+        none would slow CG down: then only the norm is used. Many sparse rows come of
+        many subdomains, and there no eigenvalue stands apart.
+        """
+        cdef Py_ssize_t i, found, kept = 0, n = self.n, r = self.rows.r
+        cdef Py_ssize_t first = 0, last = n
+        cdef const double *value = NULL
+        cdef const double *residual = NULL
+        cdef DenseBasis basis
+        cdef list held = []
+        if ritz is not None:
+            value, residual = read(ritz.values, held), read(ritz.residuals, held)
+            found = len(ritz.values)
+            kept = max(found - (1 if residual[found - 1] <= 1e-10 * value[0] else 2), 0)
+            for i in range(kept):
+                if residual[i] > value[i]:
+                    kept = i
+                    break
+            if residual[0] > FOUND * value[0]:
+                kept = 0
+            self.tail = fmax((value[kept] + residual[kept]) / self.norm, TAIL)
+        if not self.rows.C:
+            self.found, self.above = 1, Room(1)
+            self.above.at[0] = -self.tail
+            if self.rows.exist:
+                self.basis = FactoredBasis.of(self.rows)
+            return 0
+        self.found = kept + r
+        self.above = Room(self.found)
+        for i in range(self.found):
+            self.above.at[i] = -self.tail
+            if i >= r:
+                self.above.at[i] += (value[i - r] + residual[i - r]) / self.norm
+        if not self.found:
+            return 0
+        while first < n and not self.set.has_bound(first):
+            first += 1
+        while last > first and not self.set.has_bound(last - 1):
+            last -= 1
+        basis = DenseBasis.zeros(self.found, n, first, last - first)
+        memcpy(basis.U, self.rows.C, r * n * sizeof(double))
+        if kept:
+            memcpy(basis.U + r * n, read(ritz.vectors, held), kept * n * sizeof(double))
+        self.basis, self.rows.C = basis, basis.U  # read once, not from farther caches
+        self.rows.held.append(basis)
+        return 0
+
+    cdef Model model(self, double rho):
+        """Model H by the Ritz pairs and the penalty ρ."""
+        cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
+        cdef Room w
+        if self.basis is None:
+            return Model.of_norm(self.tail, self.n)
+        if self.known is None or self.known_rho != rho:
+            w = Room(self.found)
+            for i in range(self.found):
+                w.at[i] = self.above.at[i] + (rho if i < of_rows else 0.0)
+            self.known = self.basis.model(self.found, w.at, 0.0, self.tail)
+            self.known_rho = rho
+        return self.known
+
+    cdef Model model_of_penalty(self, double rho):
+        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
+        cdef Room w = Room(of_rows)
+        if not self.rows.exist:
+            return Model.of_norm(1.0, self.n)
+        for i in range(of_rows):
+            w.at[i] = fmax(rho, LEAST_RHO) - 1
+        return self.basis.model(of_rows, w.at, 0.0, 1.0)
+
+    cdef int choose_models(self) except -1:
+        """Choose B and the preconditioner for this ρ."""
+        if self.plain:  # by ‖H‖ alone
+            self.B = Model.of_norm(
+                fmax(1.0, self.rho if self.rows.exist else 0.0) / self.alpha, self.n
+            )
+        else:
+            self.B = self.model(self.rho)
+        self.preconditioner = None
+        if self.M is not None:
+            self.preconditioner = self.model_of_penalty(self.rho)
+        elif self.preconditioned:
+            self.preconditioner = self.model(self.rho)
+        return 0
+
+    # the start
+
+    def begin(self, x, mu, double rho):
+        """Return ν (n,), x moved into the set, and its gradient with multipliers μ.
+
+        One product, none for x = 0: there 𝒫ν = −𝒫x̃ = 0, and Hν = ρQν.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef list held = []
+        start, gradient = np.empty(n), np.zeros(n)
+        cdef bint moved = False
+        cdef double *nu = numbers(start)
+        cdef double *g = numbers(gradient)
+        if rho != self.rho:
+            self.directions.begin(self.free)  # of another H
+        self.rho = rho
+        self.set.project(read(x, held), 1.0, self.rows.x_tilde, nu)
+        for i in range(n):
+            moved = moved or nu[i] + self.rows.x_tilde[i] != 0
+        if self.over.any(moved):
+            self.H(nu, g)
+        else:  # 𝒫F𝒫ν = 0
+            self.rows.times(nu, self.Cv)
+            self.rows.combine(rho, self.Cv, g, g)
+        add(-1.0, self.b, g, n)
+        self.rows.combine(1.0, read(mu, held), g, g)
+        return self.over.vector(start), self.over.vector(gradient)
+
+    # the algorithm
+
+    def solve(self, options, double tol, at, infeasible, watch=None):
+        """Run the outer loop on from `at`.
+
+        For k = 0, 1, …:
+
+        1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
+        2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²
+           since the last k: M ← βM, and ρ ← ρ·growth.
+        3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed. H is the same,
+           so that on an unchanged face the directions of CG go on to serve.
+
+        until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖.
+        (Where b is zero, it is the gradient at the start, and where e is, ν that Cν is
+        compared with.) What the gradient means in the energy norm is estimated, too
+        (`energy_error`): ‖b‖ may be the gap of supports, beside which contact is small.
+        It may cost a quarter more products, not more: where stiffnesses differ much,
+        rounding can keep it away.
+
+        4. Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ←
+           10ρ up to MOST_RHO, or, where it is small enough and only the gradient is not,
+           M ← M/10 down to LEAST_M; and CᵀCν is tried as proof that there is no feasible
+           point.
+
+        Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
+        `OuterIteration`, and the status.
+
+        at : an `Iterate`
+        infeasible : asked whether ν proves that
+        watch : makes the observer of outer iteration k with that right-hand side, which
+            is told the letter of each step, x and g
+        """
+        cdef Py_ssize_t i, n = self.n, r = self.rows.r
+        cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
+        cdef long left = options.max_steps - len(at.steps) - len(at.outer)
+        cdef bint stopped, enough, solved, stalled
+        memcpy(self.x, numbers(at.nu), n * sizeof(double))
+        memcpy(self.g, numbers(at.g), n * sizeof(double))
+        if at.rho != self.rho or not at.outer:
+            self.directions.begin(self.free)
+        self.rho, self.M_now, self.tol, self.energy = at.rho, at.M, tol, options.energy
+        self.most_products, self.knows_Cx = 0, False
+        multipliers = np.array(at.mu)
+        cdef double *mu = numbers(multipliers)
+        self.b_size = sqrt(self.over.total(dot(self.b, self.b, n)))
+        if not self.b_size:
+            self.b_size = sqrt(self.over.total(dot(self.g, self.g, n)))
+        self.small_gradient = tol * self.b_size
+        self.coarse_gradient = options.eta * self.b_size
+        done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
+        status = "iteration_limit"
+        while True:
+            # 1. The inner problem.
+            trace, M = bytearray(), self.M_now
+            memcpy(self.rhs, self.b, n * sizeof(double))
+            self.rows.add(-1.0, mu, self.rhs)
+            self.choose_models()
+            note = watch and watch(
+                len(at.outer) + len(done), self.over.vector(copied(self.rhs, n))
+            )
+            stopped = self.minimise(max(left, 0), trace, note)
+            left -= len(trace) + 1
+            solved = sqrt(self.phi_square + self.beta_square) <= self.small_gradient
+            solved = solved and self.is_accurate()
+            # 2. The Lagrangian, and the precision of the inner problems.
+            self.rows.times(self.x, self.Cv)
+            error = self.rows.size(self.Cv)
+            lagrangian = self.lagrangian(mu)
+            enough = lagrangian >= before + self.rho / 2 * error * error
+            before = lagrangian
+            done.append((trace.decode(), M, self.rho, error, lagrangian))
+            # 3. The multipliers.
+            self.rows.add(self.rho, self.Cv, self.g)
+            for i in range(r):
+                mu[i] += self.rho * self.Cv[i]
+            if not enough:
+                self.M_now *= options.beta
+                if growth != 1:
+                    self.change_penalty(growth * self.rho)
+            if solved:
+                status = "solved"
+                break
+            # 4. What helps where multipliers do not.
+            errors = [*errors, error][len(errors) > 2:]
+            stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
+            if (not stopped or stalled) and infeasible(
+                self.over.vector(copied(self.x, n))
+            ):
+                status = "infeasible"
+                break
+            if not stopped or left < 0:
+                break
+            if stalled and self.rows.are_met(self.x, self.Cv, tol, self.b_size):
+                if self.M_now < LEAST_M:
+                    break
+                self.M_now /= 10
+            elif stalled:
+                if self.rho >= MOST_RHO:
+                    break
+                self.change_penalty(fmin(10 * self.rho, MOST_RHO))
+        nu, g = copied(self.x, n), copied(self.g, n)
+        return (self.over.vector(nu), self.over.vector(g),
+                self.rows.over_rows.vector(multipliers), self.M_now, self.rho, done, status)
+
+    cdef bint stops(self) except -1:
+        """Return whether an inner run may end."""
+        cdef double size = sqrt(self.phi_square + self.beta_square)
+        if self.rows.exist and size < self.coarse_gradient:
+            if size < self.M_now * self.violation():
+                return True
+        return size <= self.small_gradient and self.is_accurate()
+
+    cdef bint is_accurate(self) except -1:
+        """Return whether rows are met and the energy error is small, or cost its share.
+        """
+        self.rows.times(self.x, self.Cv)
+        if not self.rows.are_met(self.x, self.Cv, self.tol, self.b_size):
+            return False
+        if not self.most_products:
+            self.most_products = <long> (FOR_ENERGY * self.F.count)
+        if not self.energy or self.F.count >= self.most_products:
+            return True
+        return self.energy_error() <= self.energy * self.tol
+
+    cdef double energy_error(self) except? -1:
+        """Estimate the relative energy error from what is left of the gradient.
+
+        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, of which every
+        rᵢ²/F_ii is a lower bound. The root of their sum was 0.8 to 8.4 times below the
+        certified error of the contact problems at hand. Gradients that are rounding of
+        q do not count. Zero where F is an operator.
+        """
+        cdef double energy = 0.0, most = 0.0, error
+        cdef Py_ssize_t i
+        if not self.diagonal:
+            return 0.0
+        for i in range(self.n):
+            energy += self.q[i] * (self.rows.x_tilde[i] + self.x[i])
+            most = fabs(self.q[i]) if fabs(self.q[i]) > most else most
+        most = -most
+        self.over.add(&energy, 1, &most)
+        error = self.set.inward_energy(self.x, self.g, self.diagonal, self.norm,
+                                       1e3 * 2.0 ** -52 * -most)
+        return sqrt(error / fabs(energy)) if energy else 0.0
+
+    cdef double lagrangian(self, const double *mu) except? -1:
+        """Return L(ν, μ) from the gradient; Cν is in `Cv`."""
+        cdef double sum_ = 0.0
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            sum_ += 0.5 * self.x[i] * (self.g[i] - self.b[i])
+        return self.over.total(sum_) + 0.5 * self.rows.over_rows.total(
+            dot(mu, self.Cv, self.rows.r)
+        )
+
+    cdef int change_penalty(self, double rho) except -1:
+        """Change ρ; the gradient follows without a product."""
+        self.rows.times(self.x, self.Cv)
+        self.rows.add(rho - self.rho, self.Cv, self.g)
+        self.rho = rho
+        self.directions.begin(self.free)  # of another H
+        return 0
+
+    # back to the problem as given
+
+    def point(self, nu, mu, lb, ub):
+        """Return x, a, z_box and Fx of the problem with the rows Cx = Cx̃; one product.
+
+        As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
+        they are too nearly dependent on the free components for normal equations, or
+        sparse.
+        """
+        cdef Py_ssize_t i, n = self.n, r = self.rows.r
+        cdef int order = r, one = 1, info = 0
+        cdef bint any_left = False
+        cdef list held = []
+        if not self.rows.C:
+            return None
+        result, multipliers = np.zeros((3, n)), np.zeros(r)
+        cdef Room room = Room(r * r)
+        cdef double *S = room.at
+        cdef const double *C = self.rows.C
+        cdef const double *v = numbers(nu)
+        cdef const double *at_mu = numbers(mu)
+        cdef double *a = numbers(multipliers)
+        cdef double *x = numbers(result)
+        cdef double *z_box = x + n
+        cdef double *Fx = z_box + n
+        cdef double *rest = self.s
+        cdef double *free = self.x2
+        cdef double *t = self.t
+        cdef double *da = self.Cv
+        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper, read(lb, held),
+                 read(ub, held), x, free, n)
+        self.F.apply(x, Fx)
+        for i in range(n):
+            rest[i] = Fx[i] + self.q[i]
+            any_left = any_left or rest[i] != 0
+        if not any_left:  # a minimum of the cost without any constraint
+            return result[0], multipliers, result[1], result[2]
+        if r:
+            rows_times(C, rest, da, r, n)
+            for i in range(r):
+                a[i] = self.norm * at_mu[i] - da[i]
+            add_combination(1.0, C, a, rest, r, n)
+            for i in range(r):
+                masked(free, C + i * n, t, n)
+                rows_times(C, t, S + i * r, i + 1, n)
+            masked(free, rest, t, n)
+            rows_times(C, t, da, r, n)
+            dpotrf(b"U", &order, S, &order, &info)
+            for i in range(r):
+                if info or S[i * r + i] < 1e-4:
+                    return None
+            dpotrs(b"U", &order, &one, S, &order, da, &order, &info)
+            for i in range(r):
+                a[i] -= da[i]
+            add_combination(-1.0, C, da, rest, r, n)
+        held_by(v, self.set.lower, self.set.upper, rest, z_box, n)
+        return result[0], multipliers, result[1], result[2]
+
+
+def residual_bound(
+    cost, told_diagonal, at_x, at_y, at_z, told_Fx, lower, upper, right, told_rows
+):
+    """Bound the worst of `harness.kkt_residuals` from above, without products.
+
+    cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
+    at_x, at_y, at_z, told_Fx : x, y, z_box of the point, and Px
+    lower, upper, right, told_rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
+
+    With the least scale of energy that it may use, and nothing excused as rounding:
+    where this is small, so are the residuals. inf where nothing can be said.
+    """
+    cdef Py_ssize_t n = len(at_x), m = len(at_y)
+    cdef list held = []
+    cdef Room room = Room(2 * n)
+    if not len(told_diagonal) or not n:
+        return INFINITY
+    return worst_residual(
+        read(cost, held), read(told_diagonal, held), read(at_x, held), read(at_y, held),
+        read(at_z, held), read(told_Fx, held), read(lower, held), read(upper, held),
+        read(right, held), read(told_rows, held), m, n, room.at,
+    )

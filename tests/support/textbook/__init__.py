@@ -1,0 +1,1 @@
+"""SMALBE and MPRGP as a textbook has them, in NumPy: what tests compare ours with."""

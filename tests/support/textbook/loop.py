@@ -1,0 +1,104 @@
+"""The textbook's loop in the place of `solvers.smalbe.driver.outer_loop`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from scipy.sparse import issparse
+
+from mortarbench.harness import QP, Vector
+from mortarbench.solvers.smalbe.driver import History, recovered
+from mortarbench.solvers.smalbe.options import Options
+from mortarbench.solvers.smalbe.preconditioner import Preconditioner, chosen, structural
+from mortarbench.solvers.smalbe.projected import Iterate
+from mortarbench.solvers.smalbe.rows import Mask
+from tests.support.textbook import kernels
+from tests.support.textbook.mprgp import Operator, Precondition, Rules, Watch
+from tests.support.textbook.outer_loop import (
+    Constants,
+    InnerSolver,
+    first_iterate,
+    smalbe,
+)
+from tests.support.textbook.projected import Projected
+
+KEPT = 200  #: directions of CG on a face
+LEAST_RHO = 10.0  #: of the model of the penalty: with less, nothing is projected
+
+
+@dataclass(frozen=True, eq=False)
+class TextbookLoop:
+    """The outer loop as it is written."""
+
+    problem: Projected
+    constants: Constants
+    inner: InnerSolver
+
+    def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Any:
+        return first_iterate(self.problem, x, mu, M=M, rho=rho)
+
+    def solve(self, tol: float, at: Any) -> Any:
+        return smalbe(self.problem, self.constants, self.inner, tol, at)
+
+    def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
+        return recovered(self.problem, qp, at)
+
+
+def outer_loop(
+    problem: Any, qp: QP, options: Options, history: History | None = None
+) -> TextbookLoop:
+    """Do what `solvers.smalbe.driver.outer_loop` does, as it is written."""
+    fields = vars(problem)
+    problem = Projected(**fields)
+    kept = KEPT if options.recycle and not issparse(qp.P) else 0
+    rules = Rules(
+        options.Gamma, options.expansion, options.proportioning, options.reduced,
+        options.alpha, kept=kept,
+    )  # fmt: skip
+    constants = Constants(
+        options.M, options.beta, options.eta, options.rho_growth, options.max_steps,
+        options.energy,
+    )  # fmt: skip
+    plain = partial(problem.plain_model, alpha=options.alpha)
+    inner = InnerSolver(
+        rules=rules,
+        model=problem.model if options.expansion == "model" else plain,
+        precondition=face_preconditioner(
+            problem, qp, chosen(qp, options.preconditioner)
+        ),
+        watch=None if history is None else partial(_watched, history, problem),
+    )
+    return TextbookLoop(problem, constants, inner)
+
+
+def _watched(history: History, problem: Projected, outer: int, rhs: Vector) -> Watch:
+    note = history.watch(problem, outer, rhs)
+    return lambda letter, at, face: note(letter, at.x, at.g)
+
+
+def face_preconditioner(
+    problem: Projected, qp: QP, kind: Preconditioner
+) -> Callable[[float], Precondition | None]:
+    """Set up once; the result makes, for each ρ, what `mprgp` takes."""
+    if kind == "none":
+        return lambda rho: None
+    if kind == "model":
+        return lambda rho: problem.model(rho).inverse_in
+    M = structural(qp, kind)
+    assert M is not None
+
+    def in_face(free: Mask, rho: float) -> Operator:
+        of_penalty = problem.penalty(max(rho, LEAST_RHO)).inverse_in(free)
+
+        def apply(v: Vector) -> Vector:
+            problem.counts["preconditioner_applies"] += 1
+            Pv = of_penalty(v)
+            rest = kernels.combined(problem.spectrum.norm, M(Pv), -1.0, Pv)
+            return of_penalty(rest) + Pv
+
+        return apply
+
+    return lambda rho: partial(in_face, rho=rho)

@@ -1,0 +1,167 @@
+"""The projected problem, its operator and models of it, in NumPy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
+
+from mortarbench.harness import QP, Vector
+from mortarbench.solvers.common.conversion import boxed
+from mortarbench.solvers.smalbe import projected
+from mortarbench.solvers.smalbe import rows as given
+from mortarbench.solvers.smalbe.compiled import Product, Reduction, Rows
+from mortarbench.solvers.smalbe.projected import Spectrum, _diagonal, _not_vanishing
+from mortarbench.solvers.smalbe.rows import equality_rows, is_sparse
+from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
+from tests.support.textbook import kernels
+from tests.support.textbook.model import BoxModel, Model
+from tests.support.textbook.rows import model_of, orthonormal_rows
+
+FEW = 5  #: steps after which a flat spectrum shows
+FLAT = 10.0  #: ratio of Ritz values of one size
+FOUND = 1e-3  #: residual over value of the first Ritz pair where the spectrum decays
+TAIL = 1e-4  #: least τ of a model, relative to the norm
+
+
+@dataclass(eq=False)
+class Projected(projected.Projected):
+    """Steps 1 to 3 of SMALBE: H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ and b."""
+
+    def energy_error(self, nu: Vector, gradient: Vector) -> float:
+        """Estimate the relative energy error from what is left of the gradient.
+
+        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, of which every
+        rᵢ²/F_ii is a lower bound. The root of their sum was 0.8 to 8.4 times below the
+        certified error of the contact problems at hand. Gradients that are rounding of
+        q do not count. Zero where F is an operator.
+        """
+        energy = abs(self.q @ (self.rows.x_tilde + nu))
+        r = self.spectrum.norm * gradient
+        noise = 1e3 * np.finfo(float).eps * np.abs(self.q).max(initial=0.0)
+        if not self.diagonal.size:
+            return 0.0
+        told = (self.diagonal > 0) & (np.abs(r) > noise)
+        squares = r[told] ** 2 / self.diagonal[told]
+        return float(np.sqrt(squares.sum() / energy)) if energy else 0.0
+
+    def H(self, v: Vector, rho: float) -> Vector:
+        """Apply H; one product with F."""
+        C = self.rows.C
+        Cv = C @ v
+        Fv = self.F(self.rows.combined(1.0, v, -1.0, Cv))
+        scale = 1 / self.spectrum.norm
+        shift = kernels.combined(rho, Cv, -scale, C @ Fv)
+        return self.rows.combined(scale, Fv, 1.0, shift)
+
+    def model(self, rho: float) -> BoxModel:
+        """Model H by the Ritz pairs and the rows C.
+
+        The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
+        what the Ritz vectors before it leave (the last, where the process came to its
+        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
+        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
+        a short process finds not even the first eigenvector, and Ritz vectors that are
+        none would slow CG down: then only the norm is used.
+        """
+        above, U, tail = self.upper_end()
+        return model_of(self.rows, tail, above, U, rho)
+
+    def upper_end(self) -> tuple[Vector, NDArray[np.float64], float]:
+        """Return the Ritz pairs (k,), (k, n) that a model holds, and its τ."""
+        ritz = self.spectrum.ritz
+        if ritz is None:
+            raise ValueError("the power method found no Ritz pairs")
+        above = (ritz.values + ritz.residuals) / self.spectrum.norm
+        ended = ritz.residuals[-1] <= 1e-10 * ritz.values[0]
+        kept = max(len(above) - (1 if ended else 2), 0)
+        unknown = np.flatnonzero(ritz.residuals > ritz.values)
+        kept = min([kept, *unknown[:1]])
+        if ritz.residuals[0] > FOUND * ritz.values[0]:
+            kept = 0
+        return above[:kept], ritz.vectors[:kept], max(float(above[kept]), TAIL)
+
+    def penalty(self, rho: float) -> BoxModel:
+        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs."""
+        return model_of(self.rows, 1.0, np.zeros(0), np.zeros((0, self.b.size)), rho)
+
+    def plain_model(self, rho: float, *, alpha: float) -> Model:
+        """Model H by ‖H‖ = max(1, ρ) alone, ᾱ = alpha/‖H‖."""
+        norm = max(1.0, rho if len(self.rows.C) else 0.0)
+        return Model.of_norm(norm / alpha, self.b.size)
+
+
+def projected_problem(
+    qp: QP, find: Callable[[Callable[[Vector], Vector], given.Rows], Spectrum]
+) -> Projected:
+    """Homogenise, project and normalise; one product with F and those of `find`."""
+    F = Product(qp.P, qp.q.size)
+    if is_sparse(qp.A):
+        rows = equality_rows(qp.A, qp.b, boxed(qp))
+    else:
+        rows = orthonormal_rows(qp.A, qp.b)
+    spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
+    diagonal = _diagonal(qp)
+    spectrum = _not_vanishing(spectrum, diagonal)
+    d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
+    bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
+    b = rows.project(d) / spectrum.norm
+    if np.linalg.norm(b) <= 1e-14 * np.linalg.norm(d) / spectrum.norm:
+        b = np.zeros_like(b)  # nothing but rounding errors is left of d
+    C = Rows(rows, Reduction())
+    return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal)
+
+
+def by_lanczos(
+    PFP: Callable[[Vector], Vector], rows: given.Rows, *, steps: int
+) -> Spectrum:
+    """Find the norm and the upper Ritz pairs; `steps` products."""
+    start = rows.project(random_start(rows.x_tilde.size))
+    steps = min(steps, size(start) - len(rows.C))  # the dimension of the range of 𝒫
+    ritz = lanczos(PFP, start, steps)
+    return Spectrum(ritz.norm or 1.0, ritz)
+
+
+def size(v: Vector) -> int:
+    """Count the components of a vector; of one over ranks, those of all."""
+    return int((np.zeros_like(v) + 1).sum())
+
+
+def lanczos(H: Callable[[Vector], Vector], start: Vector, steps: int) -> Ritz:
+    """Run `steps` Lanczos steps, one product each, fully reorthogonalised.
+
+    What three terms leave is of the size of the next vector, so that one pass over all
+    vectors makes it orthogonal to them to rounding. The residual of the pair (θ, Vᵀs)
+    is |β s_k| with the last off-diagonal entry β. A start vector from an invariant
+    subspace keeps the process there. It ends after FEW steps where all Ritz values are
+    of one size: conjugate gradients need few steps there, and no model.
+    """
+    basis = np.zeros((min(steps, size(start)), start.size))
+    diagonal: list[float] = []
+    off: list[float] = []
+    v, beta = start, float(np.linalg.norm(start))
+    for k in range(len(basis) if beta else 0):
+        basis[k] = v / beta
+        v = H(basis[k])
+        diagonal.append(float(basis[k] @ v))
+        v = v - diagonal[-1] * basis[k]
+        if k:
+            v = v - beta * basis[k - 1]
+        v = v - basis[: k + 1].T @ (basis[: k + 1] @ v)
+        beta = float(np.linalg.norm(v))
+        off.append(beta)
+        if beta <= 1e-12 * max(map(abs, diagonal)):
+            break
+        if k + 1 == FEW:
+            values = eigvalsh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
+            if values[0] >= values[-1] / FLAT:
+                break
+    if not diagonal:
+        return Ritz(np.zeros(1), np.zeros(1), np.zeros((1, start.size)), 0.0)
+    theta, S = eigh_tridiagonal(np.array(diagonal), np.array(off[:-1]))
+    vectors = S.T @ basis[: len(theta)]
+    residuals = off[-1] * np.abs(S[-1, ::-1])
+    return Ritz(theta[::-1], residuals, vectors[::-1], diagonal[0])
