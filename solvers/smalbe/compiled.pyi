@@ -3,7 +3,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import Matrix, Vector
+from mortarbench.harness import QP, Matrix, Solution, Vector
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.solvers.smalbe import rows as orthonormal_rows
 from mortarbench.solvers.smalbe.options import Options
@@ -21,6 +21,7 @@ class Reduction:
 
 class Product:
     count: int
+    over: Reduction
     def __init__(self, P: Matrix, n: int, over: Reduction | None = None) -> None: ...
     def __call__(self, v: Vector) -> Vector: ...
 
@@ -59,16 +60,7 @@ class SMALBE:
     ) -> tuple[Vector, Vector, Vector, Vector] | None: ...
 
 def residual_bound(
-    cost: Vector,
-    told_diagonal: Vector,
-    x: Vector,
-    y: Vector,
-    z_box: Vector,
-    Fx: Vector,
-    lower: Vector,
-    upper: Vector,
-    right: Vector,
-    rows: Array,
+    qp: QP, s: Solution, Px: Vector, diagonal: Vector, G: Matrix, over: Reduction
 ) -> float: ...
 def orthonormal(
     G: Array, e: Vector

@@ -12,6 +12,7 @@ or a preconditioner of its own do.
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * mprgp.pxi: the inner loop
 * outer.pxi: the outer loop and the way back
+* residuals.pxi: a bound of the KKT residuals of the problem as given
 
 The textbook version in tests/support/textbook says the same in NumPy, and is what tests
 compare with: the same counts, and the same points up to rounding.
@@ -129,10 +130,19 @@ cdef extern from "vectors.h" nogil:
     void held_by(const double *nu, const double *lower, const double *upper,
                  const double *g, double *z, Py_ssize_t n)
     void masked(const double *free, const double *a, double *t, Py_ssize_t n)
-    double worst_residual(const double *q, const double *diagonal, const double *x,
-                          const double *y, const double *z, const double *Fx,
-                          const double *lb, const double *ub, const double *e,
-                          const double *rows, Py_ssize_t m, Py_ssize_t n, double *room)
+    double terms_of_energy(const double *q, const double *diagonal, const double *x,
+                           const double *z, const double *Fx, const double *lb,
+                           const double *ub, const double *forces, double *size,
+                           Py_ssize_t n, double *sums, double *most)
+    void known_sizes(double energy, const double *q, const double *diagonal,
+                     const double *x, double *size, Py_ssize_t n)
+    double worst_of_forces(double energy, double largest, const double *q,
+                           const double *diagonal, const double *x, const double *Fx,
+                           const double *lb, const double *ub, const double *size,
+                           double *forces, Py_ssize_t n, double worst)
+    void terms_of_rows(const double *rows, const double *e, const double *x,
+                       const double *size, Py_ssize_t m, Py_ssize_t n, double *missed,
+                       double *terms, double *known)
 
 include "operations.pxi"
 include "preparation.pxi"
@@ -140,3 +150,4 @@ include "box.pxi"
 include "model.pxi"
 include "mprgp.pxi"
 include "outer.pxi"
+include "residuals.pxi"

@@ -26,7 +26,7 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
 from mortarbench.solvers.common.conversion import dense, needs_dense, positive
-from mortarbench.solvers.smalbe.compiled import residual_bound
+from mortarbench.solvers.smalbe.compiled import Reduction, residual_bound
 from mortarbench.solvers.smalbe.driver import CLAIM, PATIENCE
 from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
@@ -110,11 +110,10 @@ class _Task:
             a = self._fitted(a, x, Px + qp.q)
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
-        worst = residual_bound(
-            qp.q, faces.diagonal, x, y, z_box, Px, qp.lb, qp.ub, qp.b, self.rows.G
-        )
+        s, alone = self.solution(x, y, z_box), Reduction()
+        worst = residual_bound(qp, s, Px, faces.diagonal, self.rows.G, alone)
         if worst == np.inf:  # it tells nothing
-            worst = kkt_residuals(qp, self.solution(x, y, z_box)).worst
+            worst = kkt_residuals(qp, s).worst
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:

@@ -324,55 +324,12 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
-    if isinstance(G, np.ndarray):
-        bound = compiled.residual_bound(
-            qp.q, diagonal, point.x, point.y, point.z_box, Fx,
-            qp.lb, qp.ub, qp.b, G,
-        )  # fmt: skip
-        if bound <= enough:
-            return bound
-    if isinstance(qp.q, DistributedVector):
-        return _residual_bound(qp, point, Fx)
+    over = task.problem.F.over
+    bound = compiled.residual_bound(qp, point, Fx, diagonal, G, over)
+    if bound <= enough or isinstance(qp.q, DistributedVector):
+        return bound
     task.problem.F.count += 1
     return kkt_residuals(qp, point).worst
-
-
-@np.errstate(all="ignore")
-def _residual_bound(qp: QP, s: Solution, Fx: Vector) -> float:
-    """Bound the worst of `harness.kkt_residuals` from above, of a QP over ranks.
-
-    As `compiled.residual_bound`: with the least scale of energy that may be used, and
-    nothing excused as rounding.
-    """
-    lower, upper = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    told, z, x = qp.diagonal(), s.z_box, s.x
-    d = np.zeros_like(x) if told is None else np.maximum(told, 0)
-    forces = qp.A.T @ s.y + z
-    r = np.abs(Fx + qp.q + forces)
-    at = np.where(z < 0, np.where(lower, qp.lb, 0), np.where(upper, qp.ub, 0))
-    xFx, qx, held = float(x @ Fx), float(qp.q @ x), float(at @ z + qp.b @ s.y)
-    most = max(abs(xFx), abs(qx), abs(held))
-    E = min(most, max(1e4 * abs(xFx / 2 + qx), most / 1e4))
-    if (
-        not E > 0
-        or (z[~lower & (z < 0)] != 0).any()
-        or (z[~upper & (z > 0)] != 0).any()
-    ):
-        return np.inf
-    size = np.maximum(np.maximum(np.abs(Fx), np.abs(qp.q)), np.abs(forces))
-    least = (d[d > 0]).min(initial=np.inf)
-    S = max(float(size.max(initial=0.0)), np.sqrt(E * least) if least < np.inf else 0.0)
-    step = np.where(d > 0, np.maximum(np.abs(x), r / np.where(d > 0, d, 1)), np.inf)
-    own = np.where(r > 0, np.minimum(r / size, r * step / E), 0.0)
-    length = np.minimum(np.sqrt(E / d), E / np.abs(qp.q))
-    known = np.maximum(np.minimum(np.abs(x), 1e3 * length), length)
-    terms = abs(qp.A) @ np.where(np.isfinite(known), known, np.abs(x)) + np.abs(qp.b)
-    missed = np.abs(qp.A @ x - qp.b)
-    return float(max(
-        np.abs(z * (x - at)).max(initial=0.0) / E, abs(xFx + qx + held) / E,
-        r.max(initial=0.0) / S, own.max(initial=0.0),
-        np.where(missed > 0, missed / terms, 0.0).max(initial=0.0),
-    ))  # fmt: skip
 
 
 def _counted(task: _Task, point: Solution) -> Solution:

@@ -167,7 +167,7 @@ cdef class MPRGP:
     cdef int make_room(self) except -1:
         """Make room for the vectors."""
         cdef Py_ssize_t n = self.n, r = self.rows.r
-        self.room = Room(17 * n + 3 * r)
+        self.room = Room(16 * n + 3 * r)
         cdef double *at = self.room.at
         self.x, self.g, self.p, self.Hp = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
@@ -176,8 +176,9 @@ cdef class MPRGP:
         self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
         self.face_set = Box.of(at, at + n, n, self.over)
-        self.rhs, self.x0, self.g0 = at + 2 * n, at + 3 * n, at + 4 * n
-        at += 5 * n
+        self.rhs, self.g0 = at + 2 * n, at + 3 * n
+        self.x0 = self.z  # which is found anew after each expansion
+        at += 4 * n
         self.Cv, self.Cw, self.Cx = at, at + r, at + 2 * r
         return 0
 

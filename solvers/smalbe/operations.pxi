@@ -106,12 +106,14 @@ cdef class Reduction:
         if self.ranks is None:
             return 0
         own = np.empty(width)
-        memcpy(numbers(own), terms, k * sizeof(double))
+        if k:
+            memcpy(numbers(own), terms, k * sizeof(double))
         if least:
             numbers(own)[k] = least[0]
         everyones = self.ranks.everyones(own)
         of_rank = numbers(everyones)
-        memset(terms, 0, k * sizeof(double))
+        for i in range(k):
+            terms[i] = 0.0
         for p in range(len(everyones)):
             for i in range(k):
                 terms[i] += of_rank[p * width + i]
@@ -122,6 +124,10 @@ cdef class Reduction:
     cdef double total(self, double term) except? -1:
         self.add(&term, 1)
         return term
+
+    cdef double least(self, double number) except? -1:
+        self.add(NULL, 0, &number)
+        return number
 
     cdef bint any(self, bint here) except -1:
         return self.total(here) > 0
@@ -142,8 +148,8 @@ cdef class Product:
 
     cdef Py_ssize_t n
     cdef public long count
+    cdef readonly Reduction over
     cdef object matrix
-    cdef Reduction over
     cdef const double *dense
     cdef sparse rows  # its data is NULL where P is not sparse
     cdef object held

@@ -404,27 +404,3 @@ cdef class SMALBE(MPRGP):
             add_combination(-1.0, C, da, rest, r, n)
         held_by(v, self.set.lower, self.set.upper, rest, z_box, n)
         return result[0], multipliers, result[1], result[2]
-
-
-def residual_bound(
-    cost, told_diagonal, at_x, at_y, at_z, told_Fx, lower, upper, right, told_rows
-):
-    """Bound the worst of `harness.kkt_residuals` from above, without products.
-
-    cost, told_diagonal : q and the diagonal of P (n,), empty for an operator
-    at_x, at_y, at_z, told_Fx : x, y, z_box of the point, and Px
-    lower, upper, right, told_rows : lb, ub, and the rows Gx = e by e (m,) and G (m, n)
-
-    With the least scale of energy that it may use, and nothing excused as rounding:
-    where this is small, so are the residuals. inf where nothing can be said.
-    """
-    cdef Py_ssize_t n = len(at_x), m = len(at_y)
-    cdef list held = []
-    cdef Room room = Room(2 * n)
-    if not len(told_diagonal) or not n:
-        return INFINITY
-    return worst_residual(
-        read(cost, held), read(told_diagonal, held), read(at_x, held), read(at_y, held),
-        read(at_z, held), read(told_Fx, held), read(lower, held), read(upper, held),
-        read(right, held), read(told_rows, held), m, n, room.at,
-    )

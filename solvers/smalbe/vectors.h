@@ -997,7 +997,7 @@ TWICE static void masked(in free, in a, out t, Py_ssize_t n)
 
 /* The sizes of variables that an energy knows of, as `harness.verify.kkt` says; zero
    where it knows of none. */
-INLINE void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssize_t n)
+TWICE static void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssize_t n)
 {
     for (Py_ssize_t j = 0; j < n; j++) {
         double step = diagonal[j] > 0 ? sqrt(energy / diagonal[j]) : INFINITY;
@@ -1023,41 +1023,45 @@ TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, d
     return total;
 }
 
-/* An upper bound of the worst residual, see `residual_bound` in `compiled.pyx`; room for
-   2n numbers. */
+/* Terms of the energy of a point with forces = Gᵀy + z: sums = xᵀFx, qᵀx, the work of the
+   bounds; most = the largest |z (x - bound)|, the largest size of a component; size (n,) of
+   each, the largest of its |Fx|, |q| and |forces|. Returns the least positive diagonal
+   entry, inf where there is none; -1 where x is outside of the bounds. */
 TWICE static double
-worst_residual(in q, in diagonal, in x, in y, in z, in Fx, in lb, in ub, in e, in rows,
-               Py_ssize_t m, Py_ssize_t n, out room)
+terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, out size,
+                Py_ssize_t n, out sums, out most)
 {
-    double *restrict forces = room, *restrict size = room + n;
-    double xFx = 0, qx = 0, held = 0, most = 0, largest = 0, least = INFINITY, all = 0;
+    double xFx = 0, qx = 0, work = 0, slack = 0, largest = 0, least = INFINITY;
     Py_ssize_t outside = 0;
-    memcpy(forces, z, n * sizeof(double));
-    add_combination(1, rows, y, forces, m, n);
-    for (Py_ssize_t i = 0; i < m; i++)
-        held += e[i] * y[i];
     for (Py_ssize_t i = 0; i < n; i++) {
         double step = z[i] > 0 ? ub[i] : lb[i], size_of_all;
         step = z[i] != 0 ? step : 0;
         outside |= !(lb[i] <= x[i]) | !(x[i] <= ub[i]);
         xFx += x[i] * Fx[i];
         qx += q[i] * x[i];
-        held += step * z[i];
-        most = LARGER(most, fabs(z[i] * (x[i] - step)));
+        work += step * z[i];
+        slack = LARGER(slack, fabs(z[i] * (x[i] - step)));
         least = diagonal[i] > 0 && diagonal[i] < least ? diagonal[i] : least;
         size_of_all = LARGER(fabs(Fx[i]), fabs(q[i]));
         size_of_all = LARGER(size_of_all, fabs(forces[i]));
         largest = LARGER(largest, size_of_all);
         size[i] = size_of_all;
     }
-    double terms = LARGER(LARGER(fabs(xFx), fabs(qx)), fabs(held));
-    double energy = LARGER(1e4 * fabs(xFx / 2 + qx), terms / 1e4);
-    energy = SMALLER(terms, energy);
-    if (outside || !(energy > 0))
-        return INFINITY;
-    double worst = LARGER(most, fabs(xFx + qx + held)) / energy;
-    if (least < INFINITY)
-        largest = LARGER(largest, sqrt(energy * least));
+    sums[0] = xFx;
+    sums[1] = qx;
+    sums[2] = work;
+    most[0] = slack;
+    most[1] = largest;
+    return outside ? -1 : least;
+}
+
+/* The worst error of stationarity, at least `worst`, where forces become the residual
+   Fx + q + forces; inf where that is not finite. */
+TWICE static double
+worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, in lb,
+                in ub, in size, out forces, Py_ssize_t n, double worst)
+{
+    double all = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
         forces[i] += Fx[i] + q[i];
         all += fabs(forces[i]);
@@ -1076,22 +1080,24 @@ worst_residual(in q, in diagonal, in x, in y, in z, in Fx, in lb, in ub, in e, i
         }
         worst = LARGER(worst, own);
     }
-    if (m)
-        known_sizes(energy, q, diagonal, x, size, n);
+    return isfinite(all) ? worst : INFINITY;
+}
+
+/* Gx - e, and the sizes |e| + |G||x| and |e| + |G|X of its terms, of rows G (m, n). */
+TWICE static void
+terms_of_rows(in rows, in e, in x, in size, Py_ssize_t m, Py_ssize_t n, out missed,
+              out terms, out known)
+{
     for (Py_ssize_t i = 0; i < m; i++) {
         in row = rows + i * n;
-        double violated = -e[i], told = fabs(e[i]), known = told;
+        double error = -e[i], own = fabs(e[i]), sized = own;
         for (Py_ssize_t j = 0; j < n; j++) {
-            violated += row[j] * x[j];
-            told += fabs(row[j] * x[j]);
-            known += fabs(row[j]) * size[j];
+            error += row[j] * x[j];
+            own += fabs(row[j] * x[j]);
+            sized += fabs(row[j]) * size[j];
         }
-        all += fabs(violated);
-        if (violated == 0)
-            continue;
-        worst = LARGER(worst, fabs(violated) / known);
-        if (fabs(e[i]) > 1e-9 * known)
-            worst = LARGER(worst, 1e-4 * fabs(violated) / told);
+        missed[i] = error;
+        terms[i] = own;
+        known[i] = sized;
     }
-    return isfinite(all) && isfinite(worst) ? worst : INFINITY;
 }

@@ -276,15 +276,16 @@ def test_no_point_has_residuals_above_the_bound(seeds):
             continue
         for size in (0.0, 1e-9, 1e-6, 1e-3, 1.0, 1e3):
             point = disturbed(qp, solution, size, rng)
-            x, y, z = point.x, point.y, point.z_box
             G = np.ascontiguousarray(
                 qp.A.toarray() if hasattr(qp.A, "toarray") else qp.A
             )
-            bound = compiled.residual_bound(
-                qp.q, qp.P.diagonal(), x, y, z, qp.P @ x, qp.lb, qp.ub, qp.b, G
-            )
+            alone = compiled.Reduction()
+            for rows in (G, csr_array(G)):
+                bound = compiled.residual_bound(
+                    qp, point, qp.P @ point.x, qp.P.diagonal(), rows, alone
+                )
 
-            assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9), seed
+                assert bound >= kkt_residuals(qp, point).worst * (1 - 1e-9), seed
 
 
 def disturbed(qp, solution, size, rng):

@@ -1,0 +1,87 @@
+# The KKT residuals of the problem as given, bounded without a product.
+#
+# Energy and sizes are those of `harness.verify.kkt`, whose constants these are; that no
+# point has residuals above the bound is tested against it.
+
+
+cdef double MAX_CANCELLATION = 1e4  # of the terms of an energy, over its value
+
+
+def residual_bound(qp, s, Px, diagonal, G, Reduction over):
+    """Bound the worst of `harness.kkt_residuals` from above, without products.
+
+    With the least scale of energy that it may use, and nothing excused as rounding:
+    where this is small, so are the residuals. inf where nothing can be said.
+
+    s : a `Solution` without multipliers of inequality rows
+    diagonal : of P (n,), empty for an operator that does not tell
+    G : the equality rows, an array or what multiplies
+    over : the processes that share vectors (n,)
+    """
+    cdef Py_ssize_t i, n = len(diagonal), m = len(s.y)
+    cdef bint is_dense = isinstance(G, np.ndarray)
+    cdef list held = []
+    cdef double sums[3]
+    cdef double most[2]
+    cdef double least, terms, energy, worst, size_of_all
+    if not over.any(n > 0):
+        return INFINITY
+    cdef Room room = Room(2 * n + 3 * m)
+    cdef double *forces = room.at
+    cdef double *size = forces + n
+    cdef double *missed = size + n
+    cdef double *own = missed + m
+    cdef double *known = own + m
+    cdef const double *q = read(qp.q, held)
+    cdef const double *d = read(diagonal, held)
+    cdef const double *x = read(s.x, held)
+    cdef const double *y = read(s.y, held)
+    cdef const double *z = read(s.z_box, held)
+    cdef const double *Fx = read(Px, held)
+    cdef const double *lb = read(qp.lb, held)
+    cdef const double *ub = read(qp.ub, held)
+    cdef const double *e = read(qp.b, held)
+    # 1. The forces Gᵀy + z, and the energy.
+    if is_dense:
+        memcpy(forces, z, n * sizeof(double))
+        add_combination(1.0, read(G, held), y, forces, m, n)
+    else:
+        take(G.T @ s.y, n, forces, "Gᵀy")
+        add(1.0, z, forces, n)
+    least = terms_of_energy(q, d, x, z, Fx, lb, ub, forces, size, n, sums, most)
+    over.add(sums, 3)
+    least = over.least(least)
+    most[0], most[1] = -over.least(-most[0]), -over.least(-most[1])
+    for i in range(m):
+        sums[2] += e[i] * y[i]
+    terms = fmax(fmax(fabs(sums[0]), fabs(sums[1])), fabs(sums[2]))
+    energy = fmax(MAX_CANCELLATION * fabs(sums[0] / 2 + sums[1]), terms / MAX_CANCELLATION)
+    energy = fmin(terms, energy)
+    if least < 0 or not energy > 0:
+        return INFINITY
+    # 2. Complementarity, the gap, and stationarity.
+    worst = fmax(most[0], fabs(sums[0] + sums[1] + sums[2])) / energy
+    size_of_all = most[1]
+    if least < INFINITY:
+        size_of_all = fmax(size_of_all, sqrt(energy * least))
+    worst = -over.least(-worst_of_forces(
+        energy, size_of_all, q, d, x, Fx, lb, ub, size, forces, n, worst
+    ))
+    if not m:
+        return worst if isfinite(worst) else INFINITY
+    # 3. The rows.
+    known_sizes(energy, q, d, x, size, n)
+    if is_dense:
+        terms_of_rows(read(G, held), e, x, size, m, n, missed, own, known)
+    else:
+        take(G @ s.x - qp.b, m, missed, "Gx − e")
+        take(abs(G) @ np.abs(s.x) + np.abs(qp.b), m, own, "|G||x| + |e|")
+        take(abs(G) @ over.vector(seen(size, n)) + np.abs(qp.b), m, known, "|G|X + |e|")
+    for i in range(m):
+        if not isfinite(missed[i]):
+            return INFINITY
+        if missed[i] != 0:
+            worst = fmax(worst, fabs(missed[i]) / known[i])
+            if fabs(e[i]) > 1e-9 * known[i]:
+                worst = fmax(worst, 1e-4 * fabs(missed[i]) / own[i])
+    return worst if isfinite(worst) else INFINITY
