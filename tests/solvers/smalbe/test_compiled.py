@@ -12,6 +12,7 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import compiled, driver
+from mortarbench.solvers.smalbe import rows as rows_module
 from mortarbench.solvers.smalbe.driver import outer_loop, recovered
 from mortarbench.solvers.smalbe.projected import by_lanczos as compiled_by_lanczos
 from mortarbench.solvers.smalbe.projected import projected_problem as compiled_problem
@@ -158,6 +159,32 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
 def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
     """Of a model whose first rows are those of the penalty."""
     they_agree(random_qp(seed), replace(SOLVERS["smalbe"], max_steps=25, rho=1e-3))
+
+
+@pytest.mark.parametrize("preconditioner", ["model", "none", "diagonal"])
+@pytest.mark.parametrize("rows", ["sparse", "dense", "none"])
+@pytest.mark.parametrize("seed", range(6))
+def test_other_rows_and_preconditioners_take_the_steps_that_are_written(
+    seed, rows, preconditioner, monkeypatch
+):
+    """With rows by a sparse factor; and with a matrix M in the face, or nothing.
+
+    There a large penalty, or eigenvalues far apart, would let rounding tell within a
+    few steps.
+    """
+    qp, rng = random_qp(seed), np.random.default_rng(seed)
+    n = qp.q.size
+    W = rng.standard_normal((n, n))
+    A = no_rows(n) if rows == "none" else rng.standard_normal((min(n, 3), n))
+    inside = np.clip(rng.standard_normal(n), qp.lb, qp.ub)
+    if rows == "sparse":
+        monkeypatch.setattr(rows_module, "MOST_DENSE", 0)
+        A = csr_array(A)
+    options = replace(
+        SOLVERS["smalbe"], preconditioner=preconditioner, max_steps=20, recycle=False,
+        rho=20.0,
+    )  # fmt: skip
+    they_agree(replace(qp, P=W @ W.T / n + np.eye(n), A=A, b=A @ inside), options)
 
 
 def they_agree(qp, options):

@@ -4,12 +4,17 @@ import re
 from collections import Counter
 from functools import partial
 from itertools import pairwise
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from mortarbench.harness import no_rows
+from mortarbench.solvers.smalbe.compiled import SMALBE, Product, Reduction, Rows
 from mortarbench.solvers.smalbe.options import EXPANSIONS
-from mortarbench.solvers.smalbe.spectrum import power_method
+from mortarbench.solvers.smalbe.projected import Iterate, Projected, Spectrum
+from mortarbench.solvers.smalbe.rows import orthonormal_rows
+from mortarbench.solvers.smalbe.spectrum import Ritz, power_method
 from tests.support.textbook import kernels
 from tests.support.textbook.model import Model
 from tests.support.textbook.mprgp import Directions, Point, Rules, mprgp, split
@@ -17,7 +22,79 @@ from tests.support.textbook.mprgp import Directions, Point, Rules, mprgp, split
 MIXED = Rules(expansion="mixed", proportioning="cg")  # every kind of step
 
 
-def minimise(
+def run_textbook(A, b, lower, upper, x, *, tau, tol, rules, B, M, **options):
+    """Run the textbook's MPRGP; M preconditions every face."""
+    products = []
+
+    def H(v):
+        products.append(v)
+        return A @ v
+
+    run = mprgp(
+        H, b, (lower, upper), (x, A @ x - b), B=B or Model.of_norm(tau, b.size),
+        stop=lambda at, face: face.projected_norm <= tol, rules=rules,
+        precondition=None if M is None else lambda free: lambda v: M @ v, **options,
+    )  # fmt: skip
+    return run, len(products)
+
+
+def run_compiled(
+    A, b, lower, upper, x, *, tau, tol, rules, B, M, watch=None, max_steps=10_000
+):
+    """Run the compiled MPRGP on a problem without rows.
+
+    A model is what Ritz pairs without residuals leave; expansions without one take
+    τ = 1/ᾱ, so that they are run in units where that is so.
+    """
+    B = B or Model.of_norm(tau, b.size)
+    unit = 1.0 if rules.expansion == "model" else rules.relaxation * B.tau
+    order = np.argsort(-B.w)
+    ritz = Ritz(
+        np.append(B.w[order] + B.tau, B.tau), np.zeros(B.w.size + 1),
+        np.vstack([B.U[order], np.zeros(b.size)]), 1.0,
+    )  # fmt: skip
+    rows, F = orthonormal_rows(no_rows(b.size), np.zeros(0)), Product(A, b.size)
+    problem = Projected(
+        F, rows, Rows(rows, Reduction()), Spectrum(unit, ritz), b / unit,
+        (lower, upper), -b, np.zeros(0),
+    )  # fmt: skip
+    options = SimpleNamespace(
+        Gamma=rules.Gamma, expansion=rules.expansion, reduced=rules.reduced,
+        proportioning=rules.proportioning, alpha=rules.relaxation,
+        recycle=rules.kept > 0, max_steps=max_steps, energy=0.0, eta=0.1, beta=0.5,
+        rho_growth=1.0,
+    )  # fmt: skip
+    solver = SMALBE(
+        problem, options, M is not None, None if M is None else M.__matmul__
+    )
+    at = Iterate(x, (A @ x - b) / unit, np.zeros(0), 1.0, 1.0)
+    bounds = (lower, upper)
+
+    def note(letter, x, g):
+        at = Point(x, unit * g)
+        watch(letter, at, split(at, bounds))
+
+    x, g, *_, outer, status = solver.solve(
+        options, tol / np.linalg.norm(b), at, lambda nu: False,
+        watch and (lambda k, rhs: note),
+    )  # fmt: skip
+    run = SimpleNamespace(
+        x=x, g=unit * g, trace=outer[0][0], stopped=status == "solved"
+    )
+    return run, F.count
+
+
+#: rounding of costs, relative: sums are taken in another order, with fused products
+ROUNDING = {run_textbook: 1e-14, run_compiled: 2e-14}
+
+
+@pytest.fixture(params=[run_compiled, run_textbook], ids=["ours", "textbook"])
+def minimise(request):
+    return partial(minimised, request.param)
+
+
+def minimised(
+    loop,
     A,
     b,
     lower,
@@ -28,6 +105,7 @@ def minimise(
     tol=1e-10,
     rules=MIXED,
     B=None,
+    M=None,
     **options,
 ):
     A, b, lower = (np.asarray(v, dtype=float) for v in (A, b, lower))
@@ -37,21 +115,13 @@ def minimise(
         if x is None
         else np.asarray(x, dtype=float)
     )
-    products = []
-
-    def H(v):
-        products.append(v)
-        return A @ v
-
-    run = mprgp(
-        H, b, (lower, upper), (x, A @ x - b),
-        B=B or Model.of_norm(1 / (alpha or 1.9 / np.linalg.norm(A, 2)), b.size),
-        stop=lambda at, face: face.projected_norm <= tol, rules=rules, **options,
-    )  # fmt: skip
-    return run, len(products)
+    tau = 1 / alpha if alpha else np.linalg.norm(A, 2) / 1.9
+    return loop(
+        A, b, lower, upper, x, tau=tau, tol=tol, rules=rules, B=B, M=M, **options
+    )
 
 
-def test_without_active_bounds_it_is_conjugate_gradients():
+def test_without_active_bounds_it_is_conjugate_gradients(minimise):
     """As many steps as there are distinct eigenvalues."""
     run, products = minimise(
         np.diag(np.repeat([1.0, 3.0, 10.0, 40.0], 5)), np.arange(1.0, 21.0),
@@ -62,7 +132,7 @@ def test_without_active_bounds_it_is_conjugate_gradients():
 
 
 @pytest.mark.parametrize(("Gamma", "first"), [(1.9, "p"), (2.1, "c")])
-def test_proportioning_when_beta_exceeds_gamma_times_phi(Gamma, first):
+def test_proportioning_when_beta_exceeds_gamma_times_phi(minimise, Gamma, first):
     """‖β‖ = 2, ‖φ̃‖ = ‖φ‖ = 1: Γ = 2 decides; Γ² = 4, not 2, multiplies ‖φ‖² = 1."""
     rules = Rules(Gamma, "mixed", "cg")
     run, _ = minimise(np.eye(2), [-1.0, 2.0], [-np.inf, 0.0], rules=rules)
@@ -70,7 +140,7 @@ def test_proportioning_when_beta_exceeds_gamma_times_phi(Gamma, first):
     assert run.trace[0] == first
 
 
-def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning():
+def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning(minimise):
     """φ = 1 but φ̃ = 10⁻⁹ at the first component: the reduced gradient decides, where
     it is asked."""
     first = [
@@ -84,7 +154,7 @@ def test_a_component_about_to_hit_its_bound_does_not_delay_proportioning():
     assert first == ["p", "e"]
 
 
-def test_proportioning_stops_at_the_opposite_bound():
+def test_proportioning_stops_at_the_opposite_bound(minimise):
     """min ½x² − 10x over [0, 1] from x = 0: the minimising step would end at 10."""
     run, _ = minimise([[1.0]], [10.0], [0.0], [1.0])
 
@@ -92,7 +162,7 @@ def test_proportioning_stops_at_the_opposite_bound():
     assert run.trace == "p"
 
 
-def test_an_expansion_projects_the_cg_step():
+def test_an_expansion_projects_the_cg_step(minimise):
     """From (1, 1) with H = I, b = (−1, 0): CG ends at (−1, 0), projected (0, 0)."""
     run, products = minimise(np.eye(2), [-1.0, 0.0], [0.0, 0.0], x=[1.0, 1.0])
 
@@ -101,7 +171,7 @@ def test_an_expansion_projects_the_cg_step():
     assert products == 2
 
 
-def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one():
+def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one(minimise):
     """In a tilted valley the second CG step ends at (−1, 0); cut at x₁ = 0 it climbs.
     One product for each c, three for the fallback."""
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
@@ -117,7 +187,7 @@ def test_an_expansion_that_raises_the_cost_falls_back_to_a_safe_one():
     assert run.x == pytest.approx([0.0, 0.3])
 
 
-def test_a_fallback_is_a_half_step_and_a_gradient_projection():
+def test_a_fallback_is_a_half_step_and_a_gradient_projection(minimise):
     """By hand: the CG step as far as x₁ = 0, then −ᾱφ on what is still free."""
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     before, _ = minimise(A, b, lower, x=[1.0, 0.2], max_steps=1)
@@ -133,14 +203,14 @@ def test_a_fallback_is_a_half_step_and_a_gradient_projection():
     assert after.x == pytest.approx([0, half[1] - alpha * g[1]])
 
 
-def test_a_fixed_variable_neither_moves_nor_delays():
+def test_a_fixed_variable_neither_moves_nor_delays(minimise):
     run, _ = minimise(np.diag([1.0, 2.0]), [3.0, 4.0], [0.5, -np.inf], [0.5, np.inf])
 
     assert run.stopped
     assert run.x == pytest.approx([0.5, 2.0])
 
 
-def test_an_unbounded_cost_is_not_called_a_minimum():
+def test_an_unbounded_cost_is_not_called_a_minimum(minimise):
     run, _ = minimise([[0.0]], [1.0], [0.0], alpha=1.0)
 
     assert not run.stopped
@@ -149,7 +219,7 @@ def test_an_unbounded_cost_is_not_called_a_minimum():
 @pytest.mark.parametrize("expansion", sorted({*EXPANSIONS} - {"projcg"}))
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
 def test_every_iterate_is_feasible_and_the_cost_never_rises(
-    manufactured, seed, expansion
+    minimise, manufactured, seed, expansion
 ):
     qp, _ = manufactured("box", seed=seed, dense=True, n=24)
     rules = Rules(expansion=expansion, proportioning="cg")
@@ -197,7 +267,7 @@ def string():
     [("std", 181, 200, 156, 18, 7), ("projcg", 160, 175, 134, 14, 12)],
 )
 def test_permons_rules_take_permons_steps(
-    expansion, iterations, products, cg, expansions, proportionings
+    minimise, expansion, iterations, products, cg, expansions, proportionings
 ):
     """Counters that PERMON 3.25 prints for this problem at rtol = 1e-5."""
     A, b, lower = string()
@@ -268,7 +338,7 @@ def test_a_model_is_raised_to_what_a_product_shows():
     assert B.raised(s, 1e9).tau == 5.0  # not more than tenfold at once
 
 
-def test_a_step_of_a_model_below_the_operator_is_shortened():
+def test_a_step_of_a_model_below_the_operator_is_shortened(minimise):
     """H = 4I, B = I: the step ends four times too far, the line search at x = b/4."""
     run, products = minimise(
         4 * np.eye(2), [4.0, 40.0], [0.0, 0.0], B=Model.of_norm(1.0, 2), rules=Rules()
@@ -278,7 +348,7 @@ def test_a_step_of_a_model_below_the_operator_is_shortened():
     assert run.x == pytest.approx([1.0, 10.0])
 
 
-def test_an_exact_model_finds_the_minimum_at_once():
+def test_an_exact_model_finds_the_minimum_at_once(minimise):
     """B = H: the first step ends at the solution."""
     U = np.linalg.qr(np.random.default_rng(271828).standard_normal((20, 4)))[0].T
     B = Model(1.0, U, np.array([50.0, 20.0, 10.0, 5.0]))
@@ -289,7 +359,7 @@ def test_an_exact_model_finds_the_minimum_at_once():
     assert (run.trace, products) == ("p", 1)
 
 
-def test_a_preconditioner_in_the_face_is_used_with_conjugation():
+def test_a_preconditioner_in_the_face_is_used_with_conjugation(minimise):
     """M = A⁻¹ solves in one step; M = D⁻¹ makes D¹ᐟ²(I + rank 2)D¹ᐟ² take three."""
     rng = np.random.default_rng(271828)
     D, W = np.diag(rng.uniform(1, 100, 30)), rng.standard_normal((30, 2))
@@ -301,16 +371,14 @@ def test_a_preconditioner_in_the_face_is_used_with_conjugation():
     )
 
     def with_(M):
-        return minimise(
-            A, b, lower, precondition=lambda free: lambda v: M @ v, tol=1e-8
-        )
+        return minimise(A, b, lower, M=M, tol=1e-8)
 
     assert with_(np.linalg.inv(A))[0].trace == "c"
     assert with_(np.linalg.inv(D))[0].trace == "ccc"
     assert len(minimise(A, b, lower, tol=1e-8)[0].trace) > 10
 
 
-def test_the_observer_sees_every_step():
+def test_the_observer_sees_every_step(minimise):
     seen = []
     A, b, lower = string()
     run, _ = minimise(A, b, lower, watch=lambda *step: seen.append(step), tol=1e-6)
@@ -321,7 +389,7 @@ def test_the_observer_sees_every_step():
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(seed):
+def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(minimise, seed):
     """A flat spectrum of [1, 50] with B = I/20: some 27 products; 40 where τ stays."""
     rng = np.random.default_rng(seed)
     V = np.linalg.qr(rng.standard_normal((60, 60)))[0]
@@ -335,7 +403,7 @@ def test_a_model_far_below_the_operator_is_raised_in_a_few_steps(seed):
     assert products <= 32
 
 
-def test_an_expansion_by_the_model_begins_with_the_half_step():
+def test_an_expansion_by_the_model_begins_with_the_half_step(minimise):
     """By hand: to x₁ = 0 along the CG step, then the model's minimum from there."""
     A, b, lower = np.array([[1.0, -2.7], [-2.7, 9.0]]), [-1.0, 2.7], [0.0, -np.inf]
     B = Model.of_norm(np.linalg.norm(A, 2), 2)
@@ -352,7 +420,7 @@ def test_an_expansion_by_the_model_begins_with_the_half_step():
     assert after.x == pytest.approx(half + step * s)
 
 
-def test_a_half_step_that_is_the_solution_is_kept():
+def test_a_half_step_that_is_the_solution_is_kept(minimise):
     """min ½x² + x over x ≥ −½ from 0: CG leads to −1, the bound is the solution."""
     run, products = minimise([[1.0]], [-1.0], [-0.5], rules=Rules())
 
@@ -369,7 +437,7 @@ def test_a_rounded_model_is_never_lowered():
     assert B.raised(s, 0.5).tau == 1.0
 
 
-def model_run(problem, rules, B=None, tol=1e-6):
+def model_run(minimise, problem, rules, B=None, tol=1e-6):
     """Run with the letter, the active set and the cost of each step kept."""
     A, b, lower = problem
     upper, seen = np.full(b.size, np.inf), []
@@ -386,9 +454,9 @@ def model_run(problem, rules, B=None, tol=1e-6):
     return seen, products
 
 
-def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it():
+def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it(minimise):
     """Else an expansion undoes the one before, and conjugate gradients never run."""
-    seen, products = model_run(string(), Rules())
+    seen, products = model_run(minimise, string(), Rules())
     expansions = 0
     for (_, before, _), (letter, after, _) in pairwise(seen):
         if letter == "e":
@@ -400,11 +468,10 @@ def test_expansions_by_the_model_keep_what_is_at_a_bound_and_add_to_it():
     assert products <= 267  # of PERMON's rules
 
 
-def test_every_step_by_the_model_lessens_the_cost():
+def test_every_step_by_the_model_lessens_the_cost(minimise):
     for expansion in ("model", "std"):
-        costs = [
-            cost for _, _, cost in model_run(string(), Rules(expansion=expansion))[0]
-        ]
+        steps, _ = model_run(minimise, string(), Rules(expansion=expansion))
+        costs = [cost for _, _, cost in steps]
 
         assert (np.diff(costs) <= 1e-13 * abs(costs[-1])).all()
 
@@ -425,7 +492,7 @@ def string_and_boxes():
     return [(A, b, lower, np.full(b.size, np.inf)), *map(tight_box, range(60))]
 
 
-def test_no_more_steps_beyond_the_box_than_inside():
+def test_no_more_steps_beyond_the_box_than_inside(minimise):
     """Or one, where there were none: what they cost is at most doubled."""
     most, steps = 0, 0
     for A, b, lower, upper in string_and_boxes():
@@ -450,9 +517,10 @@ def watched(seen, letter, at, face):
     seen.append(at)
 
 
-def test_each_step_gains_what_the_rate_of_the_book_needs():
+def test_each_step_gains_what_the_rate_of_the_book_needs(minimise):
     """G/4τ with G = τ²(x − P(x − g/τ))ᵀg/τ, τ = ‖H‖ and Γ = 1; so f − f* shrinks by
     1 − λ_min/4‖H‖ at least, the book's factor for steps of 1/‖H‖."""
+    rounding = ROUNDING[minimise.args[0]]
     letters = Counter()
     for A, b, lower, upper in string_and_boxes():
         tau = np.linalg.norm(A, 2)
@@ -467,7 +535,7 @@ def test_each_step_gains_what_the_rate_of_the_book_needs():
             g = A @ x - b
             G = tau * g @ (x - np.clip(x - g / tau, lower, upper))
 
-            assert fall >= 0.999 * G / (4 * tau) - 1e-14 * np.abs(costs).max()
+            assert fall >= 0.999 * G / (4 * tau) - rounding * np.abs(costs).max()
 
         least = np.linalg.eigvalsh(A)[0]
         above = costs - costs[-1]
@@ -485,7 +553,7 @@ def ill_conditioned(n):
     return (A + A.T) / 2, *rng.standard_normal((2, n))
 
 
-def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns():
+def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns(minimise):
     """Conjugate to the last alone, rounding costs it twice as many."""
     n = 40
     A, x, _ = ill_conditioned(n)
@@ -500,7 +568,9 @@ def test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns():
 
 def test_directions_are_conjugate_and_the_last_ones_are_kept():
     A, _, b = ill_conditioned(30)
-    run, _ = minimise(A, b, np.full(30, -np.inf), rules=Rules(kept=12), max_steps=20)
+    run, _ = minimised(
+        run_textbook, A, b, np.full(30, -np.inf), rules=Rules(kept=12), max_steps=20
+    )
     P, HP = np.array(run.directions.p), np.array(run.directions.Hp)
 
     assert P.shape == (12, 30)
@@ -514,9 +584,11 @@ def test_directions_that_span_the_face_solve_for_another_right_hand_side():
     a, b = np.linspace(1.0, 2.0, 12), np.linspace(1.0, -1.0, 12)
     p = np.diag(1 / np.sqrt(a))
     known = Directions(np.ones(12, dtype=bool), tuple(p), tuple(a * p))
-    whole, products = minimise(np.diag(a), b, np.full(12, -9.0), directions=known)
+    whole, products = minimised(
+        run_textbook, np.diag(a), b, np.full(12, -9.0), directions=known
+    )
     lower = np.where(np.arange(12) == 11, -0.1, -9.0)
-    cut, also = minimise(np.diag(a), b, lower, directions=known)
+    cut, also = minimised(run_textbook, np.diag(a), b, lower, directions=known)
 
     assert (whole.trace, products) == ("", 0)
     assert whole.x == pytest.approx(b / a)
@@ -531,7 +603,16 @@ def test_directions_of_another_face_are_forgotten():
     start = np.where(np.arange(20) < 5, 0.0, x)
     elsewhere = Directions(np.ones(20, dtype=bool), (x,), (A @ x,))
     with_them, without = (
-        minimise(A, b, lower, x=start, rules=Rules(kept=20), directions=d, tol=1e-6)[0]
+        minimised(
+            run_textbook,
+            A,
+            b,
+            lower,
+            x=start,
+            rules=Rules(kept=20),
+            directions=d,
+            tol=1e-6,
+        )[0]
         for d in (elsewhere, None)
     )
 

@@ -7,17 +7,12 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import QP, Status, no_rows
+from mortarbench.solvers.smalbe import driver
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
-from tests.support.textbook.mprgp import Rules
-from tests.support.textbook.outer_loop import (
-    Constants,
-    InnerSolver,
-    Iterate,
-    _after_stall,
-    first_iterate,
-    smalbe,
-)
+from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.textbook import loop
+from tests.support.textbook.outer_loop import Iterate, _after_stall
 from tests.support.textbook.projected import by_lanczos, projected_problem
 
 
@@ -34,16 +29,21 @@ def drawn(seed, n=60, condition=1e3):
     )  # fmt: skip
 
 
-def outer_loop(problem, x, *, tol, max_steps=20_000, energy=0.0):
+@pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
+def outer_loop(request):
     """Run from x, with the constants of which the penalty is far too small."""
-    inner = InnerSolver(
-        Rules(1.0, "mixed", "cg"),
-        partial(problem.plain_model, alpha=1.9),
-        precondition=lambda rho: None,
-    )
-    start = first_iterate(problem, x, np.zeros(len(problem.rows.C)), M=1.0, rho=0.1)
-    constants = Constants(1.0, 0.5, 0.1, 1.0, max_steps, energy)
-    return smalbe(problem, constants, inner, tol, start)
+
+    def run(problem, x, *, tol, max_steps=20_000, energy=0.0, at=None):
+        options = SMALBE(
+            expansion="mixed", proportioning="cg", preconditioner="none", M=1.0,
+            beta=0.5, eta=0.1, max_steps=max_steps or 1, energy=energy, recycle=False,
+        )  # fmt: skip
+        object.__setattr__(options, "max_steps", max_steps)
+        chosen = request.param(problem, None, options)
+        zero = np.zeros(len(problem.rows.C))
+        return chosen.solve(tol, at or chosen.first(x, zero, M=1.0, rho=0.1))
+
+    return run
 
 
 def problem_of(qp):
@@ -51,7 +51,7 @@ def problem_of(qp):
 
 
 @pytest.mark.parametrize("seed", [271828, 314159, 161803])
-def test_an_energy_error_that_is_too_large_costs_some_more_products(seed):
+def test_an_energy_error_that_is_too_large_costs_some_more_products(outer_loop, seed):
     """A quarter more, and what the last inner run takes: the estimate is never met."""
     qp = drawn(seed)
     products, found = [], []
@@ -68,7 +68,7 @@ def test_an_energy_error_that_is_too_large_costs_some_more_products(seed):
     assert errors[1] < errors[0] / 2
 
 
-def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts():
+def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts(outer_loop):
     """Relative to b, not to the gradient at the start, which is small there already."""
     free = dict(A=no_rows(60), b=np.zeros(0), lb=np.full(60, -np.inf))
     problem = problem_of(replace(drawn(271828), **free))
@@ -81,13 +81,35 @@ def test_an_answer_is_as_accurate_as_asked_for_wherever_it_starts():
 
 
 @pytest.mark.parametrize("most", [0, 1, 5, 20])
-def test_steps_and_outer_iterations_end_at_their_limit(most):
+def test_steps_and_outer_iterations_end_at_their_limit(outer_loop, most):
     found = outer_loop(
         problem_of(drawn(271828)), np.zeros(60), tol=1e-8, max_steps=most
     )
 
     assert found.status is Status.ITERATION_LIMIT
     assert len(found.steps) + len(found.outer) <= most + 1
+
+
+def test_a_run_that_goes_on_has_what_is_left_of_the_limit(outer_loop):
+    problem = problem_of(drawn(271828))
+    at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=10)
+    again = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=15, at=at)
+
+    assert len(at.steps) + len(at.outer) <= 11
+    assert again.status is Status.ITERATION_LIMIT
+    assert len(again.steps) + len(again.outer) <= 16
+
+
+@pytest.mark.parametrize("most", [1, 5, 20])
+def test_the_lagrangian_is_that_of_the_point(outer_loop, most):
+    """½νᵀHν − bᵀν + μᵀCν with the multipliers of the inner run, before their step."""
+    problem = problem_of(drawn(314159))
+    at = outer_loop(problem, np.zeros(60), tol=1e-8, max_steps=most)
+    Cnu, rho = problem.rows.C @ at.nu, at.outer[-1].rho
+    mu = at.mu - rho * Cnu
+    L = 0.5 * at.nu @ problem.H(at.nu, rho) - problem.b @ at.nu + mu @ Cnu
+
+    assert at.outer[-1].lagrangian == pytest.approx(L, rel=1e-10)
 
 
 def test_of_a_stall_with_rows_that_are_met_the_gradient_is_asked_for_more():
@@ -125,3 +147,12 @@ def test_a_box_is_called_infeasible_by_more_than_rounding_in_every_unit(seed, un
 
     assert not told(A @ lb)
     assert told((1 - 1e-6) * (A @ lb))
+
+
+@pytest.mark.parametrize("unit", [2.0**-40, 1.0, 2.0**40])
+def test_a_far_feasible_point_is_seen_in_every_unit(unit):
+    """(2, −1000) meets x₁ + x₂/1000 = 1; x₂ has no bound."""
+    rows = orthonormal_rows(np.array([[1.0, 1e-3]]), np.array([unit]))
+    bounds = (unit * np.array([2.0, -np.inf]) - rows.x_tilde, np.full(2, np.inf))
+
+    assert not infeasible(rows, bounds, unit * np.array([2.0, 0.0]) - rows.x_tilde)

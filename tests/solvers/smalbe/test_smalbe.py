@@ -16,13 +16,6 @@ from mortarbench.solvers.smalbe.rows import orthonormal_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
 from mortarbench.solvers.smalbe.spectrum import power_method
 from tests.support.textbook import loop
-from tests.support.textbook.mprgp import Rules
-from tests.support.textbook.outer_loop import (
-    Constants,
-    InnerSolver,
-    first_iterate,
-    smalbe,
-)
 from tests.support.textbook.projected import by_lanczos, lanczos, projected_problem
 
 INHOUSE = [name for name in SOLVERS if name.startswith("smalbe")]
@@ -32,16 +25,19 @@ def projected(qp, steps=10):
     return projected_problem(qp, partial(by_lanczos, steps=steps))
 
 
-def outer_loop(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
-    inner = InnerSolver(
-        Rules(1.0, "mixed", "cg"),
-        partial(problem.plain_model, alpha=1.9),
-        precondition=lambda rho: None,
-    )
-    start = first_iterate(
-        problem, np.zeros(problem.b.size), np.zeros(len(problem.rows.C)), M=M, rho=rho
-    )
-    return smalbe(problem, Constants(M, 0.5, eta, growth, 20_000), inner, tol, start)
+@pytest.fixture(params=[driver.outer_loop, loop.outer_loop], ids=["ours", "textbook"])
+def outer_loop(request):
+    def run(problem, *, M=1.0, eta=0.1, rho=3.0, growth=1.0, tol=1e-8):
+        options = SMALBE(
+            expansion="mixed", proportioning="cg", preconditioner="none", M=M,
+            beta=0.5, eta=eta, rho_growth=growth, max_steps=20_000, energy=0.0,
+            recycle=False,
+        )  # fmt: skip
+        chosen = request.param(problem, None, options)
+        x, mu = np.zeros(problem.b.size), np.zeros(len(problem.rows.C))
+        return chosen.solve(tol, chosen.first(x, mu, M=M, rho=rho))
+
+    return run
 
 
 def bounded(P, q, A=None, b=(), lb=-np.inf, ub=np.inf):
@@ -315,7 +311,7 @@ def test_a_tolerance_beyond_rounding_ends_in_the_residual_that_was_reached(
 
 
 @pytest.mark.parametrize("seed", [271828, 314159])
-def test_M_shrinks_while_the_lagrangian_grows_too_little(dual, seed):
+def test_M_shrinks_while_the_lagrangian_grows_too_little(outer_loop, dual, seed):
     """And at no other time; checked from the recorded L, ‖Cν‖ and M."""
     rho = 3.0
     outer = outer_loop(projected(dual(seed)), M=1e3, eta=1e9, rho=rho).outer
@@ -330,7 +326,9 @@ def test_M_shrinks_while_the_lagrangian_grows_too_little(dual, seed):
     assert False in cut
 
 
-def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(dual):
+def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(
+    outer_loop, dual
+):
     """By the growth where M is cut, and by 10 where it stalls."""
     outer = outer_loop(projected(dual(271828)), M=1e3, eta=1e9, growth=4.0).outer
     factors = [later.rho / o.rho for o, later in pairwise(outer[1:])]
@@ -342,7 +340,7 @@ def test_the_penalty_grows_where_it_is_asked_to_and_the_lagrangian_did_not(dual)
 
 
 @pytest.mark.parametrize(("growth", "rounding"), [(1.0, 1e-13), (4.0, 1e-12)])
-def test_the_carried_gradient_is_the_gradient(dual, growth, rounding):
+def test_the_carried_gradient_is_the_gradient(outer_loop, dual, growth, rounding):
     problem = projected(dual(271828))
     end = outer_loop(problem, M=10.0, growth=growth, tol=1e-6)
     C = problem.rows.C
@@ -535,7 +533,7 @@ def test_multipliers_leave_no_gradient_that_rows_could_take(dual):
     assert np.linalg.norm(qp.A[:, free] @ left) <= 1e-9 * size
 
 
-def test_an_inner_run_ends_at_eta_at_the_latest(dual):
+def test_an_inner_run_ends_at_eta_at_the_latest(outer_loop, dual):
     """With M so large that only η stops it."""
     problem = projected(dual(271828))
     loose, tight = (
