@@ -39,6 +39,9 @@ class SMALBE:
         M: Callable[[Vector], Vector] | None = None,
     ) -> None: ...
     def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
+    def precondition(
+        self, free: NDArray[np.bool_], v: Vector, rho: float
+    ) -> Vector: ...
     def solve(
         self,
         options: Options,

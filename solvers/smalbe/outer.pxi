@@ -155,6 +155,18 @@ cdef class SMALBE(MPRGP):
             self.preconditioner = self.model(self.rho)
         return 0
 
+    def precondition(self, free, v, double rho):
+        """Return v (n,) preconditioned in the face of the free components (n,)."""
+        cdef Py_ssize_t n = self.n
+        cdef list held = []
+        is_free = np.asarray(free, dtype=float)
+        memcpy(self.free, numbers(is_free), n * sizeof(double))
+        masked(self.free, read(v, held), self.phi, n)
+        self.rho, self.in_two = rho, False
+        self.choose_models()
+        self.first_direction()
+        return self.over.vector(copied(self.p, n))
+
     # the start
 
     def begin(self, x, mu, double rho):

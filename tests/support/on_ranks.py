@@ -5,6 +5,7 @@ Run as ``mpiexec -n N python -m mpi4py on_ranks.py CASE…``.
 
 import json
 import sys
+from functools import partial
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -22,10 +23,10 @@ from mortarbench.harness.distributed.vectors import (
     distributed,
     inner_products,
 )
-from mortarbench.solvers.smalbe.rows import equality_rows
+from mortarbench.solvers.smalbe.driver import outer_loop
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.solver import SMALBE
 from tests.support.textbook.projected import lanczos
-from tests.support.textbook.rows import model_of
 
 TOL = 1e-8
 REFUSED = {
@@ -138,13 +139,13 @@ def factors(ranks):
 def projected(qp, most):
     """Project and solve in a face, where ranks may share that many rows."""
     kept, factor.FILL = factor.FILL, most
-    rows = equality_rows(qp.A, qp.b, np.isfinite(qp.lb))
+    problem = projected_problem(qp, partial(by_lanczos, steps=3))
     factor.FILL = kept
+    rows, loop = problem.rows, outer_loop(problem, qp, SMALBE(preconditioner="model"))
     v = qp.q + rows.x_tilde
     free = np.isinf(qp.lb) | (v > 0)
-    penalty = model_of(rows, 1.0, np.zeros(0), np.zeros((0, v.size)), 100.0)
-    apply = penalty.inverse_in(free)
-    return np.asarray(rows.project(v) + apply(v) + rows.C.T @ rows.fitted(free, v))
+    z = loop.solver.precondition(free, v, 100.0)
+    return np.asarray(rows.project(v) + z + rows.C.T @ rows.fitted(free, v))
 
 
 def operator(name, ranks):

@@ -9,6 +9,8 @@ from scipy.sparse import csr_array, random_array
 from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.solvers.smalbe import rows as module
 from mortarbench.solvers.smalbe.compiled import Reduction, Rows
+from mortarbench.solvers.smalbe.driver import outer_loop
+from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
 from mortarbench.solvers.smalbe.rows import (
     DenseRows,
     SparseRows,
@@ -99,6 +101,33 @@ def test_a_model_of_the_penalty_takes_the_same_steps(pair, face, rho):
     assert columns(sparse.inverse_in(face), 40) == pytest.approx(
         columns(dense.inverse_in(face), 40), abs=1e-9
     )
+
+
+@pytest.mark.parametrize("rho", [0.5, 3.0, 1e4])
+def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch):
+    """P = I, whose model has no Ritz vectors: by a factor, by an array, and by hand."""
+    qp = QP(
+        P=np.eye(40), q=np.ones(40), A=G, b=e, G=no_rows(40), h=np.zeros(0),
+        lb=np.where(face, -np.inf, -0.5), ub=np.full(40, np.inf),
+    )  # fmt: skip
+    found = []
+    for most in (0, 10_000):
+        monkeypatch.setattr(module, "MOST_DENSE", most)
+        problem = projected_problem(qp, partial(by_lanczos, steps=3))
+        solver = outer_loop(problem, qp, SMALBE()).solver
+        found.append(columns(lambda v, s=solver: s.precondition(face, v, rho), 40))
+    sparse, dense = found
+    C = orthonormal_rows(G, e).C
+    B = np.eye(40) + max(rho - 1, 0) * C.T @ C
+    inverse = np.zeros((40, 40))
+    inverse[np.ix_(face, face)] = np.linalg.inv(B[np.ix_(face, face)])
+
+    assert dense == pytest.approx(sparse, abs=1e-9)
+    assert sparse[np.ix_(face, face)] == pytest.approx(
+        inverse[np.ix_(face, face)], abs=1e-9
+    )
+    if rho > 1:  # else nothing is preconditioned
+        assert sparse == pytest.approx(inverse, abs=1e-9)
 
 
 def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
