@@ -207,16 +207,6 @@ class SummedFactor:
             z_s /= np.sqrt(ranks.size)
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
-    def norm(self, t: Dense) -> float:
-        """Return ‖L⁻¹t‖ of an additive t (k,), in one reduction."""
-        with self.local.at.ranks.clocked("coarse"):
-            u, r = self.local.reduced(np.asarray(t))
-            z_c, r_s = self._changing(r)
-            inner = float(u @ u) / self.root**2 + float(z_c @ z_c)
-            told = self._gathered(r_s, inner)
-            z_s = _solved(self.L_ss, told[:-1])
-            return float(np.sqrt(told[-1] + z_s @ z_s))
-
     def backward(self, a: Dense) -> DistributedVector:
         """Take an orthonormal a (k - s_p + s,) to L⁻ᵀa (k,), consistent."""
         ranks, a = self.local.at.ranks, np.asarray(a)
@@ -247,13 +237,11 @@ class SummedFactor:
         z_c = _solved(self.L_cc, r[:c])
         return z_c, r[c:] - self.L_sc @ z_c
 
-    def _gathered(self, r: Dense, *more: float) -> Dense:
-        """Add what all ranks have for shared rows (s_p,), and more: (s + more,)."""
-        s = len(self.L_ss)
-        told = np.zeros(s + len(more))
-        told[self.local.at.place] = r
-        told[s:] = more
-        return self.local.at.ranks.total(told) if told.size else told
+    def _gathered(self, r: Dense) -> Dense:
+        """Add what all ranks have for shared rows (s_p,): (s,)."""
+        shared = np.zeros(len(self.L_ss))
+        shared[self.local.at.place] = r
+        return self.local.at.ranks.total(shared) if shared.size else shared
 
 
 def local_factor(

@@ -16,15 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, wraps
+from functools import cached_property
 from time import perf_counter
 from typing import (
     TYPE_CHECKING,
     Any,
     NamedTuple,
-    ParamSpec,
     Protocol,
-    TypeVar,
     runtime_checkable,
 )
 
@@ -32,14 +30,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array
 
-from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.qp import QP
 from mortarbench.harness.solution import Solution
 
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
-
-P = ParamSpec("P")
-R = TypeVar("R")
 
 FEW = 64  #: numbers that are added in the order of the ranks
 
@@ -230,45 +225,6 @@ def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
     found = np.ascontiguousarray(part).view(DistributedVector)
     found.ranks = ranks
     return found
-
-
-def inner_products(
-    *pairs: tuple[Vector, Vector], least: Vector | None = None
-) -> tuple[float, ...]:
-    """Return xᵀy of each pair of vectors (n,); over ranks, in one reduction.
-
-    Vectors of pairs that are not distributed are the same on all ranks.
-
-    least : (k,) of which the least is returned, too, after them; inf if there is none
-    """
-    one = pairs[0][0]
-    products = [float(_slice(x) @ _slice(y)) for x, y in pairs]
-    smallest = [] if least is None else [float(_slice(least).min(initial=np.inf))]
-    over = next((v for v in (one, least) if isinstance(v, DistributedVector)), None)
-    if over is None:
-        return (*products, *smallest)
-    found = over.ranks.everyones(np.array(products + smallest))
-    if one is over:
-        products = found[:, : len(products)].sum(axis=0).tolist()
-    return (*products, *found[:, len(products) :].min(axis=0).tolist())
-
-
-def on_slices(function: Callable[P, R]) -> Callable[P, R]:
-    """Have what acts component by component act on slices: one pass, wrapped once.
-
-    function : takes vectors (n,), and gives one or a tuple of them
-    """
-
-    @wraps(function)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
-        ranks = next((a.ranks for a in args if isinstance(a, DistributedVector)), None)
-        if ranks is None:
-            return function(*args, **kwargs)
-        plain: Any = [_slice(a) for a in args]
-        found: R = _again(ranks, function(*plain, **kwargs))
-        return found
-
-    return wrapped
 
 
 def _slice(value: Any) -> Any:

@@ -21,7 +21,6 @@ from mortarbench.harness.distributed.vectors import (
     DistributedVector,
     Ranks,
     distributed,
-    inner_products,
 )
 from mortarbench.solvers.smalbe.driver import outer_loop
 from mortarbench.solvers.smalbe.projected import by_lanczos, projected_problem
@@ -70,13 +69,6 @@ def vectors(ranks):
         "largest Ritz value": (ritz.values[0], 5.0),
         "clip": (np.clip(v, -1, 1).sum(), np.clip(a, -1, 1).sum()),
     }
-    known, least = inner_products((a, b), (b, b), least=w)[1:]
-    pairs |= {
-        "known to all": (known, b @ b),
-        "least beside known": (least, b.min()),
-        "two at once": (sum(inner_products((v, w), (w, w))), a @ b + b @ b),
-        "least beside": (inner_products((v, w), least=w)[1], b.min()),
-    }
     answered = []
     for name, ask in REFUSED.items():
         try:
@@ -122,7 +114,7 @@ def factors(ranks):
             np.abs(whole.backward(a) - y[k]).max() / size,
             abs(a @ b - s @ y) / work,
             abs(rows.additive(s[k]) @ whole.backward(a) - s @ y) / work,
-            abs(whole.norm(rows.additive(t[k])) ** 2 - t @ y) / (np.abs(t) @ np.abs(y)),
+            abs(a @ a - t @ y) / (np.abs(t) @ np.abs(y)),
         ]
     bad = part.toarray()
     if ranks.rank == 0:

@@ -15,8 +15,6 @@ from mortarbench.harness.distributed.vectors import (
     Emitted,
     Ranks,
     distributed,
-    inner_products,
-    on_slices,
 )
 from tests.support import on_ranks
 from tests.support.threads import on_threads
@@ -182,33 +180,23 @@ def test_columns_over_ranks_multiply_as_the_whole_matrix():
 
 
 def test_components_are_functions_of_slices_and_keep_their_ranks():
-    """Also into a given array, in tuples, and where no argument is distributed."""
+    """Also into a given array."""
     x = np.arange(6.0)
-
-    @on_slices
-    def both(a, b):
-        assert type(a) is type(b) is np.ndarray
-        return a + b, (a * b, a @ b)
 
     def work(ranks):
         own = slice(3 * ranks.rank, 3 * ranks.rank + 3)
         v, out = distributed(x[own], ranks), distributed(np.empty(3), ranks)
         assert np.add(v, 1.0, out=out) is not None
         assert (np.asarray(out) == x[own] + 1).all()
-        total, (product, number) = both(v, 2 * x[own])
-        for w, known in ((total, 3 * x[own]), (product, 2 * x[own] ** 2)):
+        for w, known in ((v + 2 * x[own], 3 * x[own]), (v * x[own], x[own] ** 2)):
             assert type(w) is DistributedVector
             assert w.ranks is ranks
             assert (np.asarray(w) == known).all()
         assert type(v[1:]) is DistributedVector
         assert v[1:].ranks is ranks
-        assert number == 2 * x[own] @ x[own]
         return True
 
     assert all(on_threads(2, work))
-    total, (_, number) = both(x, x)
-    assert type(total) is np.ndarray
-    assert number == x @ x
 
 
 def test_what_is_neither_by_components_nor_a_reduction_is_refused():
@@ -226,21 +214,6 @@ def test_what_is_neither_by_components_nor_a_reduction_is_refused():
         return float(np.linalg.norm(v))
 
     assert on_threads(2, work) == pytest.approx([np.sqrt(10)] * 2)
-
-
-def test_inner_products_over_ranks_take_one_reduction():
-    x = np.array([1.0, 2, 3, 4])
-
-    def work(ranks):
-        own = slice(2 * ranks.rank, 2 * ranks.rank + 2)
-        v = distributed(x[own], ranks)
-        found = inner_products((v, v), (v, distributed(x[own] - 2, ranks)), least=v)
-        none = inner_products((v, v), least=distributed(np.zeros(0), ranks))
-        return found, none, ranks.counts["reductions"]
-
-    assert on_threads(2, work) == [((30.0, 10.0, 1.0), (30.0, np.inf), 2)] * 2
-    assert inner_products((x, x), (x, x - 2)) == (30.0, 10.0)
-    assert inner_products((x, x), least=x) == (30.0, 1.0)
 
 
 def test_sizes_of_an_emitted_qp_are_those_of_the_whole():

@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 from scipy.linalg import blas
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import inner_products, on_slices
 
 Mask = NDArray[np.bool_]
 ROUNDING = 4 * float(np.finfo(float).eps)  #: relative error of a few operations
+
+
+def inner_products(
+    *pairs: tuple[Vector, Vector], least: Vector | None = None
+) -> tuple[float, ...]:
+    """Return xᵀy of each pair, and the least component of a vector, inf without any."""
+    products = [float(x @ y) for x, y in pairs]
+    return (*products, *([] if least is None else [float(least.min(initial=np.inf))]))
 
 
 def lengths(
@@ -31,7 +38,6 @@ def lengths(
     return slope / curvature if curvature > 0 else np.inf, feasible
 
 
-@on_slices
 def _to_bounds(x: Vector, p: Vector, lower: Vector, upper: Vector) -> Vector:
     """Return, of components that move to a bound, the α at which they are there."""
     bound = np.where(p > 0, lower, upper)
@@ -40,7 +46,6 @@ def _to_bounds(x: Vector, p: Vector, lower: Vector, upper: Vector) -> Vector:
     return found
 
 
-@on_slices
 def moved(
     x: Vector, g: Vector, alpha: float, p: Vector, Hp: Vector,
     lower: Vector, upper: Vector,
@@ -76,7 +81,6 @@ def split(
     return free, phi, beta, phi_square, beta_square
 
 
-@on_slices
 def _parted(
     x: Vector, g: Vector, lower: Vector, upper: Vector
 ) -> tuple[Mask, Vector, Vector]:
@@ -89,7 +93,6 @@ def _parted(
     return free, phi, beta
 
 
-@on_slices
 def reduced(
     x: Vector, phi: Vector, alpha: float, lower: Vector, upper: Vector
 ) -> Vector:
@@ -104,7 +107,6 @@ def conjugate(z: Vector, p: Vector, Hp: Vector) -> Vector:
     return less(z, (along / curvature,), p)
 
 
-@on_slices
 def less(v: Vector, shares: Sequence[float], *vectors: Vector) -> Vector:
     """Return v − Σ sᵢvᵢ."""
     found = v.copy()
@@ -113,14 +115,12 @@ def less(v: Vector, shares: Sequence[float], *vectors: Vector) -> Vector:
     return found
 
 
-@on_slices
 def scaled(s: float, v: Vector) -> Vector:
     """Return sv."""
     found: Vector = s * v
     return found
 
 
-@on_slices
 def tilted_step(
     x: Vector, g: Vector, tau: float, lower: Vector, upper: Vector
 ) -> tuple[Vector, NDArray[np.int8]]:
@@ -136,7 +136,6 @@ def tilted_step(
     return target - x, piece
 
 
-@on_slices
 def weighted_difference(v: Vector, w: Vector, weights: Vector) -> Vector:
     """Return vᵢ − wᵢ times a weight."""
     found: Vector = v - w
@@ -144,7 +143,6 @@ def weighted_difference(v: Vector, w: Vector, weights: Vector) -> Vector:
     return found
 
 
-@on_slices
 def combined(s: float, v: Vector, t: float, w: Vector) -> Vector:
     """Return sv + tw."""
     found: Vector = s * v

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import inner_products, on_slices
 from tests.support.textbook import kernels
-from tests.support.textbook.kernels import Mask
+from tests.support.textbook.kernels import Mask, inner_products
 
 NEWTON_STEPS = 100
 SEARCH_STEPS = 60
@@ -187,7 +186,6 @@ def _searched(
     return t, there
 
 
-@on_slices
 def _equal(one: NDArray[np.int8], other: NDArray[np.int8]) -> Vector:
     """Return 1 where two pieces are the same, else 0."""
     return np.where(one == other, 1.0, 0.0)

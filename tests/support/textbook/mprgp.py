@@ -36,9 +36,8 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import inner_products
 from tests.support.textbook import kernels
-from tests.support.textbook.kernels import Mask
+from tests.support.textbook.kernels import Mask, inner_products
 from tests.support.textbook.model import BoxModel
 
 Operator = Callable[[Vector], Vector]
