@@ -2,6 +2,8 @@
 
 
 cdef enum:
+    # Limits of Newton's method and of its line search, which is kept 5 % off the ends of
+    # its interval: behind them is a step with the largest eigenvalue for τ.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
 

@@ -1,12 +1,21 @@
 # MPRGP over the operations of this folder: it knows neither bounds nor processes.
 
 
-cdef double NOISE = 1e-13  # part of the terms of a cost that is taken for rounding
+# Rounding of a cost, relative to the sum of its absolute terms: errors of k terms grow
+# like √k·2⁻⁵³, so that this covers 8·10⁵ of them.
+cdef double NOISE = 1e-13
 
 cdef enum:
-    KEPT = 200  # directions of CG on a face
-    MOST_IDLE = 2  # proportionings by the model in vain, before one along −β
-    FIRST_LOOK = 500  # steps of a run after which its progress is looked at first
+    # Directions of CG that are kept on a face: two passes over them are 400 vectors, what
+    # a product with a dense F of 800 unknowns reads. With 3 of them
+    # `test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns` fails.
+    KEPT = 200
+    # Proportionings by the model that did not halve ‖β‖², before one along −β. Without a
+    # limit `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
+    MOST_IDLE = 2
+    # Steps of a run after which its progress is looked at first, ten times what a
+    # preconditioned dual takes. `test_a_solve_that_rounding_stops_ends` fails without it.
+    FIRST_LOOK = 500
     STD = 0
     PROJCG = 1
     MIXED = 2

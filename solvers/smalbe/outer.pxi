@@ -1,11 +1,21 @@
 # The outer loop, and the way back to the problem as given.
 
 
-cdef double MOST_RHO = 1e10  # beyond which rounding in ρQν is all that is left
-cdef double FOR_ENERGY = 1.25  # factor of the products that the energy may cost
-cdef double TAIL = 1e-4  # least τ of a model, relative to the norm
-cdef double LEAST_M = 1e-10  # beyond which M‖Cν‖ is rounding
-cdef double LEAST_RHO = 10.0  # of the model of the penalty: with less, nothing is projected
+# Largest penalty: rounding of ρQν, 2⁻⁵³ρ‖ν‖, is 1e-6 of ‖ν‖ there, and all that a
+# gradient shows beyond.
+cdef double MOST_RHO = 1e10
+# Factor of the products spent that the energy error may cost; a quarter, as
+# `test_an_energy_error_that_is_too_large_costs_some_more_products` says.
+cdef double FOR_ENERGY = 1.25
+# Least τ of a model, relative to the norm: steps are no longer than 1e4 times those of
+# plain gradient projection. With zero, a spectrum that ends leaves τ = 0, and no step
+# (`test_what_once_failed`).
+cdef double TAIL = 1e-4
+# Least M: the tenth stall in a row that rows did not cause ends the solve.
+cdef double LEAST_M = 1e-10
+# Least ρ in the model of the penalty that a structural preconditioner stands beside: with
+# it the part of a direction in the range of CᵀC becomes a tenth.
+cdef double LEAST_RHO = 10.0
 
 
 cdef class SMALBE(MPRGP):

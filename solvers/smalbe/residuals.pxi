@@ -4,7 +4,9 @@
 # point has residuals above the bound is tested against it.
 
 
-cdef double MAX_CANCELLATION = 1e4  # of the terms of an energy, over its value
+# Largest ratio of the terms of the objective to itself that counts, as in
+# `harness.verify.kkt`.
+cdef double MAX_CANCELLATION = 1e4
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
