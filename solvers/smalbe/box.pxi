@@ -2,6 +2,7 @@
 # further set (discs of friction) adds its part to each operation of this section.
 
 
+@cython.final
 cdef class Box:
     """l ≤ x ≤ u, of vectors that several processes may share.
 

@@ -25,6 +25,7 @@ product and the lengths; the step and the new gradient, whose free part is not s
 loops over vectors are in `vectors.h`.
 """
 
+cimport cython
 from cpython.buffer cimport (
     PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer,
 )

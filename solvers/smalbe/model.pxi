@@ -8,6 +8,7 @@ cdef enum:
     SEARCH_STEPS = 60
 
 
+@cython.final
 cdef class Model:
     """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis.
 
@@ -194,6 +195,7 @@ cdef class Basis:
         raise NotImplementedError
 
 
+@cython.final
 cdef class DenseBasis(Basis):
     """An array U (k, n), and U_F U_Fᵀ of the face F for which it was asked last.
 
@@ -427,6 +429,7 @@ cdef class DenseBasis(Basis):
         return scale_free(1 / B.tau, free, along, z, self.n)
 
 
+@cython.final
 cdef class FactoredBasis(Basis):
     """C = L⁻¹G of sparse rows, which a model has with one weight w: the penalty's.
 

@@ -30,6 +30,7 @@ cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
     return held
 
 
+@cython.final
 cdef class Directions:
     """The last conjugate directions that CG took on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
 

@@ -10,6 +10,7 @@
 # with the lengths that their owner knows, and stay referred to for as long.
 
 
+@cython.final
 cdef class Room:
     """Numbers, zeros at first, that are there as long as this is."""
 
@@ -79,6 +80,7 @@ cdef int take(result, Py_ssize_t n, double *y, str what) except -1:
 # --- sums ---------------------------------------------------------------------------
 
 
+@cython.final
 cdef class Reduction:
     """Sums over the processes that share a vector; of one process, what it has.
 
@@ -95,16 +97,17 @@ cdef class Reduction:
         """Return an array as the vector that operators expect."""
         return array if self.ranks is None else self.as_slice(array, self.ranks)
 
-    cdef int add(self, double *terms, Py_ssize_t k, double *least=NULL) except -1:
+    cdef inline int add(
+        self, double *terms, Py_ssize_t k, double *least=NULL
+    ) except -1:
         """Replace terms (k,) by their sums, and `least` by the least, over all processes.
-
-        Summed in the order of the ranks, so that all of them have the same bits, and
-        every run has.
         """
+        return 0 if self.ranks is None else self.gather(terms, k, least)
+
+    cdef int gather(self, double *terms, Py_ssize_t k, double *least) except -1:
+        # in the order of the ranks: the same bits on all of them, and in every run
         cdef Py_ssize_t i, p, width = k + (1 if least else 0)
         cdef const double *of_rank
-        if self.ranks is None:
-            return 0
         own = np.empty(width)
         if k:
             memcpy(numbers(own), terms, k * sizeof(double))
@@ -121,15 +124,15 @@ cdef class Reduction:
                 least[0] = fmin(least[0], of_rank[p * width + k])
         return 0
 
-    cdef double total(self, double term) except? -1:
+    cdef inline double total(self, double term) except? -1:
         self.add(&term, 1)
         return term
 
-    cdef double least(self, double number) except? -1:
+    cdef inline double least(self, double number) except? -1:
         self.add(NULL, 0, &number)
         return number
 
-    cdef bint any(self, bint here) except -1:
+    cdef inline bint any(self, bint here) except -1:
         return self.total(here) > 0
 
 
@@ -142,6 +145,7 @@ cdef enum:
     BY_BLAS = 600
 
 
+@cython.final
 cdef class Product:
     """v → Pv, counted.
 
@@ -216,6 +220,7 @@ cdef class Product:
 # --- rows ---------------------------------------------------------------------------
 
 
+@cython.final
 cdef class Rows:
     """Orthonormal rows C (r, n): an array, or L⁻¹G with a sparse factor L of GGᵀ.
 
@@ -242,12 +247,12 @@ cdef class Rows:
         if isinstance(rows.C, np.ndarray):
             self.r, self.m = len(rows.C), len(rows.GC)
             self.C, self.GC = read(rows.C, self.held), read(rows.GC, self.held)
+            self.exist = self.r > 0
         else:
             none = rows.no_multipliers
-            self.r = none.size if over.ranks is None else np.asarray(none).size
-        self.exist = len(rows.C) > 0
-        if isinstance(rows.C, np.ndarray) or getattr(none, "ranks", None) is None:
-            self.over_rows = Reduction()  # every process has all of (r,)
+            self.r, self.exist = np.asarray(none).size, len(rows.C) > 0
+            if getattr(none, "ranks", None) is None:
+                self.over_rows = Reduction()  # every process has all of (r,)
 
     cdef int times(self, const double *v, double *Cv) except -1:
         """Cv ← C v."""

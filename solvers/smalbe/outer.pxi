@@ -18,6 +18,7 @@ cdef double LEAST_M = 1e-10
 cdef double LEAST_RHO = 10.0
 
 
+@cython.final
 cdef class SMALBE(MPRGP):
     """Semimonotonic augmented Lagrangians: the outer loop over MPRGP.
 
