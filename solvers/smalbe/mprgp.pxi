@@ -337,7 +337,7 @@ cdef class MPRGP:
         self.z_Hp = self.preconditioner.inverse(self.free, self.phi, self.Hp, self.z)
         if self.M is not None:
             self.counts["preconditioner_applies"] += 1
-            take(self.M(self.over.vector(copied(self.z, n))), n, again, "M @ v")
+            take(self.M(self.over.vector(seen(self.z, n))), n, again, "M @ v")
             for i in range(n):
                 rest[i] = self.free[i] * (self.M_scale * again[i] - self.z[i])
             self.z_Hp += self.preconditioner.inverse(self.free, rest, self.Hp, again)
