@@ -2,13 +2,27 @@
 # further set (discs of friction) adds its part to each operation of this section.
 
 
+cdef struct Line:
+    double cg  # α that minimises the cost at x − αp; inf without curvature
+    double feasible  # the largest feasible α; may be inf where it is not below
+    double slope  # gᵀp
+    double curvature  # pᵀHp
+
+
+cdef struct Parts:
+    double phi_square  # ‖φ‖² of the free gradient φ, g off the boundary
+    double beta_square  # ‖β‖² of the chopped gradient β, what leads inside on it
+    double reduced_square  # φ̃ᵀφ, φ̃ the φ that no step of length 1/τ takes beyond it
+    double phi_Hp  # φᵀHp after a step along p
+
+
 @cython.final
 cdef class Box:
     """l ≤ x ≤ u, of vectors that several processes may share.
 
     Every operation is one pass over its vectors, together with the sums that the step
-    needs of them: a CG step would otherwise read each vector several times. `told` are
-    these sums, over all processes.
+    needs of them, over all processes: a CG step would otherwise read each vector several
+    times.
     """
 
     cdef Py_ssize_t n
@@ -40,49 +54,42 @@ cdef class Box:
             y[i] = fmin(fmax(x[i] - alpha * p[i], self.lower[i]), self.upper[i])
 
     cdef int lengths(self, const double *x, const double *g, const double *p,
-                     const double *Hp, double *told) except -1:
-        """Tell the α of x − αp that minimises, the largest feasible one, gᵀp and pᵀHp.
-
-        The minimising one is inf along a direction without curvature. The feasible one
-        may be inf where it is not below.
-        """
+                     const double *Hp, Line *line) except -1:
+        """Find how far to go along x − αp."""
         if self.over.ranks is None:
-            lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, told)
+            lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
             return 0
-        told[2], told[3] = dot(g, p, self.n), dot(p, Hp, self.n)
-        told[1] = first_bound(x, p, self.lower, self.upper_if_any, self.n)
-        self.over.add(told + 2, 2, told + 1)
-        told[0] = told[2] / told[3] if told[3] > 0 else INFINITY
+        line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
+        line.feasible = first_bound(x, p, self.lower, self.upper_if_any, self.n)
+        self.over.add(&line.slope, 2, &line.feasible)
+        line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
         return 0
 
     cdef void product_and_lengths(
         self, const sparse *F, double s, const double *x, const double *g, double *p,
-        double *Hp, double *told
+        double *Hp, Line *line
     ) noexcept:
         """Hp ← s F p, and its `lengths`, in one go through memory."""
-        sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, told)
+        sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
     cdef void next_product_and_lengths(
         self, const sparse *F, double s, double gamma, const double *x, const double *g,
-        double *p, double *Hp, double *told
+        double *p, double *Hp, Line *line
     ) noexcept:
         """p ← φ − γp, Hp ← s F p, and its `lengths`, in one go through memory."""
-        sparse_turn(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, told)
+        sparse_turn(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
     cdef int split(self, const double *x, const double *g, double tau, double *phi,
-                   double *free, double *told) except -1:
+                   double *free, Parts *parts) except -1:
         """Split g by the face on which x lies: φ and `free`, 1 off the boundary, else 0.
-
-        told : ‖φ‖², ‖β‖² and φ̃ᵀφ, β what of g leads inside on the boundary, φ̃ the φ
-            that no step of length 1/τ takes beyond it
         """
-        split(x, g, self.lower, self.upper, tau, phi, free, self.n, told)
-        return self.over.add(told, 3)
+        split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
+        return self.over.add(&parts.phi_square, 3)
 
     cdef int advance(self, double alpha, double *x, double *g, const double *p,
                      const double *Hp, double tau, double *phi, double *free,
-                     double *told) except -1:
-        """x ← x − αp, g ← g − αHp, and `split`; told[3] = φᵀHp.
+                     Parts *parts) except -1:
+        """x ← x − αp, g ← g − αHp, and `split`.
 
         What comes nearer to the boundary than rounding can tell is on it: a step as far
         as it is feasible must not stop short of the face.
@@ -90,8 +97,8 @@ cdef class Box:
         phi, free : NULL where they are not stored
         """
         advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
-                self.n, told)
-        return self.over.add(told, 4)
+                self.n, &parts.phi_square)
+        return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
         """β, what of g leads inside on the boundary."""

@@ -22,6 +22,11 @@ cdef enum:
     MODEL = 3
 
 
+cdef double change_along(const Line *line, double alpha) noexcept:
+    """Return f(x − αp) − f(x)."""
+    return -alpha * line.slope + 0.5 * alpha**2 * line.curvature
+
+
 cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
     """Make room for so many numbers, and keep those that are there."""
     held = <double *> realloc(held, max(size, 1) * sizeof(double))
@@ -165,8 +170,10 @@ cdef class MPRGP:
     cdef double *Cw
     cdef double *Cx  # where it is known, see `violation`
     cdef bint knows_Cx
-    cdef double told[4]
-    cdef double phi_square, beta_square, reduced_square, z_Hp
+    cdef Line line  # along which the last product was
+    cdef Parts parts  # of the gradient at x
+    cdef double sums[2]
+    cdef double z_Hp
     cdef Model B  # of H; ᾱ = 1/τ is the length of gradient projection steps
     cdef Model preconditioner  # inverted in the face; None for none
     cdef object M  # v → Mv of a structural preconditioner; None for none
@@ -220,7 +227,7 @@ cdef class MPRGP:
         #    the first direction of conjugate gradients.
         self.split()
         self.minimise_along_directions()
-        began = self.phi_square
+        began = self.parts.phi_square
         self.first_direction()
         self.directions.conjugate(self.p)
         while True:
@@ -230,18 +237,18 @@ cdef class MPRGP:
                 return 1
             if len(trace) >= most:
                 return 0
-            least = fmin(least, self.phi_square + self.beta_square)
+            least = fmin(least, self.parts.phi_square + self.parts.beta_square)
             if len(trace) >= look:
                 self.terms_of_cost()
-                if not cost - self.told[0] > NOISE * self.told[1] and 4 * least > before:
+                if not cost - self.sums[0] > NOISE * self.sums[1] and 4 * least > before:
                     return 0
-                before, least, cost = fmin(least, before), INFINITY, self.told[0]
+                before, least, cost = fmin(least, before), INFINITY, self.sums[0]
                 look = 2 * len(trace)
-            weight = self.reduced_square if self.reduced else self.phi_square
-            if self.beta_square > self.Gamma_square * weight:
+            weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
+            if self.parts.beta_square > self.Gamma_square * weight:
                 # 3. Proportioning: more is to be gained on the boundary than inside.
-                idle = idle + 1 if self.beta_square > chopped / 2 else 0
-                chopped = self.beta_square
+                idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
+                chopped = self.parts.beta_square
                 letter = self.proportion(
                     self.proportions_by_model
                     and (idle < MOST_IDLE or self.B.basis is None)
@@ -253,25 +260,22 @@ cdef class MPRGP:
                     self.lengths_of_next(gamma)
                 else:
                     self.lengths_along(self.p, self.Hp)
-                if isinf(fmin(self.told[0], self.told[1])):
+                if isinf(fmin(self.line.cg, self.line.feasible)):
                     return 0
-                if self.told[0] <= self.told[1]:
+                if self.line.cg <= self.line.feasible:
                     # 5. Conjugate gradient step, and the next direction.
                     gamma = self.minimise_along_p()
                     self.tell(b"c", trace, note)
                     inside += 1
                     continue
                 # 6. Expansion: the face has a boundary in the way.
-                letter = self.expand(
-                    self.told[0], self.told[1], not has_expanded, max(inside, 1), began,
-                    trace,
-                )
+                letter = self.expand(not has_expanded, max(inside, 1), began, trace)
                 has_expanded = True
             if not letter:
                 return 0
             # 7. On the new face, begin anew with the preconditioned free gradient.
             self.directions.begin(self.free)
-            inside, began, gamma = 0, self.phi_square, 0.0
+            inside, began, gamma = 0, self.parts.phi_square, 0.0
             self.first_direction()
             self.tell(letter, trace, note)
 
@@ -290,10 +294,9 @@ cdef class MPRGP:
 
     cdef int split(self) except -1:
         """Split the gradient at x by the face on which x lies."""
-        self.set.split(self.x, self.g, self.B.tau, self.phi, self.free, self.told)
-        self.phi_square, self.beta_square = self.told[0], self.told[1]
-        self.reduced_square = self.told[2]
-        return 0
+        return self.set.split(
+            self.x, self.g, self.B.tau, self.phi, self.free, &self.parts
+        )
 
     cdef int minimise_along_directions(self) except -1:
         """Minimise along the directions known on this face, as far as is feasible."""
@@ -301,8 +304,8 @@ cdef class MPRGP:
             return 0
         if self.directions.count and self.directions.is_on(self.free):
             self.directions.minimise(self.g, self.s, self.Hs)
-            self.set.lengths(self.x, self.g, self.s, self.Hs, self.told)
-            self.to(fmin(1.0, self.told[1]), self.s, self.Hs)
+            self.set.lengths(self.x, self.g, self.s, self.Hs, &self.line)
+            self.to(fmin(1.0, self.line.feasible), self.s, self.Hs)
         if not self.directions.is_on(self.free):
             self.directions.begin(self.free)
         return 0
@@ -352,13 +355,15 @@ cdef class MPRGP:
         It ends at the opposite boundary at the latest.
         """
         cdef double *beta = self.s
+        cdef double length
         if by_model:
             return b"p" if self.step_by_model() else 0
         self.set.chop(self.x, self.g, beta)
         self.lengths_along(beta, self.Hs)
-        if isinf(fmin(self.told[0], self.told[1])):
+        length = fmin(self.line.cg, self.line.feasible)
+        if isinf(length):
             return 0
-        self.to(fmin(self.told[0], self.told[1]), beta, self.Hs)
+        self.to(length, beta, self.Hs)
         return b"p"
 
     cdef int step_by_model(self) except -1:
@@ -373,7 +378,7 @@ cdef class MPRGP:
         length = self.searched(self.s, self.Hs)
         if length == 0 or isinf(length):
             return 0
-        if self.told[0] < 1:
+        if self.line.cg < 1:
             self.raise_model(self.s, self.Hs)
         self.to(length, self.s, self.Hs)
         return 1
@@ -382,12 +387,12 @@ cdef class MPRGP:
         """Find the length along s of the least cost, in the set where 1 is not beyond.
 
         0 for s = 0, inf where the cost falls without end. It turns s round, so that
-        x − αs is where it leads, and leaves its `lengths` in `told`; one product.
+        x − αs is where it leads, and leaves its `lengths` in `line`; one product.
         """
         if not self.over.any(turn_round(s, self.n)):
             return 0
         self.lengths_along(s, Hs)
-        return fmin(self.told[0], fmax(1.0, self.told[1]))
+        return fmin(self.line.cg, fmax(1.0, self.line.feasible))
 
     cdef int raise_model(self, const double *s, const double *Hs) except -1:
         """Raise the model to what a product shows."""
@@ -421,14 +426,14 @@ cdef class MPRGP:
         return 0
 
     cdef int lengths_along(self, double *p, double *Hp) except -1:
-        """Hp ← H p, and the `lengths` of x − αp, which are kept in `told`; one product."""
+        """Hp ← H p, and the `lengths` of x − αp, which are kept in `line`; one product."""
         if self.rows.exist or not self.F.rows.data:
             self.H(p, Hp)
-            self.set.lengths(self.x, self.g, p, Hp, self.told)
+            self.set.lengths(self.x, self.g, p, Hp, &self.line)
             return 0
         self.F.count += 1
         self.set.product_and_lengths(
-            &self.F.rows, self.inverse_norm, self.x, self.g, p, Hp, self.told
+            &self.F.rows, self.inverse_norm, self.x, self.g, p, Hp, &self.line
         )
         return 0
 
@@ -437,18 +442,18 @@ cdef class MPRGP:
         self.F.count += 1
         self.set.next_product_and_lengths(
             &self.F.rows, self.inverse_norm, gamma, self.x, self.g, self.p, self.Hp,
-            self.told,
+            &self.line,
         )
         return 0
 
     # 5. The conjugate gradient step
 
     cdef double minimise_along_p(self) except? -1:
-        """Take the CG step whose `lengths` are told, and find the next direction.
+        """Take the CG step along `line`, and find the next direction.
 
         Return γ of p ← φ − γp where that is put off, 0 else.
         """
-        cdef double length = self.told[0], curvature = self.told[3], z_Hp
+        cdef double length = self.line.cg, curvature = self.line.curvature, z_Hp
         cdef const double *z
         cdef bint knows_Cx = self.knows_Cx
         if not self.in_two:
@@ -456,7 +461,7 @@ cdef class MPRGP:
         self.to(length, self.p, self.Hp)
         add(-length, self.Cv, self.Cx, self.rows.r)  # Cp, of the product Hp
         self.knows_Cx = knows_Cx
-        z_Hp = self.told[3]
+        z_Hp = self.parts.phi_Hp
         if self.in_two:
             return z_Hp / curvature
         z = self.preconditioned_gradient()
@@ -474,20 +479,21 @@ cdef class MPRGP:
         cdef bint stored = not self.in_two
         self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau,
                          self.phi if stored else NULL, self.free if stored else NULL,
-                         self.told)
-        self.phi_square, self.beta_square = self.told[0], self.told[1]
-        self.reduced_square, self.knows_Cx = self.told[2], False
+                         &self.parts)
+        self.knows_Cx = False
         return 0
 
     # 6. Expansion
 
-    cdef int expand(self, double cg, double feasible, bint is_first, long most,
-                    double enough, bytearray trace) except -1:
+    cdef int expand(
+        self, bint is_first, long most, double enough, bytearray trace
+    ) except -1:
         """Expand the active set; returns the letter of the step, 0 where none leads on.
 
         is_first : of the run; most, enough : see `minimise_beyond`
         """
         cdef Py_ssize_t n = self.n
+        cdef double cg = self.line.cg
         self.knows_Cx = False
         if self.expansion in (PROJCG, MIXED) and isfinite(cg):
             self.set.project(self.x, cg, self.p, self.x2)
@@ -500,16 +506,17 @@ cdef class MPRGP:
                 self.split()
                 return b"e"
         if self.expansion == MODEL:
-            return self.expand_by_model(cg, feasible, is_first, most, enough, trace)
-        self.to(feasible, self.p, self.Hp)
+            return self.expand_by_model(is_first, most, enough, trace)
+        self.to(self.line.feasible, self.p, self.Hp)
         self.set.project_free(self.x, self.g, self.B.tau, self.x2)
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
         return b"f" if self.expansion == MIXED else b"e"
 
-    cdef int expand_by_model(self, double cg, double feasible, bint is_first, long most,
-                             double enough, bytearray trace) except -1:
+    cdef int expand_by_model(
+        self, bint is_first, long most, double enough, bytearray trace
+    ) except -1:
         """Project z, where CG leads beyond the set, on it in the metric of the model.
 
         z is x − α_cg p, and in a flat spectrum, where active sets change least in a
@@ -531,9 +538,10 @@ cdef class MPRGP:
         cdef double *Hs = self.Hs
         cdef double *z = self.x2
         cdef double *z_g = self.g2
-        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, tau = self.B.tau
-        cdef double change = -feasible * self.told[2] + 0.5 * feasible**2 * self.told[3]
-        cdef double least = self.reduced_square / (2 * tau), slope
+        cdef double cg = self.line.cg, feasible = self.line.feasible, tau = self.B.tau
+        cdef double beyond = cg - feasible if isfinite(cg) else 0.0, length, slope
+        cdef double change = change_along(&self.line, feasible)  # of the cost, from x
+        cdef double least = self.parts.reduced_square / (2 * tau)
         cdef bint is_flat = self.B.basis is None, release = is_first and not is_flat
         self.set.leave(feasible, beyond, release, self.x, self.g, self.p, self.Hp,
                        self.x0, self.g0, self.free, self.face_set, z, z_g)
@@ -556,12 +564,12 @@ cdef class MPRGP:
         if isinf(length):
             return 0
         if length:
-            if -self.told[2] + 0.5 * self.told[3] + change < 0:
+            if change_along(&self.line, 1.0) + change < 0:
                 length = fmax(length, 1.0)
-            change += -length * self.told[2] + 0.5 * length**2 * self.told[3]
-            rest_of_step(self.x, self.g, s, Hs, z_g, z, n, self.told)
-            self.over.add(self.told, 2)
-            self.B = self.B.raised(z, self.told[0], self.told[1])
+            change += change_along(&self.line, length)
+            rest_of_step(self.x, self.g, s, Hs, z_g, z, n, self.sums)
+            self.over.add(self.sums, 2)
+            self.B = self.B.raised(z, self.sums[0], self.sums[1])
             self.to(length, s, Hs)
         else:
             self.split()
@@ -578,31 +586,31 @@ cdef class MPRGP:
         cdef Py_ssize_t n = self.n
         cdef long step
         cdef double curvature = self.over.total(dot(self.p, self.Hp, n)), slope
-        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, n, self.told)
-        self.over.add(self.told, 2)
+        advance_freely(0.0, self.x2, self.g2, self.p, self.Hp, self.free, n, self.sums)
+        self.over.add(self.sums, 2)
         for step in range(most):
-            if self.told[0] <= enough:
+            if self.sums[0] <= enough:
                 break
-            self.turn_beyond(self.told[1] / curvature)
-            slope, curvature = self.told[0], self.told[1]
+            self.turn_beyond(self.sums[1] / curvature)
+            slope, curvature = self.sums[0], self.sums[1]
             trace.append(c'b')
             if curvature <= 0:
                 break
             advance_freely(slope / curvature, self.x2, self.g2, self.p, self.Hp,
-                           self.free, n, self.told)
-            self.over.add(self.told, 2)
+                           self.free, n, self.sums)
+            self.over.add(self.sums, 2)
         return 0
 
     cdef int turn_beyond(self, double gamma) except -1:
-        """p ← φ − γp at z, Hp ← H p; φᵀp and pᵀHp are told; one product."""
+        """p ← φ − γp at z, Hp ← H p; `sums` are φᵀp and pᵀHp; one product."""
         if self.rows.exist or not self.F.rows.data:
-            self.told[0] = turn_freely(self.g2, self.free, gamma, self.p, self.n)
+            self.sums[0] = turn_freely(self.g2, self.free, gamma, self.p, self.n)
             self.H(self.p, self.Hp)
-            self.told[1] = dot(self.p, self.Hp, self.n)
-            return self.over.add(self.told, 2)
+            self.sums[1] = dot(self.p, self.Hp, self.n)
+            return self.over.add(self.sums, 2)
         self.F.count += 1
         sparse_turn_freely(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
-                           self.p, self.Hp, self.told)
+                           self.p, self.Hp, self.sums)
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
@@ -631,15 +639,15 @@ cdef class MPRGP:
         return self.over.total(sum_)
 
     cdef int terms_of_cost(self) except -1:
-        """Tell twice the cost at x, and the sum of the absolute values of its terms."""
+        """Find `sums`, twice the cost at x, and the sum of its absolute terms."""
         cdef double term, sum_ = 0.0, size = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
             term = self.x[i] * (self.g[i] - self.rhs[i])
             sum_ += term
             size += fabs(term)
-        self.told[0], self.told[1] = sum_, size
-        return self.over.add(self.told, 2)
+        self.sums[0], self.sums[1] = sum_, size
+        return self.over.add(self.sums, 2)
 
     cdef double violation(self) except? -1:
         """Find ‖Cx‖ at the iterate; CG steps have brought Cx along."""

@@ -30,14 +30,14 @@ cdef double *numbers(a) except NULL:
 
     Raises ValueError where they are not doubles, or have gaps.
     """
-    cdef Py_buffer told
+    cdef Py_buffer buffer
     cdef bint has_doubles
-    PyObject_GetBuffer(a, &told, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)
-    has_doubles = told.format[0] == b"d"[0]
-    PyBuffer_Release(&told)
+    PyObject_GetBuffer(a, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)
+    has_doubles = buffer.format[0] == b"d"[0]
+    PyBuffer_Release(&buffer)
     if not has_doubles:
         raise ValueError(f"an array of {a.dtype}; expected float64")
-    return <double *> told.buf
+    return <double *> buffer.buf
 
 
 def _whole(a):
@@ -58,9 +58,9 @@ cdef const double *read(a, list held) except NULL:
 
 cdef copied(const double *v, Py_ssize_t n):
     """Return a new array (n,) of these numbers."""
-    told = np.empty(n)
-    memcpy(numbers(told), v, n * sizeof(double))
-    return told
+    array = np.empty(n)
+    memcpy(numbers(array), v, n * sizeof(double))
+    return array
 
 
 cdef seen(const double *v, Py_ssize_t n):
@@ -171,11 +171,11 @@ cdef class Product:
             M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
             self.hold_rows(M.data, M.indptr, M.indices)
 
-    cdef int hold_rows(self, told_data, told_indptr, told_indices) except -1:
+    cdef int hold_rows(self, values, starts, columns) except -1:
         """Take a sparse P by rows; by diagonals where these take no more room."""
-        cdef const double[::1] data = _whole(told_data)
-        cdef const int[::1] indptr = np.ascontiguousarray(told_indptr, dtype=np.int32)
-        cdef const int[::1] indices = np.ascontiguousarray(told_indices, dtype=np.int32)
+        cdef const double[::1] data = _whole(values)
+        cdef const int[::1] indptr = np.ascontiguousarray(starts, dtype=np.int32)
+        cdef const int[::1] indices = np.ascontiguousarray(columns, dtype=np.int32)
         cdef Py_ssize_t most = min(data.shape[0] // self.n, MOST_DIAGONALS), count
         cdef double[:, ::1] diagonals
         cdef Py_ssize_t[::1] offset = np.zeros(max(most, 1), dtype=np.intp)

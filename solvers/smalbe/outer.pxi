@@ -269,7 +269,7 @@ cdef class SMALBE(MPRGP):
             )
             stopped = self.minimise(max(left, 0), trace, note)
             left -= len(trace) + 1
-            solved = sqrt(self.phi_square + self.beta_square) <= self.small_gradient
+            solved = sqrt(self.parts.phi_square + self.parts.beta_square) <= self.small_gradient
             solved = solved and self.is_accurate()
             # 2. The Lagrangian, and the precision of the inner problems.
             self.rows.times(self.x, self.Cv)
@@ -313,7 +313,7 @@ cdef class SMALBE(MPRGP):
 
     cdef bint stops(self) except -1:
         """Return whether an inner run may end."""
-        cdef double size = sqrt(self.phi_square + self.beta_square)
+        cdef double size = sqrt(self.parts.phi_square + self.parts.beta_square)
         if self.rows.exist and size < self.coarse_gradient:
             if size < self.M_now * self.violation():
                 return True

@@ -69,10 +69,10 @@ def orthonormal(G, e):
 cdef double RANK = 1e-13
 
 
-def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
+def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     """Return y (m,) with Gᵀy = Cᵀa (r,), from the QR factorisation of unit rows.
 
-    triangle, rows_kept, sizes, told_a : R (r, r), the rows kept (r,), their sizes (m,), a
+    triangle, rows_kept, sizes, shares : R (r, r), the rows kept (r,), their sizes (m,), a
     """
     cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
@@ -80,7 +80,7 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, told_a):
     cdef double *y = numbers(result)
     cdef const double *R = numbers(triangle)
     cdef const double *size = numbers(sizes)
-    cdef const double *a = numbers(told_a)
+    cdef const double *a = numbers(shares)
     cdef const int[::1] kept = rows_kept
     for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
