@@ -141,9 +141,11 @@ cdef extern from "vectors.h" nogil:
                            const double *diagonal, const double *x, const double *Fx,
                            const double *lb, const double *ub, const double *size,
                            double *forces, Py_ssize_t n, double worst)
+    void own_sizes(const double *diagonal, const double *x, const double *Fx, double *own,
+                   Py_ssize_t n)
     void terms_of_rows(const double *rows, const double *e, const double *x,
-                       const double *size, Py_ssize_t m, Py_ssize_t n, double *missed,
-                       double *terms, double *known)
+                       const double *own_size, const double *size, Py_ssize_t m,
+                       Py_ssize_t n, double *missed, double *terms, double *known)
 
 include "operations.pxi"
 include "preparation.pxi"

@@ -7,6 +7,8 @@
 # Largest ratio of the terms of the objective to itself that counts, as in
 # `harness.verify.kkt`.
 cdef double MAX_CANCELLATION = 1e4
+# A row with a right-hand side is compared with this times its own terms, as there.
+cdef double TERMS_FACTOR = 10.0
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
@@ -28,10 +30,11 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     cdef double least, terms, energy, worst, size_of_all
     if not over.any(n > 0):
         return INFINITY
-    cdef Room room = Room(2 * n + 3 * m)
+    cdef Room room = Room(3 * n + 3 * m)
     cdef double *forces = room.at
     cdef double *size = forces + n
-    cdef double *missed = size + n
+    cdef double *own_size = size + n
+    cdef double *missed = own_size + n
     cdef double *own = missed + m
     cdef double *known = own + m
     cdef const double *q = read(qp.q, held)
@@ -73,17 +76,20 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
         return worst if isfinite(worst) else INFINITY
     # 3. The rows.
     known_sizes(energy, q, d, x, size, n)
+    own_sizes(d, x, Fx, own_size, n)
     if is_dense:
-        terms_of_rows(read(G, held), e, x, size, m, n, missed, own, known)
+        terms_of_rows(read(G, held), e, x, own_size, size, m, n, missed, own, known)
     else:
         take(G @ s.x - qp.b, m, missed, "Gx − e")
-        take(abs(G) @ np.abs(s.x) + np.abs(qp.b), m, own, "|G||x| + |e|")
-        take(abs(G) @ over.vector(seen(size, n)) + np.abs(qp.b), m, known, "|G|X + |e|")
+        size_of_rows, e_size = abs(G), np.abs(qp.b)
+        own_x, known_x = over.vector(seen(own_size, n)), over.vector(seen(size, n))
+        take(size_of_rows @ own_x + e_size, m, own, "own terms")
+        take(size_of_rows @ known_x + e_size, m, known, "known terms")
     for i in range(m):
         if not isfinite(missed[i]):
             return INFINITY
         if missed[i] != 0:
             worst = fmax(worst, fabs(missed[i]) / known[i])
-            if fabs(e[i]) > 1e-9 * known[i]:
-                worst = fmax(worst, 1e-4 * fabs(missed[i]) / own[i])
+            if e[i] != 0:
+                worst = fmax(worst, fabs(missed[i]) / (TERMS_FACTOR * own[i]))
     return worst if isfinite(worst) else INFINITY

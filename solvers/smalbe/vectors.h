@@ -1083,17 +1083,26 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
     return isfinite(all) ? worst : INFINITY;
 }
 
-/* Gx - e, and the sizes |e| + |G||x| and |e| + |G|X of its terms, of rows G (m, n). */
+/* The sizes of variables without an energy: |x|, and as far as the others push each. */
+TWICE static void own_sizes(in diagonal, in x, in Fx, out own, Py_ssize_t n)
+{
+    for (Py_ssize_t j = 0; j < n; j++) {
+        double d = diagonal[j] > 0 ? diagonal[j] : 1;
+        own[j] = fabs(x[j]) + (diagonal[j] > 0 ? fabs(Fx[j] - d * x[j]) / d : 0);
+    }
+}
+
+/* Gx - e, and the sizes |e| + |G| own and |e| + |G| size of its terms, of rows G (m, n). */
 TWICE static void
-terms_of_rows(in rows, in e, in x, in size, Py_ssize_t m, Py_ssize_t n, out missed,
-              out terms, out known)
+terms_of_rows(in rows, in e, in x, in own_size, in size, Py_ssize_t m, Py_ssize_t n,
+              out missed, out terms, out known)
 {
     for (Py_ssize_t i = 0; i < m; i++) {
         in row = rows + i * n;
         double error = -e[i], own = fabs(e[i]), sized = own;
         for (Py_ssize_t j = 0; j < n; j++) {
             error += row[j] * x[j];
-            own += fabs(row[j] * x[j]);
+            own += fabs(row[j]) * own_size[j];
             sized += fabs(row[j]) * size[j];
         }
         missed[i] = error;
