@@ -113,14 +113,6 @@ def pytest_unconfigure() -> None:
     gc.unfreeze()
 
 
-@pytest.fixture(scope="session", autouse=True)
-def state(tmp_path_factory):
-    """The key that signs built cases lies elsewhere than that of the user."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_STATE_HOME", str(tmp_path_factory.mktemp("state")))
-        yield
-
-
 @pytest.fixture(scope="session")
 def forks():
     """What forks the processes of runs from interpreters that have loaded modules."""

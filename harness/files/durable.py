@@ -34,10 +34,14 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     It is on the disk by then. Whatever happens, `path` leads to what was there before
     or to all that was written; who has opened or mapped the old file keeps that.
     """
-    with _unfinished(path, 0o666) as (new, file):
-        yield file
-        _sync(file)
-        move_file(new, path)
+    new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
+    try:
+        with new.open("x+b") as file:
+            yield file
+            _sync(file)
+            move_file(new, path)
+    finally:
+        new.unlink(missing_ok=True)
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
@@ -47,35 +51,10 @@ def replace_file(path: Path, content: bytes | memoryview) -> None:
         file.write(content)
 
 
-def keep_private(path: Path, content: bytes) -> None:
-    """Write a file that only its owner can read, unless there is one.
-
-    Of several processes that do so at once, one writes.
-    """
-    with _unfinished(path, 0o600) as (new, file):
-        file.write(content)
-        _sync(file)
-        with suppress(FileExistsError):
-            os.link(new, path)
-            sync_folder(path.parent)
-
-
 def move_file(whole: Path, path: Path) -> None:
     """Have a file that is on the disk take the place of `path`, in the same folder."""
     os.replace(whole, path)
     sync_folder(path.parent)
-
-
-@contextmanager
-def _unfinished(path: Path, mode: int) -> Iterator[tuple[Path, IO[bytes]]]:
-    """Open a file beside `path` that is gone after the block, unless it was moved."""
-    new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
-    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-    try:
-        with os.fdopen(os.open(new, flags, mode), "w+b") as file:
-            yield new, file
-    finally:
-        new.unlink(missing_ok=True)
 
 
 def _sync(file: IO[bytes]) -> None:

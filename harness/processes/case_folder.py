@@ -2,10 +2,9 @@
 
 ``FOLDER/KEY.json`` says which QP a case is: the key names the case and the environment
 that it was built in, so that another version of the code builds its own. Several
-processes may use one folder. An entry whose content is not that of its digest is built
-anew, and so is one that another user wrote: a folder that somebody sent could else hold
-another QP under the name of a case, with verdicts that are true of that one. So entries
-are signed with a key that lies outside, ``~/.local/state/mortarbench/key``.
+processes may use one folder. Each file is stored with a digest, and an entry with a
+damaged file is built again. Digests are not signatures: whoever writes to the folder
+can store another QP under the name of a case (docs/security.md).
 """
 
 from __future__ import annotations
@@ -16,19 +15,13 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
-from hmac import compare_digest
-from hmac import digest as keyed_digest
 from pathlib import Path
-from secrets import token_bytes
 from typing import Any
 
 from mortarbench.harness.digest import hex_digest, pieces
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.durable import keep_private, move_file, replace_file
+from mortarbench.harness.files.durable import move_file, replace_file
 from mortarbench.harness.files.reading import read_text
-
-_KEY_BYTES = 32
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +61,7 @@ def entry(
         path = folder / f"{digest}.npz"
         size = path.stat().st_size
         index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
-        text = json.dumps({**index, "signature": _signature(index)})
+        text = json.dumps({**index, "check": _check(index)})
         replace_file(folder / f"{key}.json", text.encode())
         return Entry(qp=path, digest=digest, meta=meta)
 
@@ -80,11 +73,10 @@ def content_digest(path: Path) -> str:
 
 
 def _found(folder: Path, key: str) -> Entry | None:
-    """Look up an entry; None where there is none, or none that can be trusted."""
+    """Look up an entry; return None if there is none, or a damaged one."""
     try:
         index = json.loads(read_text(folder / f"{key}.json"))
-        signature = index.pop("signature")
-        if not compare_digest(signature, _signature(index)):
+        if index.pop("check") != _check(index):
             return None
         path = folder / f"{index['digest']}.npz"
         if path.stat().st_size != index["bytes"]:  # it would be read to its end
@@ -99,32 +91,9 @@ def _found(folder: Path, key: str) -> Entry | None:
         return None
 
 
-def _signature(index: Mapping[str, Any]) -> str:
-    """Sign an entry, so that no other user can have written it."""
-    text = json.dumps(index, sort_keys=True).encode()
-    return keyed_digest(user_key(), text, "sha256").hex()
-
-
-@cache
-def user_key() -> bytes:
-    """Read the key of this user, made at the first time.
-
-    Where no file can keep it, it is another one in every process: entries of earlier
-    runs are built again.
-    """
-    state = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
-    path = Path(os.path.expanduser(state)) / "mortarbench" / "key"
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if not path.exists():
-            keep_private(path, token_bytes(_KEY_BYTES))
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-        with os.fdopen(fd, "rb") as file:
-            private = os.fstat(fd).st_uid == os.getuid()
-            key = file.read(_KEY_BYTES)
-    except OSError:
-        return token_bytes(_KEY_BYTES)
-    return key if private and len(key) == _KEY_BYTES else token_bytes(_KEY_BYTES)
+def _check(index: Mapping[str, Any]) -> str:
+    """Hash an index, whose meta data no digest of the QP protects from damage."""
+    return hex_digest([json.dumps(index, sort_keys=True).encode()], 16)
 
 
 @contextmanager

@@ -19,7 +19,6 @@ from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files import durable
 from mortarbench.harness.files.durable import (
     full_disk_told,
-    keep_private,
     refuse_full_disk,
     remove_unfinished,
     replace_file,
@@ -113,16 +112,6 @@ def test_a_block_that_raises_replaces_nothing(tmp_path):
 
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_private_file_is_its_owners_and_written_once(tmp_path):
-    path = tmp_path / "key"
-    for content in (b"first", b"second"):
-        keep_private(path, content)
-
-    assert path.read_bytes() == b"first"
-    assert path.stat().st_mode & 0o777 == 0o600
-    assert [p.name for p in tmp_path.iterdir()] == ["key"]
 
 
 def test_a_line_that_was_written_in_part_is_cut_off_at_once(lines):

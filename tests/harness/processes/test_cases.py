@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mortarbench.harness.processes.case_folder import entry, user_key
+from mortarbench.harness.processes.case_folder import entry
 
 
 def name(**params):
@@ -83,17 +83,6 @@ def test_a_build_that_fails_leaves_no_entry(get, tmp_path):
     assert get(name(n=1)).qp.read_bytes() == b"content"
 
 
-def test_an_entry_that_another_user_signed_is_built_again(get, monkeypatch):
-    """A folder that was sent could hold another QP under the name of the case."""
-    get(name(n=1), content=b"forged")
-    monkeypatch.setattr(
-        "mortarbench.harness.processes.case_folder.user_key", lambda: b"of another user"
-    )
-
-    assert get(name(n=1)).qp.read_bytes() == b"content"
-    assert len(get.made) == 2
-
-
 @pytest.mark.parametrize("change", ["digest", "meta"])
 def test_an_entry_that_was_changed_is_built_again(get, change):
     first, other = get(name(n=1)), get(name(n=2), content=b"other")
@@ -108,31 +97,3 @@ def test_an_entry_that_was_changed_is_built_again(get, change):
 
     assert get(name(n=1)) == first
     assert len(get.made) == 3
-
-
-def test_the_key_is_private_and_stays(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    keys = [user_key.__wrapped__() for _ in range(2)]
-    (path,) = tmp_path.glob("*/*")
-
-    assert keys[0] == keys[1] == path.read_bytes()
-    assert path.stat().st_mode & 0o077 == 0
-
-
-@pytest.mark.parametrize("plant", ["link", "short", "folder"])
-def test_a_key_that_is_none_is_not_used(tmp_path, monkeypatch, plant):
-    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    path = tmp_path / "mortarbench" / "key"
-    path.parent.mkdir()
-    known = tmp_path / "known"
-    known.write_bytes(b"k" * 32)
-    if plant == "link":
-        path.symlink_to(known)
-    elif plant == "short":
-        path.write_bytes(b"k")
-    else:
-        path.mkdir()
-
-    keys = [user_key.__wrapped__() for _ in range(2)]
-    assert keys[0] != keys[1]
-    assert {len(key) for key in keys} == {32}
