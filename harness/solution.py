@@ -30,6 +30,7 @@ from mortarbench.harness.qp import QP, Vector
 History = Mapping[str, NDArray[Any]]
 
 _LONGEST_TEXT = 16  #: characters
+MOST_HISTORY = 2**28  #: bytes, so that no folder of results fills the disk
 _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
@@ -117,7 +118,8 @@ def checked_history(history: object) -> History:
     Raises
     ------
     ValueError
-        When it is no mapping from identifiers to columns of one length.
+        When it is no mapping from identifiers to columns of one length, or larger than
+        MOST_HISTORY.
 
     """
     if not isinstance(history, Mapping):
@@ -127,6 +129,8 @@ def checked_history(history: object) -> History:
     if len(set(lengths.values())) > 1:
         found = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise ValueError(f"its columns have different lengths: {found}")
+    if (size := sum(column.nbytes for column in columns.values())) > MOST_HISTORY:
+        raise ValueError(f"it has {size} bytes, expected at most {MOST_HISTORY}")
     return columns
 
 

@@ -5,29 +5,22 @@ from __future__ import annotations
 import fcntl
 import os
 import shutil
-import stat
 from collections.abc import Callable, Hashable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from functools import partial
-from io import BytesIO
 from math import inf, isinf, nan
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 from typing import Any, NamedTuple
-from zipfile import ZIP_STORED, ZipFile
 
-import numpy as np
-from numpy.typing import NDArray
-
-from mortarbench.harness.errors import FaultError
+from mortarbench.harness.errors import FaultError, InputError
 from mortarbench.harness.files.qpfile import save_qp
-from mortarbench.harness.files.store import write_point
+from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.forking import Serve
-from mortarbench.harness.processes.protocol import MOST_ECHOED
 from mortarbench.harness.processes.ranks import without_content
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
@@ -38,9 +31,8 @@ from mortarbench.harness.record import (
     Verdict,
     journal_name,
 )
-from mortarbench.harness.solution import Solution, Status, checked_history
+from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import Residuals
-from mortarbench.harness.verify.measure import one_line
 from mortarbench.harness.verify.optimum import Proves, proves
 from mortarbench.harness.verify.verdicts import (
     certified,
@@ -50,7 +42,6 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-MOST_HISTORY = 2**28  #: bytes of a history, and of what a file has around its arrays
 OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
 OWN_SECONDS_PER_REPEAT = (
     3e-4  #: 0.12 ms on a busy machine, so that none is accused of it
@@ -61,9 +52,6 @@ LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
-_POINT = ("x", "y", "z", "z_box")
-_HISTORY = "history_"
-_KINDS = {stat.S_IFDIR: "folder", stat.S_IFIFO: "FIFO", stat.S_IFLNK: "symbolic link"}
 
 
 class Measured(NamedTuple):
@@ -91,7 +79,7 @@ def measured(
     whole : gives the QP. Where ranks emit it themselves and evaluate the answer, it is
         asked for only if they cannot
     request : to the worker, see `harness.processes.worker`; less what stands in the
-        record. The point is in the file ``out`` afterwards, as we have read it
+        record. The worker writes the point to the file ``out``
     time_limit, memory_limit : s and MiB
     prove : finds the optimum where residuals cannot decide, see
         `harness.verify.optimum`
@@ -108,14 +96,9 @@ def measured(
         request["memory_limit"] = memory_limit
     started = datetime.now(UTC).isoformat(timespec="milliseconds")
     out = Path(request["out"])
-    returned = out.with_name(f"{out.name}.returned")
     try:
-        _clear(out, returned)
-        reply = worker.ask(
-            {**request, "out": str(returned)},
-            time_limit=time_limit,
-            memory_limit=memory_limit,
-        )
+        out.unlink(missing_ok=True)
+        reply = worker.ask(request, time_limit=time_limit, memory_limit=memory_limit)
         if reply.fault:
             raise FaultError(f"{record.solver} on {record.case}: {reply.message}")
         record = record.but(
@@ -132,10 +115,9 @@ def measured(
             record = record.but(sizes=qp.sizes)
         if reply.answer is None:
             return Measured(record.but(verdict=reply.verdict), None)
-        solution = _solution(returned, qp, reply.answer)
-        _clear(out, returned)
-        if has_point(solution):
-            write_point(out, solution)
+        solution = _solution(out, reply.answer)
+    except InputError as e:
+        raise FaultError(f"{record.solver} on {record.case}: {e}") from None
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
@@ -203,97 +185,15 @@ def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Rec
     )
 
 
-def _clear(*paths: Path) -> None:
-    """Remove what lies there, whatever a solver has made of it."""
-    for path in paths:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        path.unlink(missing_ok=True)
-
-
-def _solution(path: Path, qp: QP, answer: Mapping[str, Any]) -> Solution:
-    """Read what a worker says that its solver returned; it fits `qp`, or has failed."""
-    claimed = Status(answer["claimed"])
-    try:
-        point = _point(path, qp)
-    except _ForeignPointError as e:
-        message = f"its point came back as {e}"
-        return Solution.without_point(qp, Status.FAILED, message)
+def _solution(path: Path, answer: Mapping[str, Any]) -> Solution:
+    """Combine the point that a worker wrote with the rest of its answer."""
     return replace(
-        point,
-        status=claimed,
+        read_point(path, Status(answer["claimed"])),
         iterations=answer["iterations"],
         counts=answer["counts"],
-        reported={
-            k: one_line(v) if isinstance(v, str) else v
-            for k, v in answer["reported"].items()
-            if v is not None
-        },
-        message=one_line(answer["message"]),
+        reported={k: v for k, v in answer["reported"].items() if v is not None},
+        message=answer["message"],
     )
-
-
-class _ForeignPointError(Exception):
-    """A file is no point of the QP; the message says what it is."""
-
-
-def _point(path: Path, qp: QP) -> Solution:
-    """Read a point that somebody else wrote: nothing is opened that could block.
-
-    Raises
-    ------
-    _ForeignPointError
-        When it is no file, too large, or holds anything but vectors that fit `qp` and a
-        history.
-
-    """
-    try:
-        at = path.lstat()
-        if not stat.S_ISREG(at.st_mode):
-            kind = _KINDS.get(stat.S_IFMT(at.st_mode), "device")
-            raise _ForeignPointError(f"a {kind}")
-        most = 8 * (2 * qp.q.size + qp.b.size + qp.h.size) + MOST_HISTORY
-        if at.st_size > most:
-            raise _ForeignPointError(f"{at.st_size} bytes, expected at most {most}")
-        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
-        with os.fdopen(os.open(path, flags), "rb") as file:
-            content = file.read(most + 1)
-    except FileNotFoundError:
-        raise _ForeignPointError("no file") from None
-    try:
-        arrays = _arrays(content)
-        history = {k[len(_HISTORY) :]: v for k, v in arrays.items() if k not in _POINT}
-        x, y, z, z_box = (arrays[name] for name in _POINT)
-        point = Solution(
-            status=Status.FAILED,
-            x=x,
-            y=y,
-            z=z,
-            z_box=z_box,
-            history=checked_history(history),
-        )
-    except Exception as e:  # bytes of any kind meet numpy's and zipfile's parsers
-        raise _ForeignPointError(f"no point: {one_line(e)[:MOST_ECHOED]}") from None
-    if (mismatch := point.mismatch(qp)) is not None:
-        raise _ForeignPointError(f"another one: {mismatch}")
-    return point
-
-
-def _arrays(content: bytes) -> dict[str, NDArray[Any]]:
-    """Read arrays as `harness.files.store` writes points: as they are, in a zip."""
-    with ZipFile(BytesIO(content)) as archive:
-        for member in archive.infolist():
-            name = member.filename.removesuffix(".npy")
-            if name not in _POINT and not name.startswith(_HISTORY):
-                raise ValueError(f"it holds {name!r}")
-            if member.file_size > len(content) or member.compress_type != ZIP_STORED:
-                raise ValueError(f"{name} is compressed")
-    with np.load(BytesIO(content), allow_pickle=False) as stored:
-        arrays = {name: stored[name] for name in stored.files}
-    for name in _POINT:
-        if arrays[name].dtype != np.float64:
-            raise ValueError(f"{name} has dtype {arrays[name].dtype}")
-    return arrays
 
 
 def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:

@@ -5,12 +5,12 @@ and some ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each wo
 keeps them together. Memory is limited by looking at what is held, since a limit on
 address space counts what libraries reserve and never touch. Needs Linux's /proc.
 
-What a worker says is not believed (`harness.processes.protocol`), its times least of
-all: they must agree with the clock of the parent and with the CPU time that the kernel
-counts. While one worker is asked, those that share its CPU are stopped by SIGSTOP:
-nothing that a solver leaves running in its process disturbs another's measurement. So
-threads of one process ask in turn. Signals go to file descriptors of processes, see
-pidfd_open(2), and never to numbers, which the kernel gives to others.
+The times that a worker reports must agree with the clock of the parent and with the CPU
+time that the kernel counts. While one worker is asked, those that share its CPU are
+stopped by SIGSTOP: nothing that a solver leaves running in its process disturbs
+another's measurement. So threads of one process ask in turn. Signals go to file
+descriptors of processes, see pidfd_open(2), and never to numbers, which the kernel
+gives to others.
 """
 
 from __future__ import annotations
@@ -41,10 +41,8 @@ from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
 from mortarbench.harness.processes.protocol import (
     LONGEST_REPLY,
     ForeignReplyError,
-    checked_answer,
-    checked_emitted,
+    emits,
     event_of,
-    kind_of,
     measures,
 )
 from mortarbench.harness.processes.turns import Turn
@@ -239,15 +237,14 @@ class WorkerProcess:
     def _asked(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
     ) -> tuple[dict[str, Any], Clock | None]:
-        nonce = secrets.token_hex(8)
         with suppress(OSError):
             self._log.write_bytes(b"")
         asked = time.monotonic()
-        self._send({**request, "nonce": nonce})
-        emits = kind_of(request) == "case"
-        if emits:
-            self._take_emitted(time_limit, memory_limit, nonce)
-        self._await("start", START_SECONDS, memory_limit, nonce)
+        self._send(request)
+        if emits(request):
+            with _stage("emission"):
+                self._emitted = self._await("emitted", time_limit, memory_limit)
+        self._await("start", START_SECONDS, memory_limit)
         started, used = time.monotonic(), self._cpu_seconds()
         waited = self._waiting_seconds()
         oom_kills = _oom_kills()
@@ -255,7 +252,7 @@ class WorkerProcess:
             clock = None
             if measures(request):
                 self._looked = started
-                self._await("timed", time_limit, memory_limit, nonce)
+                self._await("timed", time_limit, memory_limit)
                 ended = time.monotonic()
                 used = min(self._cpu_seconds() - used, ended - started)
                 took = self._looked - started - (self._waiting_seconds() - waited)
@@ -265,40 +262,25 @@ class WorkerProcess:
                     most=ended - asked,
                 )
                 self._footprint.notice(self._tree())
-                self._send({"go": nonce})
-                if emits:
-                    self._await("measured", POINT_SECONDS, memory_limit, nonce)
-                else:
-                    time_limit = POINT_SECONDS
-            if emits:
-                answer = self._evaluated(max(time_limit, POINT_SECONDS), nonce)
+                self._send({"go": True})
+            if emits(request):
+                self._await("measured", POINT_SECONDS, memory_limit)
+                answer = self._evaluated(max(time_limit, POINT_SECONDS))
             else:
-                answer = self._await("done", time_limit, memory_limit, nonce)
-            checked_answer(request, answer)
-        except ForeignReplyError as e:
-            raise _EndedError("done", Verdict.FAILED, str(e)) from None
+                limit = POINT_SECONDS if measures(request) else time_limit
+                answer = self._await("done", limit, memory_limit)
         except _EndedError as end:
             end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
             raise
         self._trim_log()
         return answer, clock
 
-    def _take_emitted(self, limit: float, memory_limit: float, nonce: str) -> None:
-        """Wait until ranks have emitted the QP."""
-        try:
-            with _stage("emission"):
-                told = self._await("emitted", limit, memory_limit, nonce)
-            checked_emitted(told)
-        except ForeignReplyError as e:
-            raise _EndedError("emitted", Verdict.FAILED, str(e)) from None
-        self._emitted = told
-
-    def _evaluated(self, limit: float, nonce: str) -> dict[str, Any]:
+    def _evaluated(self, limit: float) -> dict[str, Any]:
         """Wait until ranks have evaluated the answer; what they hold is not limited."""
         peak = self._peak_mib
         try:
             with _stage("evaluation of the answer"):
-                return self._await("done", limit, inf, nonce)
+                return self._await("done", limit, inf)
         finally:
             self._peak_mib = peak
 
@@ -334,11 +316,9 @@ class WorkerProcess:
         for is_last in (False, True):
             if not self._warms_up:
                 return
-            nonce = secrets.token_hex(8)
             try:
-                self._send({"warm_up": True, "nonce": nonce})
-                told = self._await("warm", WARM_UP_SECONDS, memory_limit, nonce)
-                self._facts = _facts(told)
+                self._send({"warm_up": True})
+                self._facts = _facts(self._await("warm", WARM_UP_SECONDS, memory_limit))
                 return
             except _EndedError as end:
                 if end.is_fault:
@@ -397,16 +377,14 @@ class WorkerProcess:
         with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
-    def _await(
-        self, event: str, limit: float, memory_limit: float, nonce: str = ""
-    ) -> dict[str, Any]:
+    def _await(self, event: str, limit: float, memory_limit: float) -> dict[str, Any]:
         """Wait for an event; whatever else happens is raised as `_EndedError`."""
         deadline = time.monotonic() + limit
         while True:
             dead = self._is_dead()  # before reading: it may reply and then die
             has_more = self._read(0 if dead else POLL_SECONDS)
             if (line := self._next_line()) is not None:
-                return self._understood(line, event, nonce)
+                return self._understood(line, event)
             if len(self._unread) > LONGEST_REPLY:
                 how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
                 raise _EndedError(event, Verdict.FAILED, how)
@@ -420,13 +398,13 @@ class WorkerProcess:
             self._check_memory(event, memory_limit)
             self._trim_log()
 
-    def _understood(self, line: bytes, event: str, nonce: str) -> dict[str, Any]:
+    def _understood(self, line: bytes, event: str) -> dict[str, Any]:
         try:
-            reply = event_of(line, nonce, event)
+            reply = event_of(line, event)
         except ForeignReplyError as e:
             raise _EndedError(event, Verdict.FAILED, str(e)) from None
         if reply.pop("event") == "fault":
-            how = one_line(reply.get("what", ""))
+            how = one_line(reply["what"])
             raise _EndedError(event, Verdict.FAILED, how, is_fault=True)
         return reply
 
@@ -696,13 +674,11 @@ def _stage(name: str) -> Iterator[None]:
 
 
 def _facts(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Take what a worker says of itself, where that can be so."""
-    threads, cpus = told.get("threads"), told.get("cpus")
-    is_one = isinstance(cpus, list) and len(cpus) == 1 and type(cpus[0]) is int
+    """Return the fields of a reply that a worker reports once, when it is warm."""
+    cpus = told.get("cpus", ())
     return {
-        "threads": threads if type(threads) is int and threads > 0 else None,
-        "cpu": cpus[0] if is_one and cpus is not None else None,
-    }
+        "threads": told.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None
+    }  # fmt: skip
 
 
 def _oom_kills() -> int:

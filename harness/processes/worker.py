@@ -40,7 +40,7 @@ from threadpoolctl import ThreadpoolController
 
 from mortarbench.harness.distributed.vectors import Emit, Ranks
 from mortarbench.harness.files.qpfile import load_qp
-from mortarbench.harness.files.store import point_arrays
+from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.case_folder import content_digest
@@ -127,8 +127,6 @@ class _Bench:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        out = Path(request["out"])
-        out.unlink(missing_ok=True)
         self._shift_heap()
         if "case" in request:
             qp = self._emitted(request, events)
@@ -147,7 +145,7 @@ class _Bench:
         )
         _limit_memory(None)
         s = timed.solution
-        _write_new(out, s)
+        write_point(Path(request["out"]), s)
         spent = Spent() if self.on_ranks is None else self.on_ranks.spent
         evaluated = dict[str, Any]()
         if "case" in request and self.on_ranks is not None:
@@ -297,12 +295,3 @@ def _measured_here(
         ends()
 
     return measure(solver, qp, tol, ends=ends_here, **how)
-
-
-def _write_new(path: Path, solution: Solution) -> None:
-    """Write a point to a file that is not there yet.
-
-    Where there is something, the solver put it there: the parent will say what.
-    """
-    with suppress(FileExistsError), path.open("xb") as file:
-        np.savez(file, **point_arrays(solution))  # type: ignore[arg-type]

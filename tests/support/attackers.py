@@ -7,7 +7,6 @@ Run as a program with the name of a solver and two file descriptors, it is a wor
 """
 
 import ctypes
-import json
 import mmap
 import os
 import signal
@@ -78,39 +77,13 @@ def reply_pipe():
             pass
 
 
-class Writes(Honest):
-    """Writes something to where the worker replies."""
-
-    text = b""
+class WritesNoise(Honest):
+    """Mistakes the file descriptor of the replies for its own."""
 
     def act(self, qp):
         for fd in reply_pipe():
-            os.write(fd, self.text)
+            os.write(fd, b"\xff\x00 no JSON \xfe\n")
         return at_the_row(qp)
-
-
-class WritesNoise(Writes):
-    text = b"\xff\x00 no JSON \xfe\n"
-
-
-class WritesHalfALine(Writes):
-    text = b'{"event": "ti'
-
-
-class WritesDone(Writes):
-    text = b'{"event": "done", "claimed": "solved", "total_seconds": 1e-9}\n'
-
-
-class WritesATimed(Writes):
-    text = b'{"event": "timed", "nonce": ""}\n'
-
-
-class WritesNesting(Writes):
-    text = b"[" * 60_000 + b"\n"
-
-
-class WritesAHugeNumber(Writes):
-    text = b'{"event": ' + b"9" * 10_000 + b"}\n"
 
 
 class WritesEndlessly(Honest):
@@ -120,137 +93,6 @@ class WritesEndlessly(Honest):
         (fd,) = reply_pipe()
         while True:
             os.write(fd, bytes(2**16))
-
-
-def of_this_request(name):
-    """Find a variable of the worker's code by its name: we share a process."""
-    frame = sys._getframe()
-    while name not in frame.f_locals:
-        frame = frame.f_back
-    return frame.f_locals[name]
-
-
-class Forges(Honest):
-    """Replies by itself, with the nonce that it finds in the memory of its process."""
-
-    answer: ClassVar[dict] = dict(
-        claimed="solved", message="", iterations=1, counts={}, reported={},
-        prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6,
-        rank_seconds={}, rank_counts={}, rank_network={},
-        first_seconds=None,
-        peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=1.0,
-        inner=1, canary_seconds=1e-6,
-    )  # fmt: skip
-
-    def act(self, qp):
-        found = of_this_request("nonce")
-        (fd,) = reply_pipe()
-        for event in (
-            {"event": "timed"},
-            {"event": "done"} | self.answer,
-        ):
-            os.write(fd, (json.dumps(event | {"nonce": found}) + "\n").encode())
-        time.sleep(3600)
-
-
-class NegativeCounts(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), iterations=-5)
-
-
-class HugeCounts(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), counts={"products": 10**5000})
-
-
-class Text(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), x=np.array(["1", "0"]))
-
-
-class Complex(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), x=np.array([1.0 + 1j, 0.0]))
-
-
-class Objects(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), x=np.array([qp.h[0], 0.0], dtype=object))
-
-
-class Bomb:
-    """Something whose reading fails in its own way."""
-
-    @property
-    def shape(self):
-        raise UnspeakableError("boom")
-
-    def __array__(self, *_, **__):
-        raise UnspeakableError("boom")
-
-
-class UnspeakableError(Exception):
-    def __str__(self):
-        raise RuntimeError("cannot be shown")
-
-
-class Bombs(Honest):
-    def act(self, qp):
-        return replace(at_the_row(qp), x=Bomb())
-
-
-class Leaves(Honest):
-    """Leaves something where the worker will write its point."""
-
-    def act(self, qp):
-        self.leave(of_this_request("out"))
-        return at_the_row(qp)
-
-
-class LeavesAFifo(Leaves):
-    def leave(self, out):
-        if not out.exists():
-            os.mkfifo(out)
-
-
-class LeavesALink(Leaves):
-    def leave(self, out):
-        if not out.is_symlink():
-            out.symlink_to("/dev/zero")
-
-
-class LeavesAFolder(Leaves):
-    def leave(self, out):
-        (out / "full").mkdir(parents=True, exist_ok=True)
-
-
-class LeavesGigabytes(Leaves):
-    def leave(self, out):
-        if not out.exists():
-            with out.open("wb") as file:
-                file.truncate(2**33)
-
-
-class LeavesAnotherPoint(Leaves):
-    def leave(self, out):
-        with out.open("wb") as file:
-            np.savez(file, x=np.ones(3), y=np.ones(0), z=np.ones(1), z_box=np.ones(2))
-
-
-class LeavesText(Leaves):
-    def leave(self, out):
-        with out.open("wb") as file:
-            np.savez(file, x=np.array(["1", "0"]), y=[], z=[1.0], z_box=[0.0, 0.0])
-
-
-class Faults(Honest):
-    """Shares the process of the worker, whose code it breaks."""
-
-    def act(self, qp):
-        from mortarbench.harness.processes import worker
-
-        worker._write_new = None
-        return at_the_row(qp)
 
 
 class Daemon(Honest):

@@ -24,12 +24,7 @@ from mortarbench.harness.processes.measurement import (
     measured,
     scratch_folder,
 )
-from mortarbench.harness.processes.protocol import (
-    ForeignReplyError,
-    checked_answer,
-    checked_emitted,
-    event_of,
-)
+from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
 from mortarbench.harness.processes.reaper import lives, state
 from mortarbench.harness.processes.supervisor import (
     REPLACED,
@@ -58,29 +53,10 @@ CASE = assemble(TINY, {}, "plain")
 FOREIGN = "came, expected 'timed'"
 SUSPECT = "is kept between measurements"
 OURS = "the time is ours"
-#: verdict, what the message says; None where an own fault is reported
+#: verdict, and a pattern of the message
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
-    "writeshalfaline": (Verdict.FAILED, "expected a reply"),
-    "writesdone": (Verdict.FAILED, FOREIGN),
-    "writesatimed": (Verdict.FAILED, "an answer to another request"),
-    "writesnesting": (Verdict.FAILED, r"'\[\[\[.*…"),
-    "writesahugenumber": (Verdict.FAILED, "999.*…"),
     "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
-    "forges": (Verdict.FAILED, "its point came back as no file"),
-    "negativecounts": (Verdict.FAILED, "iterations = -5, expected 0 to"),
-    "hugecounts": (Verdict.FAILED, "far out of range"),
-    "text": (Verdict.FAILED, "x has dtype <U1, expected real numbers"),
-    "complex": (Verdict.FAILED, "x has dtype complex128, expected real numbers"),
-    "objects": (Verdict.FAILED, "x has dtype object, expected real numbers"),
-    "bombs": (Verdict.FAILED, "malformed Solution: .it cannot be shown"),
-    "leavesafifo": (Verdict.FAILED, "its point came back as a FIFO"),
-    "leavesalink": (Verdict.FAILED, "its point came back as a symbolic link"),
-    "leavesafolder": (Verdict.FAILED, "its point came back as a folder"),
-    "leavesgigabytes": (Verdict.FAILED, "its point came back as 8589934592 bytes"),
-    "leavesanotherpoint": (Verdict.FAILED, r"Solution.x has shape \(3,\)"),
-    "leavestext": (Verdict.FAILED, "its point came back as no point: x has dtype <U1"),
-    "faults": (None, "TypeError"),
     "daemon": (Verdict.VERIFIED, "^$"),
     "executeddaemon": (Verdict.VERIFIED, "^$"),
     "forkbomb": (Verdict.VERIFIED, "^$"),
@@ -101,10 +77,9 @@ OUTCOMES = {
 }
 #: each kind once; the others are slow tests
 QUICK = {
-    "writesnoise", "writesendlessly", "forges", "text", "complex",
-    "bombs", "leavesafifo", "leavesafolder", "leavesgigabytes", "faults", "daemon",
-    "forkbomb", "burns", "hoardsinshm", "hoardsinadaemon", "sleepsbehindtheclock",
-    "killsitsreaper", "closesall", "sharespages",
+    "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
+    "hoardsinadaemon", "sleepsbehindtheclock", "killsitsreaper", "closesall",
+    "sharespages",
 }  # fmt: skip
 ANSWER = dict(
     claimed="solved", message="", iterations=1, counts={"products": 3},
@@ -114,7 +89,7 @@ ANSWER = dict(
     peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None, inner=1,
     canary_seconds=1e-6,
 )  # fmt: skip
-RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "leavesafifo", "patchestheclock")
+RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchestheclock")
 
 
 @pytest.fixture
@@ -216,85 +191,12 @@ def test_an_attack_costs_its_own_verdict_and_nothing_of_it_is_left(
     beside_a_witness, attacker
 ):
     verdict, message = OUTCOMES[attacker]
-    if verdict is None:
-        with pytest.raises(FaultError, match=message):
-            beside_a_witness(attacker, 30.0)
-        return
     hangs = verdict is Verdict.TIME_LIMIT
     record = beside_a_witness(attacker, 1.0 if hangs else 30.0)
 
     assert record.verdict is verdict, record.message
     assert re.search(message, record.message), record.message
     assert len(record.message) < 500
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"total_seconds": "fast"}, "total_seconds = '\"fast\"'"),
-        ({"iterations": -1}, "iterations = '-1'"),
-        ({"iterations": True}, "iterations = 'true'"),
-        ({"iterations": 10**30}, "iterations = '1000"),
-        ({"counts": {"products": 0.5}}, "counts = "),
-        ({"counts": {f"{i}": i for i in range(2000)}}, "counts = .*…$"),
-        ({"claimed": ["solved"]}, "claimed = "),
-        ({"claimed": "verified"}, "claimed = "),
-        ({"message": "x" * 10_000}, "message = .*…$"),
-        ({"reported": {"a": []}}, "reported = "),
-        ({"peak_mib": -1.0}, "peak_mib = '-1.0'"),
-        ({"inner": 0}, "inner = '0'"),
-        ({"solve_seconds": None}, "some of its times missing"),
-        ({"status": "verified"}, "fields are not ours: status"),
-    ],
-)
-def test_an_answer_of_another_form_is_refused(change, message):
-    checked_answer({"qp": ""}, dict(ANSWER))
-    with pytest.raises(ForeignReplyError, match=message) as e:
-        checked_answer({"qp": ""}, ANSWER | change)
-
-    assert len(str(e.value)) < 300
-
-
-EVALUATED = dict(
-    values=dict(objective=1.0, primal=0.0, dual=0.0, complementarity=0.0, gap=0.0),
-    bounds={"energy_bound": 1e-9}, quantities={}, recover_seconds=0.1, notes=[],
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"values": {"objective": 1.0}},
-        {"values": EVALUATED["values"] | {"primal": "0"}},
-        {"values": EVALUATED["values"] | {"dual": float("nan")}},
-        {"bounds": {"status": 1.0}},
-        {"quantities": []},
-        {"recover_seconds": -1.0},
-        {"notes": "text"},
-        {"status": "verified"},
-    ],
-)
-def test_an_evaluation_by_ranks_of_another_form_is_refused(change):
-    sound = ANSWER | {"evaluated": EVALUATED}
-    checked_answer({"case": {}}, dict(sound))
-    checked_answer({"case": {}}, ANSWER | {"evaluated": None})
-    with pytest.raises(ForeignReplyError, match="evaluated = "):
-        checked_answer({"case": {}}, sound | {"evaluated": EVALUATED | change})
-
-
-@pytest.mark.parametrize(
-    "told",
-    [
-        {"sizes": {"variables": -1}, "digest": "", "build_seconds": 0.0},
-        {"sizes": {}, "digest": 7, "build_seconds": 0.0},
-        {"sizes": {}, "digest": "", "build_seconds": "0"},
-        {"sizes": {}, "digest": ""},
-    ],
-)
-def test_what_is_told_of_an_emitted_qp_has_one_form(told):
-    checked_emitted({"sizes": {"variables": 3}, "digest": "", "build_seconds": None})
-    with pytest.raises(ForeignReplyError):
-        checked_emitted(told)
 
 
 CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
@@ -341,16 +243,14 @@ def test_a_total_that_is_not_the_sum_of_its_phases_is_ours():
 @pytest.mark.parametrize(
     "line",
     [
-        b"", b"\xff\xfe\x00", b'"text"', b"[]", b'{"event": []}', b"[" * 100_000,
-        b'{"event": "done", "nonce": "n", "a": NaN}', b"9" * 100_000, b"{" * 1000,
-        b'{"event": "done"}', b'{"event": "done", "nonce": ["n"]}',
-        b'{"event": "start", "nonce": "n"}',
+        b"", b"\xff\xfe\x00", b'"text"', b"[]", b'{"event": []}', b"9" * 100_000,
+        b"{" * 1000, b'{"event": "start"}',
     ],
 )  # fmt: skip
 def test_a_line_that_is_no_reply_to_the_request_is_refused(line):
-    assert event_of(b'{"event": "done", "nonce": "n"}', "n", "done")
+    assert event_of(b'{"event": "done"}', "done")
     with pytest.raises(ForeignReplyError) as e:
-        event_of(line, "n", "done")
+        event_of(line, "done")
 
     assert len(str(e.value)) < 300
 
@@ -402,8 +302,7 @@ def test_neighbours_of_attackers_keep_their_measurements_and_are_alone(
 
 @pytest.mark.slow
 def test_neighbours_of_all_attackers_together_are_alone(tmp_path, attacked):
-    others = [name for name, (verdict, _) in OUTCOMES.items() if verdict is not None]
-    check_neighbours(tmp_path, attacked, others)
+    check_neighbours(tmp_path, attacked, OUTCOMES)
 
 
 def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
@@ -496,19 +395,26 @@ def test_a_qp_that_changed_on_disk_is_a_fault(bench):
         bench("honest")
 
 
-def test_a_full_disk_is_a_fault_and_no_crash(bench):
-    limit = (
-        "import resource, signal, runpy, sys\n"
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        ("raise OSError(28, 'No space left on device')", "No space left on device"),
+        ("pass", r"point\.npz: No such file"),
+    ],
+)
+def test_a_full_disk_and_a_lost_file_are_faults(bench, write, message):
+    program = (
+        "import sys\n"
         "import mortarbench.harness.processes.worker as w\n"
-        "def full(*_): raise OSError(28, 'No space left on device')\n"
-        "w._write_new = full\n"
+        f"def write_point(*_): {write}\n"
+        "w.write_point = write_point\n"
         f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"
         "import attackers\n"
         "w.serve(attackers.SOLVERS['honest'], *map(int, sys.argv[1:]))\n"
     )
 
-    with pytest.raises(FaultError, match="No space left on device"):
-        bench("honest", command=[sys.executable, "-c", limit])
+    with pytest.raises(FaultError, match=message):
+        bench("honest", command=[sys.executable, "-c", program])
 
 
 def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):

@@ -31,16 +31,15 @@ folder = Path(sys.argv[1])
 COMMAND = [sys.executable, "-S", "-c", """
 import json, os, sys
 requests, replies = map(int, sys.argv[1:])
-def reply(line, **event):
-    nonce = json.loads(line)["nonce"]
-    os.write(replies, (json.dumps(event | {"nonce": nonce}) + "\\\\n").encode())
-reply('{"nonce": ""}', event="ready")
+def reply(**event):
+    os.write(replies, (json.dumps(event) + "\\\\n").encode())
+reply(event="ready")
 for line in os.fdopen(requests):
     if "warm_up" in line:
-        reply(line, event="warm")
+        reply(event="warm")
         continue
-    reply(line, event="start")
-    reply(line, event="done", how="command")
+    reply(event="start")
+    reply(event="done", how="command")
 """]
 held = open(folder / "held", "w")
 atexit.register(lambda: held.write("the parent ends"))

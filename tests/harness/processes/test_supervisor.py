@@ -31,12 +31,10 @@ PLUGIN = ADVERSARIES
 SHOWS = """
 import json, os, sys
 requests, replies = map(int, sys.argv[1:])
-nonce = ""
 def reply(**event):
-    os.write(replies, (json.dumps(event | {"nonce": nonce}) + "\\n").encode())
+    os.write(replies, (json.dumps(event) + "\\n").encode())
 reply(event="ready")
 for line in os.fdopen(requests):
-    nonce = json.loads(line)["nonce"]
     if "warm_up" in line:
         reply(event="warm")
         continue
@@ -277,7 +275,7 @@ def test_replies_that_come_together_are_not_waited_for(tmp_path, monkeypatch):
         "    reply(\n        event=\"done\",",
         '    both = ""\n'
         '    for event in ("start", "done"):\n'
-        '        both += json.dumps({"event": event, "nonce": nonce}) + "\\n"\n'
+        '        both += json.dumps({"event": event}) + "\\n"\n'
         "    os.write(replies, both.encode())\n"
         '    dict(',
     )  # fmt: skip

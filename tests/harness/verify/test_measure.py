@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import QP, Solution, Status, needs_matrices, no_rows
+from mortarbench.harness import solution as answers
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.verify import measure as measuring
@@ -217,6 +218,64 @@ def test_values_that_only_look_plain_become_plain(qp):
     assert s.status is Status.SOLVED
     assert type(s.iterations) is int
     assert type(s.counts["products"]) is int
+
+
+class UnspeakableError(Exception):
+    def __str__(self):
+        raise RuntimeError("cannot be shown")
+
+
+class Unreadable:
+    """An array whose reading fails, by an exception that cannot be shown either."""
+
+    @property
+    def shape(self):
+        raise UnspeakableError
+
+    def __array__(self, *_, **__):
+        raise UnspeakableError
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"iterations": -5}, "iterations = -5, expected 0 to"),
+        ({"counts": {"products": 10**400}}, "expected 0 to"),
+        ({"x": np.array(["1", "0"])}, "x has dtype <U1, expected real numbers"),
+        ({"x": np.array([1 + 1j, 0])}, "x has dtype complex128, expected real numbers"),
+        (
+            {"x": np.array([1.0, 0.0], dtype=object)},
+            "x has dtype object, expected real numbers",
+        ),
+        ({"x": Unreadable()}, "malformed Solution: (it cannot be shown)"),
+    ],
+)
+def test_a_malformed_answer_is_a_failure_with_a_short_message(qp, wrong, message):
+    class Malformed(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            return replace(super().act(qp), **wrong)
+
+    s = measure(Malformed(), qp, 1e-6).solution
+
+    assert s.status is Status.FAILED
+    assert message in s.message
+    assert len(s.message) < 500
+
+
+def test_a_history_that_would_fill_the_disk_is_dropped_and_the_answer_kept(
+    qp, monkeypatch
+):
+    monkeypatch.setattr(answers, "MOST_HISTORY", 100)
+
+    class Verbose(type(PLUGIN.solvers["honest"])):
+        def act(self, qp):
+            return replace(super().act(qp), history={"k": np.arange(20)})
+
+    s = measure(Verbose(), qp, 1e-6).solution
+
+    assert s.status is Status.SOLVED
+    assert s.history == {}
+    assert s.message == "history dropped: it has 160 bytes, expected at most 100"
 
 
 def test_garbage_is_not_collected_while_the_clock_runs(qp):
