@@ -3,7 +3,7 @@
     .venv/bin/python benchmarks/runner.py overhead [N]   ms per tiny measurement
     .venv/bin/python benchmarks/runner.py growth [N]     memory, descriptors over N
     .venv/bin/python benchmarks/runner.py null [TRIALS]  A/A: intervals of a ratio of 1
-    .venv/bin/python benchmarks/runner.py attacks [N]    neighbours of attackers: times
+    .venv/bin/python benchmarks/runner.py neighbours [N] times beside careless solvers
 
 Overhead is the time from one record to the next, less what the worker spent in the
 solver and what the disk took to sync.
@@ -27,7 +27,7 @@ from mortarbench.harness.suite.suite import NULL, Suite
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
-ATTACKERS = PLUGIN.with_name("attackers.py")
+ACCIDENTS = PLUGIN.with_name("accidents.py")
 
 
 class Watch:
@@ -134,16 +134,16 @@ def null(trials=40, blocks=10):
     )
 
 
-def attacks(n=20):
-    """Print a solver's times after honest neighbours and after attackers, in turns."""
-    calm, attackers = ("honest",), ("daemon", "executeddaemon", "burns", "pools")
-    os.environ["ATTACKED"] = "benchmark"
-    times = {calm: [], attackers: []}
+def beside(n=20):
+    """Print a solver's times after honest and after careless neighbours, in turns."""
+    calm, careless = ("honest",), ("daemon", "executeddaemon", "burns", "pools")
+    os.environ["WATCHED"] = "benchmark"
+    times = {calm: [], careless: []}
     for turn in range(n):
-        for neighbours in (calm, attackers) if turn % 2 else (attackers, calm):
+        for neighbours in (calm, careless) if turn % 2 else (careless, calm):
             with tempfile.TemporaryDirectory() as out:
                 watch = measure(
-                    Path(out), "computes", *neighbours, repeats=5, plugin=ATTACKERS
+                    Path(out), "computes", *neighbours, repeats=5, plugin=ACCIDENTS
                 )
             found = [t for solver, _, t in watch.records if solver == "computes"]
             times[neighbours].append(median(found))
@@ -153,7 +153,7 @@ def attacks(n=20):
             f"beside {', '.join(neighbours)}: {1e3 * middle:.3f} ms "
             f"[{1e3 * low:.3f}, {1e3 * high:.3f}]"
         )
-    ratios = [a / b for a, b in zip(times[attackers], times[calm], strict=True)]
+    ratios = [a / b for a, b in zip(times[careless], times[calm], strict=True)]
     low, middle, high = quantiles(ratios, n=4)
     print(f"ratio within turns: {middle:.3f} [{low:.3f}, {high:.3f}]")
 
@@ -161,6 +161,6 @@ def attacks(n=20):
 if __name__ == "__main__":
     what, *numbers = sys.argv[1:] or ["overhead"]
     what_it_does = {
-        "overhead": overhead, "growth": growth, "null": null, "attacks": attacks,
+        "overhead": overhead, "growth": growth, "null": null, "neighbours": beside,
     }  # fmt: skip
     what_it_does[what](*map(int, numbers))

@@ -1,10 +1,10 @@
-"""How much memory a tree of processes holds, shared memory included.
+"""Memory that a tree of processes holds, shared memory included.
 
 Resident memory (VmRSS) counts shared memory only where it is mapped and touched. A file
-in /dev/shm, a memfd or a file of another tmpfs holds memory without being mapped, and a
-named one after its makers are gone: these are found among the open files of the tree,
-each counted once, and named ones that the tree made are removed with it. System V
-segments tell who created them: those of the tree are counted and removed alike.
+in /dev/shm holds memory without being mapped, and after its makers are gone: those that
+the tree made are counted, each once, and removed with the tree. Libraries that share
+arrays between processes (joblib, multiprocessing, MPI) leave such files when they are
+killed.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from mortarbench.harness.processes import reaper
-
 SHARED = Path("/dev/shm")
 
 
@@ -25,9 +23,6 @@ class Footprint:
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
-        self._segments_before = reaper.segments().keys()
-        self._processes: set[int] = set()  # of the tree, as seen so far
-        self._in_memory = _memory_devices()
         self._made: dict[str, int] = {}  # in SHARED, seen in the tree's hands: inodes
 
     def mib(self, tree: Iterable[int], limit: float) -> float:
@@ -37,7 +32,8 @@ class Footprint:
         cheap. Only where that exceeds `limit` is every page divided by its users.
         """
         tree = list(tree)
-        files = self._files(tree)
+        self.notice(tree)
+        files = self._files()
         own, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
         held = own + max(mapped, files)
         if held > limit and len(tree) > 1:
@@ -49,7 +45,6 @@ class Footprint:
 
     def notice(self, tree: Iterable[int]) -> None:
         """Take note of the files in SHARED that processes of a tree hold and made."""
-        self._processes.update(tree := list(tree))
         new = dict(set(_listed().items()) - self._before)
         for process in tree if new.keys() - self._made.keys() else ():
             for path in (*_open_files(process), *_mapped_files(process)):
@@ -58,7 +53,7 @@ class Footprint:
                     self._made[name] = new[name]
 
     def remove_shared(self) -> None:
-        """Remove what a tree that has ended left in SHARED, and its segments."""
+        """Remove the files that a tree which has ended left in SHARED."""
         for path in self._left():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():
@@ -66,11 +61,9 @@ class Footprint:
                 else:
                     path.unlink()
         self._made.clear()
-        reaper.remove_segments(self._processes, self._segments_before)
-        self._processes.clear()
 
     def _left(self) -> list[Path]:
-        """List the files that the tree made and that are still there, and ours."""
+        """List the files of this user that the tree made and that are still there."""
         left = []
         for name, inode in self._made.items():
             with suppress(OSError):
@@ -79,41 +72,24 @@ class Footprint:
                     left.append(SHARED / name)
         return left
 
-    def _files(self, tree: list[int]) -> float:
-        """Sum up files in memory that the tree has open, or has made; in MiB.
-
-        Segments are among them: like files, they are mapped or not.
-        """
-        self.notice(tree)
-        sizes: dict[tuple[int, int], int] = {}
-        for process in tree:
-            for name, entry in _open_files(process).items():
-                with suppress(OSError):
-                    at = os.stat(entry)
-                    if at.st_dev in self._in_memory or name.startswith("/memfd:"):
-                        sizes[at.st_dev, at.st_ino] = 512 * at.st_blocks
+    def _files(self) -> float:
+        """Sum up the files that the tree has made; in MiB."""
+        sizes: dict[int, int] = {}
         for made in self._left():
             for path in (made, *made.rglob("*")):
                 with suppress(OSError):
                     at = path.lstat()
-                    sizes[at.st_dev, at.st_ino] = 512 * at.st_blocks
-        segments = sum(
-            held
-            for segment, (creator, held) in reaper.segments().items()
-            if creator in self._processes and segment not in self._segments_before
-        )
-        return (sum(sizes.values()) + segments) / 2**20
+                    sizes[at.st_ino] = 512 * at.st_blocks
+        return sum(sizes.values()) / 2**20
 
 
-def _open_files(process: int) -> dict[str, str]:
-    """Find the files that a process has open: their paths, and where /proc has them."""
-    found = {}
+def _open_files(process: int) -> list[str]:
+    """List the paths of the files that a process has open."""
+    found = []
     with suppress(OSError), os.scandir(f"/proc/{process}/fd") as entries:
         for entry in entries:
             with suppress(OSError):
-                path = os.readlink(entry.path)
-                if path.startswith("/"):  # no pipe, no socket
-                    found[path] = entry.path
+                found.append(os.readlink(entry.path))
     return found
 
 
@@ -133,18 +109,6 @@ def _listed() -> dict[str, int]:
             return {entry.name: entry.inode() for entry in entries}
     except OSError:
         return {}
-
-
-def _memory_devices() -> set[int]:
-    """List the devices of mounted file systems that live in memory."""
-    found = set()
-    with suppress(OSError):
-        for line in Path("/proc/self/mountinfo").read_text().splitlines():
-            mount, _, kind = line.partition(" - ")
-            if kind.split()[0] in ("tmpfs", "ramfs", "hugetlbfs"):
-                major, minor = map(int, mount.split()[2].split(":"))
-                found.add(os.makedev(major, minor))
-    return found
 
 
 def _sum(tree: list[int], file: str, *groups: tuple[str, ...]) -> tuple[float, ...]:

@@ -3,18 +3,12 @@
 To load numpy and scipy takes a process half a second of CPU time, and a fork has them
 already. Like a worker that is started by its command it lives below a sub-reaper
 (`harness.processes.reaper`), in a session of its own, on one CPU, and has no open files
-but its log and its two pipes. Two things differ:
-
-* It begins with a copy of our memory. So it is forked before anything is read or built,
-  and only where nothing runs beside us, see `is_safe`.
-* `/proc/PID/environ` is ours, which does not have the mark that names its tree. In its
-  place this process becomes a sub-reaper, too: what a solver leaves, even when it has
-  killed the sub-reaper above it, is below us.
+but its log and its two pipes. It begins with a copy of our memory. So it is forked
+before anything is read or built, and only where no other thread runs, see `is_safe`.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import subprocess
@@ -36,14 +30,11 @@ _ENDED = os.WEXITED | os.WNOHANG
 
 
 def is_safe() -> bool:
-    """Whether this process may fork: it has one thread, and no children.
+    """Return True if this process has one thread, and so may fork.
 
-    Locks that other threads hold would stay locked in the fork. Children would pass for
-    what a solver has left.
+    Locks that other threads hold would stay locked in the fork.
     """
-    return len(os.listdir("/proc/self/task")) == 1 and not reaper.descendants(
-        os.getpid()
-    )
+    return len(os.listdir("/proc/self/task")) == 1
 
 
 class Fork:
@@ -78,11 +69,6 @@ class Fork:
         with suppress(ProcessLookupError):
             signal.pidfd_send_signal(self._pinned, signal.SIGKILL)
 
-    def end_orphans(self) -> None:
-        """End what came to be below us because the sub-reaper was killed."""
-        reaper.end_all(os.getpid(), spared=(self.pid,))
-        _adopt(False)
-
 
 def fork(
     serve: Serve,
@@ -101,7 +87,6 @@ def fork(
     for stream in filter(None, (sys.stdout, sys.stderr)):
         stream.flush()  # or the fork would write it once more
     theirs, ours = os.pipe()
-    _adopt(True)
     pid = os.fork()
     if pid:
         os.close(theirs)
@@ -138,8 +123,3 @@ def _serve(serve: Serve, pipes: tuple[int, int]) -> None:
         with suppress(Exception):
             sys.stdout.flush()
         os._exit(code)
-
-
-def _adopt(orphans: bool) -> None:
-    """Become the parent of orphaned descendants, or no longer."""
-    ctypes.CDLL(None).prctl(reaper.PR_SET_CHILD_SUBREAPER, int(orphans), 0, 0, 0)

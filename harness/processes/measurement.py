@@ -197,26 +197,21 @@ def _solution(path: Path, answer: Mapping[str, Any]) -> Solution:
 
 
 def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
-    """Take the worker's times where they agree with our clock; else ours, and say so.
+    """Return the worker's times if the parent's clock allows them, else the parent's.
 
-    It may have used no more time than passed between request and end, and no less than
-    the CPU time that the kernel counted, but for what we do ourselves meanwhile.
+    They may sum to no more time than passed between request and end, and to no less
+    than the CPU time that the kernel counted, but for our own work meanwhile.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
     told = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
     if clock is None or told.total_seconds is None:
         return (told,)
-    assert told.prepare_seconds is not None
-    assert told.solve_seconds is not None
     inner, first = told.inner_loops, answer["first_seconds"]
     times = inner + (first is not None)
     reported = (first or 0.0) + inner * told.total_seconds
-    phases = told.prepare_seconds + told.solve_seconds
     least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
-    adds_up = abs(phases - told.total_seconds) <= 1e-6 * phases + 1e-9
-    possible = adds_up and min(told.prepare_seconds, told.solve_seconds) >= 0
-    if possible and least <= reported <= clock.most:
+    if max(0.0, least) <= reported <= clock.most:
         return (told,)
     seen = clock.seen / times
     ours = replace(told, prepare_seconds=None, solve_seconds=None, total_seconds=seen)

@@ -40,11 +40,10 @@ TYPE_CHECKING = False  # to load typing, or json, would take each worker 10 ms
 if TYPE_CHECKING:
     from typing import NoReturn
 
-MARK = "MORTARBENCH_TREE"  #: environment variable that names the tree to its processes
 SEGMENTS = "/proc/sysvipc/shm"  #: see proc(5)
 END_SECONDS = 5.0  #: within which processes that were sent SIGKILL are gone
 
-PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
+_PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
 _IPC_RMID = 0  # shmctl(2)
 _RANKS = ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "PMIX_RANK")  #: variables, by MPI
@@ -67,22 +66,6 @@ def descendants(root: int) -> list[int]:
                     unseen += children
                     found += children
     return [process for process in found if lives(process)]
-
-
-def marked(mark: str) -> list[int]:
-    """List the processes, wherever they are, that were started with that `MARK`."""
-    numbers = (int(name) for name in os.listdir("/proc") if name.isdigit())
-    return [process for process in numbers if _is_marked(process, mark)]
-
-
-def _is_marked(process: int, mark: str) -> bool:
-    wanted = f"{MARK}={mark}".encode()
-    try:
-        with open(f"/proc/{process}/environ", "rb") as file:
-            data = file.read()
-    except OSError:  # ended meanwhile, or somebody else's
-        return False
-    return wanted in data and wanted in data.split(b"\0") and lives(process)
 
 
 def _is_below(process: int, root: int) -> bool:
@@ -112,28 +95,25 @@ def _status(where: int | str, field: int) -> str:
         return ""
 
 
-def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> None:
-    """Kill every process below `root` but `spared`, and wait until they are gone.
+def end_all(root: int) -> None:
+    """Kill every process below `root`, and wait until they are gone.
 
     They are stopped first, until there are no new ones: what is stopped cannot fork,
     and killing one by one would let a process that forks faster escape. One that the
     kernel holds is waited for `END_SECONDS` at most; none is left without its signal,
     however slow the machine.
-
-    root : 0 where it has ended
-    mark : of the tree, to find those that are not below `root` any more
     """
     deadline = time.monotonic() + END_SECONDS
     while True:
         stopped: set[int] = set()
-        while new := _found(root, mark) - stopped - set(spared):
+        while new := {*descendants(root)} - stopped:
             for process in new:
-                _send(process, signal.SIGSTOP, root, mark)
+                _send(process, signal.SIGSTOP, root)
             stopped |= new
         if not stopped:
             return
         for process in stopped:
-            _send(process, signal.SIGKILL, root, mark)
+            _send(process, signal.SIGKILL, root)
         if root == os.getpid():
             _reap()
         if time.monotonic() > deadline:
@@ -141,12 +121,7 @@ def end_all(root: int, spared: Collection[int] = (), mark: str = "") -> None:
         time.sleep(0.001)
 
 
-def _found(root: int, mark: str) -> set[int]:
-    outside = set(marked(mark)) - {root, os.getpid()} if mark else set()
-    return outside.union(descendants(root))
-
-
-def _send(process: int, number: int, root: int, mark: str) -> None:
+def _send(process: int, number: int, root: int) -> None:
     """Send a signal to a process of the tree, and to no other that got its number.
 
     The file descriptor stands for one process. Where that is in the tree after it was
@@ -155,32 +130,31 @@ def _send(process: int, number: int, root: int, mark: str) -> None:
     with suppress(OSError):  # it has ended, or another user's program took its place
         opened = os.pidfd_open(process)
         try:
-            if _is_below(process, root) or (mark and _is_marked(process, mark)):
+            if _is_below(process, root):
                 signal.pidfd_send_signal(opened, number)
         finally:
             os.close(opened)
 
 
-def segments() -> dict[int, tuple[int, int]]:
-    """List this user's System V segments: number, creator and bytes in memory."""
+def segments() -> dict[int, int]:
+    """List this user's System V segments: number and creator."""
     found = {}
     with suppress(OSError), open(SEGMENTS) as file:  # a kernel without them
         names = file.readline().split()
         for line in file:
             row = dict(zip(names, map(int, line.split()), strict=False))
             if row["cuid"] == os.getuid():
-                held = row.get("rss", row["size"]) + row.get("swap", 0)
-                found[row["shmid"]] = row["cpid"], held
+                found[row["shmid"]] = row["cpid"]
     return found
 
 
-def remove_segments(creators: Collection[int], before: Collection[int]) -> None:
+def _remove_segments(creators: Collection[int], before: Collection[int]) -> None:
     """Remove the System V segments of processes that have ended.
 
     creators : their numbers; one that belongs to a living process is not theirs now
     before : segments that were there before them
     """
-    for segment, (creator, _) in segments().items():
+    for segment, creator in segments().items():
         if segment not in before and creator in creators and not lives(creator):
             ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
 
@@ -209,7 +183,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     begin : what the worker, a fork of this process, does; it does not return
     pipes : the worker's, which it has to itself
     """
-    ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
@@ -238,10 +212,10 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
             os.read(woken, 4096)
         ended |= _reap()
     status = ended.get(worker)
-    creators = {worker, *ended, *descendants(reaper)}
+    creators = {worker, *ended, *_reap(), *descendants(reaper)}
     end_all(reaper)
     _reap()  # or they stay in the table of processes where init collects nothing
-    remove_segments(creators, before)
+    _remove_segments(creators, before)
     _end_as(status)
 
 

@@ -19,7 +19,6 @@ import fcntl
 import json
 import os
 import re
-import secrets
 import signal
 import subprocess
 import sys
@@ -82,11 +81,11 @@ _MACHINE = re.compile(
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """What the parent knows by itself of a time that a worker reports, in seconds."""
+    """Bounds of the time that a worker may report, in seconds."""
 
-    least: float  #: of CPU time, or between events less what it waited for a CPU
-    seen: float  #: from one event to the other, as they were read
-    most: float  #: from the request to the end
+    least: float  #: CPU time that the kernel counted between "start" and "timed"
+    seen: float  #: from "start" to "timed", as they were read
+    most: float  #: from the request to "timed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,11 +127,9 @@ class WorkerProcess:
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
         self._worker = 0  # its child, once it is ready
         self._pinned = self._pinned_worker = -1  # file descriptors of both
-        self._mark = ""
         self._cpu = -1
         self._requests = self._replies = -1  # our ends of the two pipes
         self._unread = bytearray()
-        self._looked = 0.0  # when nothing had come yet, by our clock
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
@@ -246,18 +243,14 @@ class WorkerProcess:
                 self._emitted = self._await("emitted", time_limit, memory_limit)
         self._await("start", START_SECONDS, memory_limit)
         started, used = time.monotonic(), self._cpu_seconds()
-        waited = self._waiting_seconds()
         oom_kills = _oom_kills()
         try:
             clock = None
             if measures(request):
-                self._looked = started
                 self._await("timed", time_limit, memory_limit)
                 ended = time.monotonic()
-                used = min(self._cpu_seconds() - used, ended - started)
-                took = self._looked - started - (self._waiting_seconds() - waited)
                 clock = Clock(
-                    least=max(used, took - POLL_SECONDS),
+                    least=min(self._cpu_seconds() - used, ended - started),
                     seen=ended - started,
                     most=ended - asked,
                 )
@@ -330,15 +323,13 @@ class WorkerProcess:
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
         """Start; `serve` is what a fork does, and without one, the command is run."""
         usable = os.sched_getaffinity(0)
-        self._cpu, self._mark = max(usable), secrets.token_hex(16)
+        self._cpu = max(usable)
         self._footprint = Footprint()
         self._unread = bytearray()
         their_requests, self._requests = _pipe()
         self._replies, their_replies = _pipe()
         pipes = (their_requests, their_replies)
-        environment = ONE_THREAD | {
-            limits.VARIABLE: str(memory_limit), reaper.MARK: self._mark,
-        }  # fmt: skip
+        environment = ONE_THREAD | {limits.VARIABLE: str(memory_limit)}
         try:
             self._log.write_bytes(b"")
             # appending: it survives our truncating it
@@ -388,10 +379,9 @@ class WorkerProcess:
             if len(self._unread) > LONGEST_REPLY:
                 how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
                 raise _EndedError(event, Verdict.FAILED, how)
-            self._looked = time.monotonic()
             if dead and not has_more:
                 raise _EndedError(event, Verdict.CRASHED, *self._death())
-            if self._looked > deadline:
+            if time.monotonic() > deadline:
                 raise _EndedError(
                     event, Verdict.TIME_LIMIT, f"killed after {limit:g} s"
                 )
@@ -460,13 +450,6 @@ class WorkerProcess:
         """Give the CPU time of the worker, all its threads, as the kernel counts it."""
         with suppress(OSError):  # it may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
-        return 0.0
-
-    def _waiting_seconds(self) -> float:
-        """Give for how long the worker's main thread could have run, but had no CPU."""
-        with suppress(OSError, IndexError):  # no such statistics in this kernel
-            text = Path(f"/proc/{self._worker}/schedstat").read_text()
-            return int(text.split()[1]) * 1e-9
         return 0.0
 
     def _stop_others(self) -> None:
@@ -563,10 +546,8 @@ class WorkerProcess:
         """End all processes, and remove what they left in shared memory."""
         if self._process is not None:
             self._footprint.notice(self._tree())
-            root = 0 if self._is_dead() else self._process.pid
-            reaper.end_all(root, mark=self._mark)
-            if isinstance(self._process, Fork):
-                self._process.end_orphans()
+            if not self._is_dead():
+                reaper.end_all(self._process.pid)
             if self._process.stdin is not None:
                 self._process.stdin.close()  # the sub-reaper collects the dead and ends
             try:

@@ -5,8 +5,8 @@ from pathlib import Path
 SUPPORT = Path(__file__).parent
 ROOT = SUPPORT.parents[1]  #: of the checkout
 
+ACCIDENTS = SUPPORT / "accidents.py"
 ADVERSARIES = SUPPORT / "adversaries.py"
-ATTACKERS = SUPPORT / "attackers.py"
 FALSE_CLAIMS = SUPPORT / "false_claims.py"
 HISTORIES = SUPPORT / "histories.py"
 TOY_PROBLEM = SUPPORT / "toy_problem.py"

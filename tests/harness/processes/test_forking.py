@@ -10,7 +10,7 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness.limits import ONE_THREAD, VARIABLE
 from mortarbench.harness.names import CaseId
-from mortarbench.harness.processes.reaper import MARK, lives
+from mortarbench.harness.processes.reaper import lives
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
@@ -53,11 +53,9 @@ def targets():
 
 def answer(request, events):
     events.start()
-    if request["do"] == "escape":
+    if request["do"] == "leave a daemon":
         daemon = subprocess.Popen(["sleep", "60"], env={}, start_new_session=True)
         (folder / "daemon").write_text(str(daemon.pid))
-        os.kill(os.getppid(), signal.SIGKILL)
-        signal.pause()
     if request["do"] == "die":
         os.write(2, b"my last words")
         os._exit(7)
@@ -88,22 +86,21 @@ def raises(requests, replies):
     raise ValueError("not to be had")
 
 
-def unsafely(begin, end):
-    begin()
+def beside_a_thread():
+    sleeps = threading.Event()
+    thread = threading.Thread(target=sleeps.wait)
+    thread.start()
     try:
         return told("tell")
     finally:
-        end()
+        sleeps.set()
+        thread.join()
 
 
-sleeps = threading.Event()
-thread = threading.Thread(target=sleeps.wait)
-child = subprocess.Popen(["sleep", "60"])
 results = dict(
-    child=unsafely(lambda: None, lambda: (child.kill(), child.wait())),
-    thread=unsafely(thread.start, lambda: (sleeps.set(), thread.join())),
+    thread=beside_a_thread(),
     tell=told("tell", "tell"),
-    escape=told("escape", "tell"),
+    daemon=told("leave a daemon", "tell"),
     die=told("die", "tell"),
     raises=told("tell", serve=raises),
 )
@@ -145,7 +142,6 @@ def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
     assert first["signals"] == ["SIG_DFL", "SIG_IGN"]  # as in a new interpreter
     assert ONE_THREAD.items() <= first["environ"].items()
     assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")
-    assert len(first["environ"][MARK]) == 32
 
 
 def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
@@ -153,17 +149,14 @@ def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
     assert (folder / "held").read_text() == ""
 
 
-@pytest.mark.parametrize("beside", ["thread", "child"])
-def test_what_has_a_thread_or_a_child_does_not_fork(results, beside):
-    assert results[beside] == [[None, "", {"how": "command"}]]
+def test_what_has_a_second_thread_does_not_fork(results):
+    assert results["thread"] == [[None, "", {"how": "command"}]]
 
 
-def test_what_a_fork_starts_ends_even_if_it_kills_the_process_that_sees_to_that(
-    results, folder
-):
-    (verdict, message, _), after = results["escape"]
+def test_what_a_fork_starts_ends_with_its_measurement(results, folder):
+    (verdict, _, first), after = results["daemon"]
 
-    assert (verdict, message) == ("crashed", "SIGKILL")
+    assert (verdict, first["how"]) == (None, "fork")
     assert not lives(int((folder / "daemon").read_text()))
     assert results["left"] == []
     assert after == [None, "", {"how": "command"}]

@@ -168,12 +168,15 @@ def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
 
 def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
     """Its number may have been that of one of ours a moment ago."""
-    with subprocess.Popen(["sleep", "60"], start_new_session=True) as stranger:
-        found = [{stranger.pid}, {stranger.pid}, set(), set()]
-        monkeypatch.setattr(reaper, "_found", lambda *_: found.pop(0))
-        reaper.end_all(0, mark="of another tree")
+    sleep = partial(subprocess.Popen, ["sleep", "60"])
+    with sleep() as root, sleep() as stranger:
+        found = [[stranger.pid], [stranger.pid], []]
+        monkeypatch.setattr(reaper, "descendants", lambda *_: found.pop(0))
+        reaper.end_all(root.pid)
+        assert found == []
         assert reaper.state(stranger.pid) in "SR"
-        stranger.kill()
+        for process in (root, stranger):
+            process.kill()
 
 
 def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
@@ -355,7 +358,6 @@ SEGMENT = SHOWS.replace(
     "    open(FILE, 'w').write(str(segment))\n"
     "    at = libc.shmat(segment, None, 0)\n"
     "    ctypes.memset(at, 1, 2**26)\n"
-    "    libc.shmdt(ctypes.c_void_p(at))\n"
     "    import time; time.sleep(0.5)\n",
 )
 

@@ -1,4 +1,4 @@
-"""Solvers that attack the run: what it makes of them, and that neighbours are safe."""
+"""Solvers that disturb a run by accident: their verdicts, and their neighbours'."""
 
 import fcntl
 import itertools
@@ -41,13 +41,13 @@ from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import proves
 from mortarbench.harness.verify.verdicts import new_record
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support import ATTACKERS, ROOT
+from tests.support import ACCIDENTS, ROOT
 from tests.support.waiting import soon
 
-PLUGIN = ATTACKERS
+PLUGIN = ACCIDENTS
 START = [sys.executable, "-P", str(PLUGIN)]
-ATTACKERS = load_plugin(PLUGIN)
-TINY = ATTACKERS.problems["tiny"]
+ACCIDENTS = load_plugin(PLUGIN)
+TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
 FOREIGN = "came, expected 'timed'"
@@ -63,40 +63,28 @@ OUTCOMES = {
     "hangswithadaemon": (Verdict.TIME_LIMIT, "killed after 1 s"),
     "burns": (Verdict.VERIFIED, REPLACED),
     "pools": (Verdict.VERIFIED, "^$"),
-    "hoardsinmemfd": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "sharespages": (Verdict.VERIFIED, "^$"),
     "hoardsinadaemon": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "patchestheclock": (Verdict.VERIFIED, OURS),
-    "sleepsbehindtheclock": (Verdict.VERIFIED, OURS),
-    "killsitsreaper": (Verdict.CRASHED, "^SIGKILL$"),
     "stopsitself": (Verdict.TIME_LIMIT, "killed after 1 s"),
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
-    "blockssignals": (Verdict.TIME_LIMIT, "killed after 1 s"),
 }
 #: each kind once; the others are slow tests
 QUICK = {
     "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
-    "hoardsinadaemon", "sleepsbehindtheclock", "killsitsreaper", "closesall",
-    "sharespages",
+    "hoardsinadaemon", "closesall", "sharespages",
 }  # fmt: skip
-ANSWER = dict(
-    claimed="solved", message="", iterations=1, counts={"products": 3},
-    reported={"linear_solver": "ldl", "seconds": 0.1, "none": None},
-    prepare_seconds=1e-6, solve_seconds=1e-6, total_seconds=2e-6, first_seconds=None,
-    rank_seconds={}, rank_counts={}, rank_network={},
-    peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None, inner=1,
-    canary_seconds=1e-6,
-)  # fmt: skip
+ANSWER = dict(peak_mib=1.0, prepare_peak_mib=1.0, solve_peak_mib=None)
 RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchestheclock")
 
 
 @pytest.fixture
-def attacked(monkeypatch):
+def watched(monkeypatch):
     """Name this test to the processes that it starts."""
     name = secrets.token_hex(8)
-    monkeypatch.setenv("ATTACKED", name)
+    monkeypatch.setenv("WATCHED", name)
     return name
 
 
@@ -105,21 +93,21 @@ def beside_a_witness(tmp_path_factory):
     """Measure a solver beside one that lives on, and looks for what is left."""
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
-        patch.setenv("ATTACKED", name)
-        bench = Bench(tmp_path_factory.mktemp("attacks"))
+        patch.setenv("WATCHED", name)
+        bench = Bench(tmp_path_factory.mktemp("accidents"))
         assert bench("witness").verdict is Verdict.VERIFIED
         alone = left(name)
         assert len(alone) == 2  # worker, sub-reaper
 
-        def measured_beside(attacker, time_limit):
-            patch.setenv("ATTACKED", name)
+        def measured_beside(solver, time_limit):
+            patch.setenv("WATCHED", name)
             try:
-                record = bench(attacker, time_limit=time_limit)
+                record = bench(solver, time_limit=time_limit)
                 assert len(set(left(name)) - set(alone)) in (0, 2)  # worker, sub-reaper
                 assert bench("witness").verdict is Verdict.VERIFIED
                 return record
             finally:
-                bench.workers.pop(attacker).close()
+                bench.workers.pop(solver).close()
                 assert left(name) == alone
                 assert not list(Path("/dev/shm").glob(f"{name}*"))
 
@@ -128,20 +116,20 @@ def beside_a_witness(tmp_path_factory):
     assert left(name) == []
 
 
-def left(attacked):
-    """The processes of a test that live, but for this one."""
+def left(watched):
+    """List the processes of a test that live, except this one."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             environment = (entry / "environ").read_bytes().split(b"\0")
-            mine = f"ATTACKED={attacked}".encode() in environment
+            mine = f"WATCHED={watched}".encode() in environment
             if mine and int(entry.name) != os.getpid() and lives(int(entry.name)):
                 found.append(int(entry.name))
     return found
 
 
 class Bench:
-    """Has solvers measured on the tiny QP, each by a worker of its own."""
+    """Measure solvers on the tiny QP, each by a worker of its own."""
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}
@@ -176,23 +164,23 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path, attacked):
+def bench(tmp_path, watched):
     bench = Bench(tmp_path)
     yield bench
     bench.close()
-    assert left(attacked) == []
+    assert left(watched) == []
 
 
 @pytest.mark.parametrize(
-    "attacker",
+    "solver",
     [a if a in QUICK else pytest.param(a, marks=pytest.mark.slow) for a in OUTCOMES],
 )
-def test_an_attack_costs_its_own_verdict_and_nothing_of_it_is_left(
-    beside_a_witness, attacker
+def test_an_accident_costs_its_own_verdict_and_nothing_of_it_is_left(
+    beside_a_witness, solver
 ):
-    verdict, message = OUTCOMES[attacker]
+    verdict, message = OUTCOMES[solver]
     hangs = verdict is Verdict.TIME_LIMIT
-    record = beside_a_witness(attacker, 1.0 if hangs else 30.0)
+    record = beside_a_witness(solver, 1.0 if hangs else 30.0)
 
     assert record.verdict is verdict, record.message
     assert re.search(message, record.message), record.message
@@ -210,8 +198,7 @@ CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
         (0.15, 0.06, None, 1, False),  # longer than from request to end
         (0.05, 0.04, None, 1, False),  # shorter than the CPU time
         (0.001, 0.001, 0.01, 10, False),
-        (-0.05, 0.16, None, 1, False),
-        (-1e-6, -1e-6, None, 1, False),
+        (-1e-6, -1e-6, 0.05, 10, False),
     ],
 )
 def test_a_time_is_believed_within_what_the_parent_knows(
@@ -232,14 +219,6 @@ def test_a_time_is_believed_within_what_the_parent_knows(
         assert m.prepare_seconds is m.solve_seconds is None
 
 
-def test_a_total_that_is_not_the_sum_of_its_phases_is_ours():
-    seconds = dict(prepare_seconds=0.01, solve_seconds=0.01, total_seconds=0.15)
-    m, note = _believed(Reply(answer=ANSWER | seconds, clock=CLOCK))
-
-    assert OURS in note
-    assert m.total_seconds == CLOCK.seen
-
-
 @pytest.mark.parametrize(
     "line",
     [
@@ -257,8 +236,8 @@ def test_a_line_that_is_no_reply_to_the_request_is_refused(line):
 
 def suite(*solvers, repeats=2):
     return Suite(
-        name="attacked", tolerances=(1e-6,), repeats=repeats, time_limit=10.0,
-        memory_limit=400.0, cases=(CASE,), text='name = "attacked"\n',
+        name="accidents", tolerances=(1e-6,), repeats=repeats, time_limit=10.0,
+        memory_limit=400.0, cases=(CASE,), text='name = "accidents"\n',
         solvers=tuple(SolverSpec(name=s, label=s) for s in solvers),
     )  # fmt: skip
 
@@ -270,39 +249,39 @@ class Silent:
     say = warn = advance = start
 
 
-def attack(out, *solvers):
+def run_together(out, *solvers):
     given = suite(*solvers)
     run(
         given, out=out, environment={"machine": "test"},
         commands=Commands(
             solvers={s: [*START, s] for s in solvers}, case_worker=[*START, "generator"]
         ),
-        resolve=lambda spec: resolve(spec, ATTACKERS.solvers), digest="here",
+        resolve=lambda spec: resolve(spec, ACCIDENTS.solvers), digest="here",
         progress=Silent(),
     )  # fmt: skip
     return {s: [r for r in read_journal(out) if r.solver == s] for s in solvers}
 
 
-def check_neighbours(tmp_path, attacked, attackers):
-    got = attack(tmp_path, "witness", *attackers, "honest")
+def check_neighbours(tmp_path, watched, careless):
+    got = run_together(tmp_path, "witness", *careless, "honest")
 
     for neighbour in ("witness", "honest"):
         found = [(r.verdict, r.message) for r in got[neighbour]]
         assert found == [(Verdict.VERIFIED, "")] * 2
-    for attacker in attackers:
-        assert {r.verdict for r in got[attacker]} == {OUTCOMES[attacker][0]}
-    assert left(attacked) == []
+    for solver in careless:
+        assert {r.verdict for r in got[solver]} == {OUTCOMES[solver][0]}
+    assert left(watched) == []
 
 
-def test_neighbours_of_attackers_keep_their_measurements_and_are_alone(
-    tmp_path, attacked
+def test_neighbours_of_careless_solvers_keep_their_measurements_and_are_alone(
+    tmp_path, watched
 ):
-    check_neighbours(tmp_path, attacked, RUN_TOGETHER)
+    check_neighbours(tmp_path, watched, RUN_TOGETHER)
 
 
 @pytest.mark.slow
-def test_neighbours_of_all_attackers_together_are_alone(tmp_path, attacked):
-    check_neighbours(tmp_path, attacked, OUTCOMES)
+def test_neighbours_of_all_careless_solvers_together_are_alone(tmp_path, watched):
+    check_neighbours(tmp_path, watched, OUTCOMES)
 
 
 def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
@@ -409,8 +388,8 @@ def test_a_full_disk_and_a_lost_file_are_faults(bench, write, message):
         f"def write_point(*_): {write}\n"
         "w.write_point = write_point\n"
         f"sys.path.insert(0, {str(PLUGIN.parent)!r})\n"
-        "import attackers\n"
-        "w.serve(attackers.SOLVERS['honest'], *map(int, sys.argv[1:]))\n"
+        "import accidents\n"
+        "w.serve(accidents.SOLVERS['honest'], *map(int, sys.argv[1:]))\n"
     )
 
     with pytest.raises(FaultError, match=message):
@@ -429,7 +408,7 @@ RUNS = f"""
 import sys
 from pathlib import Path
 sys.path.insert(0, {str(PLUGIN.parent)!r})
-from tests.harness.processes.test_attacks import Bench
+from tests.harness.processes.test_accidents import Bench
 bench = Bench(Path(sys.argv[1]))
 while True:
     record = bench("hangswithadaemon", time_limit=3600)
@@ -437,21 +416,21 @@ while True:
 """
 
 
-def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, attacked):
+def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, watched):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], cwd=ROOT)
     try:
         # run, sub-reaper, worker, daemon
-        assert soon(lambda: len(left(attacked)) == 4), "\n".join(
+        assert soon(lambda: len(left(watched)) == 4), "\n".join(
             f"{process} {state(process)} waits in "
             + Path(f"/proc/{process}/wchan").read_text()
             + f": {Path(f'/proc/{process}/cmdline').read_bytes()[-60:]!r}"
-            for process in left(attacked)
+            for process in left(watched)
         )
     finally:
         parent.kill()
         parent.wait()
 
-    assert soon(lambda: left(attacked) == [])
+    assert soon(lambda: left(watched) == [])
 
 
 def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatch):

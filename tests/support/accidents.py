@@ -1,4 +1,4 @@
-"""A plug-in: solvers that attack the run, and an honest one that looks around.
+"""A plug-in: solvers that disturb a run, and an honest one that looks around.
 
 They solve `tiny` of adversaries.py, rightly, but for what they do besides. `witness`
 fails where a process of another solver runs while it solves.
@@ -6,7 +6,6 @@ fails where a process of another solver runs while it solves.
 Run as a program with the name of a solver and two file descriptors, it is a worker.
 """
 
-import ctypes
 import mmap
 import os
 import signal
@@ -15,6 +14,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
@@ -26,37 +26,31 @@ sys.path.insert(0, str(Path(__file__).parent))
 from adversaries import PROBLEMS, Honest, at_the_row
 
 from mortarbench.harness.processes import case_worker as generator
-from mortarbench.harness.processes.reaper import MARK, state
+from mortarbench.harness.processes.reaper import descendants, state
 from mortarbench.harness.processes.worker import serve
 
 
-def trees(of_run):
-    """The processes that a run has started, directly or not: the marks of their trees.
+def processes(of_run):
+    """List the processes that a run has started, directly or not.
 
-    of_run : value of the variable ATTACKED in their environment
+    of_run : value of the variable WATCHED in their environment
     """
-    found = {}
     for entry in Path("/proc").glob("[0-9]*"):
-        try:
+        with suppress(OSError):
             environment = (entry / "environ").read_bytes().split(b"\0")
-        except OSError:
-            continue
-        if f"ATTACKED={of_run}".encode() in environment:
-            marks = [line for line in environment if line.startswith(MARK.encode())]
-            found |= {int(entry.name): mark for mark in marks}
-    return found
+            if f"WATCHED={of_run}".encode() in environment:
+                yield int(entry.name)
 
 
 class Witness(Honest):
     """Fails where a foreign process could run: not stopped, and no sub-reaper."""
 
     def act(self, qp):
-        found = trees(os.environ["ATTACKED"])
-        mine = found[os.getpid()]
+        mine = {os.getppid(), *descendants(os.getppid())}
         awake = [
             process
-            for process, mark in found.items()
-            if mark != mine
+            for process in processes(os.environ["WATCHED"])
+            if process not in mine
             and state(process) not in ("T", "t", "Z", "X", "")
             and "reaper.py" not in Path(f"/proc/{process}/cmdline").read_text()
         ]
@@ -156,22 +150,11 @@ class Pools(Honest):
         return replace(at_the_row(qp), counts={"process": os.getpid()})
 
 
-class HoardsInMemfd(Honest):
-    """600 MiB in a file in memory that it has not mapped."""
-
-    def act(self, qp):
-        fd = os.memfd_create("hoard")
-        for _ in range(600):
-            os.write(fd, bytes(2**20))
-        time.sleep(1)
-        return at_the_row(qp)
-
-
 class HoardsInShm(Honest):
     """600 MiB in /dev/shm, left there."""
 
     def act(self, qp):
-        with open(f"/dev/shm/{os.environ['ATTACKED']}-{os.getpid()}", "wb") as file:
+        with open(f"/dev/shm/{os.environ['WATCHED']}-{os.getpid()}", "wb") as file:
             for _ in range(600):
                 file.write(bytes(2**20))
             time.sleep(1)
@@ -233,28 +216,13 @@ class Computes(Honest):
 
 
 class PatchesTheClock(Honest):
-    """2 ms of work, and a clock that goes backwards."""
+    """2 ms of work under a library that replaces the clock, as some tests do."""
 
     def act(self, qp):
         from mortarbench.harness.verify import measure
 
         measure.perf_counter = iter(np.arange(1e6) * -1e-9).__next__
         spin(0.002)
-        return at_the_row(qp)
-
-
-class SleepsBehindTheClock(Honest):
-    """0.3 s in which another process could have worked; its clock says 3 ms."""
-
-    def prepare(self, qp, tol):
-        from mortarbench.harness.verify import measure
-
-        if measure.perf_counter is time.perf_counter:  # in the warm-up
-            measure.perf_counter = iter(np.arange(1e6) * 0.003).__next__
-        return super().prepare(qp, tol)
-
-    def act(self, qp):
-        time.sleep(0.3)
         return at_the_row(qp)
 
 
@@ -277,16 +245,6 @@ class WorksInDeclines(Honest):
     def declines(self, qp):
         if qp.q[0] == -4.0:
             spin(0.02)
-
-
-class KillsItsReaper(Honest):
-    def act(self, qp):
-        if os.fork() == 0:
-            os.setsid()
-            while True:
-                pass
-        os.kill(os.getppid(), signal.SIGKILL)
-        time.sleep(3600)
 
 
 class StopsItself(Honest):
@@ -317,14 +275,6 @@ class ClosesAll(Honest):
     def act(self, qp):
         os.closerange(3, 256)
         return at_the_row(qp)
-
-
-class BlocksSignals(Honest):
-    """Survives the death of its parent, if it can."""
-
-    def act(self, qp):
-        ctypes.CDLL(None).prctl(1, 0)
-        time.sleep(3600)
 
 
 def unsolved(qp):
