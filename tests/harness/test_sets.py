@@ -8,6 +8,7 @@ import pytest
 from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Box, InputError, Solution, Status, save_qp
+from mortarbench.harness.conformance.metamorphic import change_units, permute_unknowns
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import reason_to_decline
@@ -209,6 +210,25 @@ def test_a_planted_solution_has_no_residual_and_others_have(seed):
     outside[first] *= 1.01
     assert kkt_residuals(qp, replace(s, x=outside)).primal > 1e-5
     assert radius[0] == pytest.approx(np.linalg.norm(s.x[first]))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_equivalent_qps_with_balls_have_the_same_residuals(seed):
+    qp, s = with_solution(seed)
+    order = np.random.default_rng(seed).permutation(qp.q.size)
+    new = change_units(qp, unknown=8.0, objective=2.0).then(
+        lambda other: permute_unknowns(other, order)
+    )
+    x, z_box = s.x[order] / 8, s.z_box[order] * 16
+    assert new.qp.sets[1].radius == pytest.approx(qp.sets[1].radius / 8)
+    there = replace(s, x=x * 1.001, z_box=z_box, y=16 * s.y, z=16 * s.z)
+    here = new.recover(there)
+
+    assert here.x == pytest.approx(s.x * 1.001)
+    assert (*here.y, *here.z) == pytest.approx((*s.y, *s.z))
+    assert here.z_box == pytest.approx(s.z_box)
+    after, before = kkt_residuals(new.qp, there), kkt_residuals(qp, here)
+    assert after == pytest.approx(before, rel=1e-6, abs=1e-14)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -56,7 +56,13 @@ class Balls:
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
     def substituted(self, T, a):
-        raise NotImplementedError
+        """For one factor in T, which may move no centre."""
+        assert not a[self.index].any()
+        entries = T.tocoo()
+        assert len({*np.abs(entries.data)}) == 1
+        column = np.zeros(T.shape[0], dtype=int)
+        column[entries.row] = entries.col
+        return Balls(column[self.index], self.radius / abs(entries.data[0]))
 
     def arrays(self):
         return {"ball_index": self.index, "ball_radius": self.radius}
