@@ -91,11 +91,11 @@ class _Constraints(NamedTuple):
     inequalities: Limits
     sets: list[Sequence[Limits]]  #: of each set of the QP
 
-    def all(self) -> Iterator[Limits]:
-        """Yield equality rows, inequality rows, then the limits of the sets."""
-        yield self.equalities
-        yield self.inequalities
-        for limits in self.sets:
+    def inequalities_and_limits(self) -> Iterator[Limits]:
+        """Yield inequality rows, if there are any, then the limits of the sets."""
+        if self.inequalities.size.size:
+            yield self.inequalities
+        for limits in self.sets:  # also where this rank holds no such component
             yield from limits
 
 
@@ -210,14 +210,15 @@ def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
 
 
 def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
-    equalities, *others = constraints.all()
-    outside = [(c, np.minimum(c.slack, 0)) for c in others]
+    c = constraints.equalities
+    errors = [(c, c.slack)] if c.size.size else []
+    for c in constraints.inequalities_and_limits():
+        errors.append((c, np.minimum(c.slack, 0)))
     return _largest(
         0.0,
         *(
             _violated(error, c.size, c.terms, c.sized(X), c.sized(own))
-            for c, error in ((equalities, equalities.slack), *outside)
-            if c.size.size
+            for c, error in errors
         ),
     )
 

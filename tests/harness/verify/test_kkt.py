@@ -18,6 +18,7 @@ from mortarbench.harness import (
     verdict,
 )
 from mortarbench.harness.conformance.manufactured import manufactured
+from mortarbench.harness.distributed.vectors import DistributedColumns, distributed
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.harness.verify.kkt import energy_at
 from mortarbench.problems.families.beam_ring import BeamRing
@@ -26,6 +27,7 @@ from mortarbench.solvers.adapters.osqp_ import OSQP
 from mortarbench.solvers.adapters.proxqp_ import ProxQP
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.threads import on_threads
 
 
 def one_variable(q=1.0, h=0.0):
@@ -325,3 +327,49 @@ def test_the_least_scale_of_energy_is_a_hundredth_of_what_a_variable_gains_alone
         found = energy_at(qp, nowhere)
 
     assert found == pytest.approx(expected / 100)
+
+
+class Diagonal:
+    """P of a QP whose vectors lie on ranks."""
+
+    def __init__(self, d):
+        self.d, self.shape = d, (d.size, d.size)
+
+    def __matmul__(self, x):
+        return self.d * x
+
+    def diagonal(self):
+        return self.d
+
+
+def test_a_rank_without_bounds_takes_part_in_the_residuals():
+    """Of 9 variables on 3 ranks, those of the last have no bounds."""
+    rng = np.random.default_rng(5)
+    d, q, x, z = 1 + rng.random((4, 9))
+    lb = np.where(np.arange(9) < 6, 0.5, -np.inf)
+    ub = np.where(np.arange(9) < 3, 1.1, np.inf)
+
+    def residuals(ranks=None):
+        own = (
+            slice(None) if ranks is None else slice(3 * ranks.rank, 3 * ranks.rank + 3)
+        )
+
+        def part(v):
+            return v[own] if ranks is None else distributed(v[own], ranks)
+
+        n = part(d).size
+        none = no_rows(n) if ranks is None else DistributedColumns(no_rows(n), ranks)
+        qp = QP(
+            P=Diagonal(part(d)), q=part(q), A=none, b=np.zeros(0), G=none,
+            h=np.zeros(0), lb=part(lb), ub=part(ub),
+        )  # fmt: skip
+        s = Solution(
+            status=Status.SOLVED, x=part(x), y=np.zeros(0), z=np.zeros(0),
+            z_box=part(z),
+        )  # fmt: skip
+        return kkt_residuals(qp, s)
+
+    alone = residuals()
+    assert alone.primal > 1e-3
+    for there in on_threads(3, residuals):
+        assert there == pytest.approx(alone, rel=1e-13)
