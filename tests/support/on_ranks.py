@@ -83,6 +83,15 @@ def vectors(ranks):
     return {"pairs": pairs, "answered": answered, "kept": kept}
 
 
+def refined_solution(M, t):
+    """Solve M y = t, with residuals in extended precision."""
+    y = np.linalg.solve(M, t).astype(np.longdouble)
+    for _ in range(3):
+        r = t - M.astype(np.longdouble) @ y
+        y += np.linalg.solve(M, r.astype(float))
+    return y.astype(float)
+
+
 def factors(ranks):
     """Factorise a sum of known matrices; and one that is singular on rank 0 only.
 
@@ -107,14 +116,13 @@ def factors(ranks):
     full = local.completed()
     for whole, M in ((full, A), (full.shifted(0.5, own @ own.T), 1.5 * A - less)):
         a, b = (whole.forward(rows.additive(v[k])) for v in (t, s))
-        y = np.linalg.solve(M, t)
-        size, work = np.abs(y).max(), np.abs(s) @ np.abs(y)
+        y = refined_solution(M, t)
         errors += [
-            np.abs(whole(rows.additive(t[k])) - y[k]).max() / size,
-            np.abs(whole.backward(a) - y[k]).max() / size,
-            abs(a @ b - s @ y) / work,
-            abs(rows.additive(s[k]) @ whole.backward(a) - s @ y) / work,
-            abs(a @ a - t @ y) / (np.abs(t) @ np.abs(y)),
+            np.abs(whole(rows.additive(t[k])) - y[k]).max(),
+            np.abs(whole.backward(a) - y[k]).max(),
+            abs(a @ b - s @ y),
+            abs(rows.additive(s[k]) @ whole.backward(a) - s @ y),
+            abs(a @ a - t @ y),
         ]
     bad = part.toarray()
     if ranks.rank == 0:
