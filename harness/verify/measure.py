@@ -133,7 +133,7 @@ class _Asked:
 
 
 class ReasonError(Exception):
-    """A solver's `declines` returned neither None nor a text."""
+    """A solver declares or returns no usable reason to decline."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
@@ -145,10 +145,17 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     Raises
     ------
     ReasonError
-        When `declines` returns anything else, such as False.
+        When `accepts` is not a tuple of classes, or `declines` returns anything else,
+        such as False.
 
     """
     accepted = getattr(solver, "accepts", (Box,))
+    if not isinstance(accepted, tuple) or not all(
+        isinstance(a, type) for a in accepted
+    ):
+        raise ReasonError(
+            f"accepts = {shown(accepted)}; expected a tuple of classes, such as (Box,)"
+        )
     for one in qp.sets:
         if not isinstance(one, accepted):
             return f"does not accept sets of the kind {type(one).__name__}"

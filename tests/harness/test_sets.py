@@ -11,7 +11,7 @@ from mortarbench.harness import QP, Box, InputError, Solution, Status, save_qp
 from mortarbench.harness.conformance.metamorphic import change_units, permute_unknowns
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import kkt_residuals
-from mortarbench.harness.verify.measure import reason_to_decline
+from mortarbench.harness.verify.measure import ReasonError, reason_to_decline
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.harness.verify.optimum import decided
 from tests.support.balls import Balls
@@ -306,6 +306,13 @@ def test_a_solver_that_declares_nothing_accepts_bounds_alone():
     assert reason_to_decline(Careless(), qp) == "does not accept sets of the kind Balls"
     assert reason_to_decline(Careless(), qp_with(BOX)) is None
     assert reason_to_decline(Conic(), qp) is None
+
+
+@pytest.mark.parametrize("accepts", [Box, ["Box"], (Box, "Balls")])
+def test_a_declaration_that_is_no_tuple_of_classes_is_named(accepts):
+    solver = type("Odd", (Careless,), {"accepts": accepts})()
+    with pytest.raises(ReasonError, match="expected a tuple of classes, such as"):
+        reason_to_decline(solver, qp_with(BOX))
 
 
 def test_files_refuse_sets_that_they_cannot_hold(tmp_path):
