@@ -30,14 +30,16 @@ from scipy.stats import linregress, t
 from mortarbench.harness import Mechanics, certify, no_rows
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.divided import in_parts
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.stepping import primal_qp
 from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.feti.elastic import torn
-from mortarbench.problems.feti.operators import dual_operator
+from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.feti.spectrum import spectra_of_equations
+from mortarbench.problems.feti.stored import dual_operator
+from mortarbench.problems.feti.subdomains import Contact, torn
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.models.beam_ring import model, subdivided
+from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -60,7 +62,11 @@ def one(way, Nr, cells):
     lap()
     pieces = tear = None
     if way == "feti":
-        pieces = torn(subdivided(cells, Nr, Nr // 2, Nr, "strain"), primal)
+        of = bodies_of(Nr, Nr // 2, Nr, "strain")
+        (stage,) = load_steps(1, 1, of.forces, of.fixed)
+        contact = Contact(primal.G, primal.h, np.zeros(0))
+        layout = of.shape.layout(cells)
+        pieces = torn(in_parts(of, layout, "orthonormal", stage, contact))
         dual = torn_dual(pieces, primal)
         tear = lambda: LocalProblems(pieces)  # noqa: E731
     else:

@@ -34,5 +34,5 @@ PROBLEMS: Registry[Family] = Registry(
 
 #: what puts an operator P of these families together, see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
-    {"tfeti": entry("mortarbench.problems.feti.operators", "made")}
+    {"tfeti": entry("mortarbench.problems.feti.stored", "made")}
 )

@@ -7,9 +7,7 @@ and tractions in Pa, forces in N per m of thickness.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from scipy.sparse import vstack
@@ -20,15 +18,17 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.case_forms import FORMS, contact_case
-from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.case_forms import FORMS, case_of
+from mortarbench.problems.duality.problem import (
+    Choice,
+    ContactProblem,
+    by_keys,
+    stated,
+)
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
 from mortarbench.problems.fem.mesh import (
@@ -40,9 +40,6 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from mortarbench.problems.feti.elastic import subdivide, torn
-from mortarbench.problems.feti.partition import graph_partition
-from mortarbench.problems.feti.torn import Torn
 from mortarbench.problems.ranges import (
     GLUES,
     LAWS,
@@ -118,29 +115,17 @@ def one_step(
         )
     law = FrictionLaw() if friction is None else _checked(friction, reference)
     laws = (law,) * len(bodies.pairs)
-    linearise = linearisation(bodies, contact, basis, laws)
-    rows = linearise(np.zeros(bodies.mesh.dofs))
+    of = stated(bodies)
+    rows = linearisation(bodies, contact, basis, laws)(np.zeros(bodies.mesh.dofs))
     check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))  # it may hold either way
-    factorised = cache(lambda: floating(bodies))
-    if reference is None:
-        reference = _no_reference
-    primal, tangential = single_load(
-        bodies, linearise, laws, factorise=factorised, reference=reference
-    )
-
-    def results(s: Solution) -> Mapping[str, Any]:
-        return quantities(bodies, primal, s, tangential)
-
-    def torn_bodies() -> Torn:
-        mesh = bodies.mesh
-        label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
-        return torn(subdivide(bodies, label), primal, tangential, glue)
-
-    return contact_case(
-        bodies, primal, form, torn=torn_bodies if parts else None,
-        floating=factorised, clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies), quantities=results, friction=tangential,
+    problem = ContactProblem(
+        bodies=of, linearise=by_keys({"contact": contact, "basis": basis}),
+        stages=load_steps(1, 1, of.forces, of.fixed, laws),
+        # friction may have to hold bodies
+        pressed=float(np.abs(of.forces.value).sum()),
     )  # fmt: skip
+    choice = Choice(size=parts, glue=glue)
+    return case_of(problem, form, choice, reference or _no_reference)
 
 
 def _checked(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:

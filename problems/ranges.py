@@ -272,6 +272,7 @@ def fits_dense(family: str, n: int) -> None:
         )
 
 
-def emitted_on_ranks(params: Mapping[str, Value]) -> bool:
+def divided(params: Mapping[str, Value]) -> bool:
     """Whether bodies are in subdomains, and need no Newton's method."""
-    return bool(params["feti"]) and params.get("kinematics") != "finite"
+    cut = params.get("feti") or params.get("parts")
+    return bool(cut) and params.get("kinematics") != "finite"

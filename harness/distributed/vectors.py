@@ -23,6 +23,8 @@ from typing import (
     Any,
     NamedTuple,
     Protocol,
+    TypeVar,
+    cast,
     runtime_checkable,
 )
 
@@ -36,6 +38,7 @@ from mortarbench.harness.solution import Solution
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
+T = TypeVar("T")
 FEW = 64  #: numbers that are added in the order of the ranks
 
 
@@ -143,6 +146,38 @@ class Ranks:
         """Begin to count anew."""
         for table in (self.seconds, self.counts):
             table.update(dict.fromkeys(table, 0))
+
+
+def alone() -> Ranks:
+    """Make the ranks of a single process, which needs no MPI."""
+    return Ranks(cast("Comm", _Alone()))
+
+
+class _Alone:
+    """The communicator of a single process: there is nobody else to hear from."""
+
+    size = 1
+    rank = 0
+
+    def Dup(self) -> _Alone:
+        """Return a communicator of the same process."""
+        return self
+
+    def allgather(self, part: T) -> list[T]:
+        """Return what all have, in the order of the ranks."""
+        return [part]
+
+    def alltoall(self, parts: list[T]) -> list[T]:
+        """Return what all have for this one."""
+        return parts
+
+    def Allgather(self, part: NDArray[Any], parts: NDArray[Any]) -> None:
+        """Fill parts (1, …) with what all have."""
+        parts[0] = part
+
+    def Allreduce(self, part: NDArray[Any], found: NDArray[Any]) -> None:
+        """Fill `found` with the sum of what all have."""
+        found[...] = part
 
 
 class _Clock:

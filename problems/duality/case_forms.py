@@ -1,40 +1,118 @@
-"""From one linearised contact problem to the case of each form."""
+"""From a contact problem to the case of each form, and to what ranks emit of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array, vstack
 
 from mortarbench.harness import (
     QP,
     Case,
+    Fields,
     Friction,
     Grid,
-    InputError,
     Mechanics,
+    Reference,
     Solution,
+    Vector,
 )
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.contact.results import fields
+from mortarbench.problems.contact.results import fields, quantities
+from mortarbench.problems.duality.divided import in_parts, layout_of
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
+from mortarbench.problems.duality.problem import (
+    AtSides,
+    Choice,
+    ContactProblem,
+    DisplacedMesh,
+)
 from mortarbench.problems.duality.torn_dual import (
     torn_dual,
     torn_matrices,
     torn_quantities,
 )
+from mortarbench.problems.duality.undivided import whole_path
 from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.fem.mesh import Mesh, Nodes
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.feti.torn import Torn
 
 FORMS = ("primal", "dual", "dual-bounds")
 
+
 Factorise = Callable[[], GeneralisedInverse]
+
+
+def case_of(
+    problem: ContactProblem, form: str, choice: Choice, reference: Reference
+) -> Case:
+    """Emit the QP of a contact problem that is chosen, in one of FORMS."""
+    of = problem.bodies
+    path, parts = whole_path(problem, reference), None
+    whole, friction, _ = path.problem(choice.step, choice.iterate)
+    primal, count = whole.primal, path.iterates(choice.step)
+    if choice.size:
+        contact = Contact(*contact_rows(primal, friction), friction.bound)
+        stage = problem.stages[path.last_of(choice.step)]
+        layout = layout_of(of, choice.size)
+        parts = in_parts(of, layout, choice.glue, stage, contact)
+    bodies = of.assembled
+
+    def results(s: Solution) -> Mapping[str, Any]:
+        found = FoundInWhole(AtSides(bodies, primal, s, friction), bodies, count)
+        return {**quantities(bodies, primal, s, friction), **problem.results(found)}
+
+    case = contact_case(
+        bodies, primal, form, parts=parts,
+        floating=lambda: of.floating, clamped=lambda: of.clamped,
+        supported=lambda: of.supported, quantities=results, friction=friction,
+    )  # fmt: skip
+    return case if problem.exact is None else beside(case, problem.exact)
+
+
+def beside(case: Case, exact: NDArray[np.float64]) -> Case:
+    """Draw the exact tractions beside the contact, see `ContactProblem.exact`."""
+    solved = case.fields
+    assert solved is not None
+
+    def fields(s: Solution) -> Fields:
+        found = solved(s)
+        (side,) = found.contacts
+        return replace(found, contacts=(replace(side, exact=exact),))
+
+    return replace(case, fields=fields)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundInWhole:
+    """An answer to the problem of undivided bodies; see `Found`."""
+
+    sides: AtSides
+    bodies: Bodies
+    problems: int
+
+    def at(self, component: Nodes) -> Vector:
+        """Return the displacement at components (k,)."""
+        return self.sides.solution.x[component]
+
+    def largest(self, value: float) -> float:
+        """Return the value, there being no other rank."""
+        return value
+
+    def meshes(self) -> Iterator[DisplacedMesh]:
+        """Give the bodies, one after another."""
+        bodies, u = self.bodies, self.sides.solution.x * self.bodies.length
+        for b in range(len(bodies.names)):
+            mesh = Mesh(bodies.mesh.points, bodies.mesh.cells[bodies.body == b], {})
+            yield DisplacedMesh(b, mesh, bodies.body_of_node == b, u)
 
 
 def contact_case(
@@ -47,7 +125,7 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    torn: Callable[[], Torn] | None = None,
+    parts: ProblemInParts | None = None,
 ) -> Case:
     """Emit the primal QP of a contact problem in one of FORMS.
 
@@ -61,27 +139,18 @@ def contact_case(
         the multipliers of the contact rows, then those of the friction
     friction : with a given bound; its work is a part of the energy that the objective
         stands for
-    torn : poses the problem on subdomains; then its dual is emitted, and no other form
-
-    Raises
-    ------
-    InputError
-        When a problem on subdomains is asked for in another form.
+    parts : the same in subdomains, whose dual is emitted then
 
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
     seconds, tear, subdomains = None, None, None
-    if torn is not None:
-        if form != "dual":
-            raise InputError(
-                f"feti with form {form} is not built; expected form dual, or no feti"
-            )
+    if parts is not None:
         start = perf_counter()
-        pieces = torn()
+        pieces = torn(parts)
         new, tear = torn_dual(pieces, primal, friction), partial(LocalProblems, pieces)
         seconds = perf_counter() - start
-        subdomains = pieces.label
+        subdomains = parts.layout.label
         matrices = torn_matrices(pieces, new.qp)
         decomposition = torn_quantities(pieces, new.qp)
     elif form == "primal":

@@ -20,7 +20,7 @@ from mortarbench.problems.contact.linearise import (
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.newton import Gaps, Iteration, NewtonPath, guided
-from mortarbench.problems.duality.stepping import Linearise
+from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.fem.finite_strain import (
     Cells,
     InvertedCellError,

@@ -20,7 +20,8 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.duality.dualisation import Transformed
-from mortarbench.problems.feti.operators import block_bytes, dual_operator, touched
+from mortarbench.problems.feti.operators import block_bytes, touched
+from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.torn import Torn
 
 
@@ -42,11 +43,11 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
     B, f, m_E, scale = torn.B, torn.f, torn.equalities, torn.scale
     free = domains.inverse(f)
     m_I = primal.h.size
-    bound = friction.bound / scale[m_E + m_I :]
+    bound = friction.bound / scale[m_I:]
     qp = QP(
         P=dual_operator(B, domains, m_E), q=torn.c - B @ free,
         A=csr_array((B @ R).T), b=R.T @ f,
-        G=no_rows(scale.size), h=np.zeros(0),
+        G=no_rows(torn.c.size), h=np.zeros(0),
         lb=np.concatenate([np.full(m_E, -np.inf), np.zeros(m_I), -bound]),
         ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
     )  # fmt: skip
@@ -59,7 +60,7 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
         return np.asarray((T.T @ v) / copies)
 
     def recover(s: Solution) -> Solution:
-        u, z = displacement(s), scale[m_E:] * s.x[m_E:]
+        u, z = displacement(s), scale * s.x[m_E:]
         reactions = -primal.A @ (primal.P @ u + primal.q + B_I.T @ z)
         return replace(s, x=u, y=reactions, z=z, z_box=np.zeros(u.size))
 

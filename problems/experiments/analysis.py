@@ -17,11 +17,11 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.results import fields
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.duality.undivided import path_of
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
-from mortarbench.problems.models.beam_ring import model
+from mortarbench.problems.models.beam_ring import bodies as bodies_of
 
 WAYS = {"per-row": False, "condensed": True}  #: condense?
 
@@ -42,7 +42,7 @@ def analyse(
 ) -> Analysis:
     """Run all load steps; radial = 0 stands for 2·Nh layers of the ring."""
     watch = Stopwatch()
-    bodies = model.__wrapped__(Nr, Nh, radial or 2 * Nh, "strain")
+    bodies = bodies_of.__wrapped__(Nr, Nh, radial or 2 * Nh, "strain").assembled
     watch.lap("assembly")
     inverse = floating(bodies, condense=condense)
     watch.lap("factor")
@@ -64,7 +64,7 @@ def analyse(
         solved.append((qp, solution))
         return solution
 
-    path = LoadPath(
+    path = path_of(
         bodies, linearise, lambda: inverse, solve_dual, steps, transform=dualise
     )  # fmt: skip
     path.solution(steps)

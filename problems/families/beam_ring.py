@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     CONTACT_STIFFNESS,
@@ -22,7 +22,6 @@ from mortarbench.problems.ranges import (
     at_most,
     deformed,
     doubled,
-    emitted_on_ranks,
     fits,
     one_of,
     one_state,
@@ -32,16 +31,16 @@ from mortarbench.problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Value
 
 MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 
 @dataclass(frozen=True)
-class BeamRing(InSubdomains):
+class BeamRing(ContactFamily):
     """The paper's benchmark: beam on a half ring, plane elasticity."""
 
+    model = "beam_ring"
     name: str = "beam-ring"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
@@ -93,22 +92,3 @@ class BeamRing(InSubdomains):
         one_state(self.name, params)
         without_friction(self.name, params)
         return {**params, **doubled(params, "Nr", "Nh", "radial")}
-
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and no Newton iterations."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.beam_ring import in_subdomains
-
-        return in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP of one load step in one form."""
-        from mortarbench.problems.models.beam_ring import load_step
-
-        self.check(params)
-        return load_step(form, params, reference)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.harness import InputError
 from mortarbench.harness.checked import located
 from mortarbench.harness.files.copies import content_digest
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.files.file_digest import check_digest
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
@@ -33,17 +33,17 @@ from mortarbench.problems.ranges import (
 
 if TYPE_CHECKING:
     from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
 
 
 @dataclass(frozen=True)
-class GmshBodies(InSubdomains):
+class GmshBodies(ContactFamily):
     """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
     The digest of the content of both files is a parameter of the case, so that a
     changed file is not taken for the one that was measured.
     """
 
+    model = "gmsh_bodies"
     name: str = "bodies"
     path_suffix: str = ".toml"
     defaults: Mapping[str, Value] = field(
@@ -119,22 +119,28 @@ class GmshBodies(InSubdomains):
             "pressures, mesh anew"
         )
 
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are parts, and no Newton iterations."""
-        return bool(params["parts"]) and params["kinematics"] == "linear"
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.gmsh_bodies import in_subdomains
-
-        self.check(params)
-        return in_subdomains(params)
-
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Emit the QP of one load step in one form."""
-        from mortarbench.problems.models.gmsh_bodies import load_step
+        """Emit the QP of one load step in one form.
 
-        self.check(params)
-        return load_step(form, params, reference)
+        Raises
+        ------
+        InputError
+            Also where rounding leaves the stiffness without a Cholesky factor.
+
+        """
+        from numpy.linalg import LinAlgError
+        from sksparse.cholmod import CholmodNotPositiveDefiniteError
+
+        from mortarbench.problems.models.description import remarks
+
+        path = str(params["path"])
+        try:
+            case = super().build(form, params, reference)
+        except (LinAlgError, CholmodNotPositiveDefiniteError):
+            raise InputError(
+                f"{path}: the stiffness has no Cholesky factor in double precision; "
+                "expected cells whose sides, and bodies whose E, differ by less"
+            ) from None
+        return replace(case, remarks=remarks(Path(path)))

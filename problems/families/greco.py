@@ -8,26 +8,25 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
     MOST,
     at_least,
-    emitted_on_ranks,
     fits,
     torn_by,
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Value
 
 
 @dataclass(frozen=True)
-class Greco(InSubdomains):
+class Greco(ContactFamily):
     """GRECO's plate, pushed along a rigid plane with Coulomb friction (SSNV128)."""
 
+    model = "greco"
     name: str = "greco"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
@@ -48,22 +47,3 @@ class Greco(InSubdomains):
             )
         at_least(0, self.name, params, ("iterate",))
         torn_by(self.name, params)
-
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.greco import in_subdomains
-
-        return in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit a Tresca problem of the fixed point in one form."""
-        from mortarbench.problems.models.greco import greco
-
-        self.check(params)
-        return greco(form, params, reference)

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
@@ -19,7 +19,6 @@ from mortarbench.problems.ranges import (
     at_least,
     at_most,
     deformed,
-    emitted_on_ranks,
     fits,
     one_of,
     one_state,
@@ -31,14 +30,15 @@ from mortarbench.problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Value
 
 
 @dataclass(frozen=True)
-class HertzPlane(InSubdomains):
+class HertzPlane(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
+    model = "hertz"
+    stated_by = "on_plane"
     name: str = "hertz-plane"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
@@ -65,30 +65,12 @@ class HertzPlane(InSubdomains):
         one_state(self.name, params)
         return {**params, "halvings": int(params["halvings"]) + 1}
 
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and no Newton iterations."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.hertz import on_plane_in_subdomains
-
-        return on_plane_in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP in one form."""
-        from mortarbench.problems.models.hertz import cylinder_on_plane
-
-        self.check(params)
-        return cylinder_on_plane(form, params, reference)
-
 
 @dataclass(frozen=True)
-class HertzCylinder(InSubdomains):
+class HertzCylinder(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
+    model = "hertz"
     name: str = "hertz-cylinder"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
@@ -154,23 +136,3 @@ class HertzCylinder(InSubdomains):
         """Return the case with every cell halved; the arcs are other polygons."""
         without_friction(self.name, params)
         return {**params, "halvings": int(params["halvings"]) + 1}
-
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.hertz import on_cylinder_in_subdomains
-
-        return on_cylinder_in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP, with contact linearised at the undeformed state, in one form."""
-        from mortarbench.problems.models.hertz import cylinder_on_cylinder
-
-        params = self.complete(params)
-        self.check(params)
-        return cylinder_on_cylinder(form, params, reference)

@@ -11,8 +11,8 @@ from mortarbench.problems.families.in_subdomains import InSubdomains
 from mortarbench.problems.ranges import GLUES, at_least, doubled, fits, one_of
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
+    from mortarbench.harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -39,15 +39,20 @@ class Membranes(InSubdomains):
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
 
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+    def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Whether ranks can emit it: always."""
         return True
 
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.membranes import in_subdomains
+    def emitted(
+        self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
+    ) -> Emitted:
+        """Make this rank's share of the dual; called by all ranks."""
+        from mortarbench.problems.feti.emission import dual_on, emitted
+        from mortarbench.problems.models.membranes import in_subdomains, results
 
-        return in_subdomains(params)
+        del reference
+        dual = dual_on(in_subdomains(params), ranks)
+        return emitted(dual, results(params, dual))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

@@ -12,16 +12,16 @@ from mortarbench.problems.families.in_subdomains import InSubdomains
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
     at_least,
+    divided,
     doubled,
-    emitted_on_ranks,
     fits,
     one_of,
     torn_by,
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
+    from mortarbench.harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -50,15 +50,20 @@ class Obstacle(InSubdomains):
         """Return the case with every cell halved."""
         return {**params, **doubled(params, "n")}
 
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+    def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Whether it is a membrane in subdomains."""
-        return params["dim"] == 2 and emitted_on_ranks(params)
+        return params["dim"] == 2 and divided(params)
 
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.obstacle import in_subdomains
+    def emitted(
+        self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
+    ) -> Emitted:
+        """Make this rank's share of the dual; called by all ranks."""
+        from mortarbench.problems.feti.emission import dual_on, emitted
+        from mortarbench.problems.models.obstacle import in_subdomains, results
 
-        return in_subdomains(params)
+        del reference
+        dual = dual_on(in_subdomains(params), ranks)
+        return emitted(dual, results(params, dual))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

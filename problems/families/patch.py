@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
@@ -19,7 +19,6 @@ from mortarbench.problems.ranges import (
     at_least,
     deformed,
     doubled,
-    emitted_on_ranks,
     fits,
     minimised,
     one_of,
@@ -30,14 +29,14 @@ from mortarbench.problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Value
 
 
 @dataclass(frozen=True)
-class ContactPatch(InSubdomains):
+class ContactPatch(ContactFamily):
     """Contact patch test: two blocks on each other under uniform pressure."""
 
+    model = "patch"
     name: str = "contact-patch"
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: MappingProxyType({
@@ -89,22 +88,3 @@ class ContactPatch(InSubdomains):
         meshes = "/".join(f"{key}={n}" for key, n in finer.items())
         minimised(self.name, [str(params["friction"])], meshes)
         return {**params, **finer}
-
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains, and no Newton iterations."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.patch import in_subdomains
-
-        return in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP in one form."""
-        from mortarbench.problems.models.patch import two_blocks
-
-        self.check(params)
-        return two_blocks(form, params, reference)

@@ -20,8 +20,8 @@ from mortarbench.problems.ranges import (
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
+    from mortarbench.harness.distributed.vectors import Emitted, Ranks
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,20 @@ class Plate(InSubdomains):
         """Return the case with every cell halved, in the same subdomains."""
         return {**params, **doubled(params, "n", "ny")}
 
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
+    def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Say that there are always subdomains."""
         return True
 
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.plate import in_subdomains
+    def emitted(
+        self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
+    ) -> Emitted:
+        """Make this rank's share of the dual; called by all ranks."""
+        from mortarbench.problems.feti.emission import dual_on, emitted
+        from mortarbench.problems.models.plate import in_subdomains, results
 
-        return in_subdomains(params)
+        del reference
+        dual = dual_on(in_subdomains(params), ranks)
+        return emitted(dual, results(params, dual))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference

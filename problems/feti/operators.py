@@ -1,4 +1,4 @@
-"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners; plain arrays.
+"""The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners.
 
 Only components that rows touch matter: with B_b the columns of B there and all of them
 packed group by group, a product is sparse, dense, sparse:
@@ -37,26 +37,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
-from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array, diags_array
+from scipy.sparse import csc_matrix, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from sksparse.cholmod import cholesky
 
-from mortarbench.harness import QP, Vector
-from mortarbench.harness.distributed.vectors import Ranks, Share
-from mortarbench.harness.operators import Arrays, Product, SerialisableOperator
+from mortarbench.harness import Vector
+from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import multiply
 from mortarbench.problems.feti.torn import Condensed, Dense, Kind, Subdomains
 
-NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
 #: of the diagonal of B W Bᵀ, added where contact rows might depend on one another
 SHIFT = 1e-8
 SINGULAR = 1e-10  #: of the largest eigenvalue of a block of B W Bᵀ: taken for zero
 ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
-_PARTS = ("data", "indices", "indptr")
-_OF_KINDS = ("stiffness", "fixing", "boundary")  #: whose lengths differ by kind
 
 
 class Group(NamedTuple):
@@ -230,19 +226,6 @@ class DualOperator:
             weights = np.ones_like(weights)
         return blocks, weights
 
-    @property
-    def parts(self) -> int:
-        """How many subdomains there are."""
-        return int(self.domains.kind.size)
-
-    def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Take this rank's share of a dual with this F."""
-        from mortarbench.problems.feti.distributed import (
-            shared,  # late: one process needs none
-        )
-
-        return shared(qp, self, ranks)
-
     @cached_property
     def packed(self) -> Packed:
         """Its rows on what they touch."""
@@ -383,58 +366,6 @@ def inverted_blocks(M: csr_array) -> csr_array:
         places.append([np.repeat(members, n), np.tile(members, n).ravel()])
     entries = np.concatenate(data), tuple(np.concatenate(places, axis=1))
     return csr_array(entries, shape=M.shape)
-
-
-def dual_operator(
-    B: csr_array, domains: Subdomains, equalities: int
-) -> SerialisableOperator:
-    """Make F as an operator that can be written: every kind once, and B.
-
-    equalities : rows of B that are equations, the first ones
-    """
-    kinds = domains.kinds
-    K = csc_array(block_diag([kind.K for kind in kinds], format="csc"))
-    modes = np.array([kind.R.shape[1] for kind in kinds])
-    R = [np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in kinds]
-    arrays = {
-        **{f"K_{part}": getattr(K, part) for part in _PARTS},
-        **{f"B_{part}": getattr(B, part) for part in _PARTS},
-        "R": np.concatenate(R),
-        "modes": modes,
-        "stiffness": np.concatenate([kind.stiffness for kind in kinds]),
-        "fixing": np.concatenate([kind.fixing for kind in kinds]),
-        "boundary": np.concatenate([kind.boundary for kind in kinds]),
-        "kind": domains.kind,
-        "explicit": explicit_kinds(B, domains),
-        "equalities": np.array(equalities),
-    }
-    for name in _OF_KINDS:
-        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
-    return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
-
-
-def made(arrays: Arrays) -> DualOperator:
-    """Put F together from the arrays of `dual_operator`."""
-    ends = [np.append(0, arrays[f"{name}_ends"]) for name in _OF_KINDS]
-    data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
-
-    def kind(k: int) -> Kind:
-        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
-        columns, n = indptr[own.start : own.stop + 1], own.stop - own.start
-        within = slice(columns[0], columns[-1])
-        K = (data[within], indices[within] - own.start, columns - columns[0])
-        return Kind(
-            K=csc_array(K, shape=(n, n)),
-            R=arrays["R"][own, : arrays["modes"][k]],
-            fixing=arrays["fixing"][fixing],
-            boundary=arrays["boundary"][boundary],
-            stiffness=arrays["stiffness"][own],
-        )
-
-    domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
-    shape = arrays["B_indptr"].size - 1, domains.start[-1]
-    B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    return DualOperator(B, domains, arrays["explicit"], int(arrays["equalities"]))
 
 
 def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
-from scipy.sparse import bsr_array, csr_array, hstack
+from scipy.sparse import csr_array, hstack
 
 from mortarbench.harness import Solution, Vector
 from mortarbench.harness.distributed.vectors import Answered
@@ -18,11 +18,11 @@ from mortarbench.harness.verify.over_ranks import Contact, OwnBodies, Unheld
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import Halo
 from mortarbench.problems.feti.subdivision import Points
+from mortarbench.problems.feti.subdomains import (
+    OwnSubdomains,
+    ProblemInParts,
+)
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.feti.torn import Torn
-
-if TYPE_CHECKING:
-    from mortarbench.problems.feti.emission import OwnSubdomains, ProblemInParts
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -62,16 +62,12 @@ class OwnSolution:
 Results = Callable[[OwnSolution], Mapping[str, Any]]
 
 
-def own_solution(
-    own: OwnSubdomains, halo: Halo, scale: Vector, s: Solution
-) -> OwnSolution:
+def own_solution(own: OwnSubdomains, halo: Halo, s: Solution) -> OwnSolution:
     """Go back from multipliers to displacements, on each rank for its own.
 
     It is the way of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
     multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
     supports eliminate are zero.
-
-    scale : (m,) by which the rows of contact and friction are multiplied
     """
     bodies, times = _bodies(own.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[own.own_motions]
@@ -80,18 +76,13 @@ def own_solution(
     v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
     v[own.kept] -= own.domains.kernel @ alpha
     u = bodies.among.completed(T.T @ v) / times
-    z = contact_multipliers(own, halo, scale, s)
+    z = contact_multipliers(own, halo, s)
     return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
 
 
-def contact_multipliers(
-    own: OwnSubdomains, halo: Halo, scale: Vector, s: Solution
-) -> Vector:
-    """Tell all ranks the multipliers (m,) of the rows of contact and friction.
-
-    scale : (m,) by which these rows are multiplied
-    """
-    rows = own.rows
+def contact_multipliers(own: OwnSubdomains, halo: Halo, s: Solution) -> Vector:
+    """Tell all ranks the multipliers (m,) of the rows of contact and friction."""
+    rows, scale = own.rows, own.problem.contact_scale
     owned = rows.number[halo.own]
     is_contact = owned >= rows.equalities
     z = np.zeros(scale.size)
@@ -100,21 +91,24 @@ def contact_multipliers(
 
 
 def answers(
-    own: OwnSubdomains, halo: Halo, scale: Vector, torn: Mapping[str, Any]
+    own: OwnSubdomains,
+    halo: Halo,
+    torn: Mapping[str, Any],
+    reported: Results | None,
 ) -> Callable[[Solution], Answered]:
     """Make what says what an answer means, on each rank for its own.
 
     Parameters
     ----------
-    scale : as of `own_solution`
     torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
+    reported : reports more of an answer; None where only the whole tells
 
     """
     problem = own.problem
 
     def answer(s: Solution) -> Answered:
-        found, results = own_solution(own, halo, scale, s), None
-        if (reported := problem.results) is not None:
+        found, results = own_solution(own, halo, s), None
+        if reported is not None:
 
             def results() -> Mapping[str, Any]:
                 return {**reported(found), **torn}
@@ -129,23 +123,13 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
 
     own : its subdomains float
     """
-    problem, domains, rows = own.problem, own.domains, own.rows
-    d, contact, kept = problem.components, problem.contact, _carrying(problem)
-    nodes, copy, of_node = np.unique(
-        own.nodes.number, return_index=True, return_inverse=True
-    )
-    components, place = (
-        (d * at[:, None] + np.arange(d)).ravel() for at in (nodes, of_node)
-    )
+    problem, components, place = own.problem, own.components, own.place
+    contact, kept = problem.contact, _carrying(problem)
     times = np.empty(components.size)
     times[place] = own.times
-    T = _spread(own, place, components.size)
-    torn = Torn(
-        kinds=domains.kinds, kind=domains.kind, spread=T, B=rows.B, c=rows.c,
-        scale=np.ones(rows.number.size), f=own.f, equalities=rows.equalities,
-    )  # fmt: skip
+    parts = LocalProblems(own.torn_bodies(), problem.components)
     return OwnBodies(
-        ranks=own.ranks, parts=LocalProblems(torn, d), components=components,
+        ranks=own.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=times.size) < times,
         coarse=own.own_motions,
         motions=own.coarse, f=own.f,
@@ -154,20 +138,8 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
             rows=csr_array(contact.rows[kept]), c=contact.c[kept],
             bound=contact.bound[contact.bound > 0],
         ),
-        unheld=_unheld(own, copy),
+        unheld=_unheld(own),
     ), times  # fmt: skip
-
-
-def _spread(own: OwnSubdomains, place: Nodes, n: int) -> csr_array:
-    """Return T (N, n): a block Qᵀ for each torn node, into the axes of subdomains."""
-    d, N = own.problem.components, place.size
-    if d == 1:
-        return csr_array((np.ones(N), place, np.arange(N + 1)), shape=(N, n))
-    turn = own.rotation[own.nodes.subdomain].transpose(0, 2, 1)
-    blocks = np.ascontiguousarray(turn), place[::d] // d, np.arange(N // d + 1)
-    T = csr_array(bsr_array(blocks, shape=(N, n)))
-    T.eliminate_zeros()
-    return T
 
 
 def _carrying(problem: ProblemInParts) -> Nodes:
@@ -223,11 +195,10 @@ class _Extent(NamedTuple):
         return _motions((points - self.centre) / self.radius, axis, d) / self.size
 
 
-def _unheld(own: OwnSubdomains, copy: Nodes) -> Unheld:
-    """Gather the rigid motions of the bodies that supports leave any.
-
-    copy : (n/d,) of each own node, in turn, a copy among the own torn nodes
-    """
+def _unheld(own: OwnSubdomains) -> Unheld:
+    """Gather the rigid motions of the bodies that supports leave any."""
+    #: of each own node, in turn, a copy among the own torn nodes
+    copy = np.unique(own.nodes.number, return_index=True)[1]
     problem, of, d = own.problem, own.problem.layout, own.problem.components
     components = d * copy.size
     motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()

@@ -29,12 +29,8 @@ from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import DistributedColumns
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import RankOperator
-from mortarbench.problems.feti.operators import (
-    dual_operator,
-    inverted_blocks,
-    made,
-    uncoupled,
-)
+from mortarbench.problems.feti.operators import inverted_blocks, uncoupled
+from mortarbench.problems.feti.stored import dual_operator, made
 from mortarbench.problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]

@@ -85,6 +85,19 @@ class Layout:
         """Grid of each block, (S,)."""
         return self.block.body
 
+    @property
+    def label(self) -> NDArray[np.int64]:
+        """Block of each cell of all grids, (E,)."""
+        found = []
+        for b, (columns, rows) in enumerate(self.cuts):
+            column, row = (
+                np.repeat(np.arange(cut.size - 1), np.diff(cut))
+                for cut in (columns, rows)
+            )
+            label = self.block_start[b] + row[:, None] * (columns.size - 1) + column
+            found.append(label.ravel())
+        return np.concatenate(found)
+
     @cached_property
     def block_start(self) -> NDArray[np.int64]:
         """First block of each grid, and how many there are."""

@@ -20,7 +20,7 @@ from scipy.sparse import coo_array, csr_array, triu
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.problems.fem.mesh import HalfDisc, Mesh, Nodes
-from mortarbench.problems.feti.tearing import Block
+from mortarbench.problems.feti.tearing import Block, labelled
 
 Integers = NDArray[np.integer[Any]]
 Points = NDArray[np.float64]
@@ -70,6 +70,10 @@ class Subdivision(Protocol):
     def cells(self, subdomain: int) -> Nodes:
         """List the cells (E, 4) of one; corners are places in its list of nodes."""
 
+    @property
+    def label(self) -> NDArray[np.int64]:
+        """Subdomain of each cell of the whole mesh, (E,)."""
+
     def times(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,)."""
 
@@ -112,6 +116,12 @@ class Listed:
     #: nodes (n,) of a subdomain, ascending, and its cells (E, 4) as places in these
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
+    labelling: Callable[[], NDArray[np.int64]]  #: makes `label`
+
+    @property
+    def label(self) -> NDArray[np.int64]:
+        """Subdomain of each cell of the whole mesh, (E,)."""
+        return self.labelling()
 
     @property
     def count(self) -> int:
@@ -250,8 +260,16 @@ def half_discs_in_blocks(
         nodes=int(first[-1]), body=body,
         sizes=np.array([_nodes(disc, *block) for disc, _, *block in every]),
         node=node, start=start, held_by=held_by,
-        part=part, position=position,
+        part=part, position=position, labelling=lambda: _labels(blocks),
     )  # fmt: skip
+
+
+def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
+    """Label the cells of discs, one disc after another."""
+    first = np.cumsum([0, *map(len, blocks)])
+    return np.concatenate(
+        [labelled(own) + begin for own, begin in zip(blocks, first, strict=False)]
+    )
 
 
 def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
@@ -303,4 +321,5 @@ def mesh_in_parts(
         nodes=N, body=body[by_label[ends[:-1]]],
         sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
         held_by=held_by, part=part, position=points.__getitem__,
+        labelling=lambda: label,
     )  # fmt: skip

@@ -12,7 +12,6 @@ each is the best one in the sense of least squares (Kabsch 1976).
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,29 +29,6 @@ class Part(NamedTuple):
     points: NDArray[np.float64]  #: (n_k, dim)
     cells: Nodes  #: (E_k, corners)
     material: NDArray[np.int64]  #: (E_k,)
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Decomposition:
-    """A mesh whose S subdomains have nodes of their own, M in all.
-
-    Torn nodes are numbered subdomain after subdomain, and within one in the order of
-    the nodes that they are copies of.
-    """
-
-    node: Nodes  #: (M,) node of the whole mesh that each torn node is a copy of
-    nodes: int  #: of the whole mesh
-    start: NDArray[np.int64]  #: (S + 1,) first torn node of each subdomain, and M
-    parts: tuple[Part, ...]  #: the first subdomain of each kind
-    kind: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
-    #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
-    rotation: NDArray[np.float64]
-    label: NDArray[np.int64]  #: (E,) subdomain of each cell of the whole mesh
-
-    @property
-    def subdomain(self) -> NDArray[np.int64]:
-        """Subdomain of each torn node, (M,)."""
-        return np.repeat(np.arange(self.kind.size), np.diff(self.start))
 
 
 def blocks(
@@ -79,23 +55,6 @@ def blocks(
         along = np.arange(cells) * count // cells
         label = (label[:, None] * count + along).ravel()
     return label
-
-
-def structured_bodies(
-    divisions: Sequence[tuple[int, ...]], most: int
-) -> NDArray[np.int64]:
-    """Label the cells of structured meshes, one after another, each by its `blocks`.
-
-    Parameters
-    ----------
-    divisions : of each body, as of `blocks`
-    most : H/h
-
-    """
-    labels = [np.zeros(0, dtype=np.int64)]
-    for body in divisions:
-        labels.append(blocks(body, most) + labels[-1].max(initial=-1) + 1)
-    return np.concatenate(labels)
 
 
 Block = tuple[slice, slice]  #: rows and columns of cells
@@ -147,49 +106,6 @@ def labelled(found: Sequence[Block]) -> NDArray[np.int64]:
     for b, block in enumerate(found):
         label[block] = b
     return label.ravel()
-
-
-def decompose(
-    points: NDArray[np.float64],
-    cells: Nodes,
-    label: NDArray[np.int64],
-    material: NDArray[np.int64],
-) -> Decomposition:
-    """Cut a mesh into the subdomains that its cells are labelled with.
-
-    Parameters
-    ----------
-    points : (n, dim)
-    cells : (E, corners)
-    label : (E,) subdomain of each cell, 0 … S − 1, none of them empty
-    material : (E,) of each cell; subdomains of one kind have the same
-
-    """
-    n, S = len(points), int(label.max()) + 1
-    by_label = np.argsort(label, kind="stable")
-    copies, corner = np.unique(
-        (label[by_label, None] * n + cells[by_label]).ravel(), return_inverse=True
-    )
-    start = np.searchsorted(copies, n * np.arange(S + 1))
-    first_cell = np.searchsorted(label[by_label], np.arange(S + 1))
-    node = copies % n
-    corner = corner.reshape(cells.shape) - start[label[by_label], None]
-
-    def part(s: int) -> Part:
-        mine = slice(first_cell[s], first_cell[s + 1])
-        own = node[start[s] : start[s + 1]]
-        return Part(points[own], corner[mine], material[by_label[mine]])
-
-    def key(s: int) -> tuple[bytes, bytes]:
-        mine = part(s)
-        return mine.cells.tobytes(), mine.material.tobytes()
-
-    torn = np.split(points[node], start[1:-1])
-    first, kind, rotation = classify(map(key, range(S)), torn)
-    return Decomposition(
-        node=node, nodes=n, start=start, parts=tuple(map(part, first)),
-        kind=kind, rotation=rotation, label=label,
-    )  # fmt: skip
 
 
 def classify(

@@ -19,11 +19,12 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
+from scipy.linalg import cho_solve, null_space, qr
 from scipy.sparse import csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
+from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -47,7 +48,18 @@ class Kind:
     #: Dirichlet preconditioners condense onto, glued or free
     boundary: Nodes
     stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
-    name: str = ""  #: the same on all ranks that have it, and there only
+
+    @cached_property
+    def name(self) -> str:
+        """A digest of its numbers: the same on all ranks that have it, there only."""
+        K = self.K
+        return hex_digest(
+            map(
+                np.ndarray.tobytes,
+                (K.data, K.indices, K.indptr, self.R, self.fixing, self.boundary),
+            ),
+            32,
+        )
 
     def inverse(self, b: Dense) -> Dense:
         """Apply K⁺ to columns (n_k, k)."""
@@ -187,6 +199,18 @@ class Subdomains:
         for kind, members in zip(self.kinds, self.members, strict=True):
             yield self.start[members] + np.arange(kind.R.shape[0])[:, None]
 
+    def without(self, free: NDArray[np.bool_]) -> Subdomains:
+        """Return the subdomains without all but their free torn unknowns (N,)."""
+        kinds, kind = list[Kind](), np.empty_like(self.kind)
+        known = dict[tuple[int, bytes], int]()
+        for s, k in enumerate(self.kind):
+            mine = free[self.start[s] : self.start[s + 1]]
+            found = known.setdefault((int(k), mine.tobytes()), len(kinds))
+            if found == len(kinds):
+                kinds.append(_held(self.kinds[k], mine))
+            kind[s] = found
+        return Subdomains(tuple(kinds), kind)
+
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""
         v = np.empty_like(b)
@@ -205,7 +229,7 @@ class Torn:
         min ½vᵀKv − fᵀv   subject to   B_E v = c_E,  B_I v ≤ c_I,   K = diag(K_1 … K_S)
 
     Rows of B are those of supports and gluing (E), then of contact (normals, then
-    tangents). Each is multiplied with its entry of `scale`, so that λ of the rows as
+    tangents). Those of contact are multiplied with `scale`, so that λ of the rows as
     they were is scale·λ.
     """
 
@@ -214,11 +238,9 @@ class Torn:
     spread: csr_array  #: T (N, n)
     B: csr_array  #: (m, N), scaled
     c: Vector  #: (m,), scaled
-    scale: Vector  #: (m,) positive
+    scale: Vector  #: positive, of the rows of contact, the last ones
     f: Vector  #: (N,) Tᵀf is the load of the whole
     equalities: int  #: rows of B that are equations, the first ones
-    #: (E,) subdomain of each cell of the whole mesh; None where ranks hold shares of it
-    label: NDArray[np.int64] | None = None
 
     @property
     def start(self) -> NDArray[np.int64]:
@@ -233,3 +255,18 @@ class Torn:
 
 def _symmetric(M: Dense) -> Dense:
     return np.asarray((M + M.T) / 2)
+
+
+def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:
+    """Return a subdomain without all but its free components (n_k,)."""
+    if free.all():
+        return kind
+    R = kind.R @ null_space(kind.R[~free])
+    R = np.linalg.qr(R[free])[0]
+    number = np.cumsum(free) - 1
+    return Kind(
+        K=csc_array(kind.K[free][:, free]), R=R,
+        fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
+        boundary=number[kind.boundary[free[kind.boundary]]],
+        stiffness=kind.stiffness[free],
+    )  # fmt: skip

@@ -14,133 +14,62 @@ side (GRECO working group on friction; collected in Code_Aster's document V6.04.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from mortarbench.harness import QP, Case, Friction, Reference, Solution, Value, Vector
-from mortarbench.problems.contact.bodies import (
-    Bodies,
-    ContactPair,
-    ContactSides,
-    assemble,
-    clamped,
-    floating,
-    supported,
-)
+from mortarbench.harness import QP, Friction, Solution, Value, Vector
+from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.contact.rigid_plane import above_plane
-from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ElasticBodies,
+    StructuredGrids,
+    remembered,
+)
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import (
-    Nodes,
-    StructuredGrid,
-    nodal_lengths,
-    rectangle_grid,
-)
-from mortarbench.problems.feti.elastic import (
-    AtSides,
-    SubdividedBodies,
-    in_parts,
-    posed_on,
-    subdivide,
-    tresca_problems,
-)
-from mortarbench.problems.feti.emission import ProblemInParts
-from mortarbench.problems.feti.own_bodies import OwnSolution
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.tearing import blocks
+from mortarbench.problems.fem.mesh import nodal_lengths, rectangle_grid
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
-NAMES = ("plate",)
 TOP, LEFT = 5e7, 15e7  #: pressures, Pa
-UNITS = (SIDE, TOP * SIDE)  #: l and F₀, m and N/m
+FORCE = TOP * SIDE  #: F₀, N/m
 PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: m
 PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
 FORCE_AT = 38.75e-3  #: m
 
 
-def greco(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit a Tresca problem of the fixed point in one form, the last unless asked."""
+@remembered
+def problem(params: Mapping[str, Value]) -> ContactProblem:
+    """State the plate with n × n cells."""
     p: Any = params
-    path = _path(p["n"], p["mu"], reference)
-    bodies, problem = path.bodies, path.problem(1, p["iterate"])
-    primal, friction, count = problem.primal, problem.friction, path.iterates(1)
-    return contact_case(
-        bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: path.inverse,
-        supported=lambda: supported(bodies), friction=friction,
-        torn=posed_on(
-            params, lambda: subdivided(bodies, p["n"], p["feti"]), primal, friction
+    grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (p["n"], p["n"]))
+    sides = grid.sides
+    forces = Forces(
+        np.concatenate([2 * sides["top"] + 1, 2 * sides["left"]]),
+        np.concatenate([
+            -TOP * nodal_lengths(grid.side("top")) / FORCE,
+            LEFT * nodal_lengths(grid.side("left")) / FORCE,
+        ]),
+    )  # fmt: skip
+    fixed = np.append(2 * sides["right"], 2 * sides["bottom"][-1] + 1)
+    on_rigid = ContactPair(sides["bottom"][:-1], np.zeros(0, dtype=np.int64))
+    return ContactProblem(
+        bodies=ElasticBodies(
+            shape=StructuredGrids((grid,)), names=("plate",), materials=(MATERIAL,),
+            plane="strain", length=SIDE, force=FORCE, fixed=fixed, forces=forces,
+            pairs=(on_rigid,),
         ),
-        quantities=lambda s: quantities(bodies, primal, s, friction)
-        | along_the_side(bodies, primal, s, friction) | {"tresca_problems": count},
-    )  # fmt: skip
-
-
-def plate(n: int) -> Bodies:
-    """Mesh and assemble the plate with n × n cells."""
-    grid = _grid(n)
-    mesh, (component, force) = grid.mesh(), _pressure(grid)
-    load = np.zeros(mesh.dofs)
-    load[component] = force
-    return assemble(
-        mesh, np.zeros(n**2, dtype=np.int64), names=NAMES, materials=(MATERIAL,),
-        plane="strain", units=UNITS, fixed=_supports(grid), load=load,
-        pairs=(_on_rigid(grid),),
-    )  # fmt: skip
-
-
-def subdivided(bodies: Bodies, n: int, most: int) -> SubdividedBodies:
-    """Cut the plate into subdomains of at most so many cells a side."""
-    return subdivide(bodies, blocks((n, n), most), Layout.of((_grid(n),), most))
-
-
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the first problem of the fixed point in subdomains."""
-    p: Any = params
-    grid = _grid(p["n"])
-
-    def results(found: OwnSolution, at: AtSides) -> dict[str, Any]:
-        told = along_the_side(at.bodies, at.primal, at.solution, at.friction)
-        return told | {"tresca_problems": tresca_problems(found)}
-
-    return in_parts(
-        Layout.of((grid,), p["feti"]), materials=(MATERIAL,), plane="strain",
-        units=UNITS, names=NAMES, fixed=_supports(grid), load=_pressure(grid),
-        pairs=(_on_rigid(grid),),
-        linearise=lambda side, _: above_plane(
-            side.mesh, side.pairs[0].slave, tangential=True
+        stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
+        linearise=lambda bodies, _: lambda u: above_plane(
+            bodies.mesh, bodies.pairs[0].slave, tangential=True
         ),
-        laws=(FrictionLaw("coulomb", mu=p["mu"]),), glue=p["glue"],
-        iterate=p["iterate"], results=results,
+        results=lambda found: {
+            **along_the_side(*found.sides), "tresca_problems": found.problems,
+        },
     )  # fmt: skip
-
-
-def _grid(n: int) -> StructuredGrid:
-    return rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
-
-
-def _pressure(grid: StructuredGrid) -> tuple[Nodes, Vector]:
-    """Return the components on the top and the left, and the forces there, N/m."""
-    component = 2 * grid.sides["top"] + 1, 2 * grid.sides["left"]
-    force = (
-        -TOP * nodal_lengths(grid.side("top")), LEFT * nodal_lengths(grid.side("left"))
-    )  # fmt: skip
-    return np.concatenate(component), np.concatenate(force)
-
-
-def _supports(grid: StructuredGrid) -> Nodes:
-    """Return the components that are held."""
-    return np.append(2 * grid.sides["right"], 2 * grid.sides["bottom"][-1] + 1)
-
-
-def _on_rigid(grid: StructuredGrid) -> ContactPair:
-    return ContactPair(grid.sides["bottom"][:-1], np.zeros(0, dtype=np.int64))
 
 
 def along_the_side(
@@ -162,13 +91,3 @@ def along_the_side(
         "normal_force": float(np.interp(FORCE_AT, x, normal)),
         "tangential_sum": float(abs(tangential.sum())),
     }
-
-
-@lru_cache(maxsize=2)
-def _path(n: int, mu: float, reference: Reference) -> LoadPath:
-    bodies = plate(n)
-    rows = above_plane(bodies.mesh, bodies.pairs[0].slave, tangential=True)
-    return LoadPath(
-        bodies, lambda u: rows, lambda: clamped(bodies), reference, steps=1,
-        laws=(FrictionLaw("coulomb", mu=mu),),
-    )  # fmt: skip

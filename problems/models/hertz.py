@@ -41,66 +41,42 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
 
-from mortarbench.harness import (
-    QP,
-    Case,
-    Fields,
-    Friction,
-    Reference,
-    Solution,
-    Value,
-    Vector,
-)
+from mortarbench.harness import QP, Case, Friction, Reference, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     ContactSides,
-    assemble,
-    clamped,
-    floating,
-    supported,
+    UnassembledBodies,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.results import contact_forces, quantities
+from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid_plane import above_plane
-from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.dualisation import dualise
+from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
+from mortarbench.problems.duality.case_forms import beside
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
-from mortarbench.problems.duality.stepping import LoadPath, State, primal_qp
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ElasticBodies,
+    Found,
+    HalfDiscs,
+    Linearise,
+    remembered,
+)
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
     HalfDisc,
-    Mesh,
     Nodes,
     dofs_of,
-    join,
     joined_sides,
     nodal_lengths,
 )
-from mortarbench.problems.feti.elastic import (
-    AtSides,
-    Displaced,
-    SubdividedBodies,
-    at_sides,
-    in_parts,
-    linearised_by,
-    posed_on,
-    subdivide,
-    tresca_problems,
-)
-from mortarbench.problems.feti.emission import ProblemInParts
-from mortarbench.problems.feti.own_bodies import OwnSolution
-from mortarbench.problems.feti.subdivision import half_discs_in_blocks
-from mortarbench.problems.feti.tearing import Block, compact_blocks, labelled
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
 RADIUS = 8e-3  #: m
-ALONE, NAMES = ("cylinder",), ("upper", "lower")
+NAMES = ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
@@ -109,27 +85,60 @@ UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
 CURVE = 601  #: points of exact tractions in pictures, over that part
 
 
-def cylinder_on_plane(
-    form: str, params: Mapping[str, Value], reference: Reference
-) -> Case:
-    """Emit the QP in one form; at finite strain the gap to the plane is linear, too."""
-    bodies, rows, exact = _on_plane(params)
-    if params["kinematics"] == "linear":
-        return _case(bodies, rows, form, params, half_on_plane(params))
+@remembered
+def on_plane(params: Mapping[str, Value]) -> ContactProblem:
+    """State the linear problem of a cylinder on a rigid plane."""
+    of, exact = _on_plane(params)
+
+    def results(found: Found) -> dict[str, Any]:
+        bodies, primal, s, _ = found.sides
+        return pressure_quantities(bodies, primal, exact, s)
+
+    return ContactProblem(
+        bodies=of, stages=load_steps(1, 1, of.forces, of.fixed),
+        linearise=lambda bodies, _: lambda u: above_plane(
+            bodies.mesh, bodies.pairs[0].slave
+        ),
+        results=results,
+        exact=_curve(exact),
+    )  # fmt: skip
+
+
+def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
+    """Emit the QP of a cylinder on a plane at finite strain; the gap is linear, too."""
+    exact = _on_plane(params)[1]
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     case = newton_case(
         path, form, 1, int(params["newton"]),
         lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
     )  # fmt: skip
-    return _beside(case, exact)
+    return beside(case, _curve(exact))
 
 
 @lru_cache(maxsize=4)
 def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
-    bodies, rows, _ = _on_plane(dict(items))
+    bodies = _on_plane(dict(items))[0].assembled
+    rows = above_plane(bodies.mesh, bodies.pairs[0].slave)
     return newton_path(bodies, lambda u: rows, dict(items), reference)
+
+
+def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
+    """Put the cylinder on a rigid plane, n cells per a; with Hertz's solution."""
+    p: Any = params
+    exact = LineContact(
+        p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
+    )
+    a = min(exact.a, RADIUS)  # as of `two_halves`
+    shape = HalfDiscs((_lower_half(a / p["n"], a, p["halvings"]),))
+    sides = shape.sides
+    return ElasticBodies(
+        shape=shape, names=("cylinder",), materials=(MATERIAL,), plane=p["plane"],
+        length=RADIUS, force=exact.P, fixed=2 * _on_axis(sides),
+        forces=_pressed(shape.discs, "flat", 1.0),
+        pairs=(ContactPair(sides["arc"], np.zeros(0, dtype=np.int64)),),
+    ), exact  # fmt: skip
 
 
 class Halves(NamedTuple):
@@ -139,108 +148,76 @@ class Halves(NamedTuple):
     materials: tuple[Material, ...]
     exact: LineContact
 
-    def blocks(self, most: int) -> list[list[Block]]:
-        """Cut each into blocks of rings and sectors, about as long as wide.
 
-        most : blocks have at most so many cells, squared; the triangles at a centre are
-            the last ring
-        """
-        return [compact_blocks(disc.lengths(), most) for disc in self.discs]
+@remembered
+def problem(params: Mapping[str, Value]) -> ContactProblem:
+    """State two cylinders, with contact linearised at the undeformed state.
 
-    def results(self, found: OwnSolution, at: AtSides) -> dict[str, Any]:
-        """Compare what ranks have found with the exact pressure."""
-        del found
-        return pressure_quantities(at.bodies, at.primal, self.exact, at.solution)
-
-
-def half_on_plane(params: Mapping[str, Value]) -> Halves:
-    """Divide the cylinder on a rigid plane, n cells per a."""
-    p: Any = params
-    exact = LineContact(
-        p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
-    )
-    a = min(exact.a, RADIUS)  # as of `two_halves`
-    disc = _lower_half(a / p["n"], a, p["halvings"])
-    return Halves((disc,), (MATERIAL,), exact)
-
-
-def _on_plane(
-    params: Mapping[str, Value],
-) -> tuple[Bodies, ContactRows, LineContact]:
-    """Mesh and assemble the cylinder; with Hertz's solution."""
-    p: Any = params
-    (disc,), materials, exact = half_on_plane(params)
-    mesh = disc.mesh()
-    sides = mesh.boundaries
-    bodies = assemble(
-        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=ALONE,
-        materials=materials, plane=p["plane"], units=(RADIUS, exact.P),
-        fixed=2 * _on_axis(sides),
-        load=_loaded(mesh, _pressed((disc,), "flat", exact.P)),
-        pairs=(_on_rigid(sides),),
-    )  # fmt: skip
-    return bodies, above_plane(mesh, sides["arc"]), exact
-
-
-def on_plane_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the linear problem of a cylinder on a plane in subdomains."""
-    p: Any = params
-    halves = half_on_plane(params)
-    sides = joined_sides(halves.discs)
-    return in_parts(
-        half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
-        materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
-        names=ALONE, fixed=2 * _on_axis(sides),
-        load=_pressed(halves.discs, "flat", halves.exact.P),
-        pairs=(_on_rigid(sides),),
-        linearise=lambda arc, _: above_plane(arc.mesh, arc.pairs[0].slave),
-        glue=p["glue"], results=halves.results,
-    )  # fmt: skip
-
-
-def _on_rigid(sides: Mapping[str, Nodes]) -> ContactPair:
-    return ContactPair(sides["arc"], np.zeros(0, dtype=np.int64))
-
-
-def cylinder_on_cylinder(
-    form: str, params: Mapping[str, Value], reference: Reference
-) -> Case:
-    """Emit the QP, with contact linearised at the undeformed state, in one form.
-
-    With friction it is the last of the last step, unless another iterate is asked for.
+    Where a tangential force acts, it is there in the last stage only.
     """
     p: Any = params
-    if p["friction"] == "none":
-        bodies, exact = two_cylinders(params)
-        linearise = linearisation(bodies, p["contact"], p["basis"])
-        rows = linearise(np.zeros(bodies.mesh.dofs))
-        return _case(bodies, rows, form, params, two_halves(params))
-    same_path = {**params, "iterate": 0}
-    path, exact = _friction_path(tuple(same_path.items()), reference)
-    bodies, problem = path.bodies, path.problem(1, p["iterate"])
-    primal, friction = problem.primal, problem.friction
+    of, exact = two_cylinders(p)
+    laws, shear = (law_of(p),), _exact_shear(exact, p) if p["peak"] else None
 
-    shear = _exact_shear(exact, params) if p["peak"] else None
+    def linearise(
+        bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
+    ) -> Linearise:
+        rows = linearisation(bodies, p["contact"], p["basis"], laws)
+        return lambda u: rows(np.zeros_like(u))
 
-    def results(s: Solution) -> dict[str, Any]:
-        found = quantities(bodies, primal, s, friction)
-        found |= pressure_quantities(bodies, primal, exact, s)
+    def results(found: Found) -> dict[str, Any]:
+        bodies, primal, s, friction = found.sides
+        told = pressure_quantities(bodies, primal, exact, s)
         if shear is not None:
-            found |= shear_quantities(bodies, primal, exact, s, friction, params, shear)
+            told |= shear_quantities(bodies, primal, exact, s, friction, p, shear)
         if p["friction"] == "coulomb":
-            found["tresca_problems"] = path.iterates(1)
-        return found
+            told["tresca_problems"] = found.problems
+        return told
 
-    case = contact_case(
-        bodies, primal, form,
-        floating=lambda: path.inverse, clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies), quantities=results, friction=friction,
-        torn=posed_on(
-            params, lambda: subdivided(bodies, two_halves(params), p["feti"]), primal,
-            friction,
-        ),
+    stages = load_steps(1, 1, of.forces, of.fixed, laws)
+    is_known = p["friction"] == "none" or shear is not None
+    return ContactProblem(
+        bodies=of, linearise=linearise, results=results,
+        stages=stages if shear is None else _programme(p, of),
+        exact=_curve(exact, shear or np.zeros_like) if is_known else None,
     )  # fmt: skip
-    return _beside(case, exact, shear) if shear is not None else case
+
+
+def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, ...]:
+    """List what acts in turn: P without friction, then P and Q.
+
+    First, supports on the axis keep the upper cylinder, which P does not load there.
+    Two cylinders without friction roll on each other almost freely: nothing but the
+    polygons that their arcs are resists. The slip of the next stage would begin there,
+    and Q would do work on it.
+    """
+    p: Any = params
+    discs, sides = two_halves(p).discs, of.shape.sides
+    pressing = [_pressed(discs, "upper_flat", 1.0), _pressed(discs, "lower_flat", -1.0)]
+    loads = _loads(p)
+    quasi_static = p["loading"] == "quasi-static"
+
+    def acting(P: float, Q: float) -> Forces:
+        forces = [Forces(at, P * value) for at, value in pressing]
+        return _added(forces + (_shearing(discs, Q * p["mu"]) if Q else []))
+
+    def begin(k: int, left: State) -> State:
+        """Begin where the stage before has ended; normal forces grow with P."""
+        before = loads[max(k - 1, 0)][0]
+        at_rest = not k and _forgets_pressing(p)
+        u = np.zeros_like(left.u) if at_rest else left.u
+        slip = u if quasi_static else np.zeros_like(u)
+        return State(u, slip, loads[k][0] / before * left.pressed)
+
+    kept = np.append(of.fixed, 2 * _on_axis(sides, "upper_"))
+    first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=kept)
+    return first, *(
+        Stage(
+            step=1, part=1.0, forces=acting(P, Q), fixed=of.fixed, laws=(law_of(p),),
+            begin=partial(begin, k),
+        )
+        for k, (P, Q) in enumerate(loads)
+    )  # fmt: skip
 
 
 def two_halves(params: Mapping[str, Value]) -> Halves:
@@ -264,102 +241,29 @@ def two_halves(params: Mapping[str, Value]) -> Halves:
     return Halves((upper, lower), (MATERIAL, below), exact)
 
 
-def two_cylinders(params: Mapping[str, Value]) -> tuple[Bodies, LineContact]:
-    """Mesh and assemble the cylinders under P alone; with Hertz's solution.
+def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
+    """Put the cylinders on each other under P alone; with Hertz's solution.
 
-    Where there is a tangential force, the supports are those that take no part in it.
+    Where there is a tangential force, the supports are those that take no part in it:
+    no symmetry is bent.
     """
     p: Any = params
-    discs, materials, exact = two_halves(params)
-    mesh, body = join(tuple(disc.mesh() for disc in discs))
-    sides, load = mesh.boundaries, _loaded(mesh, _pressed(discs, "upper_flat", exact.P))
+    halves = two_halves(params)
+    discs, exact, shape = halves.discs, halves.exact, HalfDiscs(halves.discs)
+    sides, flat = shape.sides, shape.sides["lower_flat"]
+    forces = [_pressed(discs, "upper_flat", 1.0)]
+    on_axis = 2 * _on_axis(sides, "lower_")
     if p["peak"]:
-        load += _loaded(mesh, _pressed(discs, "lower_flat", -exact.P))
-        fixed = _free_of_reactions(sides)
+        forces.append(_pressed(discs, "lower_flat", -1.0))
+        fixed = np.append(on_axis, 2 * flat[flat.size // 2] + 1)
     else:
-        fixed = _guided(sides)
-    bodies = assemble(
-        mesh, body, names=NAMES, materials=materials,
-        plane=p["plane"], units=(RADIUS, exact.P), fixed=fixed, load=load,
+        upper = 2 * _on_axis(sides, "upper_")
+        fixed = np.concatenate([upper, on_axis, 2 * flat + 1])
+    return ElasticBodies(
+        shape=shape, names=NAMES, materials=halves.materials, plane=p["plane"],
+        length=RADIUS, force=exact.P, fixed=fixed, forces=_added(forces),
         pairs=(_pair(params, sides),),
-    )  # fmt: skip
-    return bodies, exact
-
-
-def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe two cylinders in subdomains, and before it what friction begins from."""
-    p: Any = params
-    halves, law = two_halves(params), law_of(params)
-    discs, sides = halves.discs, joined_sides(halves.discs)
-    layout = half_discs_in_blocks(discs, halves.blocks(p["feti"]))
-    pairs, exact = (_pair(params, sides),), halves.exact
-    shear = _exact_shear(exact, params) if p["peak"] else None
-
-    def results(found: OwnSolution, at: AtSides) -> dict[str, Any]:
-        s, friction = at.solution, at.friction
-        told = pressure_quantities(at.bodies, at.primal, exact, s)
-        if shear is not None:
-            told |= shear_quantities(
-                at.bodies, at.primal, exact, s, friction, params, shear
-            )
-        if p["friction"] == "coulomb":
-            told["tresca_problems"] = tresca_problems(found)
-        return told
-
-    def posed(
-        fixed: Nodes,
-        loads: Sequence[tuple[Nodes, Vector]],
-        laws: tuple[FrictionLaw, ...],
-        displaced: Displaced | None = None,
-    ) -> ProblemInParts:
-        linearise = linearised_by(p["contact"], p["basis"], laws)
-        return in_parts(
-            layout, materials=halves.materials, plane=p["plane"],
-            units=(RADIUS, exact.P), names=NAMES, fixed=fixed, load=_added(loads),
-            pairs=pairs, linearise=lambda arcs, u: linearise(arcs, np.zeros_like(u)),
-            laws=laws, glue=p["glue"], displaced=displaced, iterate=p["iterate"],
-            results=results,
-        )  # fmt: skip
-
-    pressing = [_pressed(discs, "upper_flat", exact.P)]
-    if not p["peak"]:
-        return posed(_guided(sides), pressing, (law,))
-    pressing.append(_pressed(discs, "lower_flat", -exact.P))
-    loads, free = _loads(params), _free_of_reactions(sides)
-
-    def scaled(P: float, Q: float) -> list[tuple[Nodes, Vector]]:
-        shearing = _shearing(discs, Q * p["mu"] * exact.P) if Q else []
-        return [(at, P * force) for at, force in pressing] + shearing
-
-    def after(i: int, found: OwnSolution) -> ProblemInParts:
-        u, pressed = at_sides(found, pairs)
-        nothing = np.zeros_like(u)
-        if not i and _forgets_pressing(params):
-            u = nothing
-        (P, Q), before = loads[i], loads[max(i - 1, 0)][0]
-        slips_from = u if p["loading"] == "quasi-static" else nothing
-        at = Displaced(u, slips_from, P / before * pressed)
-        problem = posed(free, scaled(P, Q), (law,), at)
-        last = i + 1 == len(loads)
-        return problem if last else replace(problem, then=partial(after, i + 1))
-
-    kept = np.append(free, 2 * _on_axis(sides, "upper_"))
-    first = posed(kept, scaled(loads[0][0], 0.0), ())
-    return replace(first, then=partial(after, 0))
-
-
-def _guided(sides: Mapping[str, Nodes]) -> Nodes:
-    """Return the components that are held under P alone."""
-    return np.concatenate([
-        2 * _on_axis(sides, "upper_"), 2 * _on_axis(sides, "lower_"),
-        2 * sides["lower_flat"] + 1,
-    ])  # fmt: skip
-
-
-def _free_of_reactions(sides: Mapping[str, Nodes]) -> Nodes:
-    """Return the components that are held where Q acts, too: no symmetry is bent."""
-    flat = sides["lower_flat"]
-    return np.append(2 * _on_axis(sides, "lower_"), 2 * flat[flat.size // 2] + 1)
+    ), exact  # fmt: skip
 
 
 def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
@@ -369,35 +273,6 @@ def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPai
     )
 
 
-def subdivided(bodies: Bodies, halves: Halves, most: int) -> SubdividedBodies:
-    """Cut the half discs into blocks; most : as of `Halves.blocks`."""
-    label = [np.zeros(0, dtype=np.int64)]
-    for blocks in halves.blocks(most):
-        label.append(labelled(blocks) + label[-1].max(initial=-1) + 1)
-    return subdivide(bodies, np.concatenate(label))
-
-
-def kept_on_axis(bodies: Bodies) -> Bodies:
-    """Add supports u_x = 0 on the axis of the upper one, which P does not load.
-
-    Two cylinders without friction roll on each other almost freely: nothing but the
-    polygons that their arcs are resists. The slip of the next step would begin there,
-    and Q would do work on it.
-    """
-    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh.boundaries, "upper_"))
-    rows = eye_array(bodies.mesh.dofs, format="csr")[held]
-    return replace(bodies, B_D=csr_array(rows))
-
-
-def sheared(mesh: Mesh) -> Vector:
-    """Return the nodal forces (2N,) of Q = 1 N/m on both flat sides, without moment."""
-    load = np.zeros(mesh.dofs)
-    for name, Q in (("upper_flat", 1.0), ("lower_flat", -1.0)):
-        flat = mesh.boundaries[name]
-        load[dofs_of(flat)] = _shear_of(mesh.points[flat], Q)
-    return load
-
-
 def _shear_of(points: NDArray[np.float64], Q: float) -> Vector:
     """Return the forces (2k,) of Q at the nodes of a flat side, x and y in turn."""
     share, (x, y) = nodal_lengths(points), points.T
@@ -405,23 +280,23 @@ def _shear_of(points: NDArray[np.float64], Q: float) -> Vector:
     return np.column_stack(forces).ravel()
 
 
-def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[tuple[Nodes, Vector]]:
-    """Return the components at both flat sides, and the forces of Q there, N/m."""
+def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
+    """Return the forces of Q at both flat sides."""
     sides = joined_sides(discs)
     of = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
     return [
-        (dofs_of(sides[flat]), _shear_of(disc.position(disc.sides[flat]), part))
+        Forces(dofs_of(sides[flat]), _shear_of(disc.position(disc.sides[flat]), part))
         for disc, flat, part in of
     ]
 
 
-def _added(loads: Sequence[tuple[Nodes, Vector]]) -> tuple[Nodes, Vector]:
-    """Add up forces at components: each component once."""
-    component, force = (np.concatenate(part) for part in zip(*loads, strict=True))
+def _added(forces: Sequence[Forces]) -> Forces:
+    """Add up forces: each component once."""
+    component, value = (np.concatenate(part) for part in zip(*forces, strict=True))
     at, place = np.unique(component, return_inverse=True)
     found = np.zeros(at.size)
-    np.add.at(found, place, force)
-    return at, found
+    np.add.at(found, place, value)
+    return Forces(at, found)
 
 
 def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
@@ -433,37 +308,6 @@ def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
         parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a grows evenly
         return [(part, part * p["Q"]) for part in parts]
     return [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
-
-
-@lru_cache(maxsize=2)
-def _friction_path(
-    items: tuple[tuple[str, Any], ...], reference: Reference
-) -> tuple[LoadPath, LineContact]:
-    """Prepare the load steps with friction, whose last one is emitted."""
-    p = dict(items)
-    bodies, exact = two_cylinders(p)
-    law, mesh = law_of(p), bodies.mesh
-    linearise = linearisation(bodies, p["contact"], p["basis"], (law,))
-    rows = linearise(np.zeros(mesh.dofs))
-    guided = kept_on_axis(bodies)
-    path = LoadPath(
-        bodies, lambda u: rows, lambda: floating(guided), reference, steps=1,
-        transform=dualise, laws=(law,), quasi_static=p["loading"] == "quasi-static",
-    )  # fmt: skip
-    if not p["peak"]:
-        return path, exact
-    loads = _loads(p)
-    part = loads[0][0]  # of P in the step before, whose normal forces grow with P
-    pressing = replace(guided, f=part * bodies.f)
-    smooth = linearisation(bodies, p["contact"], p["basis"])
-    u, pressed = replace(path, bodies=pressing, linearise=smooth, laws=()).state(1)
-    if _forgets_pressing(p):
-        u = np.zeros(mesh.dofs)
-    for P, Q in loads:
-        both = replace(bodies, f=P * bodies.f + Q * p["mu"] * sheared(mesh))
-        path = replace(path, bodies=both, begin=State(u, P / part * pressed))
-        (u, pressed), part = path.state(1), P
-    return path, exact
 
 
 def _forgets_pressing(params: Mapping[str, Value]) -> bool:
@@ -510,18 +354,11 @@ def halved(x: Vector, times: int) -> Vector:
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
 
 
-def _pressed(discs: tuple[HalfDisc, ...], flat: str, P: float) -> tuple[Nodes, Vector]:
-    """Spread P evenly over a flat side: the components, and the forces there, N/m."""
+def _pressed(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
+    """Spread P evenly over a flat side."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
-    return 2 * joined_sides(discs)[flat] + 1, -P * share / share.sum()
-
-
-def _loaded(mesh: Mesh, load: tuple[Nodes, Vector]) -> Vector:
-    """Return the nodal forces (2N,) of forces at some components."""
-    forces = np.zeros(mesh.dofs)
-    forces[load[0]] = load[1]
-    return forces
+    return Forces(2 * joined_sides(discs)[flat] + 1, -P * share / share.sum())
 
 
 def pressure_quantities(
@@ -615,43 +452,16 @@ def _exact_shear(
     return TangentialContact(exact, p["mu"], p["Q"], p["peak"]).traction
 
 
-def _beside(
-    case: Case, exact: LineContact, shear: Callable[[Vector], Vector] = np.zeros_like
-) -> Case:
-    """Give the contact in pictures its exact tractions, those on the slave side.
+def _curve(
+    exact: LineContact, shear: Callable[[Vector], Vector] = np.zeros_like
+) -> NDArray[np.float64]:
+    """Return the exact tractions on the slave side, see `ContactProblem.exact`.
 
     Its tangent (−n_y, n_x) is along x on the upper cylinder, whose traction is −q, and
     against it on the lower one: either way the shear is −q.
     """
-    assert case.fields is not None
-    solved = case.fields
     x = exact.a * np.linspace(-UNIFORM, UNIFORM, CURVE)
-    curve = np.column_stack([x, exact.pressure(x), -shear(x)])
-
-    def fields(s: Solution) -> Fields:
-        found = solved(s)
-        (side,) = found.contacts
-        return replace(found, contacts=(replace(side, exact=curve),))
-
-    return replace(case, fields=fields)
-
-
-def _case(
-    bodies: Bodies, rows: ContactRows, form: str, params: Mapping[str, Value],
-    halves: Halves,
-) -> Case:  # fmt: skip
-    p: Any = params
-    exact = halves.exact
-    primal = primal_qp(bodies, rows)
-    case = contact_case(
-        bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s)
-        | pressure_quantities(bodies, primal, exact, s),
-        torn=posed_on(params, lambda: subdivided(bodies, halves, p["feti"]), primal),
-    )  # fmt: skip
-    return _beside(case, exact)
+    return np.column_stack([x, exact.pressure(x), -shear(x)])
 
 
 def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:

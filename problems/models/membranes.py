@@ -43,13 +43,13 @@ from mortarbench.problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import Contact, ProblemInParts
-from mortarbench.problems.feti.gluing import glue
-from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.emission import OwnDual
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.feti.tearing import Part, blocks, decompose
-from mortarbench.problems.feti.torn import Kind, Torn
+from mortarbench.problems.feti.tearing import Part
+from mortarbench.problems.feti.torn import Kind
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
@@ -66,11 +66,11 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         new = posed(pair.qp)
     else:
         start = perf_counter()
-        torn = pair.torn(p["glue"])
-        new, tear = torn_dual(torn, pair.qp), partial(LocalProblems, torn, 1)
+        pieces = torn(pair.in_subdomains(p["glue"]))
+        new, tear = torn_dual(pieces, pair.qp), partial(LocalProblems, pieces, 1)
         seconds = perf_counter() - start
-        matrices = torn_matrices(torn, new.qp)
-        decomposition = torn_quantities(torn, new.qp)
+        matrices = torn_matrices(pieces, new.qp)
+        decomposition = torn_quantities(pieces, new.qp)
     dofs = pair.qp.q.size
     return Case(
         qp=new.qp,
@@ -147,7 +147,7 @@ class Membranes:
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
     def in_subdomains(self, rows: str) -> ProblemInParts:
-        """Describe the dual, glued by `rows` of `problems.feti.gluing`."""
+        """Describe the dual, glued by `rows`, one of `GLUE`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
         G = _touching(sides, layout.nodes)
@@ -156,7 +156,6 @@ class Membranes:
             kind=membrane_kind, E=np.ones(2), names=NAMES, load=self.load, glue=rows,
             held=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
-            results=self.results,
         )  # fmt: skip
 
     @property
@@ -169,18 +168,6 @@ class Membranes:
         """Factorise K without the prescribed components; the right one is free."""
         free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
         return supported_inverse(self.qp.P, free, self.rigid)
-
-    def torn(self, rows: str) -> Torn:
-        """Tear both into squares, glued by `rows` of `problems.feti.gluing`."""
-        mesh, qp, nodes = self.mesh, self.qp, self.qp.q.size
-        squares = blocks((self.side, self.side), self.n)
-        label = np.concatenate([squares, squares + self.S**2])
-        parts = decompose(mesh.points, mesh.cells, label, np.zeros_like(self.body))
-        return glue(
-            parts, tuple(map(membrane_kind, parts.parts)), load=-qp.q,
-            supports=csr_array(qp.A), supported=qp.b, contact=csr_array(qp.G), c=qp.h,
-            E=np.ones(nodes), rows=rows,
-        )  # fmt: skip
 
     def quantities(self, s: Solution) -> dict[str, Any]:
         """Report counts, energy, force on the right membrane and its lowest height.
@@ -213,6 +200,13 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     """Describe the dual, of which ranks can emit their shares."""
     p: Any = params
     return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
+
+
+def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+    """Report what ranks have found, as `Membranes.quantities`."""
+    del dual
+    p: Any = params
+    return Membranes(p["S"], p["n"]).results
 
 
 def membrane_kind(part: Part, h: float = 1.0) -> Kind:

@@ -58,14 +58,14 @@ from mortarbench.problems.fem.inverse import (
     supported_inverse,
 )
 from mortarbench.problems.fem.laplacian import grid_stiffness
-from mortarbench.problems.fem.mesh import Nodes, StructuredGrid
-from mortarbench.problems.feti.emission import Contact, ProblemInParts
-from mortarbench.problems.feti.gluing import glue
-from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
+from mortarbench.problems.feti.emission import OwnDual
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.feti.tearing import blocks, decompose
-from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.membranes import membrane_kind
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
@@ -88,7 +88,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     if form == "primal":
         new = with_bounds(rows)
     elif p["feti"]:
-        pieces = problem.torn(p["feti"], p["glue"])
+        pieces = torn(in_subdomains(params))
         new, tear = torn_dual(pieces, rows), partial(LocalProblems, pieces, 1)
         decomposition = torn_quantities(pieces, new.qp)
     elif form == "dual":
@@ -119,11 +119,10 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
 
 
 def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the dual of a membrane (dim = 2) on a grid in blocks.
-
-    Every node within has a row of contact.
-    """
+    """Describe the dual on a grid in blocks; every node within has a row of contact."""
     p: Any = params
+    if p["dim"] == 1:
+        return _string_in_subdomains(p["n"], p["feti"], p["glue"])
     n, shape, all_ = p["n"], p["shape"], slice(None)
     grid = _grid(n, shape)
     layout = Layout.of((grid,), p["feti"])
@@ -137,8 +136,28 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
         names=("membrane",), load=partial(_load, grid, shape), held=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
-        results=partial(_found_by_ranks, grid, shape),
     )  # fmt: skip
+
+
+def _string_in_subdomains(n: int, most: int, glue: str) -> ProblemInParts:
+    """Describe the dual of a string; its mesh is listed as a whole."""
+    problem = obstacle_problem(1, n)
+    mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
+    layout = mesh_in_parts(mesh, blocks((n,), most), body, np.arange(n + 1))
+    qp = problem.qp
+    return ProblemInParts(
+        layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
+        kind=partial(membrane_kind, h=2 * HALF["flat"] / n), E=np.ones(1),
+        names=("string",), load=lambda node: -qp.q[node], held=qp.A.indices,
+        contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
+    )  # fmt: skip
+
+
+def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+    """Report what ranks have found, as `obstacle_quantities`."""
+    del dual
+    p: Any = params
+    return partial(_found_by_ranks, _grid(p["n"], p["shape"]), p["shape"])
 
 
 def _found_by_ranks(
@@ -233,22 +252,6 @@ class Problem:
         """Factorise K with its kernel, the constants."""
         N = self.qp.q.size
         return supported_inverse(self.qp.P, np.arange(N), np.full((N, 1), N**-0.5))
-
-    def torn(self, most: int, rows: str) -> Torn:
-        """Tear the grid into blocks of at most `most` cells a side.
-
-        rows : what glues them, see `problems.feti.gluing`
-        """
-        qp, (N, dim) = self.qp, self.x.shape
-        n = round(self.cells ** (1 / dim))
-        label, h = blocks((n,) * dim, most), 2 * HALF[self.shape] / n
-        of_cell = np.zeros(self.cells, dtype=np.int64)
-        parts = decompose(self.x, cells(dim, n), label, of_cell)
-        return glue(
-            parts, tuple(membrane_kind(part, h) for part in parts.parts), load=-qp.q,
-            supports=csr_array(qp.A), supported=qp.b, contact=csr_array(qp.G), c=qp.h,
-            E=np.ones(N), rows=rows,
-        )  # fmt: skip
 
     def energy(self, v: Vector) -> float:
         """Return ∫ ½|∇u|² + q u, per tension."""

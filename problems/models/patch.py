@@ -24,97 +24,74 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
-from mortarbench.harness import Case, InputError, Reference, Solution, Value, Vector
+from mortarbench.harness import Case, InputError, Reference, Solution, Value
 from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
-    assemble,
-    clamped,
     elasticity_matrices,
-    floating,
-    supported,
 )
 from mortarbench.problems.contact.friction import law_of
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.results import contact_forces, quantities
-from mortarbench.problems.duality.case_forms import contact_case
+from mortarbench.problems.contact.results import contact_forces
+from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
-from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.duality.problem import (
+    ContactProblem,
+    ElasticBodies,
+    Found,
+    StructuredGrids,
+    by_keys,
+    remembered,
+)
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.finite_strain import cauchy_stress, strain_energy
 from mortarbench.problems.fem.hyperelastic import Hyperelastic, hyperelastic
 from mortarbench.problems.fem.mesh import (
-    Mesh,
     Nodes,
     StructuredGrid,
     as_vectors,
-    join,
-    joined_sides,
     nodal_lengths,
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import gauss_stress
-from mortarbench.problems.feti.elastic import (
-    AtSides,
-    SubdividedBodies,
-    at_rest,
-    in_parts,
-    linearised_by,
-    own_meshes,
-    posed_on,
-    subdivide,
-)
-from mortarbench.problems.feti.emission import ProblemInParts
-from mortarbench.problems.feti.own_bodies import OwnSolution
-from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.tearing import structured_bodies
 from mortarbench.problems.ranges import SHORTEST
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 NAMES = ("lower", "upper")
 PRESSURE = 1e6  #: p, Pa
-UNITS = (LENGTH, PRESSURE * LENGTH)  #: l and F₀, m and N/m
 E_UPPER, NU = 10e6, 0.3  #: Pa
 
 
-def two_blocks(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP in one form."""
+@remembered
+def problem(params: Mapping[str, Value]) -> ContactProblem:
+    """State the linear problem of the blocks."""
     p: Any = params
-    if p["kinematics"] == "finite":
-        return _finite(form, params, reference)
-    bodies = model(params)
-    laws = (law_of(params),)
-    linearise = linearisation(bodies, p["contact"], p["basis"], laws)
-    factorised = cache(lambda: floating(bodies))
-    primal, friction = single_load(
-        bodies, linearise, laws,
-        factorise=factorised, reference=reference, iterate=p["iterate"],
-    )  # fmt: skip
-    return contact_case(
-        bodies, primal, form,
-        torn=posed_on(params, lambda: subdivided(bodies, params), primal, friction),
-        floating=factorised, clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s, friction)
-        | {"stress_error": stress_error(bodies, s)},
-        friction=friction,
-    )  # fmt: skip
+    of = bodies(p)
+    D = elasticity_matrices(of.materials, of.plane)
 
+    def error(found: Found) -> dict[str, Any]:
+        """Find the largest |σ_y + p|/p over all Gauss points."""
+        largest = 0.0
+        for part in found.meshes():
+            stress = gauss_stress(part.mesh, D[part.body], part.u)
+            off = np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE
+            largest = max(largest, float(off))
+        return {"stress_error": found.largest(largest)}
 
-def subdivided(bodies: Bodies, params: Mapping[str, Value]) -> SubdividedBodies:
-    """Cut the blocks into subdomains of at most `feti` cells a side."""
-    p: Any = params
-    divisions = [_divisions(p[name]) for name in ("lower", "upper")]
-    layout = Layout.of(_grids(params), p["feti"])
-    return subdivide(bodies, structured_bodies(divisions, p["feti"]), layout)
+    return ContactProblem(
+        bodies=of, linearise=by_keys(p), results=error,
+        stages=load_steps(1, 1, of.forces, of.fixed, (law_of(p),)),
+        # friction may have to hold the blocks
+        pressed=float(np.abs(of.forces.value).sum()),
+    )  # fmt: skip
 
 
 class Homogeneous(NamedTuple):
@@ -183,8 +160,8 @@ def _softest(material: Hyperelastic) -> float:
     )
 
 
-def _finite(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of one Newton iteration."""
+def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
+    """Emit the QP of one Newton iteration at finite strain."""
     p: Any = params
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     exact = _uniform(params)
@@ -203,10 +180,10 @@ def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
     params = dict(items)
-    bodies = model(params)
-    bodies = replace(bodies, f=bodies.f * (-_uniform(params).nominal / PRESSURE))
-    linearise = linearisation(bodies, params["contact"], params["basis"])
-    return newton_path(bodies, linearise, params, reference)
+    whole = model(params)
+    whole = replace(whole, f=whole.f * (-_uniform(params).nominal / PRESSURE))
+    linearise = linearisation(whole, params["contact"], params["basis"])
+    return newton_path(whole, linearise, params, reference)
 
 
 def _uniform(params: Mapping[str, Any]) -> Homogeneous:
@@ -251,44 +228,26 @@ def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, An
     }
 
 
+def bodies(params: Mapping[str, Value]) -> ElasticBodies:
+    """Put the blocks on each other, with `lower` and `upper` elements along x."""
+    p: Any = params
+    shape = StructuredGrids(_grids(params))
+    sides, force = shape.sides, PRESSURE * LENGTH
+    rollers = (
+        2 * sides["lower_left"], 2 * sides["upper_left"], 2 * sides["lower_bottom"] + 1
+    )  # fmt: skip
+    pressing = -PRESSURE * nodal_lengths(shape.grids[1].side("upper_top"))
+    return ElasticBodies(
+        shape=shape, names=NAMES, plane=p["plane"], length=LENGTH, force=force,
+        materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
+        fixed=np.concatenate(rollers), pairs=(_pair(params, sides),),
+        forces=Forces(2 * sides["upper_top"] + 1, pressing / force),
+    )  # fmt: skip
+
+
 def model(params: Mapping[str, Value]) -> Bodies:
-    """Mesh and assemble the blocks, with `lower` and `upper` elements along x."""
-    p: Any = params
-    grids = _grids(params)
-    mesh, body = join(tuple(grid.mesh() for grid in grids))
-    sides, (component, force) = mesh.boundaries, _pressure(grids)
-    load = np.zeros(mesh.dofs)
-    load[component] = force
-    return assemble(
-        mesh, body, names=NAMES, materials=_materials(params),
-        plane=p["plane"], units=UNITS, fixed=_rollers(sides), load=load,
-        pairs=(_pair(params, sides),),
-    )  # fmt: skip
-
-
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the linear problem in subdomains."""
-    p: Any = params
-    grids, laws, materials = _grids(params), (law_of(params),), _materials(params)
-    sides, layout = joined_sides(grids), Layout.of(grids, p["feti"])
-    D = elasticity_matrices(materials, p["plane"])
-
-    def error(found: OwnSolution, _: AtSides) -> dict[str, Any]:
-        largest = max(
-            _stress_error(of.mesh, D[of.body], of.u)
-            for of in own_meshes(layout, found, LENGTH)
-        )
-        return {"stress_error": found.bodies.ranks.extreme(largest, np.max)}
-
-    load, pairs = _pressure(grids), (_pair(params, sides),)
-    return in_parts(
-        layout, materials=materials, plane=p["plane"], units=UNITS, names=NAMES,
-        fixed=_rollers(sides), load=load, pairs=pairs,
-        linearise=linearised_by(p["contact"], p["basis"], laws), laws=laws,
-        glue=p["glue"], results=error, iterate=p["iterate"],
-        # as of `single_load`: friction may have to hold
-        displaced=at_rest(pairs, float(np.abs(load[1]).sum() / UNITS[1])),
-    )  # fmt: skip
+    """Mesh and assemble the blocks."""
+    return bodies(params).assembled
 
 
 def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
@@ -306,31 +265,5 @@ def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
     return lower.prefixed("lower_"), upper.prefixed("upper_")
 
 
-def _materials(params: Mapping[str, Any]) -> tuple[Material, Material]:
-    return Material(params["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)
-
-
-def _pressure(grids: tuple[StructuredGrid, StructuredGrid]) -> tuple[Nodes, Vector]:
-    """Return the components on the top, and the forces there, N/m."""
-    top = joined_sides(grids)["upper_top"]
-    return 2 * top + 1, -PRESSURE * nodal_lengths(grids[1].side("upper_top"))
-
-
-def _rollers(sides: Mapping[str, Nodes]) -> Nodes:
-    """Return the components that are held."""
-    left = (2 * sides["lower_left"], 2 * sides["upper_left"])
-    return np.concatenate([*left, 2 * sides["lower_bottom"] + 1])
-
-
 def _divisions(n: int) -> tuple[int, int]:
     return n, -(-n // 2)
-
-
-def stress_error(bodies: Bodies, s: Solution) -> float:
-    """Return the largest |σ_y + p|/p over all Gauss points."""
-    return _stress_error(bodies.mesh, bodies.D, s.x * bodies.length)
-
-
-def _stress_error(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> float:
-    stress = gauss_stress(mesh, D, u)
-    return float(np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE)

@@ -15,7 +15,7 @@ the held edge do not float, as in FETI-1 (Farhat and Roux 1991).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from typing import Any
@@ -35,7 +35,10 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
+from mortarbench.harness.distributed.vectors import alone
 from mortarbench.harness.mechanics import Substructures
+from mortarbench.problems.contact.stepping import Forces
+from mortarbench.problems.duality.divided import elastic_kind, looked_up
 from mortarbench.problems.duality.dualisation import Transformed, posed
 from mortarbench.problems.duality.torn_dual import (
     torn_dual,
@@ -58,18 +61,16 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from mortarbench.problems.feti.elastic import elastic_kind, forces_at
-from mortarbench.problems.feti.emission import Contact, ProblemInParts, dual_of
-from mortarbench.problems.feti.gluing import glue, without_supports
-from mortarbench.problems.feti.own_bodies import OwnSolution
+from mortarbench.problems.feti.emission import OwnDual, dual_on
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
-    spectra_of_equations,
     spectra_over_ranks,
 )
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
 from mortarbench.problems.feti.substructures import LocalProblems
-from mortarbench.problems.feti.tearing import blocks, decompose
+from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.feti.torn import Torn
 
 LENGTH = 1.0  #: l, m
@@ -94,7 +95,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         counts = quantities(plate, new.recover(s))
         return counts | (dual_quantities(plate) if form == "dual" else {})
 
-    def torn() -> Substructures:
+    def tear() -> Substructures:
         return LocalProblems(plate.torn)
 
     return Case(
@@ -116,7 +117,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            tear=torn if form == "dual" and not plate.eliminated else None,
+            tear=tear if form == "dual" and not plate.parts.eliminated else None,
         ),
     )  # fmt: skip
 
@@ -132,22 +133,12 @@ class Plate:
     moduli: Vector  #: of the materials; the first is that of steel
     D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials
     primal: QP
-    glue: str
-    eliminated: bool  #: whether the supports are no rows of the dual
+    parts: ProblemInParts
 
     @cached_property
     def torn(self) -> Torn:
-        """The plate in its subdomains; it is one body, all rows are scaled alike."""
-        points, primal = self.mesh.points, self.primal
-        parts = decompose(points, self.mesh.cells, self.subdomain, self.material)
-        torn = glue(
-            parts, tuple(elastic_kind(p, self.D, self.moduli) for p in parts.parts),
-            load=-primal.q, supports=csr_array(primal.A), supported=primal.b,
-            contact=csr_array(primal.G), c=primal.h,
-            E=np.full(len(points), self.moduli[0]),
-            rows=self.glue,
-        )  # fmt: skip
-        return without_supports(torn, self.held) if self.eliminated else torn
+        """The plate in its subdomains."""
+        return torn(self.parts)
 
     @cached_property
     def dual(self) -> Transformed:
@@ -157,7 +148,7 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        return _spectra(self.moduli, partial(spectra_of_equations, self.torn))
+        return _spectra(self.moduli, dual_on(self.parts, alone()))
 
     @property
     def held(self) -> NDArray[np.int64]:
@@ -170,21 +161,21 @@ class Plate:
         return regular_inverse(self.primal.P, free)
 
 
-def _spectra(
-    moduli: Vector, find: Callable[[list[tuple[str, str] | None]], list[Spectrum]]
-) -> Mapping[str, Spectrum]:
-    """Find the spectra by the names of `PRECONDITIONERS`."""
+def _spectra(moduli: Vector, dual: OwnDual) -> Mapping[str, Spectrum]:
+    """Find the spectra by the names of `PRECONDITIONERS`; called by all ranks."""
+    qp = dual.share().qp
     names = dict(PRECONDITIONERS)
     uniform = moduli[0] == moduli[1]  # so that both scalings are one
     if uniform:
         del names["dirichlet_stiffness"]
-    spectra = dict(zip(names, find(list(names.values())), strict=True))
+    found = spectra_over_ranks(qp.P, qp.A, list(names.values()))
+    spectra = dict(zip(names, found, strict=True))
     return spectra | ({"dirichlet_stiffness": spectra["dirichlet"]} if uniform else {})
 
 
 @lru_cache(maxsize=4)
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
-    """Mesh and assemble the plate of complete keys."""
+    """Mesh and assemble the plate of complete keys; it is one body."""
     p: Any = dict(params)
     grid, side = _grid(p), _side(p)
     mesh = grid.mesh()
@@ -201,7 +192,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     )  # fmt: skip
     return Plate(
         size=_size(p), mesh=mesh, subdomain=subdomain, material=material, moduli=moduli,
-        D=D, primal=primal, glue=p["glue"], eliminated=p["supports"] == "eliminated",
+        D=D, primal=primal, parts=in_subdomains(p),
     )  # fmt: skip
 
 
@@ -216,18 +207,23 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
-        load=forces_at(*_pull(grid, p["load"])), held=dofs_of(grid.sides["left"]),
+        load=looked_up(Forces(*_pull(grid, p["load"]))),
+        held=dofs_of(grid.sides["left"]),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
-        results=partial(_found_by_ranks, grid, moduli),
     )  # fmt: skip
 
 
+def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+    """Report what ranks have found, as `quantities`."""
+    return partial(_found_by_ranks, _grid(params), _stiffness(params)[0], dual)
+
+
 def _found_by_ranks(
-    grid: StructuredGrid, moduli: Vector, found: OwnSolution
+    grid: StructuredGrid, moduli: Vector, dual: OwnDual, found: OwnSolution
 ) -> dict[str, Any]:
-    """Report what ranks have found, as `quantities`; called by all of them."""
-    own, dual = found.subdomains, dual_of(found.subdomains)
+    """Report what ranks have found; called by all of them."""
+    own = found.subdomains
     tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]))
     known = {
         "nodes": grid.nodes,
@@ -237,9 +233,7 @@ def _found_by_ranks(
         "energy": found.energy * LOAD * LENGTH,
         "tip": (found.at(tip) * LENGTH).tolist(),
     }
-    return known | conditions(
-        _spectra(moduli, partial(spectra_over_ranks, dual.P, dual.A))
-    )
+    return known | conditions(_spectra(moduli, dual))
 
 
 def _size(p: Mapping[str, Any]) -> tuple[float, float]:

@@ -16,10 +16,11 @@ from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.feti.emission import OwnSubdomains, subdomains_of
+from mortarbench.problems.feti.subdomains import OwnSubdomains, subdomains_of
 from mortarbench.problems.feti.torn import Kind
 from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.torn_bodies import parts_of
 
 
 def probe(n):
@@ -31,7 +32,7 @@ def told(name, ranks):
     """Emit by all ranks; tell the first one what each has."""
     case = parse(name, PROBLEMS)
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
-    problem = case.family.in_subdomains(case.params)
+    problem = parts_of(name)
     share = made.share().qp
     rows = share.P.halo.rows
     own = rows[share.P.halo.own]

@@ -23,11 +23,11 @@ from mortarbench.harness.verify.admissible import UncertifiableError
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.feti.emission import emitted
-from mortarbench.solvers.reference.over_ranks import reference_over_ranks
+from mortarbench.problems.feti.emission import dual_on, emitted
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.disturbed import DISTURBANCES
 from tests.support.held_by_contact import disc_between_plates, disc_in_parts
+from tests.support.torn_bodies import parts_of
 
 #: of a disc between plates: what holds it but contact, and where all of it is
 DISCS = {
@@ -54,8 +54,7 @@ def posed(name):
         keys = DISCS[name]
         return disc_in_parts(**keys), lambda: disc_between_plates(**keys)
     case = parse(name, PROBLEMS)
-    problem = case.family.in_subdomains(case.params)
-    return problem, lambda: case.build(reference_solution)
+    return parts_of(name), lambda: case.build(reference_solution)
 
 
 def true(build, ranks):
@@ -169,7 +168,7 @@ class BoundSearch:
 
 def problem_of(problem, ranks):
     """Emit a problem; return what this rank has of its bodies."""
-    share = emitted(problem, ranks, reference_over_ranks)
+    share = emitted(dual_on(problem, ranks), None)
     qp = share.share().qp
     nothing = Solution(
         status=Status.FAILED, x=0 * qp.q, y=0 * qp.b, z=qp.h, z_box=0 * qp.q

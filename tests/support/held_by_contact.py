@@ -27,14 +27,13 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.dualisation import Transformed
-from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.problem import stated
 from mortarbench.problems.duality.torn_dual import torn_dual
+from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from mortarbench.problems.feti.elastic import in_parts, linearised_by, subdivide, torn
-from mortarbench.problems.feti.emission import ProblemInParts
-from mortarbench.problems.feti.partition import graph_partition
-from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdomains import ProblemInParts
+from tests.support.torn_bodies import parts_by, torn_by
 
 PRESSURE = 1e7  #: Pa
 
@@ -85,16 +84,9 @@ def disc_in_parts(
 ) -> ProblemInParts:
     """Describe the dual of `disc_between_plates`, cut into so many parts by METIS."""
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
-    mesh, fixed = bodies.mesh, bodies.B_D.indices
-    label = graph_partition(mesh.points, mesh.cells, bodies.body, parts)
-    named = np.concatenate([fixed, bodies.interface]) // 2
-    loaded = np.flatnonzero(bodies.f)
-    return in_parts(
-        mesh_in_parts(mesh, label, bodies.body, named), materials=bodies.materials,
-        plane=bodies.plane, units=(bodies.length, bodies.force), names=bodies.names,
-        fixed=fixed, load=(loaded, bodies.f[loaded] * bodies.force),
-        pairs=bodies.pairs, linearise=linearised_by(contact, basis), glue="orthonormal",
-    )  # fmt: skip
+    rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
+    return parts_by(bodies, stated(bodies).shape.layout(parts), primal)
 
 
 def torn_disc_between_plates(
@@ -109,8 +101,8 @@ def torn_disc_between_plates(
     bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
-    label = graph_partition(bodies.mesh.points, bodies.mesh.cells, bodies.body, parts)
-    return torn_dual(torn(subdivide(bodies, label), primal), primal)
+    layout = stated(bodies).shape.layout(parts)
+    return torn_dual(torn_by(bodies, layout, primal), primal)
 
 
 def _disc_and_plates(

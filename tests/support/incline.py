@@ -9,15 +9,11 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.stepping import single_load
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.case_forms import case_of
+from mortarbench.problems.duality.problem import Choice, ContactProblem, by_keys, stated
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 from mortarbench.solvers.reference.solve import reference_solution
@@ -53,15 +49,10 @@ def incline(ratio: float, slope: float = 0.1) -> Bodies:
 def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
     """Emit the QP of the block under a law of friction, in one form."""
     bodies = incline(ratio)
-    linearise = linearisation(bodies, "mortar", "dual", (law,))
-    primal, friction = single_load(
-        bodies, linearise, (law,),
-        factorise=lambda: floating(bodies), reference=reference_solution,
+    of = stated(bodies)
+    problem = ContactProblem(
+        bodies=of, linearise=by_keys({"contact": "mortar", "basis": "dual"}),
+        stages=load_steps(1, 1, of.forces, of.fixed, (law,)),
+        pressed=float(np.abs(bodies.f).sum()),
     )  # fmt: skip
-    return contact_case(
-        bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
-        quantities=lambda s: quantities(bodies, primal, s, friction),
-        friction=friction,
-    )  # fmt: skip
+    return case_of(problem, form, Choice(), reference_solution)

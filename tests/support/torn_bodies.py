@@ -1,22 +1,82 @@
-"""Beam and ring in subdomains, for tests of what works on these."""
+"""Bodies in the subdomains that cells are labelled with, for tests."""
 
+from importlib import import_module
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from mortarbench.harness import QP, Friction
+from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.stepping import primal_qp
-from mortarbench.problems.feti.elastic import subdivide, torn
-from mortarbench.problems.feti.tearing import structured_bodies
+from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.duality.divided import in_parts
+from mortarbench.problems.duality.problem import chosen, stated
+from mortarbench.problems.duality.undivided import primal_qp, whole_path
+from mortarbench.problems.families.in_subdomains import ContactFamily
+from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_parts
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
 from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.beam_ring import model
+from mortarbench.solvers.reference.solve import reference_solution
+
+
+def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
+    """Know the bodies by the labels (E,) of their cells; all nodes are listed."""
+    every = np.arange(len(bodies.mesh.points))
+    return mesh_in_parts(bodies.mesh, label, bodies.body, every)
+
+
+def torn_by(
+    bodies: Bodies,
+    layout: Subdivision,
+    primal: QP,
+    friction: Friction = NO_FRICTION,
+    rows: str = "orthonormal",
+) -> Torn:
+    """Tear bodies with a QP of theirs, with friction."""
+    return torn(parts_by(bodies, layout, primal, friction, rows))
+
+
+def parts_by(
+    bodies: Bodies,
+    layout: Subdivision,
+    primal: QP,
+    friction: Friction = NO_FRICTION,
+    rows: str = "orthonormal",
+) -> ProblemInParts:
+    """Pose a QP of the bodies, with friction, on their subdomains."""
+    of = stated(bodies)
+    (stage,) = load_steps(1, 1, of.forces, of.fixed)
+    contact = Contact(*contact_rows(primal, friction), friction.bound)
+    return in_parts(of, layout, rows, stage, contact)
+
+
+def parts_of(name: str) -> ProblemInParts:
+    """Describe the dual of a case; what comes before it is solved."""
+    case = parse(name, PROBLEMS)
+    if isinstance(case.family, ContactFamily):
+        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
+        path = whole_path(problem, reference_solution)
+        whole, friction, _ = path.problem(choice.step, choice.iterate)
+        of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
+        contact = Contact(*contact_rows(whole.primal, friction), friction.bound)
+        layout = of.shape.layout(choice.size)
+        return in_parts(of, layout, choice.glue, stage, contact)
+    models = import_module(f"mortarbench.problems.models.{case.family.name}")
+    found: ProblemInParts = models.in_subdomains(case.params)
+    return found
 
 
 def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:
     """Bodies of 32 × 4 and 36 × 6 cells, their QP, and both in subdomains."""
-    bodies = model(4, 3, 6, "strain")
+    geometry = (4, 3, 6, "strain")
+    bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
-    parts = subdivide(bodies, structured_bodies([(32, 4), (36, 6)], most))
-    return bodies, primal, torn(parts, primal, rows=rows)
+    label = of_beam_ring(*geometry).shape.layout(most).label
+    return bodies, primal, torn_by(bodies, labelled(bodies, label), primal, rows=rows)

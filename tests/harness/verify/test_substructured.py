@@ -24,12 +24,12 @@ from mortarbench.harness.verify.references import ReferencePoint, reference_poin
 from mortarbench.harness.verify.substructured import Torn, neighbour, still
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.elastic import subdivide, torn
 from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.disturbed import DISTURBANCES
+from tests.support.torn_bodies import labelled, torn_by
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
@@ -51,7 +51,7 @@ def bodies_of(name: str) -> Bodies:
         return beam_ring.model(*(params[key] for key in keys))
     if name.startswith("contact-patch"):
         return patch.model(params)
-    return hertz.two_cylinders(params)[0]
+    return hertz.two_cylinders(params)[0].assembled
 
 
 def boxes(bodies: Bodies, parts: tuple[int, int]) -> Any:
@@ -100,14 +100,16 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
     whole, bodies = case.mechanics, bodies_of(name)
     assert whole is not None
-    domains = subdivide(bodies, boxes(bodies, parts))
+    layout = labelled(bodies, boxes(bodies, parts))
 
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
     mechanics = replace(
         whole, factorise=never,
-        tear=lambda: LocalProblems(torn(domains, whole.primal, whole.friction)),
+        tear=lambda: LocalProblems(
+            torn_by(bodies, layout, whole.primal, whole.friction)
+        ),
     )  # fmt: skip
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution))

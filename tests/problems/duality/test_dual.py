@@ -11,7 +11,7 @@ from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.stepping import LoadPath
+from mortarbench.problems.duality.undivided import path_of
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -25,7 +25,8 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
 )
 from mortarbench.problems.fem.mesh import dofs_of, half_ring, join, rectangle
-from mortarbench.problems.models.beam_ring import _clamped, _floating, model
+from mortarbench.problems.models.beam_ring import bodies as bodies_of
+from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
 
@@ -257,7 +258,8 @@ def test_recovery_keeps_the_claim():
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_a_dual_is_charged_for_a_factor_that_was_there_already(form):
     family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
-    factor = {"dual": _floating, "dual-bounds": _clamped}[form](*geometry)
+    of = bodies_of(*geometry)
+    factor = {"dual": of.floating, "dual-bounds": of.clamped}[form]
     assert factor.seconds > 0
     for step in (1, 2):
         params = family.complete(dict(Nr=3, Nh=2, step=step))
@@ -280,12 +282,15 @@ class Counted:
 
 
 @pytest.mark.parametrize(
-    ("factorise", "transform"), [(_floating, dualise), (_clamped, dual_bounds)]
+    ("factorise", "transform"), [("floating", dualise), ("clamped", dual_bounds)]
 )
 def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transform):
     geometry = (3, 2, 4, "strain")
-    bodies, inverse = model(*geometry), Counted(factorise(*geometry))
-    path = LoadPath(
+    bodies, inverse = (
+        model(*geometry),
+        Counted(getattr(bodies_of(*geometry), factorise)),
+    )
+    path = path_of(
         bodies, linearisation(bodies, "nts", "dual"), lambda: inverse,
         reference_solution, 6, transform=transform,
     )  # fmt: skip
@@ -300,7 +305,7 @@ def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transfo
 
 
 @pytest.mark.parametrize(
-    ("factorise", "transform"), [(_floating, dualise), (_clamped, dual_bounds)]
+    ("factorise", "transform"), [("floating", dualise), ("clamped", dual_bounds)]
 )
 def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
     factorise, transform
@@ -308,7 +313,7 @@ def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
     family, geometry = PROBLEMS["beam-ring"], (3, 2, 4, "strain")
     params = family.complete({"Nr": 3, "Nh": 2})
     primal = family.build("primal", params, reference_solution).qp
-    dual = transform(primal, factorise(*geometry))
+    dual = transform(primal, getattr(bodies_of(*geometry), factorise))
     s = reference_solution(dual.qp)
     sides, u = np.unique(primal.G.indices), dual.recover(s).x
 

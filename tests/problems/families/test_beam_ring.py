@@ -10,9 +10,9 @@ from mortarbench.harness.suite.suite import load_suite
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.undivided import primal_qp, whole_path
 from mortarbench.problems.families.beam_ring import BeamRing
-from mortarbench.problems.models.beam_ring import _path, model
+from mortarbench.problems.models.beam_ring import model
 from mortarbench.registries import suites_folder
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
@@ -142,7 +142,7 @@ def test_steps_are_the_same_in_whatever_order_they_are_asked_for():
     orders = [(5, 2, 4), (2, 4, 5)]
     seen = []
     for order in orders:
-        _path.cache_clear()
+        whole_path.cache_clear()
         given = {k: FAMILY.complete(dict(Nr=4, Nh=3, steps=5, step=k)) for k in order}
         seen.append({k: gaps(k, given[k]) for k in order})
 

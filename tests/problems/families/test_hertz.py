@@ -11,7 +11,7 @@ from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.families.hertz import HertzCylinder, HertzPlane
-from mortarbench.problems.models.hertz import sheared, two_cylinders
+from mortarbench.problems.models.hertz import problem, two_cylinders
 from mortarbench.problems.models.line_contact import LineContact
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
@@ -262,9 +262,14 @@ def test_the_tangential_force_turns_no_body():
     """Loads and their moments cancel on each body, so that supports carry nothing."""
     given = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
     params = CYLINDER.complete(given)
-    bodies, _ = two_cylinders(params)
-    load, (x, y) = sheared(bodies.mesh).reshape(-1, 2), bodies.mesh.points.T
-    upper = bodies.body_of_node == 0
+    stated = problem(params)
+    first, last = stated.stages[0].forces, stated.stages[-1].forces
+    bodies = stated.bodies.assembled
+    (x, y), upper = bodies.mesh.points.T, bodies.body_of_node == 0
+    load = np.zeros(bodies.mesh.dofs)
+    load[last.component] = last.value / (0.5 * 0.5)  # of Q in units of μP
+    load[first.component] -= first.value / (0.5 * 0.5)
+    load = load.reshape(-1, 2)
     case = CYLINDER.build("dual", params, reference_solution)
 
     for body, Q in ((upper, 1.0), (~upper, -1.0)):
@@ -335,7 +340,8 @@ def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(rati
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)
     assert exact.a > 4 * 0.008
-    x, y = np.moveaxis(bodies.mesh.points[bodies.mesh.cells], -1, 0)
+    mesh = bodies.shape.mesh
+    x, y = np.moveaxis(mesh.points[mesh.cells], -1, 0)
     area = 0.5 * (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
     half_discs = np.pi * 0.008**2
 

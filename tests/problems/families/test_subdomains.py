@@ -9,7 +9,7 @@ from mortarbench.harness import InputError, Status, kkt_residuals
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.verdicts import certified
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.models import beam_ring
+from mortarbench.problems.duality import problem
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.press import described
@@ -68,8 +68,8 @@ def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
     def refused(*_: object) -> None:
         raise AssertionError("a factor of the whole")
 
-    monkeypatch.setattr(beam_ring, "clamped", refused)
-    monkeypatch.setattr(beam_ring, "floating", refused)
+    monkeypatch.setattr(problem, "clamped", refused)
+    monkeypatch.setattr(problem, "floating", refused)
     case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
     assert certified(case, s)[0]["energy_bound"] <= 1e-5

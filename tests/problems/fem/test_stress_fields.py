@@ -6,7 +6,7 @@ import pytest
 from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.results import fields, nodal_stresses
-from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.fem.elasticity import elasticity_matrix
 from mortarbench.problems.models.beam_ring import model
 

@@ -13,12 +13,14 @@ from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import Preconditioned
 from mortarbench.problems import OPERATORS
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.stepping import primal_qp
-from mortarbench.problems.feti.elastic import subdivide, torn
-from mortarbench.problems.feti.operators import dual_operator, inverted_blocks, made
+from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.feti.operators import inverted_blocks
+from mortarbench.problems.feti.stored import dual_operator, made
+from mortarbench.problems.feti.subdomains import torn
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
+from tests.support.torn_bodies import labelled, torn_by
 
 pytestmark = pytest.mark.together
 
@@ -34,11 +36,11 @@ def beam_and_ring(rows="orthonormal"):
     )
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
-    return torn(subdivide(bodies, label), primal, rows=rows)
+    return torn_by(bodies, labelled(bodies, label), primal, rows=rows)
 
 
 def membranes(rows="orthonormal"):
-    return Membranes(2, 4).torn(rows)
+    return torn(Membranes(2, 4).in_subdomains(rows))
 
 
 @pytest.fixture(
@@ -99,7 +101,7 @@ def test_a_product_with_a_matrix_is_that_with_each_column(pair):
 def test_a_block_that_is_not_formed_gives_the_same_product(pair):
     arrays = operator_of(pair).arrays
     implicit = made({**arrays, "explicit": np.zeros_like(arrays["explicit"])})
-    x = np.random.default_rng(3).standard_normal((pair.scale.size, 2))
+    x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
     Fx = made(arrays)(x)
 
     assert arrays["explicit"].all()
@@ -142,11 +144,11 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
 
 def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
     """Each of two membranes in one square, of the same kind or of two."""
-    pair = Membranes(1, 4).torn("orthonormal")
+    pair = torn(Membranes(1, 4).in_subdomains("orthonormal"))
     (kind,) = pair.kinds
     other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
     F, apart = operator_of(pair), operator_of(other)
-    x = np.random.default_rng(3).standard_normal((pair.scale.size, 2))
+    x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
 
     assert_allclose(apart @ x, F @ x, rtol=1e-11, atol=1e-13)
     for name in KINDS:
@@ -224,13 +226,13 @@ def test_contact_rows_do_not_weigh_the_equations(kind):
     equations = alone.build().preconditioner(kind, "stiffness")(np.eye(E))
 
     assert (pair.B[E:] @ pair.B[:E].T).nnz
-    found = whole(np.eye(pair.scale.size))[:E, :E]
+    found = whole(np.eye(pair.c.size))[:E, :E]
     assert_allclose(found, equations, atol=1e-12 * abs(equations).max())
 
 
 def test_preconditioners_bring_the_spectrum_together():
     """As the field has it: none, lumped, Dirichlet."""
-    pair = Membranes(2, 8).torn("orthonormal")
+    pair = torn(Membranes(2, 8).in_subdomains("orthonormal"))
     F = operator_of(pair)
     _, B, R = dense(pair)
     G = R.T @ B.T
@@ -261,7 +263,7 @@ def test_a_wrong_name_of_a_preconditioner_is_refused_with_the_right_ones():
 
 def test_a_written_operator_is_read_as_the_same(tmp_path):
     pair = beam_and_ring()
-    F, m = operator_of(pair), pair.scale.size
+    F, m = operator_of(pair), pair.c.size
     qp = QP(
         P=F, q=pair.c, A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
         lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
@@ -276,7 +278,8 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
 
 def test_equal_subdomains_share_one_stiffness_in_what_is_written():
     few, many = (
-        operator_of(Membranes(S, 4).torn("orthonormal")).arrays for S in (1, 3)
+        operator_of(torn(Membranes(S, 4).in_subdomains("orthonormal"))).arrays
+        for S in (1, 3)
     )
     assert few["K_data"].size == many["K_data"].size
     assert many["kind"].size == 9 * few["kind"].size

@@ -10,11 +10,10 @@ from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import QP, Vector, no_rows
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.stepping import primal_qp
+from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.feti import spectrum as module
 from mortarbench.problems.feti.distributed import shared
-from mortarbench.problems.feti.elastic import torn
-from mortarbench.problems.feti.operators import DualOperator, dual_operator
+from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     projector,
@@ -23,10 +22,12 @@ from mortarbench.problems.feti.spectrum import (
     spectra_over_ranks,
     spectrum,
 )
-from mortarbench.problems.models.beam_ring import model, subdivided
+from mortarbench.problems.feti.stored import dual_operator
+from mortarbench.problems.feti.subdomains import torn
+from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.membranes import Membranes
 from tests.support.threads import on_threads, without_lock
-from tests.support.torn_bodies import torn_pair
+from tests.support.torn_bodies import torn_by, torn_pair
 
 
 def identity(x: Vector) -> Vector:
@@ -115,10 +116,11 @@ def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
 def of_beam_ring(layers: int, cells: int) -> Spectrum:
     """Supports and gluing of beam and ring, so many layers of cells each."""
     geometry = layers, layers // 2, layers
-    bodies = model(*geometry, "strain")
+    of = bodies_of(*geometry, "strain")
+    bodies, layout = of.assembled, of.shape.layout(cells)
     contact = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
-    pieces = torn(subdivided(cells, *geometry, "strain"), primal)
+    pieces = torn_by(bodies, layout, primal)
     (found,) = spectra_of_equations(pieces, tol=1e-3)
     return found
 
@@ -154,8 +156,8 @@ def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
 
 
 def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
-    torn = Membranes(2, 2).torn("redundant")
-    B = torn.B[: torn.equalities]
+    pieces = torn(Membranes(2, 2).in_subdomains("redundant"))
+    B = pieces.B[: pieces.equalities]
     x = np.random.default_rng(1).standard_normal(B.shape[0])
     dense = B.toarray()
     found = projector(csr_array((0, B.shape[0])), B)(x)
@@ -166,11 +168,11 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
 def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
     """On ker G ∩ range B; without a coarse problem on range B."""
     without_lock(monkeypatch, DualOperator, "_blocks")
-    torn = Membranes(2, 2).torn("redundant")
-    m = torn.equalities
-    B = torn.B[:m]
-    F = dual_operator(B, torn.domains, m)
-    G = csr_array((B @ torn.domains.kernel).T)
+    pieces = torn(Membranes(2, 2).in_subdomains("redundant"))
+    m = pieces.equalities
+    B = pieces.B[:m]
+    F = dual_operator(B, pieces.domains, m)
+    G = csr_array((B @ pieces.domains.kernel).T)
     if not floating:
         G = G[:0]
     qp = QP(

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from mortarbench.problems.duality.divided import longitudinal_share
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import half_ring_grid, join, rectangle_grid
-from mortarbench.problems.feti.elastic import longitudinal_share
 from mortarbench.problems.feti.structured import Layout, shape_factors, spacings
-from mortarbench.problems.feti.tearing import decompose, structured_bodies
+from tests.support.glued import decompose, structured_bodies
 
 pytestmark = pytest.mark.together
 

@@ -4,18 +4,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from mortarbench.harness.names import parse
-from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
-from mortarbench.problems.feti.emission import subdomains_of
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
-from mortarbench.problems.feti.tearing import (
-    compact_blocks,
-    decompose,
-    labelled,
-    structured_bodies,
-)
+from mortarbench.problems.feti.subdomains import subdomains_of
+from mortarbench.problems.feti.tearing import compact_blocks, labelled
+from tests.support.glued import decompose, structured_bodies
+from tests.support.torn_bodies import parts_of
 
 pytestmark = pytest.mark.together
 
@@ -170,8 +165,7 @@ def _around(own):
 
 def test_ranks_hold_alike_much_where_few_subdomains_have_most_of_the_work():
     """A half disc, graded: long boundaries in its middle, most nodes around it."""
-    case = parse("hertz-plane/n=8/halvings=4/feti=16/dual", PROBLEMS)
-    problem = case.family.in_subdomains(case.params)
+    problem = parts_of("hertz-plane/n=8/halvings=4/feti=16/dual")
     of, rank = problem.layout, subdomains_of(problem, 2)
 
     for held in (of.sizes, of.glued() ** 2):

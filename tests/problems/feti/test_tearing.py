@@ -1,21 +1,21 @@
 """Bodies torn into subdomains, and the rows that hold these together."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
+from mortarbench.problems.contact.stepping import Forces
+from mortarbench.problems.duality.divided import elastic_kind, looked_up
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import rectangle
-from mortarbench.problems.feti.elastic import elastic_kind
-from mortarbench.problems.feti.gluing import glue, without_supports
-from mortarbench.problems.feti.tearing import (
-    blocks,
-    compact_blocks,
-    decompose,
-    labelled,
-    structured_bodies,
-)
+from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
+from mortarbench.problems.feti.tearing import blocks, compact_blocks, labelled
+from tests.support.glued import decompose, glue, structured_bodies
 from tests.support.torn_bodies import torn_pair
 
 GLUING = ("orthonormal", "chain", "redundant")
@@ -149,12 +149,10 @@ def test_rows_hold_exactly_what_is_whole_and_supported(rows: str) -> None:
     assert_allclose(held[: pair.equalities], 0, atol=1e-9)
     assert_allclose(
         held[pair.equalities :],
-        pair.scale[pair.equalities :] * (primal.G @ u),
+        pair.scale * (primal.G @ u),
         rtol=1e-10,
     )
-    assert_allclose(
-        pair.c[pair.equalities :], pair.scale[pair.equalities :] * primal.h, rtol=1e-12
-    )
+    assert_allclose(pair.c[pair.equalities :], pair.scale * primal.h, rtol=1e-12)
     # nothing else is held: the torn motions that all equations leave at rest
     B_E = (pair.B[: pair.equalities]).toarray()
     rank = int((np.linalg.svd(B_E, compute_uv=False) > 1e-9).sum())
@@ -171,10 +169,10 @@ def test_the_load_is_that_of_the_whole(rows: str) -> None:
 def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
     _, _, pair = torn_pair()
     E = pair.equalities
-    B = np.diag(1 / pair.scale) @ pair.B.toarray()
+    root_E = np.linalg.norm(pair.B.toarray(), axis=1)
+    B = np.diag(1 / root_E) @ pair.B.toarray()
     assert_allclose(B[:E] @ B[:E].T, np.eye(E), atol=1e-14)
     assert_allclose(B[E:] @ B[:E].T, 0, atol=1e-14)
-    root_E = np.linalg.norm(pair.B.toarray(), axis=1)
     assert_allclose(np.unique(root_E.round(6)), np.sqrt([400.0, 4000.0]).round(6))
 
 
@@ -186,20 +184,44 @@ def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
     assert np.unique(np.concatenate([k.stiffness for k in pair.kinds])).size == 2
 
 
+@pytest.mark.parametrize("rows", GLUING)
+def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> None:
+    """Supports, gluing and contact in the same order, with the same signs."""
+    bodies, primal, found = torn_pair(rows)
+    label = structured_bodies([(32, 4), (36, 6)], 2)
+    parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
+    D, E = bodies.elasticity * (bodies.length / bodies.force), bodies.moduli
+    expected = glue(
+        parts, tuple(elastic_kind(part, D, E) for part in parts.parts),
+        load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
+        contact=csr_array(primal.G), c=primal.h, E=E[bodies.body_of_node], rows=rows,
+    )  # fmt: skip
+    largest = abs(expected.B).max()
+
+    assert found.equalities == expected.equalities
+    assert abs(found.B - expected.B).max() <= 1e-14 * largest
+    assert abs(found.spread - expected.spread).max() <= 1e-14
+    for name in ("c", "f", "scale"):
+        assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-14)
+    assert np.array_equal(found.kind, expected.kind)
+
+
 def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     mesh = rectangle((0.0, 0.0), (2.0, 1.0), (4, 2))
     label, n = blocks((4, 2), 2), mesh.dofs
-    parts = decompose(mesh.points, mesh.cells, label, np.zeros_like(label))
     D, E = elasticity_matrix(Material(1.0, 0.3), "strain")[None], np.ones(1)
-    kinds = tuple(elastic_kind(part, D, E) for part in parts.parts)
     held = 2 * mesh.boundaries["left"]
-    pair = glue(
-        parts, kinds, load=np.arange(1.0, n + 1),
-        contact=csr_array(eye_array(n, format="csr")[held[:1]]), c=np.ones(1),
-        supports=csr_array(eye_array(n, format="csr")[held]),
-        supported=np.zeros(held.size), E=np.ones(len(mesh.points)),
+    load = np.arange(1.0, n + 1)
+    layout = mesh_in_parts(mesh, label, np.zeros_like(label), np.arange(n // 2))
+    problem = ProblemInParts(
+        layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
+        kind=partial(elastic_kind, D=D, E=E), E=E, names=("plate",),
+        load=looked_up(Forces(np.arange(n), load)), held=held, glue="orthonormal",
+        contact=Contact(
+            csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
+        ),
     )  # fmt: skip
-    found = without_supports(pair, held)
+    pair, found = torn(problem), torn(replace(problem, eliminated=True))
     first, second = (found.kinds[k] for k in found.kind)
     assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
     assert abs(first.K @ first.R).max() < 1e-13
@@ -212,4 +234,4 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     assert_allclose(found.spread @ u, (pair.spread @ u)[pair.spread @ u != 0])
     assert_allclose(found.B @ (found.spread @ u), 0, atol=1e-12)
     free = ~np.isin(np.arange(n), held)
-    assert_allclose(found.spread.T @ found.f, free * np.arange(1.0, n + 1))
+    assert_allclose(found.spread.T @ found.f, free * load)

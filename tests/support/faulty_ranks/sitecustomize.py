@@ -20,7 +20,7 @@ STAGES = {
     "solve": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
     "residuals": ("mortarbench.harness.verify.verdicts", "_values_by_ranks"),
     "certificate": ("mortarbench.harness.verify.verdicts", "certify_over_ranks"),
-    "quantities": ("mortarbench.problems.feti.elastic", "_largest_von_mises"),
+    "quantities": ("mortarbench.problems.duality.divided", "_largest_von_mises"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 

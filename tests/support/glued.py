@@ -1,57 +1,106 @@
-"""Rows that hold torn bodies together: supports, gluing, contact.
+"""Tearing and gluing of a whole mesh by sparse algebra: what subdomains must make.
 
-Supports are rows of every copy of a node. Copies of a component that is free are glued,
-m copies by one of
-
-* ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
-* ``chain``: m − 1 rows  v_p − v_q = 0  of copies that follow one another,
-* ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
-
-Contact rows act on the average of the copies, which is the same for all of them once
-they are glued; so a contact row is there once, wherever subdomains meet, and orthogonal
-to all gluing.
-
-Rows of a body are scaled by √E of that body, contact rows by that of the softest body
-they touch, after they are normalised: then F does not depend on E where each body is
-homogeneous. A factor of E may follow the shape of cells (`problems.feti.structured`).
+A second way to the same rows, for tests. Rows are those of
+`mortarbench.problems.feti.subdomains`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from itertools import combinations
-from types import MappingProxyType
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space, qr
-from scipy.sparse import bsr_array, csc_array, csr_array, diags_array, eye_array, vstack
+from scipy.sparse import bsr_array, csr_array, diags_array, eye_array, vstack
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.tearing import Decomposition
-from mortarbench.problems.feti.torn import Kind, Subdomains, Torn
-
-Weights = Callable[[int], NDArray[np.float64]]
-
-
-def _orthonormal(m: int) -> NDArray[np.float64]:
-    return np.asarray(np.linalg.qr(np.ones((m, 1)), mode="complete")[0][:, 1:].T)
+from mortarbench.problems.feti.subdomains import GLUE, Weights
+from mortarbench.problems.feti.tearing import Part, blocks, classify
+from mortarbench.problems.feti.torn import Kind, Torn
 
 
-def _chain(m: int) -> NDArray[np.float64]:
-    return np.eye(m - 1, m) - np.eye(m - 1, m, 1)
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Decomposition:
+    """A mesh whose S subdomains have nodes of their own, M in all.
+
+    Torn nodes are numbered subdomain after subdomain, and within one in the order of
+    the nodes that they are copies of.
+    """
+
+    node: Nodes  #: (M,) node of the whole mesh that each torn node is a copy of
+    nodes: int  #: of the whole mesh
+    start: NDArray[np.int64]  #: (S + 1,) first torn node of each subdomain, and M
+    parts: tuple[Part, ...]  #: the first subdomain of each kind
+    kind: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
+    #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
+    rotation: NDArray[np.float64]
+    label: NDArray[np.int64]  #: (E,) subdomain of each cell of the whole mesh
+
+    @property
+    def subdomain(self) -> NDArray[np.int64]:
+        """Subdomain of each torn node, (M,)."""
+        return np.repeat(np.arange(self.kind.size), np.diff(self.start))
 
 
-def _redundant(m: int) -> NDArray[np.float64]:
-    p, q = np.array(list(combinations(range(m), 2))).T
-    return np.asarray(np.eye(m)[p] - np.eye(m)[q])
+def structured_bodies(
+    divisions: Sequence[tuple[int, ...]], most: int
+) -> NDArray[np.int64]:
+    """Label the cells of structured meshes, one after another, each by its `blocks`.
+
+    Parameters
+    ----------
+    divisions : of each body, as of `blocks`
+    most : H/h
+
+    """
+    labels = [np.zeros(0, dtype=np.int64)]
+    for body in divisions:
+        labels.append(blocks(body, most) + labels[-1].max(initial=-1) + 1)
+    return np.concatenate(labels)
 
 
-#: the weights (rows, m) of m copies of a component
-GLUE: Mapping[str, Weights] = MappingProxyType(
-    {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
-)
+def decompose(
+    points: NDArray[np.float64],
+    cells: Nodes,
+    label: NDArray[np.int64],
+    material: NDArray[np.int64],
+) -> Decomposition:
+    """Cut a mesh into the subdomains that its cells are labelled with.
+
+    Parameters
+    ----------
+    points : (n, dim)
+    cells : (E, corners)
+    label : (E,) subdomain of each cell, 0 … S − 1, none of them empty
+    material : (E,) of each cell; subdomains of one kind have the same
+
+    """
+    n, S = len(points), int(label.max()) + 1
+    by_label = np.argsort(label, kind="stable")
+    copies, corner = np.unique(
+        (label[by_label, None] * n + cells[by_label]).ravel(), return_inverse=True
+    )
+    start = np.searchsorted(copies, n * np.arange(S + 1))
+    first_cell = np.searchsorted(label[by_label], np.arange(S + 1))
+    node = copies % n
+    corner = corner.reshape(cells.shape) - start[label[by_label], None]
+
+    def part(s: int) -> Part:
+        mine = slice(first_cell[s], first_cell[s + 1])
+        own = node[start[s] : start[s + 1]]
+        return Part(points[own], corner[mine], material[by_label[mine]])
+
+    def key(s: int) -> tuple[bytes, bytes]:
+        mine = part(s)
+        return mine.cells.tobytes(), mine.material.tobytes()
+
+    torn = np.split(points[node], start[1:-1])
+    first, kind, rotation = classify(map(key, range(S)), torn)
+    return Decomposition(
+        node=node, nodes=n, start=start, parts=tuple(map(part, first)),
+        kind=kind, rotation=rotation, label=label,
+    )  # fmt: skip
 
 
 def glue(
@@ -106,8 +155,8 @@ def glue(
     return Torn(
         kinds=kinds, kind=decomposition.kind, spread=T,
         B=csr_array(diags_array(scale) @ vstack([B_E @ turn, B_I])),
-        c=scale * np.append(values, c), scale=scale, f=average @ load,
-        equalities=of_row.size, label=decomposition.label,
+        c=scale * np.append(values, c), scale=scale[of_row.size :],
+        f=average @ load, equalities=of_row.size,
     )  # fmt: skip
 
 
@@ -158,54 +207,3 @@ def _rotation(decomposition: Decomposition, d: int) -> csr_array:
     )
     Q.eliminate_zeros()
     return Q
-
-
-def without_supports(torn: Torn, held: Nodes) -> Torn:
-    """Eliminate what supports hold, as FETI-1 does: such subdomains do not float.
-
-    Parameters
-    ----------
-    torn : its supports hold components at zero, in the axes of the whole
-    held : these components of the whole
-
-    """
-    N, E = torn.f.size, torn.equalities
-    free = np.ones(N, dtype=bool)
-    free[csr_array(torn.spread[:, held]).nonzero()[0]] = False
-    kept = np.flatnonzero(free)
-    B = csr_array(torn.B[:, kept])
-    rows = np.flatnonzero((np.diff(B.indptr) > 0) | (np.arange(B.shape[0]) >= E))
-    domains = without(torn.domains, free)
-    return Torn(
-        kinds=domains.kinds, kind=domains.kind, spread=csr_array(torn.spread[kept]),
-        B=csr_array(B[rows]), c=torn.c[rows], scale=torn.scale[rows], f=torn.f[kept],
-        equalities=int((rows < E).sum()),
-    )  # fmt: skip
-
-
-def without(domains: Subdomains, free: NDArray[np.bool_]) -> Subdomains:
-    """Return subdomains without all but their free torn unknowns (N,)."""
-    kinds, kind = list[Kind](), np.empty_like(domains.kind)
-    known = dict[tuple[int, bytes], int]()
-    for s, k in enumerate(domains.kind):
-        mine = free[domains.start[s] : domains.start[s + 1]]
-        found = known.setdefault((int(k), mine.tobytes()), len(kinds))
-        if found == len(kinds):
-            kinds.append(_held(domains.kinds[k], mine))
-        kind[s] = found
-    return Subdomains(tuple(kinds), kind)
-
-
-def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:
-    """Return a subdomain without all but its free components (n_k,)."""
-    if free.all():
-        return kind
-    R = kind.R @ null_space(kind.R[~free])
-    R = np.linalg.qr(R[free])[0]
-    number = np.cumsum(free) - 1
-    return Kind(
-        K=csc_array(kind.K[free][:, free]), R=R,
-        fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
-        boundary=number[kind.boundary[free[kind.boundary]]],
-        stiffness=kind.stiffness[free],
-    )  # fmt: skip
