@@ -39,6 +39,7 @@ from mortarbench.problems.feti.spectrum import spectra_of_equations
 from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import Contact, torn
 from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.smalbe.solver import SMALBE

@@ -171,7 +171,7 @@ def operator(name, ranks):
     by_rank, alike = projected(share.qp, factor.FILL), projected(share.qp, 0)
     worst["coarse"] = float(np.abs(by_rank - alike).max() / np.abs(alike).max())
     solved = share.whole(SMALBE().prepare(share.qp, TOL)())
-    everywhere = ranks.comm.gather((worst, own.size, P.local.parts))
+    everywhere = ranks.comm.gather((worst, own.size, P.local.domains.kind.size))
     if solved is None:
         return None
     alone = SMALBE().prepare(qp, TOL)()
