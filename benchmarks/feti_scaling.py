@@ -31,14 +31,14 @@ from mortarbench.harness import Mechanics, certify, no_rows
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import in_parts
+from mortarbench.problems.duality.divided import described
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.torn_dual import torn_dual
 from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.feti.own_bodies import certified_by
 from mortarbench.problems.feti.spectrum import spectra_of_equations
 from mortarbench.problems.feti.stored import dual_operator
-from mortarbench.problems.feti.subdomains import Contact, torn
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.baselines.feti import FETI
@@ -61,15 +61,15 @@ def one(way, Nr, cells):
     u = np.zeros(bodies.mesh.dofs)
     primal = primal_qp(bodies, node_to_segment(bodies.mesh.points, u, *bodies.pairs[0]))
     lap()
-    pieces = tear = None
+    pieces = in_parts = None
     if way == "feti":
         of = bodies_of(Nr, Nr // 2, Nr, "strain")
         (stage,) = load_steps(1, 1, of.forces, of.fixed)
         contact = Contact(primal.G, primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
-        pieces = torn(in_parts(of, layout, "orthonormal", stage, contact))
+        own = on_one_process(described(of, layout, "orthonormal", stage, contact))
+        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
         dual = torn_dual(pieces, primal)
-        tear = lambda: LocalProblems(pieces)  # noqa: E731
     else:
         dual = dualise(primal, floating(bodies))
     lap()
@@ -80,7 +80,8 @@ def one(way, Nr, cells):
     back = dual.recover(s)
     lap()
     mechanics = Mechanics(
-        primal=primal, back=dual.recover, factorise=lambda: clamped(bodies), tear=tear,
+        primal=primal, back=dual.recover, factorise=lambda: clamped(bodies),
+        in_parts=in_parts,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound

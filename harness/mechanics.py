@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import null_space
 from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
 
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
@@ -250,8 +249,9 @@ class Mechanics:
         None  #: to compare meshes, see `harness.crossval.discretisation`
     )
     friction: Friction = NO_FRICTION
-    #: called once, if at all; with it, certificates need no factor of the whole K
-    tear: Callable[[], Substructures] | None = None
+    #: bounds the error of a displacement (n,) with multipliers (m,) of `rows` by
+    #: subdomains, as a `Certificate`; no factor of the whole K is needed then
+    in_parts: Callable[[Vector, Vector], Any] | None = None
 
     @cached_property
     def rows(self) -> csr_array:
@@ -301,15 +301,9 @@ class Mechanics:
         return csr_array(self.primal.P).astype(Real)
 
     @cached_property
-    def substructures(self) -> Substructures:
-        """K as a sum over subdomains, torn at the first use."""
-        assert self.tear is not None
-        return self.tear()
-
-    @cached_property
     def whole(self) -> Mechanics:
         """The same without subdomains: for what needs K⁺, or u_λ without jumps."""
-        return self if self.tear is None else replace(self, tear=None)
+        return self if self.in_parts is None else replace(self, in_parts=None)
 
     def energy(self, u: Extended) -> float:
         """Return the potential energy of `u` (n,), SI, summed in extended precision.
@@ -321,24 +315,14 @@ class Mechanics:
         return float(self.scale * objective + self.constant)
 
     @cached_property
-    def _unsupported(self) -> NDArray[np.float64]:
-        """Orthonormal rigid motions (n, r) that the supports leave."""
-        if self.tear is None:
-            return self.inverse.kernel
-        held = self.exact.held
-        R = self.rigid @ null_space(self.rigid[held]) if held.size else self.rigid
-        R[held] = 0
-        return np.asarray(np.linalg.qr(R)[0])
-
-    @cached_property
     def kernel(self) -> Any:
         """All rigid motions that the supports leave (n, r), sparse, in extended."""
-        return _orthonormal(self._unsupported)
+        return _orthonormal(self.inverse.kernel)
 
     @cached_property
     def motions(self) -> RigidMotions:
         """These motions, split by whether contact feels them."""
-        exact, B, R = self.exact, self.rows, self._unsupported
+        exact, B, R = self.exact, self.rows, self.inverse.kernel
         turn, p = felt_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
         felt = turned[:, :p]

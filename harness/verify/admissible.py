@@ -51,29 +51,14 @@ def admissible(
     """Find û with Bû ≤ c near u, with equality on the rows `closed`; None if none.
 
     û = u − K⁺B_Vᵀμ + Rα,  F_VV μ = (Bu − c)_V + B_V Rα  is nearest in the energy norm
-    with equality on the rows V. Of torn bodies, for which K⁺ is not to be had, it is
-    nearest in the norm of diag(K): then only nodes move that rows touch, but for Rα.
+    with equality on the rows V.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
         u = u - moving.free @ (moving.free.T @ u)
-    if mechanics.tear is None:
-        rows = _Rows(exact.B, exact.c, exact.contact)
-        found = _inside(rows, u, closed, partial(_nearest, mechanics))
-        return None if found is None else found.u
-    at = np.unique(mechanics.rows.indices)
-    softness = 1 / mechanics.primal.P.diagonal()
-    softness[exact.held] = 0
-    R = csr_array(moving.felt)[at].toarray()
-    touched = exact._replace(B=csr_array(exact.B[:, at]))
-    found = inside_at_rows(touched, R.astype(np.float64), softness[at], u[at], closed)
-    if found is None:
-        return None
-    whole = u + moving.felt @ found.u[at.size :] if R.size else u.copy()
-    if found.theta != 1:
-        whole *= found.theta
-    whole[at] = found.u[: at.size]
-    return np.asarray(whole)
+    rows = _Rows(exact.B, exact.c, exact.contact)
+    found = _inside(rows, u, closed, partial(_nearest, mechanics))
+    return None if found is None else found.u
 
 
 class _Rows(NamedTuple):

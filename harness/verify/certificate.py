@@ -75,7 +75,6 @@ from mortarbench.harness.verify.admissible import (
 from mortarbench.harness.verify.substructured import (
     Rounding,
     Split,
-    Torn,
     Undivided,
     length,
     neighbour,
@@ -180,9 +179,12 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    split = Undivided(mechanics) if mechanics.tear is None else Torn(mechanics)
+    if mechanics.in_parts is not None:
+        found: Certificate = mechanics.in_parts(s.x, mechanics.multipliers(s))
+        return found
+    split = Undivided(mechanics)
     best = sharpest(_certificates(split, s), lambda: _at_rest(split, s))
-    if best.least >= best.error or mechanics.tear is not None:
+    if best.least >= best.error:
         return best
     return replace(best, least=max(best.least, _least_norm(split)))
 
@@ -213,7 +215,7 @@ def sharpest(
     raise UncertifiableError(f"no admissible pair near the answer: {proven[0]}")
 
 
-def _least_norm(split: Undivided | Torn) -> float:
+def _least_norm(split: Undivided) -> float:
     """Bound ‖u*‖ from below by a pair that owes nothing to an answer."""
     mechanics = split.mechanics
     u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
@@ -223,7 +225,7 @@ def _least_norm(split: Undivided | Torn) -> float:
         return 0.0
 
 
-def _certificates(split: Undivided | Torn, s: Solution) -> Iterator[Certificate | str]:
+def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
     """Yield what the answer's own pair proves and, if that is mostly work, others."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
@@ -233,8 +235,6 @@ def _certificates(split: Undivided | Torn, s: Solution) -> Iterator[Certificate 
     states = suggested(exact, u, multipliers)
     tidied = at_bounds(exact, states, multipliers), states == CLOSED
     pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
-    if mechanics.tear is not None:
-        pairs.reverse()  # of large problems what mostly is enough comes first
     proven = np.inf
     for pair in pairs:
         found = _proved(split, s.x, u, *pair)
@@ -242,20 +242,20 @@ def _certificates(split: Undivided | Torn, s: Solution) -> Iterator[Certificate 
         if is_sharp(found):
             return
         proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
-    exchangeable = mechanics.tear is None and mechanics.kernel.shape[1] > 0
+    exchangeable = mechanics.kernel.shape[1] > 0
     if exchangeable and GOOD < proven <= NEAR:
         v, mu, states = exchanged(mechanics, states, EXCHANGES)
         yield _proved(split, s.x, v, mu, states == CLOSED)
 
 
-def _at_rest(split: Undivided | Torn, s: Solution) -> Certificate | str:
+def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
     """Evaluate the proof for the pair near u = 0, λ = 0."""
     exact = split.mechanics.exact
     u, lam = np.zeros(exact.f.size, dtype=Real), np.zeros(exact.c.size, dtype=Real)
     return _proved(split, s.x, u, lam, np.zeros(lam.size, dtype=bool))
 
 
-def _proved(split: Undivided | Torn, *pair: Any) -> Certificate | str:
+def _proved(split: Undivided, *pair: Any) -> Certificate | str:
     """Evaluate the proof, or say why there is none."""
     try:
         return proof(split, *pair)
@@ -271,7 +271,7 @@ def is_sharp(found: Certificate | str) -> bool:
 
 
 def proof(
-    split: Undivided | Torn, claimed: Vector | Extended, u: Extended,
+    split: Undivided, claimed: Vector | Extended, u: Extended,
     multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
     """Evaluate (4) and (3) for the pair that mending u and λ yields.

@@ -32,6 +32,7 @@ from mortarbench.harness.mechanics import (
     Extended,
     Real,
     Substructures,
+    cancelling,
     felt_first,
 )
 from mortarbench.harness.qp import Vector
@@ -102,6 +103,9 @@ class OwnBodies:
     held: NDArray[np.int64]  #: (h,) places in `components` of those prescribed
     contact: Contact
     unheld: Unheld
+    #: (n, n) of a single process that has assembled it: what rounding makes of it is a
+    #: part of the problem then, where an answer moves bodies with their supports
+    stored: csr_array | None = None
 
     @cached_property
     def among(self) -> AmongRanks:
@@ -230,12 +234,10 @@ def certify_over_ranks(
         raise UncertifiableError("the answer holds NaN or inf")
     u = claimed.astype(Real)
     u[own.held] = 0
-    at = np.unique(own.contact.rows.indices).astype(np.int64)
-    exact, softness = _at_rows(own, at)
-    rigid = _rigid_motions(own, exact, at)
+    split = _OnRanks(own)
+    at, exact, rigid, softness = split.at, split.exact, split.rigid, split.softness
     u = rigid.without_free(own, u)
     trace = own.among.traced(u, at)
-    split = _OnRanks(own, exact, rigid, at)
     raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
     states = suggested(exact, trace, raw)
     tidied = at_bounds(exact, states, raw), states == CLOSED
@@ -418,17 +420,21 @@ class _OnRanks:
     exact kernels, and E is estimated by samples of the rounding of doubles.
     """
 
-    def __init__(self, own: OwnBodies, exact: Exact, rigid: _RigidMotions, at: Any):
-        """Prepare what several pairs need; `at` (w,) are the components of the rows."""
-        self._own, self._exact, self._rigid = own, exact, rigid
-        self._places, self._here = own.among.places(at)
-        self._sharing = Sharing(own.parts, own.held, rigid.together, own.among)
+    def __init__(self, own: OwnBodies) -> None:
+        """Prepare what several pairs need."""
+        self._own = own
+        #: (w,) components that the rows touch
+        self.at = np.unique(own.contact.rows.indices).astype(np.int64)
+        self.exact, self.softness = _at_rows(own, self.at)
+        self.rigid = _rigid_motions(own, self.exact, self.at)
+        self._places, self._here = own.among.places(self.at)
+        self._sharing = Sharing(own.parts, own.held, self.rigid.together, own.among)
 
     def along(self, v: Extended) -> Extended:
-        return self._own.among.along(self._rigid.all, v)
+        return self._own.among.along(self.rigid.all, v)
 
     def motion(self, alpha: Extended) -> Extended:
-        return np.asarray(self._rigid.all @ alpha)
+        return np.asarray(self.rigid.all @ alpha)
 
     def residual(self, u: Extended) -> Residual:
         deformed = still(self, u)
@@ -444,7 +450,7 @@ class _OnRanks:
 
     def pulled(self, multipliers: Extended) -> Extended:
         found = np.zeros(self._own.components.size, dtype=Real)
-        forces = self._exact.B.T @ multipliers
+        forces = self.exact.B.T @ multipliers
         found[self._places[self._here]] = forces[self._here]
         found[self._own.held] = 0
         return found
@@ -473,7 +479,7 @@ class _OnRanks:
         return self._own.among.total(*numbers)
 
     def scattered(self, v: Extended) -> Extended:
-        R = csr_array(self._rigid.all)
+        R = csr_array(self.rigid.all)
         return np.asarray(np.sqrt(self._own.among.along(R.multiply(R), v**2)))
 
     def noise(self, u: Extended) -> Extended:
@@ -483,6 +489,13 @@ class _OnRanks:
         return found
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
+        if self._own.stored is not None:
+            # bodies that w moves far with their supports leave Kw as sums that cancel
+            v = self.spread(w)
+            Kw, Kv = cancelling(self._own.stored, w[:, None])[:, 0], self.product(v)
+            off = Kw - self.joined(Kv)
+            off[self._own.held] = 0
+            return off, abs(float(w @ Kw - v @ Kv))
         variances = self._sharing.variances(self.spread(w))
         off = sample(variances, w, self._own.components, np.float64)
         square = self._own.among.along(csr_array(w[:, None] ** 2), off**2)[0]
@@ -492,7 +505,7 @@ class _OnRanks:
     def rounding(self, held: NDArray[np.float64]) -> Rounding:
         h, p = held.shape[1], held.shape[0]
         strain, curvature = np.zeros(h), np.zeros((h, h))
-        rest = np.zeros(self._rigid.all.shape[1] - p)
+        rest = np.zeros(self.rigid.all.shape[1] - p)
         for k, motion in enumerate(held.T):
             off = self.noise(self.motion(np.append(motion, rest)))
             strain[k] = length(self, off)

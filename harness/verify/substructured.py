@@ -49,7 +49,7 @@ from mortarbench.harness.mechanics import (
     cancelling,
 )
 from mortarbench.harness.qp import Vector
-from mortarbench.harness.verify.products import times_columns, times_rows
+from mortarbench.harness.verify.products import times_columns
 
 #: by how much energies in K and in K_T may differ more than those of û do: it is among
 #: the softest displacements, for which they differ most
@@ -315,64 +315,6 @@ class Undivided(_Stored):
         return Rounding(np.array(strain), along.astype(np.float64))
 
 
-class Torn(_Stored):
-    """Bodies in subdomains, all in this process."""
-
-    def __init__(self, mechanics: Mechanics) -> None:
-        super().__init__(mechanics)
-        parts = mechanics.substructures
-        self.parts = parts
-        loose = np.asarray((parts.kernel.T @ (parts.spread @ self.R)).toarray())
-        self.sharing = Sharing(parts, mechanics.exact.held, loose, Alone())
-        self._rows = csr_array(parts.spread)
-
-    def residual(self, u: Extended) -> Residual:
-        """Return Ku − f with the stored K, and both energies."""
-        Ku, square, deformed = self.stored(u)
-        v = self.spread(deformed)
-        Kv = self.product(v)
-        torn = float(v @ Kv)
-        theta = SAFETY * abs(square - torn) / torn if torn > 0 else 0.0
-        return Residual(self.free(Ku + self.mechanics.primal.q), v, Kv, theta)
-
-    def spread(self, u: Extended) -> Extended:
-        """Return Tu."""
-        T = self._rows
-        return times_rows(T.data, T.indices, T.indptr, u)
-
-    def joined(self, b: Extended) -> Extended:
-        """Return Tᵀb where no support holds."""
-        T = self._rows  # by rows, its transpose by columns
-        return self.free(times_columns(T.data, T.indices, T.indptr, b, T.shape[1]))
-
-    def averaged(self, v: Extended) -> Extended:
-        """Average copies in subdomains that are moved rigidly to agree most."""
-        return self.joined(self.sharing.part * self.sharing.matched(v))
-
-    def product(self, v: Extended) -> Extended:
-        """Apply K_T, exactly zero along the motions of subdomains."""
-        return self.parts.product(v)
-
-    def solve(self, rho: Extended) -> Vector:
-        """Share ρ among the subdomains, and solve in each."""
-        return self.parts.solve(self.sharing(rho.astype(np.float64)))
-
-    def noise(self, u: Extended) -> Extended:
-        """Return a sample of the rounding of Ku without rigid motion."""
-        deformed = still(self, u)
-        variances = self.sharing.variances(self.spread(deformed))
-        return self.free(sample(variances, deformed, np.arange(u.size), Real))
-
-    def rounding(self, held: NDArray[np.float64]) -> Rounding:
-        """Return what E does along the motions, ER = KR − TᵀK_T TR."""
-        felt, KR = self.mechanics.motions.felt @ held, self.mechanics.motions.KR @ held
-        columns = np.ascontiguousarray(felt.T)
-        torn = [self.joined(self.product(self.spread(r))) for r in columns]
-        ER = KR - np.stack(torn, axis=1) if torn else KR
-        along = np.abs(felt.T @ ER).astype(np.float64)
-        return Rounding(np.array([length(self, g) for g in ER.T]), along)
-
-
 class Among(Protocol):
     """How what some subdomains have is added to what others have elsewhere.
 
@@ -394,26 +336,6 @@ class Among(Protocol):
 
         S : (t, own) its rows are of the components `at`
         """
-
-
-class Alone:
-    """All subdomains are here."""
-
-    def completed(self, v: Any, at: Any = None) -> Any:
-        """Return v: nothing is elsewhere."""
-        return v
-
-    def gathered(self, alpha: Vector) -> Vector:
-        """Return all coefficients."""
-        return alpha
-
-    def own(self, alpha: Vector) -> Vector:
-        """Return all coefficients."""
-        return alpha
-
-    def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S."""
-        return csr_array(M - S.T @ scaled_rows(S, scale))
 
 
 class Sharing:

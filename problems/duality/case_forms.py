@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -26,7 +25,7 @@ from mortarbench.harness import (
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
-from mortarbench.problems.duality.divided import in_parts, layout_of
+from mortarbench.problems.duality.divided import described, layout_of
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
 from mortarbench.problems.duality.problem import (
     AtSides,
@@ -42,8 +41,8 @@ from mortarbench.problems.duality.torn_dual import (
 from mortarbench.problems.duality.undivided import whole_path
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.own_bodies import certified_by
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -63,7 +62,7 @@ def case_of(
         contact = Contact(*contact_rows(primal, friction), friction.bound)
         stage = problem.stages[path.last_of(choice.step)]
         layout = layout_of(of, choice.size)
-        parts = in_parts(of, layout, choice.glue, stage, contact)
+        parts = described(of, layout, choice.glue, stage, contact)
     bodies = of.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
@@ -144,11 +143,12 @@ def contact_case(
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, tear, subdomains = None, None, None
+    seconds, in_parts, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
-        pieces = torn(parts)
-        new, tear = torn_dual(pieces, primal, friction), partial(LocalProblems, pieces)
+        own = on_one_process(parts)
+        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
+        new = torn_dual(pieces, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
         matrices = torn_matrices(pieces, new.qp)
@@ -182,7 +182,7 @@ def contact_case(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction, tear=tear,
+            friction=friction, in_parts=in_parts,
         ),
         unsettled=friction.unsettled,
     )  # fmt: skip

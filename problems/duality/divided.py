@@ -116,7 +116,7 @@ def torn_path(
 
     def pose(stage: Stage, at: State) -> TornProblem:
         sides = linearised(problem, layout, stage, at)
-        parts = in_parts(of, layout, choice.glue, stage, sides.contact)
+        parts = described(of, layout, choice.glue, stage, sides.contact)
         if known:  # the bodies are the same, and so are what was made of them alone
             known[0] = OwnDual(known[0].own.posed(parts))
         else:
@@ -163,7 +163,7 @@ def emitted_by(
     return emitted(dual, reported, first, len(before))
 
 
-def in_parts(
+def described(
     bodies: ElasticBodies, layout: Subdivision, glue: str, stage: Stage,
     contact: Contact,
 ) -> ProblemInParts:  # fmt: skip

@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, null_space
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import csc_array, csr_array, hstack
 
 from mortarbench.harness import Solution, Vector
 from mortarbench.harness.distributed.vectors import Answered
-from mortarbench.harness.verify.over_ranks import Contact, OwnBodies, Unheld
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.over_ranks import (
+    Contact,
+    OwnBodies,
+    Unheld,
+    certify_over_ranks,
+)
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import Halo
 from mortarbench.problems.feti.subdivision import Points
@@ -118,6 +124,22 @@ def answers(
     return answer
 
 
+def certified_by(
+    own: OwnSubdomains, K: csc_array
+) -> Callable[[Vector, Vector], Certificate]:
+    """Make what bounds the error of displacements with multipliers, by subdomains.
+
+    K : (n, n) of the whole, as it is stored on this one process
+    """
+    bodies = cache(lambda: replace(own_bodies(own), stored=csr_array(K)))
+    return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
+
+
+def own_bodies(own: OwnSubdomains) -> OwnBodies:
+    """Gather what certificates need of this rank's subdomains."""
+    return _bodies(own.floating)[0]
+
+
 def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     """Gather what this rank has, and count the copies (n,) of its components.
 
@@ -127,7 +149,7 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     contact, kept = problem.contact, _carrying(problem)
     times = np.empty(components.size)
     times[place] = own.times
-    parts = LocalProblems(own.torn_bodies(), problem.components)
+    parts = LocalProblems(own.torn_bodies, problem.components)
     return OwnBodies(
         ranks=own.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=times.size) < times,

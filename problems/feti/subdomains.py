@@ -353,6 +353,7 @@ class OwnSubdomains:
         """Its rows of B."""
         return _rows(self)
 
+    @cached_property
     def torn_bodies(self) -> Torn:
         """Collect what its subdomains are; rows and components are those it has."""
         domains, rows = self.domains, self.rows
@@ -569,7 +570,7 @@ def _equalities(problem: ProblemInParts) -> int:
     return glued if problem.eliminated else int(times.sum()) + glued
 
 
-def torn(problem: ProblemInParts) -> Torn:
-    """Tear the bodies on a single process, which has all subdomains."""
+def on_one_process(problem: ProblemInParts) -> OwnSubdomains:
+    """Hold all subdomains on a single process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
-    return OwnSubdomains(problem, alone(), every).torn_bodies()
+    return OwnSubdomains(problem, alone(), every)

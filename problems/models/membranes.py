@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from time import perf_counter
 from typing import Any
 
@@ -44,10 +44,13 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    ProblemInParts,
+    on_one_process,
+)
 from mortarbench.problems.feti.tearing import Part
 from mortarbench.problems.feti.torn import Kind
 
@@ -61,13 +64,14 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, tear = None, None
+    seconds, in_parts = None, None
     if form == "primal":
         new = posed(pair.qp)
     else:
         start = perf_counter()
-        pieces = torn(pair.in_subdomains(p["glue"]))
-        new, tear = torn_dual(pieces, pair.qp), partial(LocalProblems, pieces, 1)
+        own = on_one_process(pair.in_subdomains(p["glue"]))
+        pieces, in_parts = own.torn_bodies, certified_by(own, pair.qp.P)
+        new = torn_dual(pieces, pair.qp)
         seconds = perf_counter() - start
         matrices = torn_matrices(pieces, new.qp)
         decomposition = torn_quantities(pieces, new.qp)
@@ -84,7 +88,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
             primal=pair.qp, back=new.recover, factorise=pair.factorise,
             mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
-            tear=tear,
+            in_parts=in_parts,
         ),
     )  # fmt: skip
 

@@ -60,11 +60,14 @@ from mortarbench.problems.fem.inverse import (
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
 from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    ProblemInParts,
+    on_one_process,
+)
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.membranes import membrane_kind
 
@@ -83,13 +86,14 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
             f"feti with form {form} is not built; expected form dual, or no feti"
         )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start, tear = problem.qp, perf_counter(), None
+    rows, start, in_parts = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}
     if form == "primal":
         new = with_bounds(rows)
     elif p["feti"]:
-        pieces = torn(in_subdomains(params))
-        new, tear = torn_dual(pieces, rows), partial(LocalProblems, pieces, 1)
+        own = on_one_process(in_subdomains(params))
+        pieces, in_parts = own.torn_bodies, certified_by(own, rows.P)
+        new = torn_dual(pieces, rows)
         decomposition = torn_quantities(pieces, new.qp)
     elif form == "dual":
         new = dualise(rows, problem.floating())
@@ -109,7 +113,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         mechanics=Mechanics(
             primal=rows, back=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
-            tear=tear,
+            in_parts=in_parts,
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,

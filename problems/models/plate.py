@@ -35,8 +35,6 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.vectors import alone
-from mortarbench.harness.mechanics import Substructures
 from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.divided import elastic_kind, looked_up
 from mortarbench.problems.duality.dualisation import Transformed, posed
@@ -61,15 +59,19 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import OwnDual, dual_on
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results
+from mortarbench.problems.feti.emission import OwnDual
+from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
 )
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
-from mortarbench.problems.feti.substructures import LocalProblems
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    OwnSubdomains,
+    ProblemInParts,
+    on_one_process,
+)
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.feti.torn import Torn
 
@@ -95,9 +97,6 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         counts = quantities(plate, new.recover(s))
         return counts | (dual_quantities(plate) if form == "dual" else {})
 
-    def tear() -> Substructures:
-        return LocalProblems(plate.torn)
-
     return Case(
         qp=new.qp,
         recover=lambda s: new.recover(s).x * LENGTH,
@@ -117,7 +116,9 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            tear=tear if form == "dual" and not plate.parts.eliminated else None,
+            in_parts=(
+                certified_by(plate.own, plate.primal.P) if form == "dual" else None
+            ),
         ),
     )  # fmt: skip
 
@@ -136,9 +137,14 @@ class Plate:
     parts: ProblemInParts
 
     @cached_property
+    def own(self) -> OwnSubdomains:
+        """The plate in its subdomains, all of them."""
+        return on_one_process(self.parts)
+
+    @property
     def torn(self) -> Torn:
-        """The plate in its subdomains."""
-        return torn(self.parts)
+        """The same with what was made of them."""
+        return self.own.torn_bodies
 
     @cached_property
     def dual(self) -> Transformed:
@@ -148,7 +154,7 @@ class Plate:
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        return _spectra(self.moduli, dual_on(self.parts, alone()))
+        return _spectra(self.moduli, OwnDual(self.own))
 
     @property
     def held(self) -> NDArray[np.int64]:

@@ -1,5 +1,6 @@
 """Bodies in the subdomains that cells are labelled with, for tests."""
 
+from dataclasses import replace
 from importlib import import_module
 from typing import Any
 
@@ -13,12 +14,12 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import in_parts
+from mortarbench.problems.duality.divided import described
 from mortarbench.problems.duality.problem import chosen, stated
 from mortarbench.problems.duality.undivided import primal_qp, whole_path
 from mortarbench.problems.families.in_subdomains import ContactFamily
 from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
 from mortarbench.problems.feti.torn import Torn
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.beam_ring import model
@@ -39,7 +40,7 @@ def torn_by(
     rows: str = "orthonormal",
 ) -> Torn:
     """Tear bodies with a QP of theirs, with friction."""
-    return torn(parts_by(bodies, layout, primal, friction, rows))
+    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).torn_bodies
 
 
 def parts_by(
@@ -50,10 +51,10 @@ def parts_by(
     rows: str = "orthonormal",
 ) -> ProblemInParts:
     """Pose a QP of the bodies, with friction, on their subdomains."""
-    of = stated(bodies)
+    of = stated(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
     contact = Contact(*contact_rows(primal, friction), friction.bound)
-    return in_parts(of, layout, rows, stage, contact)
+    return described(of, layout, rows, stage, contact)
 
 
 def parts_of(name: str) -> ProblemInParts:
@@ -66,7 +67,7 @@ def parts_of(name: str) -> ProblemInParts:
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
         contact = Contact(*contact_rows(whole.primal, friction), friction.bound)
         layout = of.shape.layout(choice.size)
-        return in_parts(of, layout, choice.glue, stage, contact)
+        return described(of, layout, choice.glue, stage, contact)
     models = import_module(f"mortarbench.problems.models.{case.family.name}")
     found: ProblemInParts = models.in_subdomains(case.params)
     return found

@@ -20,16 +20,23 @@ from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError,
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.over_ranks import (
+    OwnBodies,
+    _OnRanks,
+    certify_over_ranks,
+)
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import Torn, neighbour, still
+from mortarbench.harness.verify.substructured import neighbour, still
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
+from mortarbench.problems.feti.own_bodies import own_bodies
+from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.disturbed import DISTURBANCES
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.torn_bodies import labelled, parts_by
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
@@ -72,6 +79,7 @@ class Known:
 
     mechanics: Mechanics
     exact: ReferencePoint
+    own: OwnBodies
 
     def solution(self) -> Solution:
         """The solution as `Mechanics.back` would give it."""
@@ -85,7 +93,7 @@ class Known:
 
     def pair_error(self, c: Certificate) -> float:
         """√(‖û − u*‖² + ‖u_λ − Tu*‖²), the second one of torn displacements."""
-        parts = self.mechanics.substructures
+        parts = self.own.parts
         jump = parts.spread.astype(Real) @ (c.u - self.exact.u) - c.off
         torn = float(np.sqrt(jump @ parts.product(jump)))
         return float(np.hypot(self.error(c.u), torn))
@@ -105,14 +113,13 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
+    subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
+    own = own_bodies(subdomains)
     mechanics = replace(
-        whole, factorise=never,
-        tear=lambda: LocalProblems(
-            torn_by(bodies, layout, whole.primal, whole.friction)
-        ),
-    )  # fmt: skip
+        whole, factorise=never, in_parts=lambda u, z: certify_over_ranks(own, u, z)
+    )
     vars(mechanics)["whole"] = whole
-    return Known(mechanics, reference_point(whole, reference_solution))
+    return Known(mechanics, reference_point(whole, reference_solution), own)
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
@@ -228,11 +235,11 @@ def test_no_bound_at_the_level_of_rounding_is_exceeded(name: str) -> None:
 
 def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     problem = known(CASES[0])
-    mechanics, parts = problem.mechanics, problem.mechanics.substructures
+    mechanics, parts = problem.mechanics, problem.own.parts
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
     u[mechanics.exact.held] = 0
-    split = Torn(mechanics)
+    split = _OnRanks(problem.own)
     near = neighbour(split, split.residual(u).rho + split.pulled(exact.multipliers))
     held = mechanics.exact.held
     b = parts.product(near.d)
@@ -249,8 +256,9 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
 
 @pytest.mark.parametrize("name", [CASES[0], "contact-patch/ratio=0.1"])
 def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
-    mechanics, rng = known(name).mechanics, np.random.default_rng(8)
-    split, parts = Torn(mechanics), known(name).mechanics.substructures
+    problem, rng = known(name), np.random.default_rng(8)
+    mechanics, parts = problem.mechanics, problem.own.parts
+    split = _OnRanks(problem.own)
     u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
     u[mechanics.exact.held] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
@@ -261,7 +269,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
 
 
 def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
-    parts = known(CASES[0]).mechanics.substructures
+    parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
     K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
     rng = np.random.default_rng(6)
@@ -275,7 +283,7 @@ def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
 
 
 def test_local_solves_neither_feel_nor_cause_rigid_motions() -> None:
-    parts = known(CASES[0]).mechanics.substructures
+    parts = known(CASES[0]).own.parts
     rng = np.random.default_rng(7)
     b, alpha = (rng.standard_normal(size) for size in parts.kernel.shape)
     d = parts.solve(b)
@@ -287,10 +295,9 @@ def test_local_solves_neither_feel_nor_cause_rigid_motions() -> None:
 
 def test_a_load_that_nothing_balances_has_no_certificate() -> None:
     problem = known("contact-patch/ratio=0.1")
-    primal = problem.mechanics.primal
-    away = replace(problem.mechanics, primal=replace(primal, q=-primal.q))
+    own, s = replace(problem.own, f=-problem.own.f), problem.solution()
     with pytest.raises(UncertifiableError, match="pull"):
-        certify(away, problem.solution())
+        certify_over_ranks(own, s.x, problem.mechanics.multipliers(s))
 
 
 @pytest.mark.parametrize("size", [1e160, 1e300])

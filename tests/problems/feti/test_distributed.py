@@ -26,7 +26,7 @@ from mortarbench.problems.feti.distributed import (
 )
 from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.stored import dual_operator
-from mortarbench.problems.feti.subdomains import torn as torn_apart
+from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.membranes import Membranes
 from tests.support.threads import on_threads, without_lock
 from tests.support.torn_bodies import torn_pair
@@ -145,7 +145,7 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
 @pytest.fixture(
     scope="module",
     params=[
-        lambda: torn_apart(Membranes(2, 3).in_subdomains("redundant")),
+        lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).torn_bodies,
         lambda: torn_pair("chain", most=4)[2],
         lambda: torn_pair("orthonormal", most=4)[2],
     ],

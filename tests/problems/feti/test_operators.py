@@ -16,7 +16,7 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.feti.operators import inverted_blocks
 from mortarbench.problems.feti.stored import dual_operator, made
-from mortarbench.problems.feti.subdomains import torn
+from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
@@ -40,7 +40,7 @@ def beam_and_ring(rows="orthonormal"):
 
 
 def membranes(rows="orthonormal"):
-    return torn(Membranes(2, 4).in_subdomains(rows))
+    return on_one_process(Membranes(2, 4).in_subdomains(rows)).torn_bodies
 
 
 @pytest.fixture(
@@ -144,7 +144,7 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
 
 def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
     """Each of two membranes in one square, of the same kind or of two."""
-    pair = torn(Membranes(1, 4).in_subdomains("orthonormal"))
+    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).torn_bodies
     (kind,) = pair.kinds
     other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
     F, apart = operator_of(pair), operator_of(other)
@@ -232,7 +232,7 @@ def test_contact_rows_do_not_weigh_the_equations(kind):
 
 def test_preconditioners_bring_the_spectrum_together():
     """As the field has it: none, lumped, Dirichlet."""
-    pair = torn(Membranes(2, 8).in_subdomains("orthonormal"))
+    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).torn_bodies
     F = operator_of(pair)
     _, B, R = dense(pair)
     G = R.T @ B.T
@@ -278,7 +278,9 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
 
 def test_equal_subdomains_share_one_stiffness_in_what_is_written():
     few, many = (
-        operator_of(torn(Membranes(S, 4).in_subdomains("orthonormal"))).arrays
+        operator_of(
+            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).torn_bodies
+        ).arrays
         for S in (1, 3)
     )
     assert few["K_data"].size == many["K_data"].size

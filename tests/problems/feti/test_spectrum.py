@@ -23,7 +23,7 @@ from mortarbench.problems.feti.spectrum import (
     spectrum,
 )
 from mortarbench.problems.feti.stored import dual_operator
-from mortarbench.problems.feti.subdomains import torn
+from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.membranes import Membranes
 from tests.support.threads import on_threads, without_lock
@@ -156,7 +156,7 @@ def test_the_condition_is_wrong_by_the_relative_errors_of_both_eigenvalues():
 
 
 def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
-    pieces = torn(Membranes(2, 2).in_subdomains("redundant"))
+    pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).torn_bodies
     B = pieces.B[: pieces.equalities]
     x = np.random.default_rng(1).standard_normal(B.shape[0])
     dense = B.toarray()
@@ -168,7 +168,7 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
 def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
     """On ker G ∩ range B; without a coarse problem on range B."""
     without_lock(monkeypatch, DualOperator, "_blocks")
-    pieces = torn(Membranes(2, 2).in_subdomains("redundant"))
+    pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).torn_bodies
     m = pieces.equalities
     B = pieces.B[:m]
     F = dual_operator(B, pieces.domains, m)

@@ -13,7 +13,7 @@ from mortarbench.problems.duality.divided import elastic_kind, looked_up
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import rectangle
 from mortarbench.problems.feti.subdivision import mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, torn
+from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
 from mortarbench.problems.feti.tearing import blocks, compact_blocks, labelled
 from tests.support.glued import decompose, glue, structured_bodies
 from tests.support.torn_bodies import torn_pair
@@ -221,7 +221,10 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),
     )  # fmt: skip
-    pair, found = torn(problem), torn(replace(problem, eliminated=True))
+    pair, found = (
+        on_one_process(one).torn_bodies
+        for one in (problem, replace(problem, eliminated=True))
+    )
     first, second = (found.kinds[k] for k in found.kind)
     assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
     assert abs(first.K @ first.R).max() < 1e-13
