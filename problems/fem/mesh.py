@@ -1,6 +1,7 @@
 """Meshes with named boundaries (paper, Section 2 and Figure 1).
 
-Cells are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
+The dimension and the number of corners say which element the cells are. In the plane
+they are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
 whose last two corners are one: with N₃ + N₄ for that corner, the bilinear map is onto
 the triangle, and N₁, N₂, N₃ + N₄ are its barycentric coordinates,
 
@@ -21,26 +22,45 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
+from mortarbench.harness.mechanics import CellBlock, cell_blocks
+from mortarbench.problems.fem.elements import ELEMENTS, QUAD, Element
 
 Nodes = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Quadrilaterals and triangles; lengths in m.
+    """Nodes and cells; lengths in m.
 
-    A boundary is the chain of its nodes, ordered so that the body lies on its left:
-    with the unit tangent t the outward normal is (t_y, −t_x).
+    A boundary in the plane is the chain of its nodes, ordered so that the body lies on
+    its left: with the unit tangent t the outward normal is (t_y, −t_x).
     """
 
-    points: NDArray[np.float64]  #: (N, 2)
-    cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
+    points: NDArray[np.float64]  #: (N, dim)
+    #: (E, c) nodes of each cell, in the plane counter-clockwise; where kinds are mixed,
+    #: a cell of fewer corners repeats its last node
+    cells: Nodes
     boundaries: Mapping[str, Nodes]
 
     @property
+    def dim(self) -> int:
+        """Number of coordinates of a node, and of components of its displacement."""
+        return int(self.points.shape[1])
+
+    @property
     def dofs(self) -> int:
-        """Number of displacement components; node i has 2i (x) and 2i + 1 (y)."""
+        """Number of displacement components, see `dofs_of`."""
         return self.points.size
+
+    @property
+    def element(self) -> Element:
+        """What all cells are integrated as."""
+        return ELEMENTS[self.dim, self.cells.shape[1]]
+
+    @property
+    def blocks(self) -> tuple[CellBlock, ...]:
+        """Cells by their kinds, in the vocabulary of meshio."""
+        return cell_blocks(self.cells, self.dim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,8 +319,8 @@ def triangular(cells: Nodes) -> NDArray[np.bool_]:
 
 
 def boundary_edges(cells: Nodes) -> Nodes:
-    """List the edges (k, 2) of exactly one cell, the body on their left."""
-    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
+    """List the edges (k, 2) of exactly one cell (E, 4), the body on their left."""
+    edges = cells[:, QUAD.facets].reshape(-1, 2)
     edges = edges[edges[:, 0] != edges[:, 1]]
     low, high = edges.min(axis=1), edges.max(axis=1)
     name = low * (high.max(initial=0) + 1) + high  # in the order of low, then high
@@ -327,11 +347,16 @@ def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
     )
 
 
-def dofs_of(nodes: Nodes) -> Nodes:
-    """List both displacement components of each node, (2·len,)."""
-    return np.stack([2 * nodes, 2 * nodes + 1], axis=-1).ravel()
+def dofs_of(nodes: Nodes, dim: int = 2, axis: int | None = None) -> Nodes:
+    """List the displacement components of nodes: dim·i, dim·i + 1, … of node i.
+
+    axis : 0, 1, …: the components along this axis alone
+    """
+    if axis is not None:
+        return np.asarray(dim * nodes + axis)
+    return np.add.outer(dim * nodes, np.arange(dim)).ravel()
 
 
-def as_vectors(u: Vector) -> NDArray[np.float64]:
-    """See a dof vector (2N,) as one vector per node (N, 2)."""
-    return u.reshape(-1, 2)
+def as_vectors(u: Vector, dim: int = 2) -> NDArray[np.float64]:
+    """See a dof vector (dim·N,) as one vector per node (N, dim)."""
+    return u.reshape(-1, dim)
