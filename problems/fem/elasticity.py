@@ -149,7 +149,7 @@ def sparsity(mesh: Mesh) -> Pattern:
 
 def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
     """List the dofs of each cell, (E, n·dim)."""
-    return dofs_of(mesh.cells, mesh.dim).reshape(len(mesh.cells), -1)
+    return dofs_of(mesh.cells, mesh.dim).reshape(-1, mesh.dim * mesh.cells.shape[1])
 
 
 def rigid_motions(points: Floats) -> Floats:

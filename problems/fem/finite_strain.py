@@ -268,7 +268,7 @@ def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
     """Integrate ∫ P ∂N/∂X, (E, n·dim)."""
     at_points = gradients @ np.swapaxes(P, -1, -2)  # (E, q, n, dim)
     nodal = (volumes[:, :, None, None] * at_points).sum(axis=1)
-    return np.asarray(nodal.reshape(len(P), -1))
+    return np.asarray(nodal.reshape(-1, np.prod(nodal.shape[1:])))
 
 
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:

@@ -354,7 +354,7 @@ def dofs_of(nodes: Nodes, dim: int = 2, axis: int | None = None) -> Nodes:
     """
     if axis is not None:
         return np.asarray(dim * nodes + axis)
-    return np.add.outer(dim * nodes, np.arange(dim)).ravel()
+    return np.stack([dim * nodes + k for k in range(dim)], axis=-1).ravel()
 
 
 def as_vectors(u: Vector, dim: int = 2) -> NDArray[np.float64]:

@@ -16,8 +16,8 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import (
     ContactRows,
     rows_along,
-    tangent,
 )
+from mortarbench.problems.contact.surface import tangents
 from mortarbench.problems.duality.stepping import LoadPath
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
@@ -325,7 +325,7 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     )  # fmt: skip
     normal, one = np.array([[np.cos(0.1), np.sin(0.1)]]), np.ones((1, 1))
     B = rows_along(tip[:, None], one, normal, mesh.dofs)
-    T = rows_along(tip[:, None], one, tangent(normal), mesh.dofs)
+    T = rows_along(tip[:, None], one, tangents(normal)[:, 0], mesh.dofs)
     first = np.zeros(1, dtype=np.int64)
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
