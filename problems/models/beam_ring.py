@@ -143,7 +143,7 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
 
 
 def _clamps(sides: Mapping[str, Nodes]) -> Nodes:
-    clamped = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
+    clamped = [dofs_of(sides[b], 2) for b in ("left", "left_foot", "right_foot")]
     return np.concatenate(clamped)
 
 
@@ -153,7 +153,7 @@ def _pair(sides: Mapping[str, Nodes]) -> ContactPair:
 
 def _tip(sides: Mapping[str, Nodes]) -> Nodes:
     """Return both components of the upper right corner of the beam."""
-    return dofs_of(np.intersect1d(sides["top"], sides["right"]))
+    return dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)
 
 
 @lru_cache(maxsize=4)

@@ -165,7 +165,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
                 check_friction(bodies, rows.B, friction, 1, 1 / p["steps"])
         label = graph_partition(mesh.points, mesh.cells, bodies.body, p["parts"])
     fixed, loaded = bodies.B_D.indices, np.flatnonzero(bodies.f)
-    named = np.concatenate([fixed, bodies.interface]) // 2
+    named = np.concatenate([fixed, bodies.interface]) // mesh.dim
     layout, pairs = mesh_in_parts(mesh, label, bodies.body, named), bodies.pairs
 
     def posed(step: int, displaced: Displaced) -> ProblemInParts:

@@ -38,6 +38,7 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
+    dofs_of,
     nodal_lengths,
     rectangle_grid,
 )
@@ -127,7 +128,7 @@ def _grid(n: int) -> StructuredGrid:
 
 def _pressure(grid: StructuredGrid) -> tuple[Nodes, Vector]:
     """Return the components on the top and the left, and the forces there, N/m."""
-    component = 2 * grid.sides["top"] + 1, 2 * grid.sides["left"]
+    component = dofs_of(grid.sides["top"], 2, 1), dofs_of(grid.sides["left"], 2, 0)
     force = (
         -TOP * nodal_lengths(grid.side("top")), LEFT * nodal_lengths(grid.side("left"))
     )  # fmt: skip
@@ -136,7 +137,8 @@ def _pressure(grid: StructuredGrid) -> tuple[Nodes, Vector]:
 
 def _supports(grid: StructuredGrid) -> Nodes:
     """Return the components that are held."""
-    return np.append(2 * grid.sides["right"], 2 * grid.sides["bottom"][-1] + 1)
+    right, corner = grid.sides["right"], grid.sides["bottom"][-1]
+    return np.append(dofs_of(right, 2, 0), dofs_of(corner, 2, 1))
 
 
 def _on_rigid(grid: StructuredGrid) -> ContactPair:
@@ -153,7 +155,7 @@ def along_the_side(
     all nodes, N/m.
     """
     nodes = bodies.pairs[0].slave
-    x, u = bodies.mesh.points[nodes, 0], s.x[2 * nodes] * bodies.length
+    x, u = bodies.mesh.points[nodes, 0], s.x[dofs_of(nodes, 2, 0)] * bodies.length
     normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
     at_places: Vector = np.interp(PLACES, x, u)
     return {

@@ -77,6 +77,7 @@ from mortarbench.problems.fem.mesh import (
     HalfDisc,
     Mesh,
     Nodes,
+    as_vectors,
     dofs_of,
     join,
     joined_sides,
@@ -175,7 +176,7 @@ def _on_plane(
     bodies = assemble(
         mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=ALONE,
         materials=materials, plane=p["plane"], units=(RADIUS, exact.P),
-        fixed=2 * _on_axis(sides),
+        fixed=_on_axis(sides),
         load=_loaded(mesh, _pressed((disc,), "flat", exact.P)),
         pairs=(_on_rigid(sides),),
     )  # fmt: skip
@@ -190,7 +191,7 @@ def on_plane_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     return in_parts(
         half_discs_in_blocks(halves.discs, halves.blocks(p["feti"])),
         materials=halves.materials, plane=p["plane"], units=(RADIUS, halves.exact.P),
-        names=ALONE, fixed=2 * _on_axis(sides),
+        names=ALONE, fixed=_on_axis(sides),
         load=_pressed(halves.discs, "flat", halves.exact.P),
         pairs=(_on_rigid(sides),),
         linearise=lambda arc, _: above_plane(arc.mesh, arc.pairs[0].slave),
@@ -343,7 +344,7 @@ def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         last = i + 1 == len(loads)
         return problem if last else replace(problem, then=partial(after, i + 1))
 
-    kept = np.append(free, 2 * _on_axis(sides, "upper_"))
+    kept = np.append(free, _on_axis(sides, "upper_"))
     first = posed(kept, scaled(loads[0][0], 0.0), ())
     return replace(first, then=partial(after, 0))
 
@@ -351,15 +352,16 @@ def on_cylinder_in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
 def _guided(sides: Mapping[str, Nodes]) -> Nodes:
     """Return the components that are held under P alone."""
     return np.concatenate([
-        2 * _on_axis(sides, "upper_"), 2 * _on_axis(sides, "lower_"),
-        2 * sides["lower_flat"] + 1,
+        _on_axis(sides, "upper_"), _on_axis(sides, "lower_"),
+        dofs_of(sides["lower_flat"], 2, 1),
     ])  # fmt: skip
 
 
 def _free_of_reactions(sides: Mapping[str, Nodes]) -> Nodes:
     """Return the components that are held where Q acts, too: no symmetry is bent."""
     flat = sides["lower_flat"]
-    return np.append(2 * _on_axis(sides, "lower_"), 2 * flat[flat.size // 2] + 1)
+    middle = dofs_of(flat[flat.size // 2], 2, 1)
+    return np.append(_on_axis(sides, "lower_"), middle)
 
 
 def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
@@ -384,7 +386,7 @@ def kept_on_axis(bodies: Bodies) -> Bodies:
     polygons that their arcs are resists. The slip of the next step would begin there,
     and Q would do work on it.
     """
-    held = np.append(bodies.B_D.indices, 2 * _on_axis(bodies.mesh.boundaries, "upper_"))
+    held = np.append(bodies.B_D.indices, _on_axis(bodies.mesh.boundaries, "upper_"))
     rows = eye_array(bodies.mesh.dofs, format="csr")[held]
     return replace(bodies, B_D=csr_array(rows))
 
@@ -394,7 +396,7 @@ def sheared(mesh: Mesh) -> Vector:
     load = np.zeros(mesh.dofs)
     for name, Q in (("upper_flat", 1.0), ("lower_flat", -1.0)):
         flat = mesh.boundaries[name]
-        load[dofs_of(flat)] = _shear_of(mesh.points[flat], Q)
+        load[dofs_of(flat, 2)] = _shear_of(mesh.points[flat], Q)
     return load
 
 
@@ -410,7 +412,7 @@ def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[tuple[Nodes, Vector
     sides = joined_sides(discs)
     of = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
     return [
-        (dofs_of(sides[flat]), _shear_of(disc.position(disc.sides[flat]), part))
+        (dofs_of(sides[flat], 2), _shear_of(disc.position(disc.sides[flat]), part))
         for disc, flat, part in of
     ]
 
@@ -514,7 +516,7 @@ def _pressed(discs: tuple[HalfDisc, ...], flat: str, P: float) -> tuple[Nodes, V
     """Spread P evenly over a flat side: the components, and the forces there, N/m."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
-    return 2 * joined_sides(discs)[flat] + 1, -P * share / share.sum()
+    return dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum()
 
 
 def _loaded(mesh: Mesh, load: tuple[Nodes, Vector]) -> Vector:
@@ -573,8 +575,9 @@ def shear_quantities(
     x = bodies.mesh.points[slave, 0]
     width = nodal_lengths(x[:, None])
     normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
-    pressing = np.abs((primal.G.T @ normal)[2 * slave + 1])
-    force = (friction.T.T @ tangential)[2 * slave] * (1.0 if upper else -1.0)
+    pressing = np.abs(as_vectors(primal.G.T @ normal, 2)[slave, 1])
+    force = as_vectors(friction.T.T @ tangential, 2)[slave, 0]
+    force = force * (1.0 if upper else -1.0)
     mindlin = TangentialContact(exact, p["mu"], p["Q"], p["peak"])
     Q = p["Q"] * p["mu"] * exact.P
     expected, centre = shear(x), float(shear(np.zeros(1))[0])
@@ -655,9 +658,9 @@ def _case(
 
 
 def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
-    """Find the middle of the arc and the centre, which symmetry keeps at u_x = 0."""
+    """List u_x of the middle of the arc and of the centre, which symmetry holds."""
     chains = [sides[prefix + name] for name in ("arc", "flat")]
-    return np.array([chain[chain.size // 2] for chain in chains])
+    return dofs_of(np.array([chain[chain.size // 2] for chain in chains]), 2, 0)
 
 
 def _compliance(material: Material, plane: Plane) -> float:

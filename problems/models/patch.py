@@ -56,6 +56,7 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     as_vectors,
+    dofs_of,
     join,
     joined_sides,
     nodal_lengths,
@@ -223,7 +224,7 @@ def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     nominal_stress: the contact force over the undeformed length, Pa. cauchy_stress:
     mean of σ_y over the cells, Pa. strain_energy: ∫W, J/m.
     """
-    bodies, u = path.bodies, as_vectors(s.x * path.bodies.length)
+    bodies, u = path.bodies, as_vectors(s.x * path.bodies.length, 2)
     sides = bodies.mesh.boundaries
     right = np.concatenate([sides["lower_right"], sides["upper_right"]])
     force = contact_forces(bodies, at.primal, s)[sides["lower_top"], 1].sum()
@@ -243,7 +244,7 @@ def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, An
     """Report the largest errors: of σ_y over the cells, relative; of x at nodes, m."""
     bodies = path.bodies
     stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
-    u = as_vectors(s.x * bodies.length)
+    u = as_vectors(s.x * bodies.length, 2)
     strains = np.array([exact.lateral - 1, exact.stretch - 1])
     return {
         "stress_error": float(np.abs(stress / exact.cauchy - 1).max()),
@@ -313,13 +314,13 @@ def _materials(params: Mapping[str, Any]) -> tuple[Material, Material]:
 def _pressure(grids: tuple[StructuredGrid, StructuredGrid]) -> tuple[Nodes, Vector]:
     """Return the components on the top, and the forces there, N/m."""
     top = joined_sides(grids)["upper_top"]
-    return 2 * top + 1, -PRESSURE * nodal_lengths(grids[1].side("upper_top"))
+    return dofs_of(top, 2, 1), -PRESSURE * nodal_lengths(grids[1].side("upper_top"))
 
 
 def _rollers(sides: Mapping[str, Nodes]) -> Nodes:
     """Return the components that are held."""
-    left = (2 * sides["lower_left"], 2 * sides["upper_left"])
-    return np.concatenate([*left, 2 * sides["lower_bottom"] + 1])
+    left = np.concatenate([sides["lower_left"], sides["upper_left"]])
+    return np.append(dofs_of(left, 2, 0), dofs_of(sides["lower_bottom"], 2, 1))
 
 
 def _divisions(n: int) -> tuple[int, int]:
