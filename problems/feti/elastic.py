@@ -96,14 +96,14 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
     E : (k,) their moduli, without dimension
 
     """
-    cells = part.cells
+    cells, dim = part.cells, part.points.shape[1]
     around = np.bincount(cells.ravel(), np.repeat(E[part.material], cells.shape[1]))
     return Kind(
         K=stiffness(Mesh(part.points, cells, {}), D, part.material),
         R=rigid_modes(part.points),
-        fixing=dofs_of(fixing_nodes(part.points)),
-        boundary=dofs_of(np.unique(boundary_edges(cells))),
-        stiffness=np.repeat(around / np.bincount(cells.ravel()), 2),
+        fixing=dofs_of(fixing_nodes(part.points), dim),
+        boundary=dofs_of(np.unique(boundary_edges(cells)), dim),
+        stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
     )
 
 
@@ -204,7 +204,7 @@ def at_sides(found: OwnSolution, pairs: Sequence[ContactPair]) -> tuple[Vector, 
 
     """
     contact = found.subdomains.problem.contact
-    u = found.at(dofs_of(side_nodes(pairs)))
+    u = found.at(dofs_of(side_nodes(pairs), 2))
     places = sum(pair.slave.size for pair in pairs)
     normal = found.z[: contact.place.size]
     return u, forces_at_nodes(normal, contact.place, places)
@@ -335,13 +335,13 @@ class _LinearisedSides:
         if friction.bound.size:
             B = csr_array(vstack([B, friction.T]))
             c = np.append(c, friction.start)
-        column = dofs_of(self.node)[B.indices]
+        column = dofs_of(self.node, 2)[B.indices]
         rows = csr_array((B.data, column, B.indptr), shape=(B.shape[0], 2 * nodes))
         return Contact(rows, c, friction.bound, self.place)
 
     def found(self, found: OwnSolution) -> AtSides:
         """Gather what ranks have found along the sides; called by all of them."""
-        at = dofs_of(self.node)
+        at = dofs_of(self.node, 2)
         K = found.diagonal(at) if self.friction.bound.size else np.zeros(at.size)
         free = np.full(at.size, np.inf)
         primal = QP(
@@ -415,10 +415,10 @@ def own_meshes(
     here = found.bodies.components[::2] // 2
     place = np.minimum(np.searchsorted(here, node), here.size - 1)
     lacks = here[place] != node
-    u = as_vectors(found.u)[place]
+    u = as_vectors(found.u, 2)[place]
     everyones = found.bodies.ranks.comm.allgather(node[lacks])
     asked = np.unique(np.concatenate(everyones))
-    told = as_vectors(found.at(dofs_of(asked)))
+    told = as_vectors(found.at(dofs_of(asked, 2)), 2)
     u[lacks] = told[np.searchsorted(asked, node[lacks])]
 
     def meshes() -> Iterator[OwnMesh]:
