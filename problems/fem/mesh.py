@@ -347,7 +347,7 @@ def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
     )
 
 
-def dofs_of(nodes: Nodes, dim: int = 2, axis: int | None = None) -> Nodes:
+def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
     """List the displacement components of nodes: dim·i, dim·i + 1, … of node i.
 
     axis : 0, 1, …: the components along this axis alone
@@ -357,6 +357,6 @@ def dofs_of(nodes: Nodes, dim: int = 2, axis: int | None = None) -> Nodes:
     return np.stack([dim * nodes + k for k in range(dim)], axis=-1).ravel()
 
 
-def as_vectors(u: Vector, dim: int = 2) -> NDArray[np.float64]:
+def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
     """See a dof vector (dim·N,) as one vector per node (N, dim)."""
     return u.reshape(-1, dim)
