@@ -26,7 +26,7 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
+from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_facets, dofs_of
 
 
 class ContactPair(NamedTuple):
@@ -107,8 +107,9 @@ class UnassembledBodies:
 
         Where there are none, on all sides.
         """
-        chains = [pair.slave for pair in self.pairs] or boundary_edges(self.mesh.cells)
-        sides = [self.mesh.points[chain] for chain in chains]
+        mesh, slaves = self.mesh, [pair.slave for pair in self.pairs]
+        chains = slaves or boundary_facets(mesh.cells, mesh.dim)
+        sides = [mesh.points[chain] for chain in chains]
         steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
         return float(np.concatenate(steps).mean() / self.length)
 

@@ -68,11 +68,10 @@ from mortarbench.problems.contact.segment_search import Reach, facing
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
-    cross,
     current_surface,
     unit,
 )
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes, cross, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
 NEGLIGIBLE = 1e-8

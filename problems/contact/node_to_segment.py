@@ -49,7 +49,7 @@ from mortarbench.problems.contact.surface import (
     tangents,
     unit,
 )
-from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
+from mortarbench.problems.fem.mesh import Nodes, cross, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 
@@ -166,7 +166,7 @@ def geometric_stiffness(
     x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
-    t, area = e / L[:, None], d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0]
+    t, area = e / L[:, None], cross(d, e)
     one, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])  # a = dᵀ turn e
     in_d, in_e = np.hstack([one, -one, 0 * one]), np.hstack([0 * one, -one, one])
     area_1 = (e @ turn.T) @ in_d + (d @ turn) @ in_e  # (s, 6)

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.surface import Points, Surface, cross, tangents
-from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.contact.surface import Points, Surface, tangents
+from mortarbench.problems.fem.mesh import Nodes, cross
 
 BRANCHES = 4
 ROOTS = 16  #: levels with fewer sub-chains than this are not worth a visit

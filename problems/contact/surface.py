@@ -127,9 +127,3 @@ def unit(vectors: Points, otherwise: Points) -> Points:
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
     vanishes = length <= DEGENERATE
     return np.where(vanishes, otherwise, vectors / np.where(vanishes, 1.0, length))
-
-
-def cross(a: Points, b: Points) -> Vector:
-    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
-    product: Vector = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product

@@ -16,14 +16,13 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.harness.mechanics import CellBlock, cell_blocks
-from mortarbench.problems.fem.elements import ELEMENTS, QUAD, Element
+from mortarbench.problems.fem.elements import ELEMENTS, Element
 
 Nodes = NDArray[np.int64]
 
@@ -129,7 +128,8 @@ class StructuredGrid:
 
     def mesh(self) -> Mesh:
         """Connect all points."""
-        return _structured(self.place(self.columns, self.rows), self.names)
+        cells = cells_of_block(self.columns.size, self.rows.size)
+        return Mesh(self.block(slice(None), slice(None)), cells, self.sides)
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,14 +318,22 @@ def triangular(cells: Nodes) -> NDArray[np.bool_]:
     return np.asarray(cells[:, 2] == cells[:, 3])
 
 
-def boundary_edges(cells: Nodes) -> Nodes:
-    """List the edges (k, 2) of exactly one cell (E, 4), the body on their left."""
-    edges = cells[:, QUAD.facets].reshape(-1, 2)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    name = low * (high.max(initial=0) + 1) + high  # in the order of low, then high
+def boundary_facets(cells: Nodes, dim: int) -> Nodes:
+    """List the facets (k, m) of exactly one cell (E, c), the body on their left.
+
+    Edges in the plane, ordered by their lower node, then by the other; facets that
+    repeated corners collapse are left out.
+    """
+    element = ELEMENTS[dim, cells.shape[1]]
+    facets = cells[:, element.facets].reshape(-1, element.facets.shape[1])
+    nodes = np.sort(facets, axis=1)
+    is_facet = (nodes[:, 1:] != nodes[:, :-1]).all(axis=1)
+    facets, nodes = facets[is_facet], nodes[is_facet]
+    name, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
+    for k in range(dim):  # so many nodes tell facets apart
+        name = name * count + nodes[:, k]
     _, first, times = np.unique(name, return_index=True, return_counts=True)
-    return np.asarray(edges[first[times == 1]])
+    return np.asarray(facets[first[times == 1]])
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
@@ -333,18 +341,6 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     edge = chain[1:] - chain[:-1]
     half = np.sqrt(np.einsum("ex,ex->e", edge, edge)) / 2
     return np.asarray(np.append(half, 0) + np.append(0, half))
-
-
-def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
-    """Connect a (rows, columns, 2) grid of points; names from row 0 anticlockwise."""
-    rows, columns = grid.shape[:2]
-    i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
-    sides = (i[0], i[:, -1], i[-1, ::-1], i[::-1, 0])
-    return Mesh(
-        np.ascontiguousarray(grid.reshape(-1, 2)),
-        cells_of_block(columns, rows),
-        dict(zip(names, sides, strict=True)),
-    )
 
 
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
@@ -360,3 +356,8 @@ def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
 def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
     """See a dof vector (dim·N,) as one vector per node (N, dim)."""
     return u.reshape(-1, dim)
+
+
+def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> Vector:
+    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -22,7 +22,7 @@ from mortarbench.problems.fem.elasticity import (
     shape_gradients,
     strain_matrix,
 )
-from mortarbench.problems.fem.mesh import Mesh, boundary_edges
+from mortarbench.problems.fem.mesh import Mesh, boundary_facets
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
@@ -102,7 +102,7 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
 def _on_boundary(mesh: Mesh) -> NDArray[np.bool_]:
     """Mark nodes on an edge that belongs to one cell only."""
     mark = np.zeros(len(mesh.points), dtype=bool)
-    mark[boundary_edges(mesh.cells)] = True
+    mark[boundary_facets(mesh.cells, mesh.dim)] = True
     return mark
 
 

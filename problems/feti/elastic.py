@@ -33,7 +33,7 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     as_vectors,
-    boundary_edges,
+    boundary_facets,
     dofs_of,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
@@ -102,7 +102,7 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
         K=stiffness(Mesh(part.points, cells, {}), D, part.material),
         R=rigid_modes(part.points),
         fixing=dofs_of(fixing_nodes(part.points), dim),
-        boundary=dofs_of(np.unique(boundary_edges(cells)), dim),
+        boundary=dofs_of(np.unique(boundary_facets(cells, dim)), dim),
         stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
     )
 

@@ -19,6 +19,7 @@ from mortarbench.problems.fem.elements import HEXAHEDRON, QUAD
 from mortarbench.problems.fem.mesh import (
     Mesh,
     as_vectors,
+    boundary_facets,
     dofs_of,
     half_disc,
     half_ring,
@@ -162,6 +163,18 @@ def test_rigid_modes_of_any_dimension_are_orthonormal_rigid_motions(points, mode
         v = as_vectors(mode, dim)
         change = np.einsum("abx,abx->ab", apart, v[:, None] - v)
         assert abs(change).max() <= 1e-14
+
+
+def test_facets_of_hexahedra_enclose_the_body_anticlockwise_from_outside():
+    mesh = bricks(3, amplitude=0)
+    facets = boundary_facets(mesh.cells, mesh.dim)
+
+    assert len({tuple(sorted(facet)) for facet in facets.tolist()}) == 6 * 9
+    a, b, c, d = np.moveaxis(mesh.points[facets], 1, 0)
+    area = np.cross(c - a, d - b) / 2
+    outwards = (a + c) / 2 - 0.5
+    np.testing.assert_allclose(np.linalg.norm(area, axis=1), 1 / 9)
+    np.testing.assert_allclose(np.einsum("fx,fx->f", area, outwards), 1 / 18)
 
 
 def test_rigid_motions_of_hexahedra_cost_nothing():
