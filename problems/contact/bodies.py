@@ -148,28 +148,7 @@ def assemble(
     load: Vector,
     pairs: tuple[ContactPair, ...],
 ) -> Bodies:
-    """Assemble the bodies of a joined mesh; arguments as of `unassembled`."""
-    return assembled(
-        unassembled(
-            mesh, body, names=names, materials=materials, plane=plane, units=units,
-            fixed=fixed, load=load, pairs=pairs,
-        )
-    )  # fmt: skip
-
-
-def unassembled(
-    mesh: Mesh,
-    body: NDArray[np.int64],
-    *,
-    names: tuple[str, ...],
-    materials: tuple[Material, ...],
-    plane: Plane,
-    units: tuple[float, float],
-    fixed: Nodes,
-    load: Vector,
-    pairs: tuple[ContactPair, ...],
-) -> UnassembledBodies:
-    """Put together what is known of the bodies of a joined mesh before any stiffness.
+    """Assemble the bodies of a joined mesh.
 
     Parameters
     ----------
@@ -181,11 +160,18 @@ def unassembled(
 
     """
     length, force = units
-    return UnassembledBodies(
-        mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-        length=length, force=force, f=load / force,
-        B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]), pairs=pairs,
+    return assembled(
+        UnassembledBodies(
+            mesh=mesh, body=body, names=names, materials=materials, plane=plane,
+            length=length, force=force, f=load / force,
+            B_D=supports(mesh, fixed), pairs=pairs,
+        )
     )  # fmt: skip
+
+
+def supports(mesh: Mesh, fixed: Nodes) -> csr_array:
+    """Return the rows (m_E, n) of prescribed components."""
+    return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
 
 
 def assembled(bodies: UnassembledBodies) -> Bodies:

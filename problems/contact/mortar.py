@@ -71,7 +71,8 @@ from mortarbench.problems.contact.surface import (
     current_surface,
     unit,
 )
-from mortarbench.problems.fem.mesh import Nodes, cross, dofs_of
+from mortarbench.problems.fem.elements import cross
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
 NEGLIGIBLE = 1e-8

@@ -49,7 +49,8 @@ from mortarbench.problems.contact.surface import (
     tangents,
     unit,
 )
-from mortarbench.problems.fem.mesh import Nodes, cross, dofs_of, nodal_lengths
+from mortarbench.problems.fem.elements import cross
+from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
 

@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.problems.contact.surface import Points, Surface, tangents
-from mortarbench.problems.fem.mesh import Nodes, cross
+from mortarbench.problems.fem.elements import cross
+from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
 ROOTS = 16  #: levels with fewer sub-chains than this are not worth a visit

@@ -20,7 +20,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.fem.elements import ELEMENTS
+from mortarbench.problems.fem.elements import (
+    ELEMENTS,
+    Floats,
+    determinant,
+    inverse_transpose,
+)
 from mortarbench.problems.fem.kernels import (
     add_stiffness,
     dof_pattern,
@@ -30,8 +35,6 @@ from mortarbench.problems.fem.kernels import (
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
-Floats = NDArray[np.float64]
-
 #: places of the components of a symmetric tensor in Voigt's notation, by dimension
 VOIGT = {
     2: np.array([[0, 2], [2, 1]]),
@@ -75,21 +78,8 @@ def shape_gradients(corners: Floats, at: Vector) -> tuple[Floats, Vector]:
     """
     reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(at)
     J = np.einsum("ar,eax->erx", reference, corners)  # ∂x/∂ξ
-    inverse, det = _inverse(J)  # ∂ξ/∂x, first index x
-    gradients: Floats = np.einsum("exr,ar->eax", inverse, reference)
-    return gradients, det
-
-
-def _inverse(J: Floats) -> tuple[Floats, Vector]:
-    """Invert matrices (E, dim, dim), and return their determinants."""
-    if J.shape[1] > 2:
-        return np.asarray(np.linalg.inv(J)), np.asarray(np.linalg.det(J))
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    inverse = np.empty_like(J)
-    inverse[:, 0, 0], inverse[:, 1, 1] = J[:, 1, 1], J[:, 0, 0]
-    inverse[:, 0, 1], inverse[:, 1, 0] = -J[:, 0, 1], -J[:, 1, 0]
-    inverse /= det[:, None, None]
-    return inverse, det
+    gradients: Floats = np.einsum("erx,ar->eax", inverse_transpose(J), reference)
+    return gradients, determinant(J)
 
 
 def strain_matrix(gradients: Floats) -> Floats:

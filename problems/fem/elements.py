@@ -83,3 +83,25 @@ HEXAHEDRON = Element(
 )  # fmt: skip
 #: by dimension and number of corners in a table of cells
 ELEMENTS = {(of.dim, len(of.corners)): of for of in (QUAD, HEXAHEDRON)}
+
+
+def determinant(A: Floats) -> Floats:
+    """Return det A (…) of matrices (…, dim, dim)."""
+    if A.shape[-1] != 2:
+        return np.asarray(np.linalg.det(A))
+    return cross(A[..., 0, :], A[..., 1, :])
+
+
+def inverse_transpose(A: Floats) -> Floats:
+    """Return A⁻ᵀ (…, dim, dim)."""
+    if A.shape[-1] != 2:
+        return np.asarray(np.swapaxes(np.linalg.inv(A), -1, -2))
+    cofactors = np.empty_like(A)
+    cofactors[..., 0, 0], cofactors[..., 1, 1] = A[..., 1, 1], A[..., 0, 0]
+    cofactors[..., 0, 1], cofactors[..., 1, 0] = -A[..., 1, 0], -A[..., 0, 1]
+    return np.asarray(cofactors / determinant(A)[..., None, None])
+
+
+def cross(a: Floats, b: Floats) -> Vector:
+    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

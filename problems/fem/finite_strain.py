@@ -39,7 +39,8 @@ from mortarbench.problems.fem.elasticity import (
     shape_gradients,
     sparsity,
 )
-from mortarbench.problems.fem.hyperelastic import Floats, Hyperelastic, determinant
+from mortarbench.problems.fem.elements import Floats, determinant
+from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, triangular
 

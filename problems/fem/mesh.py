@@ -356,8 +356,3 @@ def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
 def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
     """See a dof vector (dim·N,) as one vector per node (N, dim)."""
     return u.reshape(-1, dim)
-
-
-def cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> Vector:
-    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

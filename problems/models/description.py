@@ -61,7 +61,7 @@ from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
-    unassembled,
+    supports,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
@@ -159,15 +159,16 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
         _described_once(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
-        units = _units(table.get("units", {}), named, load)
+        length, force = _units(table.get("units", {}), named, load)
     body = np.repeat(
         np.arange(len(named.surfaces)), [len(c) for c in named.surfaces.values()]
     )
-    return unassembled(
-        Mesh(named.points, named.cells, {}), body, names=tuple(named.surfaces),
+    mesh = Mesh(named.points, named.cells, {})
+    return UnassembledBodies(
+        mesh=mesh, body=body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
-        units=units, fixed=np.unique(np.concatenate(fixed)), load=load.ravel(),
-        pairs=tuple(pairs),
+        length=length, force=force, f=load.ravel() / force,
+        B_D=supports(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
     )  # fmt: skip
 
 

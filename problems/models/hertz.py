@@ -41,7 +41,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import (
     QP,
@@ -61,6 +60,7 @@ from mortarbench.problems.contact.bodies import (
     clamped,
     floating,
     supported,
+    supports,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
@@ -387,8 +387,7 @@ def kept_on_axis(bodies: Bodies) -> Bodies:
     and Q would do work on it.
     """
     held = np.append(bodies.B_D.indices, _on_axis(bodies.mesh.boundaries, "upper_"))
-    rows = eye_array(bodies.mesh.dofs, format="csr")[held]
-    return replace(bodies, B_D=csr_array(rows))
+    return replace(bodies, B_D=supports(bodies.mesh, held))
 
 
 def sheared(mesh: Mesh) -> Vector:
