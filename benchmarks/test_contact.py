@@ -7,8 +7,8 @@ import pytest
 
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.polyline import polyline
 from mortarbench.problems.contact.segment_search import nearest
+from mortarbench.problems.contact.surface import surface
 from mortarbench.problems.models.beam_ring import model
 
 
@@ -33,7 +33,7 @@ def test_search(benchmark, segments):
     x = 2 * np.arange(segments + 1) / segments
     beam = np.column_stack([x, 0.5 - 0.025 * x**2])
 
-    found = benchmark(lambda: nearest(ring, polyline(beam, "master")))
+    found = benchmark(lambda: nearest(ring, surface(beam, "master")))
 
     assert len(found.segment) == segments
 

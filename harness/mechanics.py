@@ -213,6 +213,46 @@ class RigidMotions(NamedTuple):
     KR: Extended  #: (n, p)  K·felt on the components that no support holds
 
 
+#: meshio's names of cells of first order, by their dimension and number of corners
+KINDS = {
+    (0, 1): "vertex",
+    (1, 2): "line",
+    (2, 3): "triangle",
+    (2, 4): "quad",
+    (3, 4): "tetra",
+    (3, 6): "wedge",
+    (3, 8): "hexahedron",
+}
+
+
+class CellBlock(NamedTuple):
+    """The cells of one kind."""
+
+    kind: str  #: as meshio calls it
+    nodes: NDArray[np.int64]  #: (k, corners)
+    cells: NDArray[np.int64]  #: (k,) rows of the table that they are
+
+
+def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
+    """Sort a table of cells (E, c) by kinds, those with the fewest corners first.
+
+    Where kinds are mixed, a cell with fewer corners than the table has columns repeats
+    its last one: a triangle among quadrilaterals is (a, b, c, c).
+
+    dim : of the cells, which is that of the points of bodies
+    """
+    differs = np.ones(table.shape, dtype=bool)
+    differs[:, 1:] = table[:, 1:] != table[:, :-1]
+    corners = table.shape[1] - np.argmax(differs[:, ::-1], axis=1)
+    blocks = []
+    for count in np.unique(corners):
+        cells = np.flatnonzero(corners == count)
+        blocks.append(
+            CellBlock(KINDS[dim, int(count)], table[cells, : int(count)], cells)
+        )
+    return tuple(blocks)
+
+
 class Grid(NamedTuple):
     """The mesh behind the unknowns, which are numbered node by node."""
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from mortarbench.harness.distributed.vectors import Emitted, Ranks
-    from mortarbench.harness.mechanics import Mechanics
+    from mortarbench.harness.mechanics import CellBlock, Mechanics
     from mortarbench.harness.qp import QP, Vector
     from mortarbench.harness.solution import Solution
 
@@ -110,7 +110,7 @@ class ContactSide:
     name: str  #: of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) along the side
     length: Vector  #: (s,) of the undeformed side that belongs to each node, m
-    force: NDArray[Any]  #: (s, 2) on each node by this contact, N/m
+    force: NDArray[Any]  #: (s, dim) on each node by this contact, N/m; in space N
     pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
     gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
     #: (s,) force on each node against the normal of its own contact row, N/m
@@ -144,17 +144,30 @@ class ContactSide:
 class Fields:
     """A deformed state of bodies, for pictures and files; SI units."""
 
-    points: NDArray[Any]  #: (N, 2) reference positions, m
+    points: NDArray[Any]  #: (N, dim) reference positions, m
     #: (E, 4) node numbers, counter-clockwise; a triangle repeats its last node
     cells: NDArray[Any]
     bodies: NDArray[Any]  #: (E,) body number of each cell
-    displacement: NDArray[Any]  #: (N, 2) m
+    displacement: NDArray[Any]  #: (N, dim) m
     nodal: Mapping[str, Vector] = field(default_factory=dict)  #: e.g. von_mises (N,) Pa
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
-    contact_forces: NDArray[Any] | None = None  #: (c, 2) force on each slave node, N/m
+    #: (c, dim) force on each slave node: N/m in the plane, N in space
+    contact_forces: NDArray[Any] | None = None
     contacts: tuple[ContactSide, ...] = ()  #: each pair on its own
     #: (E,) subdomain of each cell, from 0; None for bodies that are not torn
     subdomains: NDArray[Any] | None = None
+
+    @property
+    def dim(self) -> int:
+        """Number of coordinates of a point."""
+        return int(self.points.shape[1])
+
+    @property
+    def blocks(self) -> tuple[CellBlock, ...]:
+        """Cells by their kinds, in the vocabulary of meshio."""
+        from mortarbench.harness.mechanics import cell_blocks  # late: loads numpy
+
+        return cell_blocks(self.cells, self.dim)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

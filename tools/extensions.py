@@ -22,7 +22,6 @@ MODULES = {
     "mortarbench.harness.distributed.sparse": [],
     # the digits of a stiffness, and the order of its factor, are the same everywhere
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
-    "mortarbench.problems.fem.tangents": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
     "mortarbench.problems.feti.blocks": [],

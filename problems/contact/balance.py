@@ -14,15 +14,17 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Friction, InputError, Matrix
 from mortarbench.problems.contact.bodies import UnassembledBodies
+from mortarbench.problems.fem.elasticity import rigid_motions
 
 #: part of the load that may be left: rounding of coordinates, normals and tractions
 UNBALANCED = 1e-6
 _SLIGHT = 1e-3  #: parts of a motion that are not worth a word
-_AXES = ("x", "y")
+_AXES = "xyz"
 
 Floats = NDArray[np.float64]
 
@@ -31,8 +33,8 @@ class _Moving(NamedTuple):
     """How a body moves."""
 
     name: str
-    centre: Floats  #: (2,) of its nodes, m
-    velocity: Floats  #: (2,) of the centre
+    centre: Floats  #: (dim,) of its nodes, m
+    velocity: Floats  #: (dim,) of the centre
     turn: float  #: anticlockwise, as a velocity at a `size` from the centre
 
 
@@ -53,12 +55,13 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         return
     load, closing = R.T @ bodies.f, csr_array(B) @ R
     least = UNBALANCED * np.abs(bodies.f).sum()
+    of_body, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
     sliding = [
         (b, axis)
         for b in range(len(bodies.names))
-        for axis in (0, 1)
-        if abs(load[3 * b + axis]) > least
-        and _slides(bodies, R[:, 3 * b + axis], B, np.sign(load[3 * b + axis]))
+        for axis in range(dim)
+        if abs(load[k := of_body * b + axis]) > least
+        and _slides(bodies, R[:, k], B, np.sign(load[k]))
     ]
     if sliding:
         first = sliding[0][0]
@@ -69,9 +72,9 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     left = allowed @ _remainder(allowed.T @ load, closing @ allowed)
     if np.linalg.norm(left) <= least:
         return
-    parts = left.reshape(-1, 3)
+    parts = left.reshape(-1, of_body)
     moving = [
-        _Moving(name, centre, part[:2], float(part[2]))
+        _Moving(name, centre, part[:dim], float(part[dim]))
         for name, centre, part in zip(bodies.names, centres, parts, strict=True)
         if np.abs(part).max() > _SLIGHT * np.abs(parts).max()
     ]
@@ -121,22 +124,18 @@ def check_friction(
 
 
 def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
-    """Return R (n, 3 bodies), the centres (bodies, 2) of the turns, and a size, both m.
+    """Return R (n, r bodies), the centres (bodies, dim) of the turns, and a size, m.
 
-    Of each body: x, y, and a turn about its centre that moves what is `size` away by 1,
-    so that loads along all of them are forces.
+    Of each body: translations, and turns about its centre that move what is `size` away
+    by 1, so that loads along all of them are forces.
     """
-    owner, points = bodies.body_of_node, bodies.mesh.points
-    size = float(np.ptp(points, axis=0).max())
-    R = np.zeros((points.size, 3 * len(bodies.names)))
-    centres = np.zeros((len(bodies.names), 2))
-    for b in range(len(bodies.names)):
-        mine = np.flatnonzero(owner == b)
-        centres[b] = points[mine].mean(axis=0)
-        x, y = ((points[mine] - centres[b]) / size).T
-        R[2 * mine, 3 * b] = R[2 * mine + 1, 3 * b + 1] = 1
-        R[2 * mine, 3 * b + 2], R[2 * mine + 1, 3 * b + 2] = -y, x
-    return R, centres, size
+    size = float(np.ptp(bodies.mesh.points, axis=0).max())
+    parts = bodies.points_of_bodies
+    motions = [rigid_motions(part) for part in parts]
+    for R in motions:
+        R[:, bodies.mesh.dim :] /= size
+    centres = np.array([part.mean(axis=0) for part in parts])
+    return np.asarray(block_diag(*motions)), centres, size
 
 
 def _kernel(A: Floats) -> Floats:
@@ -177,7 +176,7 @@ def _named(moving: list[_Moving], size: float) -> str:
     if abs(turning.turn) <= _SLIGHT * most:
         axes = [
             axis
-            for axis, v in zip(_AXES, sliding.velocity, strict=True)
+            for axis, v in zip(_AXES, sliding.velocity, strict=False)
             if abs(v) > _SLIGHT * most
         ]
         names = [body.name for body in moving]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import InputError, Vector
@@ -25,7 +26,7 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_edges, dofs_of
+from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_facets, dofs_of
 
 
 class ContactPair(NamedTuple):
@@ -80,24 +81,25 @@ class UnassembledBodies:
     def body_of_node(self) -> NDArray[np.int64]:
         """Body of each node, (N,)."""
         owner = np.zeros(len(self.mesh.points), dtype=np.int64)
-        owner[self.mesh.cells.ravel()] = np.repeat(self.body, 4)
+        owner[self.mesh.cells.ravel()] = np.repeat(self.body, self.mesh.cells.shape[1])
         return owner
 
     @property
     def interface(self) -> Nodes:
         """Displacement components that contact rows can touch, ascending."""
         sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
-        return np.unique(dofs_of(np.concatenate(sides)))
+        return np.unique(dofs_of(np.concatenate(sides), self.mesh.dim))
 
     @property
     def rigid(self) -> NDArray[np.float64]:
-        """Orthonormal rigid motions of every body on its own, (n, 3 bodies)."""
-        owner, points = self.body_of_node, self.mesh.points
-        motions = np.zeros((points.size, 3 * len(self.names)))
-        for b in range(len(self.names)):
-            own = dofs_of(np.flatnonzero(owner == b))
-            motions[own, 3 * b : 3 * b + 3] = rigid_modes(points[owner == b])
-        return motions
+        """Orthonormal rigid motions of every body on its own, (n, r bodies)."""
+        return np.asarray(block_diag(*map(rigid_modes, self.points_of_bodies)))
+
+    @property
+    def points_of_bodies(self) -> list[NDArray[np.float64]]:
+        """Nodes of each body, (N_b, dim)."""
+        ends = np.cumsum(np.bincount(self.body_of_node, minlength=len(self.names)))
+        return np.split(self.mesh.points, ends[:-1])
 
     @property
     def mesh_size(self) -> float:
@@ -105,8 +107,9 @@ class UnassembledBodies:
 
         Where there are none, on all sides.
         """
-        chains = [pair.slave for pair in self.pairs] or boundary_edges(self.mesh.cells)
-        sides = [self.mesh.points[chain] for chain in chains]
+        mesh, slaves = self.mesh, [pair.slave for pair in self.pairs]
+        chains = slaves or boundary_facets(mesh.cells, mesh.dim)
+        sides = [mesh.points[chain] for chain in chains]
         steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
         return float(np.concatenate(steps).mean() / self.length)
 
@@ -145,28 +148,7 @@ def assemble(
     load: Vector,
     pairs: tuple[ContactPair, ...],
 ) -> Bodies:
-    """Assemble the bodies of a joined mesh; arguments as of `unassembled`."""
-    return assembled(
-        unassembled(
-            mesh, body, names=names, materials=materials, plane=plane, units=units,
-            fixed=fixed, load=load, pairs=pairs,
-        )
-    )  # fmt: skip
-
-
-def unassembled(
-    mesh: Mesh,
-    body: NDArray[np.int64],
-    *,
-    names: tuple[str, ...],
-    materials: tuple[Material, ...],
-    plane: Plane,
-    units: tuple[float, float],
-    fixed: Nodes,
-    load: Vector,
-    pairs: tuple[ContactPair, ...],
-) -> UnassembledBodies:
-    """Put together what is known of the bodies of a joined mesh before any stiffness.
+    """Assemble the bodies of a joined mesh.
 
     Parameters
     ----------
@@ -174,15 +156,22 @@ def unassembled(
     names, materials : per body
     units : (l, F₀) of the non-dimensional QPs, m and N/m
     fixed : displacement components that are zero
-    load : (2N,) nodal forces, N/m
+    load : (n,) nodal forces: N/m in the plane, N in space
 
     """
     length, force = units
-    return UnassembledBodies(
-        mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-        length=length, force=force, f=load / force,
-        B_D=csr_array(eye_array(mesh.dofs, format="csr")[fixed]), pairs=pairs,
+    return assembled(
+        UnassembledBodies(
+            mesh=mesh, body=body, names=names, materials=materials, plane=plane,
+            length=length, force=force, f=load / force,
+            B_D=supports(mesh, fixed), pairs=pairs,
+        )
     )  # fmt: skip
+
+
+def supports(mesh: Mesh, fixed: Nodes) -> csr_array:
+    """Return the rows (m_E, n) of prescribed components."""
+    return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
 
 
 def assembled(bodies: UnassembledBodies) -> Bodies:
@@ -198,10 +187,9 @@ def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     Condensed onto what constraints can touch, or else (the paper's way) with one solve
     per constraint row of each load step.
     """
-    owner, points = bodies.body_of_node, bodies.mesh.points
-    parts = [points[owner == b] for b in range(len(bodies.names))]
+    parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
-    fixing = [fixing_nodes(part) for part in parts]
+    fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
     touched = np.union1d(bodies.interface, bodies.B_D.indices)
     interface = Interface(touched, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)

@@ -20,7 +20,7 @@ from mortarbench.problems.contact.node_to_segment import (
     geometric_stiffness,
     node_to_segment,
 )
-from mortarbench.problems.contact.polyline import current_polyline, current_positions
+from mortarbench.problems.contact.surface import current_positions, current_surface
 from mortarbench.problems.fem.mesh import Nodes
 
 
@@ -114,7 +114,7 @@ def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
     found = []
     for pair in bodies.pairs:
         x = current_positions(bodies.mesh.points, u, pair.slave, "slave")
-        line = current_polyline(bodies.mesh.points, u, pair.master, "master")
+        line = current_surface(bodies.mesh.points, u, pair.master, "master")
         found.append(closest_points(x, line).segment)
     return np.concatenate(found)
 

@@ -64,14 +64,14 @@ from scipy.sparse import coo_array, csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.polyline import (
+from mortarbench.problems.contact.segment_search import Reach, facing
+from mortarbench.problems.contact.surface import (
     Points,
-    Polyline,
-    cross,
-    current_polyline,
+    Surface,
+    current_surface,
     unit,
 )
-from mortarbench.problems.contact.segment_search import Reach, facing
+from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
@@ -87,7 +87,7 @@ Basis = Literal["dual", "standard"]
 class Mortar:
     """Mortar integrals of a pair of sides, numbered along their chains.
 
-    The columns of D and M are components, x and y of each node.
+    The columns of D and M are components of displacement, see `dofs_of`.
     """
 
     D: csr_array  #: (s, 2s) ∫ Φ_j N_k ν, m
@@ -145,11 +145,11 @@ def mortar(
         When a position is not finite or a side has no segment.
 
     """
-    s = current_polyline(points, u, slave, "slave")
-    m = current_polyline(points, u, master, "master")
+    s = current_surface(points, u, slave, "slave")
+    m = current_surface(points, u, master, "master")
     integrals = integrate(s, m, basis, reach)
     j = np.flatnonzero(integrals.cover)
-    B = _rows(integrals, j, (slave, master), points.size)
+    B = _rows(integrals, j, (slave, master), points.shape)
     T = _turned(B if tangential else B[:0])
     return ContactRows(
         B, integrals.gap[j] / integrals.cover[j] + B @ u,
@@ -157,14 +157,13 @@ def mortar(
     )  # fmt: skip
 
 
-def integrate(slave: Polyline, master: Polyline, basis: Basis, reach: Reach) -> Mortar:
+def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
     """Compute D, M and the weighted gaps."""
     at = cast_rays(slave, master, overlaps(slave, master), reach)
     N = _shape(at.xi)
     phi = _dual(at) if basis == "dual" else N
     s, v = len(slave.x), len(master.x)
-    j = slave.first[at.slave][:, None] + np.arange(2)  # (p, 2) nodes
-    k = master.first[at.master][:, None] + np.arange(2)
+    j, k = slave.facets[at.slave], master.facets[at.master]  # (p, 2) nodes
     weighted = phi * at.weight[..., None]  # (p, 3, 2)
     overlap = np.einsum("pgj,pgk->pjk", weighted, N)
     if basis == "dual":  # what cancels in sums over the segments, left out
@@ -185,12 +184,11 @@ def integrate(slave: Polyline, master: Polyline, basis: Basis, reach: Reach) -> 
     )  # fmt: skip
 
 
-def overlaps(slave: Polyline, master: Polyline) -> Overlaps:
+def overlaps(slave: Surface, master: Surface) -> Overlaps:
     """Find the integration segments, before any filter."""
     e, m = facing(slave, master)
-    j = slave.first[e]
-    x = np.stack([slave.x[j], slave.x[j + 1]])  # (2, p, 2)
-    n = np.stack([slave.node_normal[j], slave.node_normal[j + 1]])
+    nodes = slave.facets.T[:, e]
+    x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
     low, high = np.zeros(len(e)), np.ones(len(e))
     for side, (x_j, n_j) in zip((1.0, -1.0), zip(x, n, strict=True), strict=True):
@@ -224,17 +222,17 @@ def project(x: Points, n: Points, p: Points) -> Vector:
 
 
 def cast_rays(
-    slave: Polyline, master: Polyline, parts: Overlaps, reach: Reach
+    slave: Surface, master: Surface, parts: Overlaps, reach: Reach
 ) -> GaussPoints:
     """Place Gauss points, cast their rays, and leave out the segments out of reach."""
     e, m, ends = parts
     half = (ends[:, 1] - ends[:, 0]) / 2
     xi = ends.mean(axis=1)[:, None] + half[:, None] * ABSCISSAE
-    N, j = _shape(xi), slave.first[e]
+    N, (j, k) = _shape(xi), slave.facets.T[:, e]
     edge = slave.end[e] - slave.start[e]
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
-    field += N[..., 1:] * slave.node_normal[j + 1][:, None]
+    field += N[..., 1:] * slave.node_normal[k][:, None]
     n = unit(field, slave.normal[e][:, None])
 
     A, B = master.start[m][:, None], master.end[m][:, None]
@@ -281,26 +279,31 @@ def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
 def _sum(
     vectors: NDArray[np.float64], rows: Nodes, nodes: Nodes, shape: tuple[int, int]
 ) -> csr_array:
-    """Add vectors (p, 2, 2, 2) into a matrix at rows (p, 2) × nodes (p, 2).
+    """Add vectors (p, 2, 2, dim) into a matrix at rows (p, 2) × nodes (p, 2).
 
-    shape : counts of rows and nodes; a node has two columns, its components
+    shape : counts of rows and nodes; a node has a column for each component
     """
-    i = np.repeat(rows, 4, axis=1)
-    j = np.tile(dofs_of(nodes.ravel()).reshape(-1, 4), (1, 2))
+    dim = vectors.shape[-1]
+    i = np.repeat(rows, 2 * dim, axis=1)
+    j = np.tile(dofs_of(nodes, dim).reshape(-1, 2 * dim), (1, 2))
     at = (i.ravel(), j.ravel())
-    return csr_array(coo_array((vectors.ravel(), at), (shape[0], 2 * shape[1])))
+    return csr_array(coo_array((vectors.ravel(), at), (shape[0], dim * shape[1])))
 
 
 def _rows(
-    integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], size: int
+    integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], shape: tuple[int, int]
 ) -> csr_array:
-    """Build (D u_s − M u_m)_j / cover_j for the slave nodes j as a matrix on u."""
+    """Build (D u_s − M u_m)_j / cover_j for the slave nodes j as a matrix on u.
+
+    shape : of all nodes (N, dim)
+    """
+    N, dim = shape
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
     row = np.concatenate([D.row, M.row])
-    slave, master = (dofs_of(side) for side in sides)
+    slave, master = (dofs_of(side, dim) for side in sides)
     at = (row, np.concatenate([slave[D.col], master[M.col]]))
     values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
-    B = csr_array(coo_array((values, at), (len(j), size)))
+    B = csr_array(coo_array((values, at), (len(j), N * dim)))
     B.eliminate_zeros()
     return B
 

@@ -39,15 +39,17 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.polyline import (
+from mortarbench.problems.contact.segment_search import Reach, nearest
+from mortarbench.problems.contact.surface import (
     Points,
-    Polyline,
-    current_polyline,
+    Surface,
     current_positions,
-    polyline,
+    current_surface,
+    surface,
+    tangents,
     unit,
 )
-from mortarbench.problems.contact.segment_search import Reach, nearest
+from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
@@ -58,9 +60,9 @@ Normals = Literal["segment", "averaged"]
 class ContactRows(NamedTuple):
     """The linear inequalities B u ≤ c on the total displacement u, and its slip T u."""
 
-    B: csr_array  #: (m_I, 2N) dimensionless
+    B: csr_array  #: (m_I, n) dimensionless
     c: Vector  #: (m_I,) m
-    T: csr_array  #: (k, 2N) tangential rows, of d − 1 directions each; often none
+    T: csr_array  #: (k, n) tangential rows, of d − 1 directions each; often none
     row: Nodes  #: (k,) the contact row that each of them belongs to
     share: Vector  #: (m_I,) of the slave side that a row stands for, ∫N_j, m
     place: Nodes  #: (m_I,) number of its node in the slave chain
@@ -107,7 +109,7 @@ def node_to_segment(
 
     """
     x = current_positions(points, u, slave, "slave")
-    line = current_polyline(points, u, master, "master")
+    line = current_surface(points, u, master, "master")
     at = _opposite(x, line, normals, kept)
     N = np.stack([1 - at.xi, at.xi], axis=1)
     ends = np.stack([at.segment, at.segment + 1], axis=1)
@@ -118,13 +120,16 @@ def node_to_segment(
     weight = np.column_stack([-np.ones(len(slave)), N])
     kept = np.arange(len(slave))
     if reach is not None:
-        kept = np.flatnonzero(_in_reach(polyline(x, "slave"), line, at, foot, reach))
-    held = kept if tangential else kept[:0]
-    B = rows_along(node[kept], weight[kept], at.normal[kept], points.size)
-    T = rows_along(node[held], weight[held], tangent(at.normal[held]), points.size)
-    return ContactRows(
-        B, gap[kept] + B @ u, T, np.arange(held.size), nodal_lengths(x)[kept], kept
-    )
+        kept = np.flatnonzero(_in_reach(surface(x, "slave"), line, at, foot, reach))
+    node, weight, normal = node[kept], weight[kept], at.normal[kept]
+    B = rows_along(node, weight, normal, points.size)
+    T, row = csr_array((0, points.size)), np.arange(0)
+    if tangential:
+        directions = tangents(normal)
+        row = np.repeat(np.arange(kept.size), directions.shape[1])
+        along = directions.reshape(-1, points.shape[1])
+        T = rows_along(node[row], weight[row], along, points.size)
+    return ContactRows(B, gap[kept] + B @ u, T, row, nodal_lengths(x)[kept], kept)
 
 
 def geometric_stiffness(
@@ -157,12 +162,12 @@ def geometric_stiffness(
 
     """
     x = current_positions(points, u, slave, "slave")
-    line = current_polyline(points, u, master, "master")
+    line = current_surface(points, u, master, "master")
     at = _opposite(x, line, "segment", kept)
     x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
-    t, area = e / L[:, None], d[:, 0] * e[:, 1] - d[:, 1] * e[:, 0]
+    t, area = e / L[:, None], cross(d, e)
     one, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])  # a = dᵀ turn e
     in_d, in_e = np.hstack([one, -one, 0 * one]), np.hstack([0 * one, -one, one])
     area_1 = (e @ turn.T) @ in_d + (d @ turn) @ in_e  # (s, 6)
@@ -182,18 +187,18 @@ def geometric_stiffness(
         inside |= kept >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
     nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
-    return blocks, dofs_of(nodes.ravel()).reshape(-1, 6)
+    return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
 def closest_points(
-    x: Points, line: Polyline, normals: Normals = "segment"
+    x: Points, line: Surface, normals: Normals = "segment"
 ) -> ClosestPoints:
     """Find the closest points of x (s, 2) on a chain and its outward normals there."""
     segment, xi = nearest(x, line)
-    first = line.first[segment]
+    first, second = line.facets.T[:, segment]
     at_first, at_second = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
-    n_1, n_2 = line.node_normal[first], line.node_normal[first + 1]
+    n_1, n_2 = line.node_normal[first], line.node_normal[second]
     normal = line.normal[segment]
     if normals == "averaged":
         normal = unit((1 - xi)[:, None] * n_1 + xi[:, None] * n_2, normal)
@@ -204,7 +209,7 @@ def closest_points(
 
 
 def _opposite(
-    x: Points, line: Polyline, normals: Normals, kept: Nodes | None
+    x: Points, line: Surface, normals: Normals, kept: Nodes | None
 ) -> ClosestPoints:
     """Find what the slave nodes x (s, 2) stand against: the closest, or what is kept.
 
@@ -218,37 +223,31 @@ def _opposite(
     edge = line.x[segment + 1] - start
     xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
     length = np.linalg.norm(edge, axis=1)[:, None]
-    across = np.column_stack([edge[:, 1], -edge[:, 0]]) / length
+    across = -tangents(edge)[:, 0] / length
     return ClosestPoints(
         segment, np.where(own, xi, at.xi), np.where(own[:, None], across, at.normal)
     )
-
-
-def tangent(normal: Points) -> Points:
-    """Turn outward unit normals (…, 2) to the unit tangents (−n_y, n_x)."""
-    return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)
 
 
 def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
     """Build rows that weight the displacements of equally many nodes along a direction.
 
     Row r is Σ_a weight_ra · direction_r at the components of node_ra: node and weight
-    are (m, k), direction is (m, 2), the result (m, size) without stored zeros.
+    are (m, k), direction is (m, dim), the result (m, size) without stored zeros.
     """
-    m, k = node.shape
+    (m, k), dim = node.shape, direction.shape[1]
     if not m:
         return csr_array((0, size))
-    columns = np.stack([2 * node, 2 * node + 1], axis=-1)
     values = weight[:, :, None] * direction[:, None, :]
-    indptr = 2 * k * np.arange(m + 1)
-    B = csr_array((values.ravel(), columns.ravel(), indptr), shape=(m, size))
+    indptr = dim * k * np.arange(m + 1)
+    B = csr_array((values.ravel(), dofs_of(node, dim), indptr), shape=(m, size))
     B.sum_duplicates()
     B.eliminate_zeros()
     return B
 
 
 def _in_reach(
-    slave: Polyline, master: Polyline, at: ClosestPoints, foot: Points, reach: Reach
+    slave: Surface, master: Surface, at: ClosestPoints, foot: Points, reach: Reach
 ) -> NDArray[np.bool_]:
     """Say which slave nodes face their closest point and are near enough, (s,)."""
     cosine = np.einsum("sx,sx->s", slave.node_normal, at.normal)

@@ -75,7 +75,7 @@ def results_of(
     return {
         "nodes": inside.nodes,
         "elements": inside.elements,
-        "dofs": 2 * inside.nodes,
+        "dofs": bodies.mesh.dim * inside.nodes,
         "equality_rows": inside.supports,
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
@@ -97,7 +97,7 @@ def _contact_force(
     if len(bodies.pairs) > 1:
         return {}
     if not bodies.pairs:
-        return {"contact_force": [0.0, 0.0]}
+        return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
     loaded = owner == owner[(master if master.size else slave)[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
@@ -149,7 +149,7 @@ def pair_results(
         force = {slave: total.tolist()}
         if pair.master.size:
             force = {master: (0.0 - total).tolist()} | force
-        largest = float(np.hypot(*side.force.T).max(initial=0.0))
+        largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
         pressed = side.pressed(ACTIVE * largest)
         found[side.name] = {
             "force": force,
@@ -178,7 +178,7 @@ def fields(
         points=bodies.mesh.points,
         cells=bodies.mesh.cells,
         bodies=bodies.body,
-        displacement=as_vectors(u),
+        displacement=as_vectors(u, bodies.mesh.dim),
         nodal=stresses or nodal_stresses(bodies, u),
         contact_nodes=slaves,
         contact_forces=contact_forces(bodies, primal, s, friction)[slaves],
@@ -193,9 +193,9 @@ def contact_forces(
     s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> NDArray[np.float64]:
-    """Return the forces −Bᵀλ of contact and friction on the nodes (N, 2), N/m."""
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m."""
     B, _ = contact_rows(primal, friction)
-    return as_vectors(-(B.T @ s.z) * bodies.force)
+    return as_vectors(-(B.T @ s.z) * bodies.force, bodies.mesh.dim)
 
 
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.contact.polyline import Points, Polyline, cross
+from mortarbench.problems.contact.surface import Points, Surface, tangents
+from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes
 
 BRANCHES = 4
@@ -47,7 +48,7 @@ class Reach:
         if self.distance is not None and not self.distance > 0:
             raise InputError(f"reach: distance={self.distance} m must be positive")
 
-    def within(self, slave: Polyline, master: Polyline) -> float:
+    def within(self, slave: Surface, master: Surface) -> float:
         """Return the largest distance kept between these sides, m."""
         if self.distance is not None:
             return self.distance
@@ -68,13 +69,13 @@ Keep = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 
 
 class Nearest(NamedTuple):
-    """Closest points on a chain; segments count as in its Polyline."""
+    """Closest points on a chain; segments count as in its Surface."""
 
     segment: Nodes  #: (s,)
     xi: Vector  #: (s,) place in [0, 1] from the segment's first end to its second
 
 
-def nearest(x: Points, line: Polyline) -> Nearest:
+def nearest(x: Points, line: Surface) -> Nearest:
     """Find the closest point of a whole chain for each point of x, (s, 2).
 
     Of segments that are equally close, to rounding, the first of the chain is returned.
@@ -93,7 +94,7 @@ def nearest(x: Points, line: Polyline) -> Nearest:
     return Nearest(segment, _to_chords(x, levels[-1], segment)[0])
 
 
-def facing(slave: Polyline, master: Polyline) -> tuple[Nodes, Nodes]:
+def facing(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
     """Find which master segments may lie between the normals at a slave segment's ends.
 
     With f_j(p) = (x_j − p) × n_j, p lies between the lines along the averaged normals
@@ -106,20 +107,20 @@ def facing(slave: Polyline, master: Polyline) -> tuple[Nodes, Nodes]:
 
     """
     x, n = slave.x, slave.node_normal
-    across = np.column_stack([-n[:, 1], n[:, 0]])  # f_j(p) = offset_j + p · across_j
+    across = tangents(n)[:, 0]  # f_j(p) = offset_j + p · across_j
     offset = cross(x, n)
-    j = slave.first
+    j, k = slave.facets.T
 
     def keep(level: Chords, query: Nodes, node: Nodes) -> NDArray[np.bool_]:
         start, edge = level.start.take(node, axis=0), level.edge.take(node, axis=0)
 
-        def ends(k: Nodes) -> tuple[Vector, Vector]:
-            along = across.take(k, axis=0)
-            one = offset[k] + np.einsum("px,px->p", start, along)
+        def ends(of: Nodes) -> tuple[Vector, Vector]:
+            along = across.take(of, axis=0)
+            one = offset[of] + np.einsum("px,px->p", start, along)
             return one, one + np.einsum("px,px->p", edge, along)
 
         above = np.maximum(*ends(j[query])) >= -level.deviation[node]
-        below = np.minimum(*ends(j[query] + 1)) <= level.deviation[node]
+        below = np.minimum(*ends(k[query])) <= level.deviation[node]
         kept: NDArray[np.bool_] = above & below
         return kept
 
@@ -141,12 +142,12 @@ def _descend(queries: int, levels: list[Chords], keep: Keep) -> tuple[Nodes, Nod
     return query[kept], node[kept]
 
 
-def _levels(line: Polyline) -> list[Chords]:
+def _levels(line: Surface) -> list[Chords]:
     """Build the tree, from its roots to the segments."""
     return list(_rising(line))[::-1]
 
 
-def _rising(line: Polyline) -> Iterator[Chords]:
+def _rising(line: Surface) -> Iterator[Chords]:
     """Build the tree from the segments upwards.
 
     The chords of the parts of a sub-chain end at nodes within some h of its chord, so

@@ -16,9 +16,13 @@ from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
-from mortarbench.problems.contact.node_to_segment import tangent
-from mortarbench.problems.contact.polyline import current_polyline
-from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
+from mortarbench.problems.contact.surface import current_surface
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    as_vectors,
+    dofs_of,
+    nodal_lengths,
+)
 
 RIGID = "rigid"  #: name of a master that is no body
 ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
@@ -42,28 +46,26 @@ def contact_sides(
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
-    points, u = bodies.mesh.points, s.x * l
+    points, dim, u = bodies.mesh.points, bodies.mesh.dim, s.x * l
     slack = (primal.h - B @ s.x) * l
     found = []
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        pressing = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F)[pair.slave]
+        pressing = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
         rough = (friction.row >= rows.start) & (friction.row < rows.stop)
         rubbing = np.zeros_like(pressing)
         if rough.any():
-            rubbing -= (
-                as_vectors(friction.T[rough].T @ tangential[rough])[pair.slave] * F
-            )
-        side = current_polyline(points, u, pair.slave, "slave")
+            force = friction.T[rough].T @ tangential[rough]
+            rubbing -= as_vectors(force, dim)[pair.slave] * F
+        side = current_surface(points, u, pair.slave, "slave")
         length = nodal_lengths(points[pair.slave])
         normal = np.einsum("sx,sx->s", pressing, side.node_normal)
         gap, push = np.full((2, len(pair.slave)), np.nan)
-        place, own = slave_places(B[rows], pair.slave)
+        place, own = slave_places(B[rows], pair.slave, dim)
         gap[place] = slack[rows]
         push[place] = np.einsum("rx,rx->r", pressing[place], -own)
         push = np.nan_to_num(push)
-        t = tangent(side.node_normal)
         told = np.full(len(pair.slave), "open", dtype=state.dtype)
         told[place[friction.row[rough] - rows.start]] = state[rough]
         found.append(
@@ -71,7 +73,7 @@ def contact_sides(
                 name=name, nodes=pair.slave, length=length,
                 force=pressing + rubbing, pressure=(0.0 - normal) / length, gap=gap,
                 push=push,
-                shear=np.einsum("sx,sx->s", rubbing, t) / length
+                shear=np.einsum("sx,sx->s", rubbing, side.tangents[:, 0]) / length
                 if rough.any() else None,
                 friction=told if rough.any() else None,
             )
@@ -125,13 +127,11 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Find which rows of B (m, n) belong to which pair."""
-    m = B.shape[0]
-    touches = csr_array(
-        (np.ones(B.nnz), B.indices // 2, B.indptr), shape=(m, len(bodies.mesh.points))
-    )
+    m, (N, dim) = B.shape[0], bodies.mesh.points.shape
+    touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
     outside = []
     for pair in bodies.pairs:
-        other = np.ones(len(bodies.mesh.points))
+        other = np.ones(N)
         other[np.concatenate(pair)] = 0.0
         outside.append(touches @ other > 0)
     slices, first = [], 0
@@ -144,16 +144,17 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
 
 
 def slave_places(
-    B: csr_array, slave: Nodes
+    B: csr_array, slave: Nodes, dim: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Find each row's node, as its place on the slave side: where B is largest.
 
     Returns
     -------
-    places (r,), and the directions (r, 2) of the rows there, unit vectors
+    places (r,), and the directions (r, dim) of the rows there, unit vectors
 
     """
-    entries = np.stack([B[:, 2 * slave + c].toarray() for c in (0, 1)], axis=-1)
+    components = [B[:, dofs_of(slave, dim, axis)] for axis in range(dim)]
+    entries = np.stack([part.toarray() for part in components], axis=-1)
     place = np.abs(entries).sum(axis=2).argmax(axis=1)
     own = entries[np.arange(len(place)), place]
     return place, own / np.linalg.norm(own, axis=1, keepdims=True)

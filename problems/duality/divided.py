@@ -46,7 +46,7 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     as_vectors,
-    boundary_edges,
+    boundary_facets,
     dofs_of,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
@@ -123,7 +123,7 @@ def torn_path(
             known.append(dual_on(parts, ranks))
         return TornProblem(stage, known[0], sides, reference)
 
-    nothing = np.zeros(2 * side_nodes(of.pairs).size)
+    nothing = np.zeros(of.shape.dim * side_nodes(of.pairs).size)
     places = sum(pair.slave.size for pair in of.pairs)
     rest = State(nothing, nothing, np.full(places, problem.pressed))
     return LoadPath(problem.stages, pose, rest)
@@ -174,7 +174,7 @@ def described(
     share = longitudinal_share(D)
     force = stage.forces._replace(value=stage.forces.value * stage.part)
     return ProblemInParts(
-        layout=layout, components=2, material=layout.body,
+        layout=layout, components=bodies.shape.dim, material=layout.body,
         kind=partial(elastic_kind, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         held=stage.fixed, load=looked_up(force), glue=glue, contact=contact,
@@ -215,7 +215,7 @@ class LinearisedSides:
     @property
     def component(self) -> Nodes:
         """Components of the whole that the columns are of, (2N,)."""
-        return dofs_of(self.node)
+        return dofs_of(self.node, self.bodies.mesh.dim)
 
     @property
     def places(self) -> int:
@@ -231,7 +231,7 @@ class LinearisedSides:
             c = np.append(c, friction.start)
         rows = csr_array(
             (B.data, self.component[B.indices], B.indptr),
-            shape=(B.shape[0], 2 * self.nodes),
+            shape=(B.shape[0], self.bodies.mesh.dim * self.nodes),
         )
         return Contact(rows, c, friction.bound)
 
@@ -329,14 +329,14 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
     E : (k,) their moduli, without dimension
 
     """
-    cells = part.cells
+    cells, dim = part.cells, part.points.shape[1]
     around = np.bincount(cells.ravel(), np.repeat(E[part.material], cells.shape[1]))
     return Kind(
         K=stiffness(Mesh(part.points, cells, {}), D, part.material),
         R=rigid_modes(part.points),
-        fixing=dofs_of(fixing_nodes(part.points)),
-        boundary=dofs_of(np.unique(boundary_edges(cells))),
-        stiffness=np.repeat(around / np.bincount(cells.ravel()), 2),
+        fixing=dofs_of(fixing_nodes(part.points), dim),
+        boundary=dofs_of(np.unique(boundary_facets(cells, dim)), dim),
+        stiffness=np.repeat(around / np.bincount(cells.ravel()), dim),
     )
 
 
@@ -356,16 +356,17 @@ def own_meshes(
 
     """
     layout = found.subdomains.problem.layout
+    dim = found.subdomains.problem.components
     batches = _batches(layout, found.subdomains.number)
     around = [_around(layout, batch, reach) for batch in batches]
     node = np.unique(np.concatenate([part.node for part in around]))
-    here = found.bodies.components[::2] // 2
+    here = found.bodies.components[::dim] // dim
     place = np.minimum(np.searchsorted(here, node), here.size - 1)
     lacks = here[place] != node
-    u = as_vectors(found.u)[place]
+    u = as_vectors(found.u, dim)[place]
     everyones = found.bodies.ranks.comm.allgather(node[lacks])
     asked = np.unique(np.concatenate(everyones))
-    told = as_vectors(found.at(dofs_of(asked)))
+    told = as_vectors(found.at(dofs_of(asked, dim)), dim)
     u[lacks] = told[np.searchsorted(asked, node[lacks])]
 
     def meshes() -> Iterator[DisplacedMesh]:

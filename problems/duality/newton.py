@@ -525,7 +525,7 @@ def translations_left(bodies: Bodies) -> list[NDArray[np.float64]]:
     held[bodies.B_D.indices] = True
     rigid = bodies.rigid
     for b, name in enumerate(bodies.names):
-        own = dofs_of(np.flatnonzero(owner == b))
+        own = dofs_of(np.flatnonzero(owner == b), bodies.mesh.dim)
         R = rigid[own][:, 3 * b : 3 * b + 3]
         left = null_space(R[held[own]]) if held[own].any() else np.eye(3)
         if np.abs(left[2]).max(initial=0.0) > TURNING:
@@ -542,8 +542,9 @@ def guided(tangent: Bodies) -> GeneralisedInverse:
     """Factorise K with the translations that its supports leave, as `dual` needs it."""
     kernels = translations_left(tangent)
     owner, points = tangent.body_of_node, tangent.mesh.points
+    dim, none = tangent.mesh.dim, np.zeros(0, dtype=np.int64)
     fixing = [
-        fixing_nodes(points[owner == b]) if R.shape[1] else np.zeros(0, dtype=np.int64)
+        dofs_of(fixing_nodes(points[owner == b]), dim) if R.shape[1] else none
         for b, R in enumerate(kernels)
     ]
     touched = np.union1d(tangent.interface, tangent.B_D.indices)

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array, eye_array
 
 from mortarbench.harness import QP, Friction, InputError, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import (
@@ -25,6 +24,7 @@ from mortarbench.problems.contact.bodies import (
     clamped,
     floating,
     supported,
+    supports,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -56,6 +56,10 @@ class Shape(Protocol):
     """Bodies without material, meshed when somebody asks for the mesh."""
 
     @property
+    def dim(self) -> int:
+        """How many coordinates points have."""
+
+    @property
     def mesh(self) -> Mesh:
         """All bodies, joined, m."""
 
@@ -76,6 +80,7 @@ class StructuredGrids:
     """Structured grids, one after another; subdomains of at most size² cells."""
 
     grids: tuple[StructuredGrid, ...]
+    dim = 2
 
     @cached_property
     def _joined(self) -> tuple[Mesh, Nodes]:
@@ -106,6 +111,7 @@ class HalfDiscs:
     """Half discs, one after another; subdomains are blocks of rings and sectors."""
 
     discs: tuple[HalfDisc, ...]
+    dim = 2
 
     @cached_property
     def _joined(self) -> tuple[Mesh, Nodes]:
@@ -142,6 +148,11 @@ class Meshed:
     mesh: Mesh
     body: NDArray[np.int64]
     named: Nodes  #: nodes that supports and contact name
+
+    @property
+    def dim(self) -> int:
+        """How many coordinates points have."""
+        return self.mesh.dim
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
@@ -182,7 +193,7 @@ class ElasticBodies:
         return UnassembledBodies(
             mesh=mesh, body=self.shape.body, names=self.names,
             materials=self.materials, plane=self.plane, length=self.length,
-            force=self.force, f=f, B_D=unit_rows(self.fixed, mesh.dofs),
+            force=self.force, f=f, B_D=supports(mesh, self.fixed),
             pairs=self.pairs,
         )  # fmt: skip
 
@@ -211,7 +222,7 @@ class ElasticBodies:
 def stated(bodies: UnassembledBodies) -> ElasticBodies:
     """State bodies that there is a mesh of already; their own stiffness is kept."""
     fixed = bodies.B_D.indices
-    named = np.concatenate([fixed, bodies.interface]) // 2
+    named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
     found = ElasticBodies(
         shape=Meshed(bodies.mesh, bodies.body, named), names=bodies.names,
         materials=bodies.materials, plane=bodies.plane, length=bodies.length,
@@ -221,11 +232,6 @@ def stated(bodies: UnassembledBodies) -> ElasticBodies:
     if isinstance(bodies, Bodies):
         vars(found)["assembled"] = bodies
     return found
-
-
-def unit_rows(fixed: Nodes, n: int) -> csr_array:
-    """Return a row with one unit entry for each prescribed component, (k, n)."""
-    return csr_array(eye_array(n, format="csr")[fixed])
 
 
 class AtSides(NamedTuple):

@@ -15,7 +15,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
 from mortarbench.problems.contact.balance import check_friction
-from mortarbench.problems.contact.bodies import Bodies, floating
+from mortarbench.problems.contact.bodies import Bodies, floating, supports
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     forces_at_nodes,
@@ -35,7 +35,7 @@ from mortarbench.problems.duality.dualisation import (
     dual_bounds,
     dualise,
 )
-from mortarbench.problems.duality.problem import ContactProblem, Linearise, unit_rows
+from mortarbench.problems.duality.problem import ContactProblem, Linearise
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -146,7 +146,7 @@ def whole_path(problem: ContactProblem, reference: Reference) -> WholePath:
     def factor() -> GeneralisedInverse:
         if held.size == of.fixed.size:
             return of.floating
-        return floating(replace(bodies, B_D=unit_rows(held, bodies.mesh.dofs)))
+        return floating(replace(bodies, B_D=supports(bodies.mesh, held)))
 
     is_held = of.is_held and all(stage.fixed is of.fixed for stage in stages)
     return _path(
@@ -174,7 +174,7 @@ def _path(
         if names not in known:
             f = np.zeros(bodies.mesh.dofs)
             f[stage.forces.component] = stage.forces.value
-            held = unit_rows(stage.fixed, f.size)
+            held = supports(bodies.mesh, stage.fixed)
             known[names] = replace(bodies, f=f, B_D=held)
         return known[names]
 

@@ -22,7 +22,7 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.fixing import fixing_nodes, spectral_fixing_nodes
 from mortarbench.problems.fem.inverse import floating_inverse
-from mortarbench.problems.fem.mesh import Mesh, Nodes, rectangle
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, rectangle
 from mortarbench.problems.fem.triplets import stiffness_by_triplets
 from mortarbench.problems.models.beam_ring import BEAM, LENGTH, LOAD, model
 
@@ -107,8 +107,8 @@ def _cholesky(
     mesh: Mesh, K: Any, v: NDArray[np.float64], fixing: Callable[..., Nodes]
 ) -> Laps:
     watch = Stopwatch()
-    nodes = fixing(mesh.points)
-    inverse = floating_inverse(K, [rigid_modes(mesh.points)], [nodes])
+    held = dofs_of(fixing(mesh.points), mesh.dim)
+    inverse = floating_inverse(K, [rigid_modes(mesh.points)], [held])
     watch.lap("build")
     inverse(v)
     watch.lap("multiply")

@@ -48,7 +48,7 @@ def _results(bodies: Bodies, path: WholePath, step: int) -> dict[str, Value]:
     primal, s = path.primal(step), path.answer(step)
     found = quantities(bodies, primal, s)
     sides = bodies.mesh.boundaries
-    tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]))] * LENGTH
+    tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
     force = found["contact_force"]
     return {
         "tip_x": float(tip[0]), "tip_y": float(tip[1]), "energy": found["energy"],

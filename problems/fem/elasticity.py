@@ -1,14 +1,18 @@
-"""Plane linear elasticity with bilinear quadrilaterals (paper, Section 2).
+"""Linear elasticity with multilinear elements, in the plane and in space.
 
-Triangles are quadrilaterals with two corners in one, see `problems.fem.mesh`.
+In the plane that is the bilinear quadrilateral of the paper (Section 2); triangles are
+quadrilaterals with two corners in one, see `problems.fem.mesh`.
 
-Voigt notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy); stiffness per unit
-thickness, so K has the unit of stress (Pa) and forces are in N/m.
+Voigt's notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy) in the plane,
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) and so on in space. Plane stiffness is per unit
+thickness, so K has the unit of stress (Pa) and forces are in N/m; in space they are N/m
+and N.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -16,6 +20,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
 from mortarbench.harness import Vector
+from mortarbench.problems.fem.elements import (
+    ELEMENTS,
+    Floats,
+    determinant,
+    inverse_transpose,
+)
 from mortarbench.problems.fem.kernels import (
     add_stiffness,
     dof_pattern,
@@ -25,10 +35,11 @@ from mortarbench.problems.fem.kernels import (
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
-
-#: 2×2 Gauss points of the reference square [−1, 1]², all of weight 1.
-GAUSS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / np.sqrt(3)
-CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+#: places of the components of a symmetric tensor in Voigt's notation, by dimension
+VOIGT = {
+    2: np.array([[0, 2], [2, 1]]),
+    3: np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]]),
+}
 
 
 @dataclass(frozen=True)
@@ -39,51 +50,44 @@ class Material:
     nu: float  #: Poisson's ratio
 
 
-def elasticity_matrix(material: Material, plane: Plane) -> NDArray[np.float64]:
-    """Return D (3, 3) of σ = D ε in plane strain or plane stress, Pa."""
+def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
+    """Return D (3, 3) of σ = D ε in plane strain or stress, or (6, 6) in space, Pa."""
     E, nu = material.E, material.nu
     if plane == "stress":
         factor, off, shear = E / (1 - nu**2), nu, (1 - nu) / 2
         return factor * np.array([[1, off, 0], [off, 1, 0], [0, 0, shear]])
     factor = E / ((1 + nu) * (1 - 2 * nu))
-    a, b, shear = 1 - nu, nu, (1 - 2 * nu) / 2
-    return factor * np.array([[a, b, 0], [b, a, 0], [0, 0, shear]])
+    D = np.diag([1 - nu] * 3 + [(1 - 2 * nu) / 2] * 3)
+    D[:3, :3][~np.eye(3, dtype=bool)] = nu
+    kept = [0, 1, 5] if plane == "strain" else list(range(6))
+    return np.asarray(factor * D[np.ix_(kept, kept)])
 
 
-def shape_gradients(
-    corners: NDArray[np.float64], at: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], Vector]:
-    """Differentiate the bilinear shape functions with respect to x and y.
+def shape_gradients(corners: Floats, at: Vector) -> tuple[Floats, Vector]:
+    """Differentiate the shape functions of cells with respect to x.
 
     Parameters
     ----------
-    corners : (E, 4, 2) corner positions of the cells
-    at : (2,) point of the reference square
+    corners : (E, n, dim) corner positions of the cells
+    at : (dim,) point of the reference cell
 
     Returns
     -------
-    (E, 4, 2) gradients ∂N_a/∂(x, y) and (E,) Jacobian determinants
+    (E, n, dim) gradients ∂N_a/∂x and (E,) Jacobian determinants
 
     """
-    xi, eta = CORNERS[:, 0], CORNERS[:, 1]
-    reference = np.stack(
-        [xi * (1 + eta * at[1]), eta * (1 + xi * at[0])], axis=-1
-    ) / 4  # (4, 2): ∂N_a/∂(ξ, η)  # fmt: skip
+    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(at)
     J = np.einsum("ar,eax->erx", reference, corners)  # ∂x/∂ξ
-    det = J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    inverse = np.empty_like(J)
-    inverse[:, 0, 0], inverse[:, 1, 1] = J[:, 1, 1], J[:, 0, 0]
-    inverse[:, 0, 1], inverse[:, 1, 0] = -J[:, 0, 1], -J[:, 1, 0]
-    inverse /= det[:, None, None]  # ∂ξ/∂x, first index x
-    gradients: NDArray[np.float64] = np.einsum("exr,ar->eax", inverse, reference)
-    return gradients, det
+    gradients: Floats = np.einsum("erx,ar->eax", inverse_transpose(J), reference)
+    return gradients, determinant(J)
 
 
-def strain_matrix(gradients: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return B (E, 3, 8) of ε = B u_e, with u_e = (u_x1, u_y1, …, u_y4)."""
-    B = np.zeros((len(gradients), 3, 8))
-    B[:, 0, 0::2] = B[:, 2, 1::2] = gradients[:, :, 0]
-    B[:, 1, 1::2] = B[:, 2, 0::2] = gradients[:, :, 1]
+def strain_matrix(gradients: Floats) -> Floats:
+    """Return B (E, v, n·dim) of ε = B u_e, with u_e = (u_x1, u_y1, …) of the nodes."""
+    E, n, dim = gradients.shape
+    B = np.zeros((E, dim * (dim + 1) // 2, n * dim))
+    for (i, j), component in np.ndenumerate(VOIGT[dim]):
+        B[:, component, i::dim] = gradients[:, :, j]
     return B
 
 
@@ -93,12 +97,12 @@ def stiffness(
     material: NDArray[np.int64] | None = None,
     pattern: Pattern | None = None,
 ) -> csc_array:
-    """Assemble K = Σ_e ∫ BᵀDB (2N, 2N) by 2×2 Gauss quadrature, Pa.
+    """Assemble K = Σ_e ∫ BᵀDB (n, n), n = dim·N, by Gauss quadrature.
 
     Parameters
     ----------
     mesh : the body or bodies
-    D : (3, 3), or (k, 3, 3) of k materials
+    D : (v, v), or (k, v, v) of k materials
     material : (E,) of each cell, 0 … k − 1; left out: all 0
     pattern : of the mesh, where it is known
 
@@ -107,8 +111,8 @@ def stiffness(
     if material is None:
         material = np.zeros(len(mesh.cells), dtype=np.int64)
     data = add_stiffness(
-        mesh.points, pattern.cells, D.reshape(-1, 3, 3), material.astype(np.int32),
-        pattern.ptr, pattern.slot,
+        mesh.element, mesh.points, pattern.cells, D.reshape(-1, *D.shape[-2:]),
+        material.astype(np.int32), pattern.ptr, pattern.slot,
     )  # fmt: skip
     n = mesh.dofs
     return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
@@ -118,10 +122,10 @@ def stiffness(
 class Pattern:
     """Where the entries of a stiffness matrix are; depends on the cells alone."""
 
-    cells: NDArray[np.int32]  #: (E, 4)
+    cells: NDArray[np.int32]  #: (E, c)
     ptr: NDArray[np.int32]  #: (N + 1,) of the neighbours of each node
-    slot: NDArray[np.int32]  #: (E, 4, 4) of node b among the neighbours of node a
-    indptr: NDArray[np.int32]  #: (2N + 1,) of K
+    slot: NDArray[np.int32]  #: (E, c, c) of node b among the neighbours of node a
+    indptr: NDArray[np.int32]  #: (n + 1,) of K
     indices: NDArray[np.int32]
 
 
@@ -129,23 +133,42 @@ def sparsity(mesh: Mesh) -> Pattern:
     """Find the pattern of K, once for all values."""
     cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
     ptr, idx = node_pattern(cells, len(mesh.points))
-    return Pattern(cells, ptr, slots(cells, ptr, idx), *dof_pattern(ptr, idx))
+    pattern = dof_pattern(ptr, idx, mesh.dim)
+    return Pattern(cells, ptr, slots(cells, ptr, idx), *pattern)
 
 
 def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
-    """List the dofs of each cell, (E, 8)."""
-    return dofs_of(mesh.cells.ravel()).reshape(-1, 8)
+    """List the dofs of each cell, (E, n·dim)."""
+    return dofs_of(mesh.cells, mesh.dim).reshape(-1, mesh.dim * mesh.cells.shape[1])
 
 
-def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return an orthonormal basis R (2N, 3) of ker K of one body.
+def rigid_motions(points: Floats) -> Floats:
+    """Return the rigid motions (n, r) of one body with the nodes (N, dim).
 
-    Two translations and the linearised rotation (−(y − ȳ), x − x̄) about the centroid
-    of the nodes: orthogonal by construction, the analytic formula of the paper.
+    One translation along each axis, then in each plane of two axes (k, l) the
+    linearised rotation about the centroid of the nodes, x_k e_l − x_l e_k: in the plane
+    r = 3, in space 6, and on a line there is the translation alone.
     """
-    x, y = (points - points.mean(axis=0)).T
-    R = np.zeros((points.size, 3))
-    R[0::2, 0] = R[1::2, 1] = 1
-    R[0::2, 2], R[1::2, 2] = -y, x
+    N, dim = points.shape
+    offset = points - points.mean(axis=0)
+    planes = list(combinations(range(dim), 2))
+    motions = np.zeros((N, dim, dim + len(planes)))
+    motions[:, range(dim), range(dim)] = 1
+    for mode, (k, l) in enumerate(planes, start=dim):
+        motions[:, k, mode], motions[:, l, mode] = -offset[:, l], offset[:, k]
+    return motions.reshape(N * dim, -1)
+
+
+def rigid_modes(points: Floats) -> Floats:
+    """Return an orthonormal basis R (n, r) of ker K of one body.
+
+    In the plane the rigid motions are orthogonal, the analytic formula of the paper; in
+    space rotations are, about the principal axes of the nodes' inertia.
+    """
+    R = rigid_motions(points)
+    dim = points.shape[1]
+    if R.shape[1] > dim + 1:
+        turns = R[:, dim:]
+        R[:, dim:] = turns @ np.linalg.eigh(turns.T @ turns)[1]
     R /= np.linalg.norm(R, axis=0)
     return R

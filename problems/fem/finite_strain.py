@@ -34,15 +34,15 @@ from scipy.sparse import csc_array
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.elasticity import (
-    GAUSS,
     Pattern,
     cell_dofs,
     shape_gradients,
     sparsity,
 )
-from mortarbench.problems.fem.hyperelastic import Floats, Hyperelastic, determinant
+from mortarbench.problems.fem.elements import Floats, determinant
+from mortarbench.problems.fem.hyperelastic import Hyperelastic
+from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, triangular
-from mortarbench.problems.fem.tangents import add_tangents, cell_tangents
 
 #: Poisson's ratio from which on cells take the mean dilatation
 NEARLY_INCOMPRESSIBLE = 0.4
@@ -67,9 +67,9 @@ class Cells:
     mesh: Mesh
     materials: tuple[Hyperelastic, ...]  #: of the bodies
     body: NDArray[np.int64]  #: (E,) of each cell
-    dofs: NDArray[np.int64]  #: (E, 8)
-    gradients: Floats  #: (E, 4, 4, 2)  ∂N_a/∂X at the Gauss points; second: point
-    volumes: Floats  #: (E, 4) that each Gauss point stands for
+    dofs: NDArray[np.int64]  #: (E, n·dim)
+    gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the Gauss points; second: point
+    volumes: Floats  #: (E, q) that each Gauss point stands for
     pattern: Pattern  #: of K_t
 
 
@@ -78,7 +78,7 @@ class Evaluated(NamedTuple):
 
     energy: float  #: Π
     forces: Vector  #: (n,)  r = ∂Π/∂u, internal forces
-    tangents: Floats  #: (E, 8, 8)  ∂²Π_e/∂u² of each cell, see `assemble`
+    tangents: Floats  #: (E, n·dim, n·dim)  ∂²Π_e/∂u² of each cell, see `assemble`
 
 
 def cells_of(
@@ -86,7 +86,7 @@ def cells_of(
 ) -> Cells:
     """Prepare the cells of bodies, (E,) numbers `body`, with a material each."""
     corners = mesh.points[mesh.cells]
-    points = [shape_gradients(corners, point) for point in GAUSS]
+    points = [shape_gradients(corners, point) for point in mesh.element.points]
     return Cells(
         mesh, tuple(materials), body, cell_dofs(mesh),
         gradients=np.stack([gradients for gradients, _ in points], axis=1),
@@ -96,9 +96,15 @@ def cells_of(
 
 
 def deformation_gradients(cells: Cells, u: Vector) -> Floats:
-    """Return F = I + ∂u/∂X (E, 4, 2, 2) at the Gauss points."""
-    moved = u[cells.dofs].reshape(-1, 1, 4, 2)
-    return np.asarray(np.eye(2) + np.swapaxes(moved, -1, -2) @ cells.gradients)
+    """Return F = I + ∂u/∂X (E, q, dim, dim) at the Gauss points."""
+    return _deformed(cells, u, cells.gradients)
+
+
+def _deformed(cells: Cells, u: Vector, gradients: Floats) -> Floats:
+    """Return F (E, q, dim, dim) where shape functions have these gradients."""
+    E, _, n, dim = gradients.shape
+    moved = u[cells.dofs].reshape(E, 1, n, dim)
+    return np.asarray(np.eye(dim) + np.swapaxes(moved, -1, -2) @ gradients)
 
 
 def strain_energy(cells: Cells, u: Vector) -> float:
@@ -156,7 +162,7 @@ def evaluate(cells: Cells, u: Vector) -> Evaluated:
 
 
 def assemble(cells: Cells, tangents: Floats) -> csc_array:
-    """Sum the tangents (E, 8, 8) of the cells to K_t (n, n)."""
+    """Sum the tangents of the cells to K_t."""
     at = cells.pattern
     data = add_tangents(np.ascontiguousarray(tangents), at.cells, at.ptr, at.slot)
     n = cells.mesh.dofs
@@ -175,7 +181,7 @@ def convexified(
 
     Parameters
     ----------
-    tangents : (E, 8, 8) of the cells
+    tangents : of the cells, see `Evaluated`
     positive : whether a sum K_t (n, n) is positive definite as the caller needs it: by
         its Cholesky factor, with the supports
 
@@ -218,9 +224,9 @@ def clip(tangents: Floats) -> tuple[Floats, int]:
 
 def cauchy_stress(cells: Cells, u: Vector) -> Floats:
     """Return σ = PFᵀ/J at the cell centres, (E, 4): σ_x, σ_y, τ_xy, σ_z."""
-    gradients, _ = shape_gradients(cells.mesh.points[cells.mesh.cells], np.zeros(2))
-    moved = u[cells.dofs].reshape(-1, 4, 2)
-    centre = np.eye(2) + np.swapaxes(moved, -1, -2) @ gradients
+    mesh = cells.mesh
+    gradients, _ = shape_gradients(mesh.points[mesh.cells], np.zeros(mesh.dim))
+    centre = _deformed(cells, u, gradients[:, None])[:, 0]
     inside = deformation_gradients(cells, u)
     stress = np.empty((len(centre), 4))
     for material, own in _by_material(cells):
@@ -254,17 +260,16 @@ def _by_material(cells: Cells) -> list[tuple[Hyperelastic, NDArray[np.int64]]]:
 
 
 def _average(values: Floats, volumes: Floats) -> Floats:
-    """Return the mean over each cell's points, at each of its points (E, 4)."""
+    """Return the mean over each cell's points, at each of its points (E, q)."""
     mean = (values * volumes).sum(axis=1) / volumes.sum(axis=1)
     return np.repeat(mean[:, None], volumes.shape[1], axis=1)
 
 
 def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
-    """Integrate ∫ P ∂N/∂X, (E, 8)."""
-    at_points = gradients @ np.swapaxes(P, -1, -2)  # (E, 4, 4, 2)
-    return np.asarray(
-        (volumes[:, :, None, None] * at_points).sum(axis=1).reshape(-1, 8)
-    )
+    """Integrate ∫ P ∂N/∂X, (E, n·dim)."""
+    at_points = gradients @ np.swapaxes(P, -1, -2)  # (E, q, n, dim)
+    nodal = (volumes[:, :, None, None] * at_points).sum(axis=1)
+    return np.asarray(nodal.reshape(-1, np.prod(nodal.shape[1:])))
 
 
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:

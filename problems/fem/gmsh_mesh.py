@@ -17,13 +17,19 @@ from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
 from mortarbench.harness.files.datafile import check_size, opened, parsing
-from mortarbench.problems.fem.mesh import Nodes, boundary_edges, triangular
+from mortarbench.harness.mechanics import KINDS
+from mortarbench.problems.fem.elements import cross
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    boundary_facets,
+    triangular,
+)
 
 _COPIES = 32  #: of a file that its parser may hold
 FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
-DIMENSION = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2}  #: cells that we read
+DIMENSION = {kind: dim for (dim, _), kind in KINDS.items() if dim < 3}  #: that we read
 FAR = 1e100  #: coordinates whose products overflow
-CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4}
+CORNERS = {kind: corners for (_, corners), kind in KINDS.items() if kind in DIMENSION}
 #: kinds of cells that start so are of higher order or solid, by the names of meshio
 _CURVED = ("line", "triangle", "quad")
 _SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
@@ -80,7 +86,7 @@ def read_msh(path: Path) -> NamedMesh:
     ends = np.cumsum([0] + [len(part) for part in parts.values()])
     surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(parts)}
     _check_apart(path, len(points), cells, surfaces)
-    once = boundary_edges(cells).tolist()
+    once = boundary_facets(cells, 2).tolist()
     directed = {(min(a, b), max(a, b)): (a, b) for a, b in once}
     return NamedMesh(
         points, cells, surfaces,
@@ -282,7 +288,7 @@ def _distinct(parts: list[Nodes]) -> Nodes:
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
     """Turn clockwise cells over; refuse flat ones and those that are not convex."""
     x, triangle = points[cells], triangular(cells)[:, None]
-    twice_area = _cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of the diagonals
+    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of the diagonals
     turned = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, turned, cells)
     if (flat := twice_area == 0).any():
@@ -292,7 +298,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
             "that are apart, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
-    corners = _cross(np.roll(edges, 1, axis=1), edges)
+    corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
         x, y = points[cells[bad.argmax()]].mean(axis=0)
         raise InputError(
@@ -344,7 +350,3 @@ def _directed(
             "one; expected edges of cells on the boundary"
         )
     return np.array([boundary[edge] for edge in sorted_], dtype=np.int64)
-
-
-def _cross(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])

@@ -26,11 +26,9 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mortarbench.problems.fem.elasticity import Material
-
-Floats = NDArray[np.float64]
+from mortarbench.problems.fem.elements import Floats, determinant, inverse_transpose
 
 _I = np.eye(2)
 #: ε_ik ε_jl with the permutation symbol: the second derivative of J = det F
@@ -106,7 +104,7 @@ class NeoHooke(Hyperelastic):
 
     def shear(self, F: Floats) -> Derivatives:
         """Return w = μ/2 (F:F − 2 − 2 ln J); NaN where J ≤ 0."""
-        mu, back = self.shear_modulus, _inverse_transpose(F)
+        mu, back = self.shear_modulus, inverse_transpose(F)
         with np.errstate(invalid="ignore", divide="ignore"):
             log_J = np.log(determinant(F))
         return Derivatives(
@@ -121,7 +119,7 @@ class NeoHooke(Hyperelastic):
         J = determinant(F)
         return Derivatives(
             J,
-            J[..., None, None] * _inverse_transpose(F),
+            J[..., None, None] * inverse_transpose(F),
             np.broadcast_to(_CURVATURE_OF_J, (*J.shape, 2, 2, 2, 2)),
         )
 
@@ -184,16 +182,3 @@ def hyperelastic(name: str, linear: Material, unit: float = 1.0) -> Hyperelastic
     unit : of stress, Pa; its moduli are multiples of this
     """
     return MATERIALS[name](linear.E / unit, linear.nu)
-
-
-def determinant(F: Floats) -> Floats:
-    """Return J = det F (…)."""
-    return np.asarray(F[..., 0, 0] * F[..., 1, 1] - F[..., 0, 1] * F[..., 1, 0])
-
-
-def _inverse_transpose(F: Floats) -> Floats:
-    """Return F⁻ᵀ (…, 2, 2)."""
-    cofactors = np.empty_like(F)
-    cofactors[..., 0, 0], cofactors[..., 1, 1] = F[..., 1, 1], F[..., 0, 0]
-    cofactors[..., 0, 1], cofactors[..., 1, 0] = -F[..., 1, 0], -F[..., 0, 1]
-    return np.asarray(cofactors / determinant(F)[..., None, None])

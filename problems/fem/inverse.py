@@ -35,7 +35,7 @@ from mortarbench.harness import Matrix, Vector
 from mortarbench.problems.fem.dissection import index_arrays
 from mortarbench.problems.fem.elimination import spread_symmetric
 from mortarbench.problems.fem.kernels import congruence
-from mortarbench.problems.fem.mesh import Nodes, dofs_of
+from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.multifrontal import Multifrontal, multifrontal
 
 NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
@@ -45,7 +45,7 @@ class Interface(NamedTuple):
     """What constraints can touch, and where the unknowns are."""
 
     components: Nodes  #: (c,) ascending
-    points: NDArray[np.float64]  #: (N, 2) of the nodes that K's components belong to
+    points: NDArray[np.float64]  #: (N, dim) of the nodes that K's components belong to
 
 
 class GeneralisedInverse(Protocol):
@@ -152,15 +152,14 @@ def floating_inverse(
     Parameters
     ----------
     K : (n, n) block diagonal over the bodies
-    kernels : per body, an orthonormal basis (2N_body, r_body) of its rigid modes
-    fixing : per body, the numbers (within it) of nodes that no rigid motion leaves all
-        at rest: at least two that are apart
+    kernels : per body, an orthonormal basis (n_body, r_body) of its rigid modes
+    fixing : per body, components (within it) that no rigid motion leaves all at rest:
+        of two nodes that are apart in the plane, of three in space, at least
     interface : to condense onto
 
     """
     starred, fixed, start = [], [], 0
-    for R, nodes in zip(kernels, fixing, strict=True):
-        rows = dofs_of(nodes)
+    for R, rows in zip(kernels, fixing, strict=True):
         Q = np.zeros_like(R)
         Q[rows] = np.linalg.qr(R[rows])[0]
         starred.append(csr_array(Q))

@@ -1,13 +1,11 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Compiled loops of the stiffness assembly, and of the congruence with its inverse.
+"""Compiled loops of the assembly of cells, and of the congruence with its inverse.
 
-Bilinear quadrilaterals couple each node to few others, so the sparsity pattern is
-found node by node, and each cell adds its 64 entries straight into the CSC arrays: no
-triplets, no sorting. Compiled when the package is installed; `kernels.pyi` has the
-types.
+Cells couple each node to few others, so the sparsity pattern is found node by node, and
+each cell adds its entries straight into the CSC arrays: no triplets, no sorting. The
+integrals are in `cells.h`, for any element. Compiled when the package is installed;
+`kernels.pyi` has the types.
 """
-
-from libc.math cimport sqrt
 
 import numpy as np
 
@@ -15,28 +13,28 @@ import numpy as np
 def node_pattern(const int[:, ::1] cells, int nodes):
     """Find the nodes that share a cell with each node, ascending, as CSR (ptr, idx).
 
-    cells : (E, 4) node numbers below `nodes`
+    cells : (E, n) node numbers below `nodes`
     """
-    cdef Py_ssize_t e, a, b, i, j, k, t, first, end = 0
+    cdef Py_ssize_t e, a, b, i, j, k, t, first, end = 0, n = cells.shape[1]
     starts = np.zeros(nodes + 1, dtype=np.int32)
     starts[1:] = np.bincount(np.ravel(cells), minlength=nodes).cumsum()
     cdef int[::1] start = starts
     cdef int[::1] filled = starts[:nodes].copy()
     cdef int[::1] touching = np.empty(start[nodes], dtype=np.int32)
     for e in range(cells.shape[0]):
-        for i in range(4):
+        for i in range(n):
             a = cells[e, i]
             touching[filled[a]] = e
             filled[a] += 1
 
     pointers = np.zeros(nodes + 1, dtype=np.int32)
-    neighbours = np.empty(4 * start[nodes], dtype=np.int32)
+    neighbours = np.empty(n * start[nodes], dtype=np.int32)
     cdef int[::1] ptr = pointers, idx = neighbours
     cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
     for a in range(nodes):
         first = end
         for t in range(start[a], start[a + 1]):
-            for j in range(4):
+            for j in range(n):
                 b = cells[touching[t], j]
                 if seen[b] == a:
                     continue
@@ -51,33 +49,33 @@ def node_pattern(const int[:, ::1] cells, int nodes):
     return pointers, neighbours[:end].copy()
 
 
-def dof_pattern(const int[::1] ptr, const int[::1] idx):
-    """Expand a node pattern to the displacement components 2i and 2i + 1."""
-    cdef Py_ssize_t a, c, t, at = 0, nodes = ptr.shape[0] - 1
-    pointers = np.empty(2 * nodes + 1, dtype=np.int32)
-    rows = np.empty(4 * idx.shape[0], dtype=np.int32)
+def dof_pattern(const int[::1] ptr, const int[::1] idx, int dim):
+    """Expand a node pattern to the components dim·i, dim·i + 1, … of each node i."""
+    cdef Py_ssize_t a, c, k, t, at = 0, nodes = ptr.shape[0] - 1
+    pointers = np.empty(dim * nodes + 1, dtype=np.int32)
+    rows = np.empty(dim * dim * idx.shape[0], dtype=np.int32)
     cdef int[::1] indptr = pointers, indices = rows
     for a in range(nodes):
-        for c in range(2):
-            indptr[2 * a + c] = at
+        for c in range(dim):
+            indptr[dim * a + c] = at
             for t in range(ptr[a], ptr[a + 1]):
-                indices[at] = 2 * idx[t]
-                indices[at + 1] = 2 * idx[t] + 1
-                at += 2
-    indptr[2 * nodes] = at
+                for k in range(dim):
+                    indices[at] = dim * idx[t] + k
+                    at += 1
+    indptr[dim * nodes] = at
     return pointers, rows
 
 
 def slots(const int[:, ::1] cells, const int[::1] ptr, const int[::1] idx):
-    """Place of node b among the neighbours of node a, for a, b of a cell: (E, 4, 4)."""
-    cdef Py_ssize_t e, i, j, t
+    """Place of node b among the neighbours of node a, for a, b of a cell: (E, n, n)."""
+    cdef Py_ssize_t e, i, j, t, n = cells.shape[1]
     cdef int a, b
-    places = np.empty((cells.shape[0], 4, 4), dtype=np.int32)
+    places = np.empty((cells.shape[0], n, n), dtype=np.int32)
     cdef int[:, :, ::1] place = places
     for e in range(cells.shape[0]):
-        for i in range(4):
+        for i in range(n):
             a = cells[e, i]
-            for j in range(4):
+            for j in range(n):
                 b = cells[e, j]
                 t = ptr[a]
                 while idx[t] != b:
@@ -86,65 +84,30 @@ def slots(const int[:, ::1] cells, const int[::1] ptr, const int[::1] idx):
     return places
 
 
-cdef extern from *:
-    """
-    #if defined(__x86_64__) && defined(__gnu_linux__)
-    /* compiled twice, chosen when loaded; without FMA the digits are the same */
-    __attribute__((target_clones("avx2", "default")))
-    #endif
-    static void cell_stiffness(double *, double *, double *, double *);
-    """
+cdef extern from "cells.h" nogil:
+    ctypedef struct element:
+        int points, pairs
+        const double *gradients
+        const double *weights
+        const int *edges
 
-
-cdef void cell_stiffness "cell_stiffness"(
-    double *x, double *y, double *d, double *Ke
-) noexcept nogil:
-    """Integrate ∫ BᵀDB of one cell, 2×2 Gauss.
-
-    x, y (4,) of the corners, d (3, 3): D; Ke (2, 2, 4, 4) by components, then by nodes
-    """
-    cdef double g = 1 / sqrt(3.0)
-    cdef double[4] dx, dy
-    cdef Py_ssize_t q, i, j
-    cdef double xi, eta, a, b, c, f, x_xi, y_xi, x_eta, y_eta, det, weight
-    cdef double sx0, sx1, sx2, sy0, sy1, sy2
-    cdef double d00 = d[0], d01 = d[1], d02 = d[2], d11 = d[4], d12 = d[5], d22 = d[8]
-    cdef double[16] xx, xy, yx, yy
-    for i in range(16):
-        xx[i] = xy[i] = yx[i] = yy[i] = 0.0
-    for q in range(4):
-        xi = g if q == 1 or q == 2 else -g
-        eta = g if q >= 2 else -g
-        # ∂x/∂ξ and so on; the shape functions are ¼(1 ± ξ)(1 ± η)
-        a, b = (1 - eta) / 4, (1 + eta) / 4
-        c, f = (1 - xi) / 4, (1 + xi) / 4
-        x_xi = a * (x[1] - x[0]) + b * (x[2] - x[3])
-        y_xi = a * (y[1] - y[0]) + b * (y[2] - y[3])
-        x_eta = c * (x[3] - x[0]) + f * (x[2] - x[1])
-        y_eta = c * (y[3] - y[0]) + f * (y[2] - y[1])
-        det = x_xi * y_eta - x_eta * y_xi
-        dx[0], dx[1] = -a * y_eta + c * y_xi, a * y_eta + f * y_xi
-        dx[2], dx[3] = b * y_eta - f * y_xi, -b * y_eta - c * y_xi
-        dy[0], dy[1] = a * x_eta - c * x_xi, -a * x_eta - f * x_xi
-        dy[2], dy[3] = -b * x_eta + f * x_xi, b * x_eta + c * x_xi
-        weight = 1 / det  # both gradients lack their factor 1/det
-        for i in range(4):
-            sx0 = (d00 * dx[i] + d02 * dy[i]) * weight
-            sx1 = (d01 * dx[i] + d12 * dy[i]) * weight
-            sx2 = (d02 * dx[i] + d22 * dy[i]) * weight
-            sy0 = (d01 * dy[i] + d02 * dx[i]) * weight
-            sy1 = (d11 * dy[i] + d12 * dx[i]) * weight
-            sy2 = (d12 * dy[i] + d22 * dx[i]) * weight
-            for j in range(4):
-                xx[4 * i + j] += sx0 * dx[j] + sx2 * dy[j]
-                xy[4 * i + j] += sx1 * dy[j] + sx2 * dx[j]
-                yx[4 * i + j] += sy0 * dx[j] + sy2 * dy[j]
-                yy[4 * i + j] += sy1 * dy[j] + sy2 * dx[j]
-    for i in range(16):
-        Ke[i], Ke[16 + i], Ke[32 + i], Ke[48 + i] = xx[i], xy[i], yx[i], yy[i]
+    void sum_stiffness(
+        int n, int dim, const element *of, const double *points, Py_ssize_t E,
+        const int *cells, const double *D, const int *material, const int *ptr,
+        const int *slot, double *data
+    )
+    void sum_blocks(
+        int n, int dim, const double *blocks, Py_ssize_t E, const int *cells,
+        const int *ptr, const int *slot, double *data
+    )
+    void integrate_tangents(
+        int n, int dim, int points, const double *gradients, const double *volumes,
+        const double *A, Py_ssize_t E, double *K
+    )
 
 
 def add_stiffness(
+    of,
     const double[:, ::1] points,
     const int[:, ::1] cells,
     const double[:, :, ::1] D,
@@ -152,29 +115,72 @@ def add_stiffness(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Sum ∫ BᵀDB over the cells, 2×2 Gauss, into the values of the dof pattern.
+    """Sum ∫ BᵀDB over the cells into the values of the dof pattern.
 
-    points (N, 2), cells (E, 4), D (materials, 3, 3), material (E,) of each cell.
+    of: the element; points (N, dim), cells (E, n), D (materials, v, v) in Voigt's
+    notation, material (E,) of each cell.
     """
-    values = np.zeros(4 * ptr[ptr.shape[0] - 1])
-    cdef double[::1] data = values
-    cdef double[64] Ke
-    cdef double[4] x, y
-    cdef Py_ssize_t e, i, j, node, row, at
-    for e in range(cells.shape[0]):
-        for i in range(4):
-            x[i], y[i] = points[cells[e, i], 0], points[cells[e, i], 1]
-        cell_stiffness(x, y, <double *> &D[material[e], 0, 0], Ke)
-        for i in range(4):
-            node = cells[e, i]
-            row = 2 * (ptr[node + 1] - ptr[node])  # entries per component
-            for j in range(4):
-                at = 4 * ptr[node] + 2 * slot[e, i, j]
-                data[at] += Ke[4 * i + j]
-                data[at + 1] += Ke[16 + 4 * i + j]
-                data[at + row] += Ke[32 + 4 * i + j]
-                data[at + row + 1] += Ke[48 + 4 * i + j]
+    cdef int n = cells.shape[1], dim = points.shape[1]
+    cdef const double[:, :, ::1] gradients = of.table
+    cdef const double[::1] weights = of.weights
+    cdef const int[:, :, ::1] edges = of.edges
+    cdef element data
+    values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
+    cdef double[::1] sums = values
+    if gradients.shape[1] != dim or gradients.shape[2] != n or n > 8 or dim not in (2, 3):
+        raise ValueError(f"cells of {n} nodes with {dim} coordinates: not this element")
+    if cells.shape[0]:
+        data.points, data.pairs = gradients.shape[0], edges.shape[1]
+        data.gradients, data.weights = &gradients[0, 0, 0], &weights[0]
+        data.edges = &edges[0, 0, 0]
+        sum_stiffness(
+            n, dim, &data, &points[0, 0], cells.shape[0], &cells[0, 0], &D[0, 0, 0],
+            &material[0], &ptr[0], &slot[0, 0, 0], &sums[0],
+        )
     return values
+
+
+def add_tangents(
+    const double[:, :, ::1] tangents,
+    const int[:, ::1] cells,
+    const int[::1] ptr,
+    const int[:, :, ::1] slot,
+):
+    """Sum the tangents (E, n·dim, n·dim) of the cells (E, n) into such values."""
+    cdef int n = cells.shape[1]
+    cdef int dim = tangents.shape[1] // n
+    values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
+    cdef double[::1] data = values
+    if cells.shape[0]:
+        sum_blocks(
+            n, dim, &tangents[0, 0, 0], cells.shape[0], &cells[0, 0], &ptr[0],
+            &slot[0, 0, 0], &data[0],
+        )
+    return values
+
+
+def cell_tangents(
+    const double[:, :, :, ::1] gradients,
+    const double[:, ::1] volumes,
+    const double[:, :, :, :, :, ::1] A,
+):
+    """Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of each cell.
+
+    gradients (E, q, n, dim) of the shape functions at the quadrature points, volumes
+    (E, q) of these, A (E, q, dim, dim, dim, dim) symmetric; returned:
+    (E, n·dim, n·dim), exactly symmetric.
+    """
+    cdef int points = gradients.shape[1], n = gradients.shape[2]
+    cdef int dim = gradients.shape[3]
+    cdef Py_ssize_t E = gradients.shape[0]
+    blocks = np.zeros((E, n * dim, n * dim))
+    cdef double[:, :, ::1] K = blocks
+    if E:
+        integrate_tangents(
+            n, dim, points, &gradients[0, 0, 0, 0], &volumes[0, 0],
+            &A[0, 0, 0, 0, 0, 0], E, &K[0, 0, 0],
+        )
+    return blocks
 
 
 def congruence(

@@ -1,6 +1,7 @@
 """Meshes with named boundaries (paper, Section 2 and Figure 1).
 
-Cells are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
+The dimension and the number of corners say which element the cells are. In the plane
+they are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
 whose last two corners are one: with N₃ + N₄ for that corner, the bilinear map is onto
 the triangle, and N₁, N₂, N₃ + N₄ are its barycentric coordinates,
 
@@ -15,32 +16,50 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
+from mortarbench.harness.mechanics import CellBlock, cell_blocks
+from mortarbench.problems.fem.elements import ELEMENTS, Element
 
 Nodes = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Quadrilaterals and triangles; lengths in m.
+    """Nodes and cells; lengths in m.
 
-    A boundary is the chain of its nodes, ordered so that the body lies on its left:
-    with the unit tangent t the outward normal is (t_y, −t_x).
+    A boundary in the plane is the chain of its nodes, ordered so that the body lies on
+    its left: with the unit tangent t the outward normal is (t_y, −t_x).
     """
 
-    points: NDArray[np.float64]  #: (N, 2)
-    cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
+    points: NDArray[np.float64]  #: (N, dim)
+    #: (E, c) nodes of each cell, in the plane counter-clockwise; where kinds are mixed,
+    #: a cell of fewer corners repeats its last node
+    cells: Nodes
     boundaries: Mapping[str, Nodes]
 
     @property
+    def dim(self) -> int:
+        """Number of coordinates of a node, and of components of its displacement."""
+        return int(self.points.shape[1])
+
+    @property
     def dofs(self) -> int:
-        """Number of displacement components; node i has 2i (x) and 2i + 1 (y)."""
+        """Number of displacement components, see `dofs_of`."""
         return self.points.size
+
+    @property
+    def element(self) -> Element:
+        """What all cells are integrated as."""
+        return ELEMENTS[self.dim, self.cells.shape[1]]
+
+    @property
+    def blocks(self) -> tuple[CellBlock, ...]:
+        """Cells by their kinds, in the vocabulary of meshio."""
+        return cell_blocks(self.cells, self.dim)
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +128,8 @@ class StructuredGrid:
 
     def mesh(self) -> Mesh:
         """Connect all points."""
-        return _structured(self.place(self.columns, self.rows), self.names)
+        cells = cells_of_block(self.columns.size, self.rows.size)
+        return Mesh(self.block(slice(None), slice(None)), cells, self.sides)
 
 
 @dataclass(frozen=True, eq=False)
@@ -298,14 +318,22 @@ def triangular(cells: Nodes) -> NDArray[np.bool_]:
     return np.asarray(cells[:, 2] == cells[:, 3])
 
 
-def boundary_edges(cells: Nodes) -> Nodes:
-    """List the edges (k, 2) of exactly one cell, the body on their left."""
-    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    low, high = edges.min(axis=1), edges.max(axis=1)
-    name = low * (high.max(initial=0) + 1) + high  # in the order of low, then high
+def boundary_facets(cells: Nodes, dim: int) -> Nodes:
+    """List the facets (k, m) of exactly one cell (E, c), the body on their left.
+
+    Edges in the plane, ordered by their lower node, then by the other; facets that
+    repeated corners collapse are left out.
+    """
+    element = ELEMENTS[dim, cells.shape[1]]
+    facets = cells[:, element.facets].reshape(-1, element.facets.shape[1])
+    nodes = np.sort(facets, axis=1)
+    is_facet = (nodes[:, 1:] != nodes[:, :-1]).all(axis=1)
+    facets, nodes = facets[is_facet], nodes[is_facet]
+    name, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
+    for k in range(dim):  # so many nodes tell facets apart
+        name = name * count + nodes[:, k]
     _, first, times = np.unique(name, return_index=True, return_counts=True)
-    return np.asarray(edges[first[times == 1]])
+    return np.asarray(facets[first[times == 1]])
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
@@ -315,23 +343,16 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     return np.asarray(np.append(half, 0) + np.append(0, half))
 
 
-def _structured(grid: NDArray[Any], names: tuple[str, str, str, str]) -> Mesh:
-    """Connect a (rows, columns, 2) grid of points; names from row 0 anticlockwise."""
-    rows, columns = grid.shape[:2]
-    i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
-    sides = (i[0], i[:, -1], i[-1, ::-1], i[::-1, 0])
-    return Mesh(
-        np.ascontiguousarray(grid.reshape(-1, 2)),
-        cells_of_block(columns, rows),
-        dict(zip(names, sides, strict=True)),
-    )
+def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
+    """List the displacement components of nodes: dim·i, dim·i + 1, … of node i.
+
+    axis : 0, 1, …: the components along this axis alone
+    """
+    if axis is not None:
+        return np.asarray(dim * nodes + axis)
+    return np.stack([dim * nodes + k for k in range(dim)], axis=-1).ravel()
 
 
-def dofs_of(nodes: Nodes) -> Nodes:
-    """List both displacement components of each node, (2·len,)."""
-    return np.stack([2 * nodes, 2 * nodes + 1], axis=-1).ravel()
-
-
-def as_vectors(u: Vector) -> NDArray[np.float64]:
-    """See a dof vector (2N,) as one vector per node (N, 2)."""
-    return u.reshape(-1, 2)
+def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
+    """See a dof vector (dim·N,) as one vector per node (N, dim)."""
+    return u.reshape(-1, dim)

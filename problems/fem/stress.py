@@ -17,23 +17,23 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.elasticity import (
-    GAUSS,
     Plane,
     cell_dofs,
     shape_gradients,
     strain_matrix,
 )
-from mortarbench.problems.fem.mesh import Mesh, boundary_edges, triangular
+from mortarbench.problems.fem.mesh import Mesh, boundary_facets
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
-    """Return σ = DBu (E, 3) at the cell centres, Pa; u in m, D (3, 3) or (E, 3, 3)."""
-    return _stress_at(np.zeros(2), mesh, D, u)
+    """Return σ = DBu (E, v) at the cell centres, Pa; u in m, D (v, v) or (E, v, v)."""
+    return _stress_at(np.zeros(mesh.dim), mesh, D, u)
 
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
-    """Return σ = DBu (E, 4, 3) at the 2×2 Gauss points, Pa; else as `centre_stress`."""
-    return np.stack([_stress_at(point, mesh, D, u) for point in GAUSS], axis=1)
+    """Return σ = DBu (E, q, v) at the Gauss points, Pa; else as `centre_stress`."""
+    at = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
+    return np.stack(at, axis=1)
 
 
 def _stress_at(
@@ -48,25 +48,26 @@ def _stress_at(
 def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Recover nodal values (N, k) from cell-centre values (E, k) by patch recovery."""
     corner = np.ones(mesh.cells.shape, dtype=bool)
-    corner[:, 3] = ~triangular(mesh.cells)
+    corner[:, 1:] = mesh.cells[:, 1:] != mesh.cells[:, :-1]
     nodes, cells = mesh.cells[corner], np.nonzero(corner)[0]
-    N, k = len(mesh.points), values.shape[1]
+    N, dim = mesh.points.shape
+    k, terms = values.shape[1], dim + 1
     size = np.ptp(mesh.points, axis=0).max()
     centre = np.average(
         mesh.points[mesh.cells], axis=1,
-        weights=np.broadcast_to(corner[..., None], (*corner.shape, 2)),
+        weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
     )  # fmt: skip
     offset = (centre[cells] - mesh.points[nodes]) / size
-    basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, y about the node
-    normal, right = np.empty((N, 3, 3)), np.empty((N, 3, k))
-    for p, q in combinations_with_replacement(range(3), 2):
+    basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, … about the node
+    normal, right = np.empty((N, terms, terms)), np.empty((N, terms, k))
+    for p, q in combinations_with_replacement(range(terms), 2):
         sums = np.bincount(nodes, basis[:, p] * basis[:, q], N)
         normal[:, p, q] = normal[:, q, p] = sums
-    for p, q in np.ndindex(3, k):
+    for p, q in np.ndindex(terms, k):
         right[:, p, q] = np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
     interior = ~_on_boundary(mesh)
-    polynomial = np.zeros((N, 3, k))
+    polynomial = np.zeros((N, terms, k))
     polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
     known = interior
     for _ in range(2):
@@ -101,7 +102,7 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
 def _on_boundary(mesh: Mesh) -> NDArray[np.bool_]:
     """Mark nodes on an edge that belongs to one cell only."""
     mark = np.zeros(len(mesh.points), dtype=bool)
-    mark[boundary_edges(mesh.cells)] = True
+    mark[boundary_facets(mesh.cells, mesh.dim)] = True
     return mark
 
 
@@ -110,7 +111,8 @@ def _neighbours(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pair each node of `first` with those of `second` that share a cell with it."""
     cells = mesh.cells[first[mesh.cells].any(axis=1)]
-    a, b = np.repeat(cells, 4, axis=1).ravel(), np.tile(cells, 4).ravel()
+    corners = cells.shape[1]
+    a, b = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, corners).ravel()
     keep = first[a] & second[b]
     from_first, to_second = np.divmod(
         np.unique(a[keep] * first.size + b[keep]), first.size

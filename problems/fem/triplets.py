@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csc_array
 
 from mortarbench.problems.fem.elasticity import (
-    GAUSS,
     cell_dofs,
     shape_gradients,
     strain_matrix,
@@ -20,14 +19,14 @@ from mortarbench.problems.fem.mesh import Mesh
 
 
 def stiffness_by_triplets(mesh: Mesh, D: NDArray[np.float64]) -> csc_array:
-    """Assemble K (2N, 2N) of one material D (3, 3), Pa, by 2×2 Gauss quadrature."""
-    corners = mesh.points[mesh.cells]
-    K_e = np.zeros((len(mesh.cells), 8, 8))
-    for point in GAUSS:
+    """Assemble K (n, n) of one material D (v, v), Pa, by Gauss quadrature."""
+    corners, dof = mesh.points[mesh.cells], cell_dofs(mesh)
+    E, size = dof.shape
+    K_e = np.zeros((E, size, size))
+    for point in mesh.element.points:
         gradients, det = shape_gradients(corners, point)
         B = strain_matrix(gradients)
         K_e += np.swapaxes(B, 1, 2) @ (D @ B) * det[:, None, None]
-    dof = cell_dofs(mesh)
-    i, j = np.repeat(dof, 8, axis=1), np.tile(dof, 8)
+    i, j = np.repeat(dof, size, axis=1), np.tile(dof, size)
     shape = (mesh.dofs, mesh.dofs)
     return csc_array(coo_array((K_e.ravel(), (i.ravel(), j.ravel())), shape=shape))

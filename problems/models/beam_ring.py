@@ -85,7 +85,7 @@ def bodies(Nr: int, Nh: int, radial: int, plane: Plane) -> ElasticBodies:
     """Put a beam (8Nr × Nr cells) above a ring (12Nh × radial)."""
     shape = StructuredGrids(_grids(Nr, Nh, radial))
     sides = shape.sides
-    clamped = [dofs_of(sides[b]) for b in ("left", "left_foot", "right_foot")]
+    clamped = [dofs_of(sides[b], 2) for b in ("left", "left_foot", "right_foot")]
     return ElasticBodies(
         shape=shape, names=NAMES, materials=(BEAM, RING), plane=plane, length=LENGTH,
         force=LOAD, fixed=np.concatenate(clamped),
@@ -108,7 +108,7 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
 
 def _tip(sides: Mapping[str, Nodes]) -> Nodes:
     """Return both components of the upper right corner of the beam."""
-    return dofs_of(np.intersect1d(sides["top"], sides["right"]))
+    return dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)
 
 
 @lru_cache(maxsize=4)

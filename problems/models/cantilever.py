@@ -36,7 +36,12 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle
+from mortarbench.problems.fem.mesh import (
+    as_vectors,
+    dofs_of,
+    nodal_lengths,
+    rectangle,
+)
 
 LENGTH = 1.0  #: L, m
 E = 10e6  #: Pa, that of rubber
@@ -87,7 +92,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
         """Report the end: the mean displacement of its face, m, and the elastica's."""
         end = at.tangent.mesh.boundaries["right"]
         share = nodal_lengths(at.tangent.mesh.points[end])
-        u = share @ s.x.reshape(-1, 2)[end] / share.sum() * LENGTH
+        u = share @ as_vectors(s.x, 2)[end] / share.sum() * LENGTH
         return {
             "tip": u.tolist(),
             "deflection": -u[1] / LENGTH,
@@ -107,11 +112,11 @@ def beam(slenderness: float, load: float, cells: tuple[int, int], nu: float) -> 
     end = mesh.boundaries["right"]
     share = nodal_lengths(mesh.points[end])
     force = np.zeros(mesh.dofs)
-    force[2 * end + 1] = -P * share / share.sum()
+    force[dofs_of(end, 2, 1)] = -P * share / share.sum()
     return assemble(
         mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("beam",),
         materials=(Material(E, nu),), plane="strain", units=(LENGTH, P),
-        fixed=dofs_of(mesh.boundaries["left"]), load=force, pairs=(),
+        fixed=dofs_of(mesh.boundaries["left"], 2), load=force, pairs=(),
     )  # fmt: skip
 
 

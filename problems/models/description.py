@@ -61,12 +61,12 @@ from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
-    unassembled,
+    supports,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
-from mortarbench.problems.fem.mesh import Mesh, Nodes
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
     FINITE,
     LAWS,
@@ -83,6 +83,7 @@ from mortarbench.problems.ranges import (
 _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
+_AXES = ("x", "y")
 #: names of units of length, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -158,15 +159,16 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
         _described_once(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
-        units = _units(table.get("units", {}), named, load)
+        length, force = _units(table.get("units", {}), named, load)
     body = np.repeat(
         np.arange(len(named.surfaces)), [len(c) for c in named.surfaces.values()]
     )
-    return unassembled(
-        Mesh(named.points, named.cells, {}), body, names=tuple(named.surfaces),
+    mesh = Mesh(named.points, named.cells, {})
+    return UnassembledBodies(
+        mesh=mesh, body=body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
-        units=units, fixed=np.unique(np.concatenate(fixed)), load=load.ravel(),
-        pairs=tuple(pairs),
+        length=length, force=force, f=load.ravel() / force,
+        B_D=supports(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
     )  # fmt: skip
 
 
@@ -230,9 +232,9 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
     nodes, _ = _place(entry, named, ("fix",))
     fix = checked.filled_list("fix", entry["fix"])
     for component in fix:
-        if component not in ("x", "y"):
-            raise unknown("component", checked.text("fix", component), ("x", "y"))
-    return np.concatenate([2 * nodes + "xy".index(c) for c in fix])
+        if component not in _AXES:
+            raise unknown("component", checked.text("fix", component), _AXES)
+    return np.concatenate([dofs_of(nodes, len(_AXES), _AXES.index(c)) for c in fix])
 
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
@@ -242,7 +244,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     if len(kinds) != 1:
         raise InputError("expected either force or traction, [x, y]")
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
-    if len(vector) != 2 or not all(map(checked.is_number, vector)):
+    if len(vector) != len(_AXES) or not all(map(checked.is_number, vector)):
         raise InputError(f"{kinds[0]} = {shown(vector)}; expected two numbers, [x, y]")
     vector = [physical(kinds[0], component) for component in vector]
     nodes, edges = _place(entry, named, tuple(kinds))
@@ -267,9 +269,9 @@ def _check_felt(
     """Refuse a load with a component that acts on prescribed displacements alone."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
         lost = []
-        for component, name in enumerate("xy"):
-            at = np.flatnonzero(load[:, component])
-            if at.size and np.isin(2 * at + component, fixed).all():
+        for axis, name in enumerate(_AXES):
+            at = np.flatnonzero(load[:, axis])
+            if at.size and np.isin(dofs_of(at, len(_AXES), axis), fixed).all():
                 lost.append(name)
         if lost:
             where = entry.get("boundary", entry.get("point"))

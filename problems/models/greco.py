@@ -30,7 +30,7 @@ from mortarbench.problems.duality.problem import (
     remembered,
 )
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import nodal_lengths, rectangle_grid
+from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle_grid
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
@@ -48,13 +48,16 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (p["n"], p["n"]))
     sides = grid.sides
     forces = Forces(
-        np.concatenate([2 * sides["top"] + 1, 2 * sides["left"]]),
+        np.concatenate(
+            [dofs_of(sides["top"], 2, 1), dofs_of(sides["left"], 2, 0)]
+        ),
         np.concatenate([
             -TOP * nodal_lengths(grid.side("top")) / FORCE,
             LEFT * nodal_lengths(grid.side("left")) / FORCE,
         ]),
     )  # fmt: skip
-    fixed = np.append(2 * sides["right"], 2 * sides["bottom"][-1] + 1)
+    right, corner = sides["right"], sides["bottom"][-1]
+    fixed = np.append(dofs_of(right, 2, 0), dofs_of(corner, 2, 1))
     on_rigid = ContactPair(sides["bottom"][:-1], np.zeros(0, dtype=np.int64))
     return ContactProblem(
         bodies=ElasticBodies(
@@ -82,7 +85,7 @@ def along_the_side(
     all nodes, N/m.
     """
     nodes = bodies.pairs[0].slave
-    x, u = bodies.mesh.points[nodes, 0], s.x[2 * nodes] * bodies.length
+    x, u = bodies.mesh.points[nodes, 0], s.x[dofs_of(nodes, 2, 0)] * bodies.length
     normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
     at_places: Vector = np.interp(PLACES, x, u)
     return {

@@ -69,6 +69,7 @@ from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
     HalfDisc,
     Nodes,
+    as_vectors,
     dofs_of,
     joined_sides,
     nodal_lengths,
@@ -135,7 +136,7 @@ def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
     sides = shape.sides
     return ElasticBodies(
         shape=shape, names=("cylinder",), materials=(MATERIAL,), plane=p["plane"],
-        length=RADIUS, force=exact.P, fixed=2 * _on_axis(sides),
+        length=RADIUS, force=exact.P, fixed=_on_axis(sides),
         forces=_pressed(shape.discs, "flat", 1.0),
         pairs=(ContactPair(sides["arc"], np.zeros(0, dtype=np.int64)),),
     ), exact  # fmt: skip
@@ -209,7 +210,7 @@ def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, .
         slip = u if quasi_static else np.zeros_like(u)
         return State(u, slip, loads[k][0] / before * left.pressed)
 
-    kept = np.append(of.fixed, 2 * _on_axis(sides, "upper_"))
+    kept = np.append(of.fixed, _on_axis(sides, "upper_"))
     first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=kept)
     return first, *(
         Stage(
@@ -252,13 +253,13 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineConta
     discs, exact, shape = halves.discs, halves.exact, HalfDiscs(halves.discs)
     sides, flat = shape.sides, shape.sides["lower_flat"]
     forces = [_pressed(discs, "upper_flat", 1.0)]
-    on_axis = 2 * _on_axis(sides, "lower_")
+    on_axis = _on_axis(sides, "lower_")
     if p["peak"]:
         forces.append(_pressed(discs, "lower_flat", -1.0))
-        fixed = np.append(on_axis, 2 * flat[flat.size // 2] + 1)
+        fixed = np.append(on_axis, dofs_of(flat[flat.size // 2], 2, 1))
     else:
-        upper = 2 * _on_axis(sides, "upper_")
-        fixed = np.concatenate([upper, on_axis, 2 * flat + 1])
+        upper = _on_axis(sides, "upper_")
+        fixed = np.concatenate([upper, on_axis, dofs_of(flat, 2, 1)])
     return ElasticBodies(
         shape=shape, names=NAMES, materials=halves.materials, plane=p["plane"],
         length=RADIUS, force=exact.P, fixed=fixed, forces=_added(forces),
@@ -285,7 +286,9 @@ def _shearing(discs: tuple[HalfDisc, ...], Q: float) -> list[Forces]:
     sides = joined_sides(discs)
     of = zip(discs, ("upper_flat", "lower_flat"), (Q, -Q), strict=True)
     return [
-        Forces(dofs_of(sides[flat]), _shear_of(disc.position(disc.sides[flat]), part))
+        Forces(
+            dofs_of(sides[flat], 2), _shear_of(disc.position(disc.sides[flat]), part)
+        )
         for disc, flat, part in of
     ]
 
@@ -358,7 +361,7 @@ def _pressed(discs: tuple[HalfDisc, ...], flat: str, P: float) -> Forces:
     """Spread P evenly over a flat side."""
     (disc,) = (disc for disc in discs if flat in disc.sides)
     share = nodal_lengths(disc.position(disc.sides[flat]))
-    return Forces(2 * joined_sides(discs)[flat] + 1, -P * share / share.sum())
+    return Forces(dofs_of(joined_sides(discs)[flat], 2, 1), -P * share / share.sum())
 
 
 def pressure_quantities(
@@ -410,8 +413,9 @@ def shear_quantities(
     x = bodies.mesh.points[slave, 0]
     width = nodal_lengths(x[:, None])
     normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
-    pressing = np.abs((primal.G.T @ normal)[2 * slave + 1])
-    force = (friction.T.T @ tangential)[2 * slave] * (1.0 if upper else -1.0)
+    pressing = np.abs(as_vectors(primal.G.T @ normal, 2)[slave, 1])
+    force = as_vectors(friction.T.T @ tangential, 2)[slave, 0]
+    force = force * (1.0 if upper else -1.0)
     mindlin = TangentialContact(exact, p["mu"], p["Q"], p["peak"])
     Q = p["Q"] * p["mu"] * exact.P
     expected, centre = shear(x), float(shear(np.zeros(1))[0])
@@ -465,9 +469,9 @@ def _curve(
 
 
 def _on_axis(sides: Mapping[str, Nodes], prefix: str = "") -> Nodes:
-    """Find the middle of the arc and the centre, which symmetry keeps at u_x = 0."""
+    """List u_x of the middle of the arc and of the centre, which symmetry holds."""
     chains = [sides[prefix + name] for name in ("arc", "flat")]
-    return np.array([chain[chain.size // 2] for chain in chains])
+    return dofs_of(np.array([chain[chain.size // 2] for chain in chains]), 2, 0)
 
 
 def _compliance(material: Material, plane: Plane) -> float:

@@ -58,6 +58,7 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     as_vectors,
+    dofs_of,
     nodal_lengths,
     rectangle_grid,
 )
@@ -200,7 +201,7 @@ def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     nominal_stress: the contact force over the undeformed length, Pa. cauchy_stress:
     mean of σ_y over the cells, Pa. strain_energy: ∫W, J/m.
     """
-    bodies, u = path.bodies, as_vectors(s.x * path.bodies.length)
+    bodies, u = path.bodies, as_vectors(s.x * path.bodies.length, 2)
     sides = bodies.mesh.boundaries
     right = np.concatenate([sides["lower_right"], sides["upper_right"]])
     force = contact_forces(bodies, at.primal, s)[sides["lower_top"], 1].sum()
@@ -220,7 +221,7 @@ def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, An
     """Report the largest errors: of σ_y over the cells, relative; of x at nodes, m."""
     bodies = path.bodies
     stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
-    u = as_vectors(s.x * bodies.length)
+    u = as_vectors(s.x * bodies.length, 2)
     strains = np.array([exact.lateral - 1, exact.stretch - 1])
     return {
         "stress_error": float(np.abs(stress / exact.cauchy - 1).max()),
@@ -233,15 +234,14 @@ def bodies(params: Mapping[str, Value]) -> ElasticBodies:
     p: Any = params
     shape = StructuredGrids(_grids(params))
     sides, force = shape.sides, PRESSURE * LENGTH
-    rollers = (
-        2 * sides["lower_left"], 2 * sides["upper_left"], 2 * sides["lower_bottom"] + 1
-    )  # fmt: skip
+    left = np.concatenate([sides["lower_left"], sides["upper_left"]])
+    rollers = dofs_of(left, 2, 0), dofs_of(sides["lower_bottom"], 2, 1)
     pressing = -PRESSURE * nodal_lengths(shape.grids[1].side("upper_top"))
     return ElasticBodies(
         shape=shape, names=NAMES, plane=p["plane"], length=LENGTH, force=force,
         materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
         fixed=np.concatenate(rollers), pairs=(_pair(params, sides),),
-        forces=Forces(2 * sides["upper_top"] + 1, pressing / force),
+        forces=Forces(dofs_of(sides["upper_top"], 2, 1), pressing / force),
     )  # fmt: skip
 
 

@@ -103,7 +103,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         quantities=results,
         fields=lambda s: Fields(
             points=mesh.points, cells=mesh.cells, bodies=plate.material,
-            displacement=as_vectors(new.recover(s).x * LENGTH),
+            displacement=as_vectors(new.recover(s).x * LENGTH, mesh.dim),
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
@@ -159,7 +159,7 @@ class Plate:
     @property
     def held(self) -> NDArray[np.int64]:
         """Components at the held edge."""
-        return dofs_of(self.mesh.boundaries["left"])
+        return dofs_of(self.mesh.boundaries["left"], 2)
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
@@ -190,7 +190,7 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     moduli, D = _stiffness(p)
     n = mesh.dofs
     one = csr_array(eye_array(n, format="csr"))
-    held = dofs_of(mesh.boundaries["left"])
+    held = dofs_of(mesh.boundaries["left"], 2)
     primal = QP(
         P=stiffness(mesh, D, material), q=-load(grid, p["load"]),
         A=one[held], b=np.zeros(held.size), G=no_rows(n), h=np.zeros(0),
@@ -214,7 +214,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
         material=_material(p, column, row),
         kind=partial(elastic_kind, D=D, E=moduli),
         load=looked_up(Forces(*_pull(grid, p["load"]))),
-        held=dofs_of(grid.sides["left"]),
+        held=dofs_of(grid.sides["left"], 2),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
     )  # fmt: skip
@@ -230,7 +230,7 @@ def _found_by_ranks(
 ) -> dict[str, Any]:
     """Report what ranks have found; called by all of them."""
     own = found.subdomains
-    tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]))
+    tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]), 2)
     known = {
         "nodes": grid.nodes,
         "elements": int(np.prod(grid.divisions)),
@@ -291,13 +291,13 @@ def _pull(grid: StructuredGrid, kind: str) -> tuple[Nodes, Vector]:
         "edge": nodal_lengths(grid.side("right")),
         "nodal": np.ones(right.size),
     }[kind]
-    return 2 * right + 1, -share / share.sum()
+    return dofs_of(right, 2, 1), -share / share.sum()
 
 
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
     """Report counts, energy, J/m, and the tip [u_x, u_y], m: the upper right corner."""
     mesh = plate.mesh
-    tip = dofs_of(np.intersect1d(mesh.boundaries["top"], mesh.boundaries["right"]))
+    tip = dofs_of(np.intersect1d(mesh.boundaries["top"], mesh.boundaries["right"]), 2)
     return {
         "nodes": len(mesh.points),
         "elements": len(mesh.cells),

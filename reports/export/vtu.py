@@ -28,14 +28,13 @@ _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
 
 def write_vtu(fields: Fields, path: Path) -> list[Path]:
-    """Write a deformed state, SI units; points and vectors get a third component 0.
+    """Write a deformed state, SI units; plane vectors get a third component 0.
 
-    Point data: displacement (m), contact_force (N/m, on slave nodes, else 0),
-    in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m, on slave nodes
-    that face a master, else NaN, which ParaView leaves out) and the nodal fields; cell
-    data: body, and subdomain of torn bodies. Triangles come before quadrilaterals.
-    *Warp By Vector* in ParaView takes
-    vectors of three components only.
+    Point data: displacement (m), contact_force (N/m in the plane, N in space; on slave
+    nodes, else 0), in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m,
+    on slave nodes that face a master, else NaN, which ParaView leaves out) and the
+    nodal fields; cell data: body, and subdomain of torn bodies. Triangles come before
+    quadrilaterals. *Warp By Vector* in ParaView takes vectors of three components only.
 
     Returns the files written: the .vtu, and a CSV for each contact.
 
@@ -49,29 +48,23 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     if fields.contact_nodes is not None and fields.contact_forces is not None:
         forces[fields.contact_nodes] = fields.contact_forces
     touching = _in_contact(fields, forces)
-    cells = np.asarray(fields.cells)
     of_cells = {"body": fields.bodies}
     if fields.subdomains is not None:
         of_cells["subdomain"] = fields.subdomains
-    triangle = cells[:, 2] == cells[:, 3]
-    blocks = [
-        (kind, which, corners)
-        for kind, which, corners in (("triangle", triangle, 3), ("quad", ~triangle, 4))
-        if which.any()
-    ]
+    blocks = fields.blocks
     mesh = meshio.Mesh(
-        _padded(fields.points),
-        [(kind, cells[which, :corners]) for kind, which, corners in blocks],
+        _in_space(fields.points),
+        [(block.kind, block.nodes) for block in blocks],
         point_data={
-            "displacement": _padded(fields.displacement),
-            "contact_force": _padded(forces),
+            "displacement": _in_space(fields.displacement),
+            "contact_force": _in_space(forces),
             "in_contact": touching.astype(np.int32),
             **_along_sides(fields),
             **fields.nodal,
         },
         cell_data={
-            name: [np.asarray(values).astype(np.int32)[which] for _, which, _ in blocks]
-            for name, values in of_cells.items()
+            name: [np.asarray(v).astype(np.int32)[block.cells] for block in blocks]
+            for name, v in of_cells.items()
         },
     )
     try:
@@ -82,7 +75,7 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
 
 
 def _in_contact(fields: Fields, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which nodes (N,) are pressed; forces: on the nodes, (N, 2)."""
+    """Mark the nodes (N,) that are pressed; forces: on the nodes, (N, dim)."""
     sizes = np.linalg.norm(forces, axis=1)
     least = IN_CONTACT * float(sizes.max(initial=0.0))
     if not fields.contacts:
@@ -123,15 +116,14 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     path = vtu.with_name(f"{vtu.stem}-{_spelt(side.name)}.csv")
     points = fields.points[side.nodes]
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    u, axes = fields.displacement[side.nodes], "xyz"[: fields.dim]
+    extent, unit = ("length_m", "N_per_m") if fields.dim < 3 else ("area_m2", "N")
     columns = {
         "along_m": np.append(0.0, np.cumsum(steps)),
-        "x_m": points[:, 0],
-        "y_m": points[:, 1],
-        "ux_m": fields.displacement[side.nodes, 0],
-        "uy_m": fields.displacement[side.nodes, 1],
-        "length_m": side.length,
-        "force_x_N_per_m": side.force[:, 0],
-        "force_y_N_per_m": side.force[:, 1],
+        **{f"{axis}_m": points[:, k] for k, axis in enumerate(axes)},
+        **{f"u{axis}_m": u[:, k] for k, axis in enumerate(axes)},
+        extent: side.length,
+        **{f"force_{axis}_{unit}": side.force[:, k] for k, axis in enumerate(axes)},
         "pressure_Pa": side.pressure,
         "gap_m": side.gap,
         **({} if side.shear is None else {"shear_Pa": side.shear}),
@@ -184,6 +176,6 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
     return [path, *written]
 
 
-def _padded(vectors: NDArray[np.float64] | Vector) -> NDArray[np.float64]:
-    """Append a third component 0 to (N, 2)."""
-    return np.column_stack([vectors, np.zeros(len(vectors))])
+def _in_space(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Append components 0 to vectors (N, dim) until there are three."""
+    return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))

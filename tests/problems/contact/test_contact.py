@@ -6,8 +6,8 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import node_to_segment as contact
 from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.polyline import polyline
 from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.surface import surface
 
 #: a master below the slave: body under the chain means the chain runs right to left
 MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
@@ -28,7 +28,7 @@ def rows(slave, master, u=None, **options):
 
 
 def closest_points(x, chain, *normals):
-    return contact.closest_points(x, polyline(chain, "master"), *normals)
+    return contact.closest_points(x, surface(chain, "master"), *normals)
 
 
 def test_a_node_above_a_segment_may_descend_by_its_gap():
@@ -268,3 +268,29 @@ def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
         np.array([[0] * 8, [0, 0, 0, 0.5, 0, 0.5, 0, -1]])
     )
     assert c == pytest.approx([0, 0.25])
+
+
+def test_a_surface_has_orthonormal_frames_and_areas_that_add_up_to_its_length():
+    theta = np.linspace(0, np.pi, 13)
+    arc = surface(np.column_stack([np.cos(theta), np.sin(theta)]), "slave")
+
+    assert arc.tangents.shape == (13, 1, 2)
+    np.testing.assert_allclose(np.linalg.norm(arc.tangents[:, 0], axis=1), 1)
+    assert (np.einsum("vx,vx->v", arc.tangents[:, 0], arc.node_normal) == 0).all()
+    turn = np.linalg.det(np.stack([arc.node_normal, arc.tangents[:, 0]], axis=1))
+    np.testing.assert_allclose(turn, 1)  # anticlockwise
+    edges = arc.x[arc.facets[:, 1]] - arc.x[arc.facets[:, 0]]
+    assert arc.areas.sum() == pytest.approx(np.linalg.norm(edges, axis=1).sum())
+
+
+def test_rows_along_directions_in_space_weight_displacements_of_nodes():
+    node = np.array([[0, 2], [1, 3]])
+    weight = np.array([[-1.0, 1.0], [-1.0, 0.5]])
+    direction = np.array([[0.0, 0, 1], [0.6, 0.8, 0]])
+    u = np.arange(12) ** 2.0
+
+    B = contact.rows_along(node, weight, direction, 12)
+
+    v = u.reshape(-1, 3)
+    expected = [v[2, 2] - v[0, 2], direction[1] @ (0.5 * v[3] - v[1])]
+    np.testing.assert_allclose(B @ u, expected, rtol=1e-15)

@@ -8,8 +8,8 @@ from hypothesis.extra.numpy import arrays
 
 from mortarbench.problems.contact.mortar import _dual, cast_rays, mortar, overlaps
 from mortarbench.problems.contact.node_to_segment import closest_points, node_to_segment
-from mortarbench.problems.contact.polyline import polyline
 from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.surface import surface
 
 quick = settings(derandomize=True, max_examples=40, deadline=None)
 
@@ -60,7 +60,7 @@ def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
     points, u, slave, master = side
     B, *_ = node_to_segment(*side)
     x = points + u.reshape(-1, 2)
-    at = closest_points(x[slave], polyline(x[master], "master"))
+    at = closest_points(x[slave], surface(x[master], "master"))
     inside = (at.xi > 0) & (at.xi < 1)
 
     forces = B.toarray().reshape(len(slave), -1, 2)
@@ -73,7 +73,7 @@ def test_forces_of_a_node_inside_a_segment_have_no_moment(side):
 def test_forces_of_a_mortar_row_have_no_moment(side):
     points, u, slave, master = side
     x = points + u.reshape(-1, 2)
-    s, m = polyline(x[slave], "slave"), polyline(x[master], "master")
+    s, m = surface(x[slave], "slave"), surface(x[master], "master")
     at = cast_rays(s, m, overlaps(s, m), Reach())
     for basis, phi in (("dual", _dual(at)), ("standard", None)):
         B, c, *rest = METHODS[basis](*side)
@@ -85,7 +85,7 @@ def test_forces_of_a_mortar_row_have_no_moment(side):
         terms = 1 + np.abs(moments).sum(axis=(1, 2))
         if phi is not None:
             sums = np.zeros(len(slave))
-            j = s.first[at.slave][:, None] + [0, 1]
+            j = s.facets[at.slave]
             np.add.at(sums, j, np.einsum("pgj,pg->pj", np.abs(phi), at.weight))
             terms += sums[rest[-1]] / rest[-2]
         assert (np.abs(moments.sum(axis=(1, 2))) <= 1e-14 * terms).all(), basis
@@ -144,7 +144,7 @@ def test_the_gap_is_what_the_inequality_leaves_at_the_linearisation_point(side):
     points, u, slave, master = side
     B, c, *_ = node_to_segment(*side)
     x = points + u.reshape(-1, 2)
-    at = closest_points(x[slave], polyline(x[master], "master"))
+    at = closest_points(x[slave], surface(x[master], "master"))
     inside = (at.xi > 0) & (at.xi < 1)
 
     edge = np.diff(x[master], axis=0)

@@ -12,8 +12,8 @@ from mortarbench.problems.contact.mortar import (
     overlaps,
     project,
 )
-from mortarbench.problems.contact.polyline import polyline
 from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.surface import surface
 from mortarbench.problems.models.beam_ring import model
 
 BASES = ["dual", "standard"]
@@ -21,7 +21,7 @@ ANY_ANGLE = Reach(cosine=1.0)
 
 
 def sides(slave, master):
-    return polyline(np.asarray(slave, float), "s"), polyline(
+    return surface(np.asarray(slave, float), "s"), surface(
         np.asarray(master, float), "m"
     )
 
@@ -69,7 +69,7 @@ def arcs(n, master_share=0.9):
 
 
 def test_normals_of_a_known_polyline():
-    normal = polyline(np.array([[0.0, 0], [4, 3], [7, 7]]), "slave").node_normal
+    normal = surface(np.array([[0.0, 0], [4, 3], [7, 7]]), "slave").node_normal
 
     expected = [[3 / 5, -4 / 5], [np.sqrt(0.5), -np.sqrt(0.5)], [4 / 5, -3 / 5]]
     assert normal == pytest.approx(np.array(expected))

@@ -5,8 +5,8 @@ import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import segment_search as search
-from mortarbench.problems.contact.polyline import polyline
 from mortarbench.problems.contact.segment_search import Reach, facing, nearest
+from mortarbench.problems.contact.surface import surface
 
 
 def all_pairs(x, chain):
@@ -36,7 +36,7 @@ def test_the_closest_segment_of_the_whole_chain_is_found(segments, roughness):
     rng = np.random.default_rng(577215)
     chain = arc(segments) + roughness * rng.standard_normal((segments + 1, 2))
     x = rng.uniform(-1, 3, (200, 2))
-    found = nearest(x, polyline(chain, "master"))
+    found = nearest(x, surface(chain, "master"))
     distance = all_pairs(x, chain)
 
     start, edge = chain[found.segment], np.diff(chain, axis=0)[found.segment]
@@ -49,7 +49,7 @@ def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
     circle = np.column_stack([np.cos(theta), np.sin(theta)])
     circle[-1] = circle[0]
     x = np.random.default_rng(141421).uniform(-2, 2, (100, 2))
-    found = nearest(x, polyline(circle, "master"))
+    found = nearest(x, surface(circle, "master"))
 
     distance = all_pairs(x, circle)
     assert np.take_along_axis(distance, found.segment[:, None], 1)[:, 0] == (
@@ -61,7 +61,7 @@ def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
     """Every four segments return to their start: their chord has no direction."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])
-    found = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), polyline(loops, "m"))
+    found = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), surface(loops, "m"))
 
     assert found.segment.tolist() == [0, 1, 2]
 
@@ -69,7 +69,7 @@ def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
 def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
     down = np.column_stack([np.zeros(65), np.arange(64, -1, -1.0)])
     corner = np.concatenate([down, down[-2::-1, ::-1]])  # (0, 64) → origin → (64, 0)
-    found = nearest(np.array([[20.5, 20.5]]), polyline(corner, "master"))
+    found = nearest(np.array([[20.5, 20.5]]), surface(corner, "master"))
 
     assert (found.segment.tolist(), found.xi.tolist()) == ([43], [0.5])
 
@@ -85,7 +85,7 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
         return distances(x, level, node)
 
     monkeypatch.setattr(search, "_to_chords", counted)
-    nearest(arc(segments), polyline(bent_beam(segments), "master"))
+    nearest(arc(segments), surface(bent_beam(segments), "master"))
 
     assert sum(visited) <= 60 * segments
 
@@ -95,7 +95,7 @@ def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
     """With a point on the inner side of each of the two normals (x − p) × n."""
     rng = np.random.default_rng(577215)
     bent = arc(40) + 0.002 * rng.standard_normal((41, 2))
-    slave, master = polyline(bent, "s"), polyline(bent_beam(segments), "m")
+    slave, master = surface(bent, "s"), surface(bent_beam(segments), "m")
 
     def side(j, p):
         way = slave.x[j][:, None] - p
@@ -103,8 +103,8 @@ def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
         return way[..., 0] * normal[..., 1] - way[..., 1] * normal[..., 0]
 
     begins, ends = master.start, master.end
-    first = np.maximum(side(slave.first, begins), side(slave.first, ends)) >= 0
-    last = slave.first + 1
+    first, last = slave.facets.T
+    first = np.maximum(side(first, begins), side(first, ends)) >= 0
     second = np.minimum(side(last, begins), side(last, ends)) <= 0
 
     assert np.array_equal(facing(slave, master), np.nonzero(first & second))
@@ -112,7 +112,7 @@ def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
 
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_few_master_segments_face_a_slave_segment(segments):
-    slave, master = polyline(arc(segments), "s"), polyline(bent_beam(segments), "m")
+    slave, master = surface(arc(segments), "s"), surface(bent_beam(segments), "m")
 
     assert len(facing(slave, master)[0]) <= 6 * segments
 
@@ -128,7 +128,7 @@ def test_a_reach_that_means_nothing_is_refused(wrong, message):
 
 
 def test_by_default_the_larger_side_bounds_the_distance():
-    small, large = polyline(arc(4, 0.1), "s"), polyline(arc(4, 2.0), "m")
+    small, large = surface(arc(4, 0.1), "s"), surface(arc(4, 2.0), "m")
 
     expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
     assert Reach().within(small, large) == pytest.approx(expected)

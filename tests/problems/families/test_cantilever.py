@@ -176,7 +176,7 @@ def test_a_rotated_problem_has_the_rotated_answer(material):
         bodies = assemble(
             mesh, np.zeros(20, dtype=np.int64), names=("beam",),
             materials=(Material(1.0, 0.3),), plane="strain", units=(1.0, 0.01),
-            fixed=dofs_of(mesh.boundaries["left"]), load=load.ravel(), pairs=(),
+            fixed=dofs_of(mesh.boundaries["left"], 2), load=load.ravel(), pairs=(),
         )  # fmt: skip
         path = newton_path(bodies, no_contact(bodies), {"material": material}, None)
         answers.append(path.iteration(1).answer.x.reshape(-1, 2))

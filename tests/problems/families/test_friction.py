@@ -16,8 +16,8 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import (
     ContactRows,
     rows_along,
-    tangent,
 )
+from mortarbench.problems.contact.surface import tangents
 from mortarbench.problems.duality.undivided import path_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
@@ -317,15 +317,15 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     sides = mesh.boundaries
     tip = np.intersect1d(sides["top"], sides["right"])
     force = np.zeros(mesh.dofs)
-    force[dofs_of(tip)] = load
+    force[dofs_of(tip, 2)] = load
     bodies = assemble(
         mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("beam",),
         materials=(Material(1e6, 0.3),), plane="strain", units=(1.0, 1.0),
-        fixed=dofs_of(sides["left"]), load=force, pairs=(ContactPair(tip, tip),),
+        fixed=dofs_of(sides["left"], 2), load=force, pairs=(ContactPair(tip, tip),),
     )  # fmt: skip
     normal, one = np.array([[np.cos(0.1), np.sin(0.1)]]), np.ones((1, 1))
     B = rows_along(tip[:, None], one, normal, mesh.dofs)
-    T = rows_along(tip[:, None], one, tangent(normal), mesh.dofs)
+    T = rows_along(tip[:, None], one, tangents(normal)[:, 0], mesh.dofs)
     first = np.zeros(1, dtype=np.int64)
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)

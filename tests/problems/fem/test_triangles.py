@@ -17,7 +17,7 @@ from mortarbench.problems.fem.elasticity import (
 )
 from mortarbench.problems.fem.mesh import (
     as_vectors,
-    boundary_edges,
+    boundary_facets,
     dofs_of,
     half_ring,
     rectangle,
@@ -71,7 +71,7 @@ def test_a_linear_stress_is_recovered_from_the_centroids():
 def test_the_boundary_of_triangles_is_that_of_their_quadrilaterals():
     for quads in MESHES:
         one, two = (
-            {tuple(edge) for edge in boundary_edges(m.cells).tolist()}
+            {tuple(edge) for edge in boundary_facets(m.cells, m.dim).tolist()}
             for m in (quads, halved(quads))
         )
         assert one == two
@@ -87,7 +87,7 @@ def bending(n):
     K = stiffness(mesh, D)
     x, y = mesh.points.T
     u = np.column_stack([x * y, -(x**2 + 0.3 * y**2) / 2]).ravel()
-    held = dofs_of(np.unique(boundary_edges(mesh.cells)))
+    held = dofs_of(np.unique(boundary_facets(mesh.cells, mesh.dim)), 2)
     free = np.setdiff1d(np.arange(mesh.dofs), held)
     u[free] = spsolve(K[free][:, free], -K[free][:, held] @ u[held])
     exact = np.column_stack([y, 0 * y, 0 * y])
@@ -125,7 +125,7 @@ def test_mortar_passes_the_patch_test_on_triangles(which, slave, basis):
 
 def test_node_to_segment_fails_it_on_triangles_too_but_passes_the_whole_force():
     bodies, primal, s, error = pressed((True, True), contact="nts")
-    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force)
+    forces = as_vectors(-(primal.G.T @ s.z) * bodies.force, 2)
 
     assert error > 0.05
     assert forces[bodies.body_of_node == 0].sum(axis=0) == pytest.approx(

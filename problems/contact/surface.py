@@ -1,4 +1,7 @@
-"""A contact side in the current configuration: segments and normals of its chain."""
+"""A contact side in the current configuration: facets, normals and nodal areas.
+
+In the plane facets are the segments of a chain of nodes.
+"""
 
 from __future__ import annotations
 
@@ -8,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.fem.mesh import Nodes, as_vectors
+from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 
-Points = NDArray[np.float64]  #: (…, 2), m or dimensionless
+Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
 
 #: a segment this much shorter than the longest of its chain has no direction
 DEGENERATE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
-class Polyline:
-    """A chain of nodes with its body on the left; segments without length are left out.
+class Surface:
+    """Facets with their body on the left; those without extent are left out.
 
     With the unit tangent t of a segment its outward normal is (t_y, −t_x). The normal
     of a node is the normalised sum of those of the segments before and after it, at an
@@ -26,34 +29,44 @@ class Polyline:
     nodal normal, in two dimensions and without weights).
     """
 
-    x: Points  #: (v, 2) nodes, m
-    first: Nodes  #: (e,) first node of each segment; first + 1 is the second
-    normal: Points  #: (e, 2) outward unit normals of the segments
-    node_normal: Points  #: (v, 2) averaged outward unit normals of the nodes
+    x: Points  #: (v, dim) nodes, m
+    facets: Nodes  #: (f, 2) first and second node of each segment
+    normal: Points  #: (f, dim) outward unit normals of the facets
+    node_normal: Points  #: (v, dim) averaged outward unit normals of the nodes
 
     @property
     def start(self) -> Points:
-        """First end of each segment, (e, 2)."""
-        return self.x[self.first]
+        """First end of each segment, (f, dim)."""
+        return self.x[self.facets[:, 0]]
 
     @property
     def end(self) -> Points:
-        """Second end of each segment, (e, 2)."""
-        return self.x[self.first + 1]
+        """Second end of each segment, (f, dim)."""
+        return self.x[self.facets[:, 1]]
+
+    @property
+    def tangents(self) -> Points:
+        """Unit tangents at the nodes, (v, dim − 1, dim)."""
+        return tangents(self.node_normal)
+
+    @property
+    def areas(self) -> Vector:
+        """Area that belongs to each node, ∫N_j (v,): in the plane a length, m."""
+        return nodal_lengths(self.x)
 
     @property
     def extent(self) -> float:
-        """Diagonal of the box around the chain, m."""
+        """Diagonal of the box around the nodes, m."""
         return float(np.linalg.norm(np.ptp(self.x, axis=0)))
 
 
-def current_polyline(points: Points, u: Vector, chain: Nodes, name: str) -> Polyline:
+def current_surface(points: Points, u: Vector, chain: Nodes, name: str) -> Surface:
     """Place a chain of nodes at X + u.
 
     Parameters
     ----------
-    points : (N, 2) reference positions X, m
-    u : (2N,) displacement, m
+    points : (N, dim) reference positions X, m
+    u : (n,) displacement, m
     chain : (v,) nodes, the body on their left
     name : of the side, for the message
 
@@ -63,12 +76,12 @@ def current_polyline(points: Points, u: Vector, chain: Nodes, name: str) -> Poly
         When a position is not finite or no segment has a length.
 
     """
-    return polyline(current_positions(points, u, chain, name), name)
+    return surface(current_positions(points, u, chain, name), name)
 
 
 def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Points:
-    """Return X + u of some nodes, (len(nodes), 2); refuse what is not finite."""
-    x = points[nodes] + as_vectors(u)[nodes]
+    """Return X + u of some nodes, (len(nodes), dim); refuse what is not finite."""
+    x = points[nodes] + as_vectors(u, points.shape[1])[nodes]
     if not np.isfinite(x).all():
         k = int(np.flatnonzero(~np.isfinite(x).all(axis=1))[0])
         raise InputError(
@@ -78,7 +91,7 @@ def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Poi
     return x
 
 
-def polyline(x: Points, name: str) -> Polyline:
+def surface(x: Points, name: str) -> Surface:
     """Compute segments and normals of a chain (v, 2)."""
     edge = np.diff(x, axis=0)
     length = np.sqrt(np.einsum("ex,ex->e", edge, edge))
@@ -88,17 +101,25 @@ def polyline(x: Points, name: str) -> Polyline:
             f"contact {name}: {len(x)} node(s) and no segment of positive length, "
             "expected a chain of at least two nodes"
         )
-    tangent = edge[first] / length[first, None]
-    normal = np.column_stack([tangent[:, 1], -tangent[:, 0]])
+    normal = -tangents(edge[first] / length[first, None])[:, 0]
     after = np.searchsorted(first, np.arange(len(x)))
     before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(first) - 1)
     mean = normal[before] + normal[after]
-    return Polyline(x, first, normal, unit(mean, normal[before]))
+    facets = np.stack([first, first + 1])
+    return Surface(x, facets.T, normal, unit(mean, normal[before]))
+
+
+def tangents(normal: Points) -> Points:
+    """Return unit vectors (…, dim − 1, dim) across normals (…, dim).
+
+    In the plane that is the normal turned anticlockwise, (−n_y, n_x).
+    """
+    return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None, :]
 
 
 def unit(vectors: Points, otherwise: Points) -> Points:
-    """Normalise vectors (…, 2) of order one; those that vanish become `otherwise`.
+    """Normalise vectors (…, dim) of order one; those that vanish become `otherwise`.
 
     Two opposite normals have no mean: there the chain folds back onto itself, and
     the caller says which normal stands in.
@@ -106,9 +127,3 @@ def unit(vectors: Points, otherwise: Points) -> Points:
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
     vanishes = length <= DEGENERATE
     return np.where(vanishes, otherwise, vectors / np.where(vanishes, 1.0, length))
-
-
-def cross(a: Points, b: Points) -> Vector:
-    """Return a_x b_y − a_y b_x of vectors (…, 2)."""
-    product: Vector = a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
-    return product

@@ -1,0 +1,223 @@
+/* Integrals over single cells, and their sums in the values of a CSC matrix.
+
+   The functions work for n nodes and dim coordinates. They are inlined, so that the loops
+   are unrolled where a caller has constants: as for the quadrilaterals of the paper. */
+
+#include <stddef.h>
+
+#define NODES 8 /* of the largest element */
+#define DIM 3
+
+#if defined(__x86_64__) && defined(__gnu_linux__)
+/* compiled twice, chosen when loaded; without FMA the digits are the same */
+#define CLONED __attribute__((target_clones("avx2", "default")))
+#else
+#define CLONED
+#endif
+#if defined(__GNUC__)
+#define INLINED static inline __attribute__((always_inline))
+#else
+#define INLINED static inline
+#endif
+
+/* Places of the components of a symmetric tensor, Voigt's notation. */
+static const int VOIGT[DIM + 1][DIM][DIM] = {
+    {{0}}, {{0}}, {{0, 2}, {2, 1}}, {{0, 5, 4}, {5, 1, 3}, {4, 3, 2}},
+};
+
+/* The finite element as data, see problems.fem.elements. */
+typedef struct {
+    int points, pairs;
+    const double *gradients; /* (points, dim, n) of the shape functions */
+    const double *weights;   /* (points,) */
+    const int *edges;        /* (dim, pairs, 2) first and last node, along each axis */
+} element;
+
+/* adj(J) with J adj(J) = det(J); returns det(J). */
+INLINED double adjugate(int dim, const double J[DIM][DIM], double adj[DIM][DIM]) {
+    double det = 0;
+    if (dim == 2) {
+        adj[0][0] = J[1][1], adj[0][1] = -J[0][1];
+        adj[1][0] = -J[1][0], adj[1][1] = J[0][0];
+        return J[0][0] * J[1][1] - J[0][1] * J[1][0];
+    }
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++)
+            adj[j][i] = J[(i + 1) % 3][(j + 1) % 3] * J[(i + 2) % 3][(j + 2) % 3]
+                      - J[(i + 1) % 3][(j + 2) % 3] * J[(i + 2) % 3][(j + 1) % 3];
+    for (int j = 0; j < 3; j++)
+        det += J[0][j] * adj[j][0];
+    return det;
+}
+
+/* Integrate BᵀDB of one cell.
+
+   x (n, dim) corners, D (v, v) with v = dim(dim + 1)/2 components of strain,
+   Ke (dim, dim, n, n): by components, then by nodes */
+INLINED void cell_stiffness(
+    int n, int dim, int pairs, const element *of, const double *x, const double *D,
+    double *Ke
+) {
+    const int v = dim * (dim + 1) / 2;
+    double span[DIM * NODES * DIM], grad[DIM * NODES];
+    double J[DIM][DIM], adj[DIM][DIM], stress[DIM * (DIM + 1) / 2];
+    for (int e = 0; e < dim * pairs; e++)
+        for (int m = 0; m < dim; m++)
+            span[e * dim + m] =
+                x[of->edges[2 * e + 1] * dim + m] - x[of->edges[2 * e] * dim + m];
+    for (int i = 0; i < dim * dim * n * n; i++)
+        Ke[i] = 0;
+    for (int q = 0; q < of->points; q++) {
+        const double *reference = of->gradients + q * dim * n;
+        for (int k = 0; k < dim; k++)
+            for (int m = 0; m < dim; m++) { /* ∂x/∂ξ; differences first, for digits */
+                const int *last = of->edges + 2 * k * pairs + 1;
+                double sum = reference[k * n + last[0]] * span[k * pairs * dim + m];
+                for (int e = 1; e < pairs; e++)
+                    sum += reference[k * n + last[2 * e]]
+                         * span[(k * pairs + e) * dim + m];
+                J[k][m] = sum;
+            }
+        /* gradients lack their factor 1/det here, the stresses have it twice */
+        const double weight = of->weights[q] / adjugate(dim, J, adj);
+        for (int m = 0; m < dim; m++)
+            for (int a = 0; a < n; a++) {
+                double sum = adj[m][0] * reference[a];
+                for (int k = 1; k < dim; k++)
+                    sum += adj[m][k] * reference[k * n + a];
+                grad[m * n + a] = sum;
+            }
+        for (int k = 0; k < dim; k++)
+            for (int i = 0; i < n; i++) {
+                for (int c = 0; c < v; c++) {
+                    double sum = D[VOIGT[dim][k][0] * v + c] * grad[i];
+                    for (int m = 1; m < dim; m++)
+                        sum += D[VOIGT[dim][k][m] * v + c] * grad[m * n + i];
+                    stress[c] = sum * weight;
+                }
+                for (int l = 0; l < dim; l++) {
+                    double *to = Ke + ((k * dim + l) * n + i) * n;
+                    for (int j = 0; j < n; j++) {
+                        double sum = stress[VOIGT[dim][l][0]] * grad[j];
+                        for (int m = 1; m < dim; m++)
+                            sum += stress[VOIGT[dim][l][m]] * grad[m * n + j];
+                        to[j] += sum;
+                    }
+                }
+            }
+    }
+}
+
+/* Add the block Ke of a cell to the values of a dof pattern.
+
+   Entry (i, k), (j, l) of nodes and components is
+   Ke[i·node_i + k·part_k + j·node_j + l·part_l];
+   nodes (n,), ptr and slot (n, n): see problems.fem.elasticity.Pattern */
+INLINED void scatter(
+    int n, int dim, const double *Ke, int node_i, int part_k, int node_j, int part_l,
+    const int *nodes, const int *ptr, const int *slot, double *data
+) {
+    for (int i = 0; i < n; i++) {
+        const ptrdiff_t first = ptr[nodes[i]], row = dim * (ptr[nodes[i] + 1] - first);
+        for (int j = 0; j < n; j++) {
+            double *to = data + dim * dim * first + dim * slot[i * n + j];
+            const double *from = Ke + i * node_i + j * node_j;
+            for (int k = 0; k < dim; k++)
+                for (int l = 0; l < dim; l++)
+                    to[k * row + l] += from[k * part_k + l * part_l];
+        }
+    }
+}
+
+INLINED void sum_cells(
+    int n, int dim, int pairs, const element *of, const double *points, ptrdiff_t E,
+    const int *cells, const double *D, const int *material, const int *ptr,
+    const int *slot, double *data
+) {
+    const int v = dim * (dim + 1) / 2;
+    double x[NODES * DIM], Ke[NODES * NODES * DIM * DIM];
+    for (ptrdiff_t e = 0; e < E; e++) {
+        const int *nodes = cells + e * n;
+        for (int i = 0; i < n; i++)
+            for (int m = 0; m < dim; m++)
+                x[i * dim + m] = points[(ptrdiff_t)nodes[i] * dim + m];
+        cell_stiffness(n, dim, pairs, of, x, D + material[e] * v * v, Ke);
+        scatter(n, dim, Ke, n, dim * n * n, 1, n * n, nodes, ptr, slot + e * n * n, data);
+    }
+}
+
+/* Sum the stiffness of E cells (E, n); points (N, dim), D (materials, v, v). */
+CLONED static void sum_stiffness(
+    int n, int dim, const element *of, const double *points, ptrdiff_t E,
+    const int *cells, const double *D, const int *material, const int *ptr,
+    const int *slot, double *data
+) {
+    if (n == 4 && dim == 2 && of->pairs == 2)
+        sum_cells(4, 2, 2, of, points, E, cells, D, material, ptr, slot, data);
+    else
+        sum_cells(n, dim, of->pairs, of, points, E, cells, D, material, ptr, slot, data);
+}
+
+/* Sum blocks (E, n·dim, n·dim), numbered by nodes, then by components. */
+static void sum_blocks(
+    int n, int dim, const double *blocks, ptrdiff_t E, const int *cells, const int *ptr,
+    const int *slot, double *data
+) {
+    const int size = n * dim;
+    for (ptrdiff_t e = 0; e < E; e++)
+        if (n == 4 && dim == 2)
+            scatter(4, 2, blocks + e * 64, 16, 8, 2, 1, cells + e * 4, ptr,
+                    slot + e * 16, data);
+        else
+            scatter(n, dim, blocks + e * size * size, dim * size, size, dim, 1,
+                    cells + e * n, ptr, slot + e * n * n, data);
+}
+
+/* Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of one cell.
+
+   grad (points, n, dim), volumes (points,), A (points, dim, dim, dim, dim), symmetric */
+INLINED void cell_tangent(
+    int n, int dim, int points, const double *grad, const double *volumes,
+    const double *A, double *K
+) {
+    const int size = n * dim, tensor = dim * dim * dim * dim;
+    for (int q = 0; q < points; q++, grad += size, A += tensor)
+        for (int a = 0; a < n; a++)
+            for (int i = 0; i < dim; i++)
+                for (int j = 0; j < dim; j++) {
+                    double left[DIM]; /* ∂N_a/∂X_m A_imjk of every k */
+                    for (int k = 0; k < dim; k++) {
+                        double sum = grad[a * dim] * A[((i * dim) * dim + j) * dim + k];
+                        for (int m = 1; m < dim; m++)
+                            sum += grad[a * dim + m]
+                                 * A[((i * dim + m) * dim + j) * dim + k];
+                        left[k] = volumes[q] * sum;
+                    }
+                    for (int b = a; b < n; b++) {
+                        if (b * dim + j < a * dim + i)
+                            continue;
+                        double sum = left[0] * grad[b * dim];
+                        for (int k = 1; k < dim; k++)
+                            sum += left[k] * grad[b * dim + k];
+                        K[(a * dim + i) * size + b * dim + j] += sum;
+                    }
+                }
+    for (int row = 0; row < size; row++)
+        for (int column = 0; column < row; column++)
+            K[row * size + column] = K[column * size + row];
+}
+
+/* Integrate the tangents (E, n·dim, n·dim) of all cells, which are zero before. */
+static void integrate_tangents(
+    int n, int dim, int points, const double *gradients, const double *volumes,
+    const double *A, ptrdiff_t E, double *K
+) {
+    const int size = n * dim, tensor = points * dim * dim * dim * dim;
+    for (ptrdiff_t e = 0; e < E; e++)
+        if (n == 4 && dim == 2 && points == 4)
+            cell_tangent(4, 2, 4, gradients + e * 32, volumes + e * 4, A + e * 64,
+                         K + e * 64);
+        else
+            cell_tangent(n, dim, points, gradients + e * points * size,
+                         volumes + e * points, A + e * tensor, K + e * size * size);
+}
