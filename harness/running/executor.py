@@ -62,7 +62,8 @@ class Executor:
             commands.case_worker, scratch / "case-worker.log"
         )
         self._workers: dict[str, WorkerProcess] = {}
-        self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
+        self._number = -1  # of the last block
+        self._entries: tuple[Entry, ...] = ()  # of that, once they are built
         self._end = ""  # why there are fewer than its sequence asked for
         self._loaded: dict[str, QP] = {}  # theirs, by digest
         self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
@@ -91,7 +92,8 @@ class Executor:
         """
         with full_disk_told(self._scratch):
             try:
-                self._entries = ()
+                if block.number != self._number:  # else it goes on with its next turns
+                    self._number, self._entries = block.number, ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _UnbuiltError as e:
