@@ -3,67 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import InSubdomains
+from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
     MOST,
-    at_least,
-    emitted_on_ranks,
+    declared,
     fits,
-    torn_by,
+    key,
 )
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
-    from mortarbench.problems.feti.emission import ProblemInParts
+    from mortarbench.harness import Value
 
 
-@dataclass(frozen=True)
-class Greco(InSubdomains):
+class Greco(DeclaredFamily):
     """GRECO's plate, pushed along a rigid plane with Coulomb friction (SSNV128)."""
 
-    name: str = "greco"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({
-            "n": 32, "mu": 1.0, "iterate": 0, **DECOMPOSITION,
-        }),
-        hash=False,
-    )  # fmt: skip
-    forms: tuple[str, ...] = CONTACT_FORMS
+    name = "greco"
+    keys = declared(n=key(32, 2), mu=key(1.0), iterate=key(0, 0), **DECOMPOSITION)
+    forms = CONTACT_FORMS
+    model = "greco.greco"
+    subdomains = "greco.in_subdomains"
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless there are cells and a coefficient of friction."""
-        at_least(2, self.name, params, ("n",))
+        super().check(params)
         fits(self.name, int(params["n"]) ** 2)
         if not 0 <= float(params["mu"]) <= MOST:
             raise InputError(
                 f"{self.name}: mu={params['mu']}; expected a coefficient of friction "
                 "of 0 or more"
             )
-        at_least(0, self.name, params, ("iterate",))
-        torn_by(self.name, params)
-
-    def is_emitted_by_ranks(self, params: Mapping[str, Value]) -> bool:
-        """Whether there are subdomains."""
-        return emitted_on_ranks(params)
-
-    def in_subdomains(self, params: Mapping[str, Value]) -> ProblemInParts:
-        """Describe the dual that ranks emit."""
-        from mortarbench.problems.models.greco import in_subdomains
-
-        return in_subdomains(params)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit a Tresca problem of the fixed point in one form."""
-        from mortarbench.problems.models.greco import greco
-
-        self.check(params)
-        return greco(form, params, reference)
