@@ -335,8 +335,3 @@ def fits_dense(family: str, n: int) -> None:
             f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
             "what there is"
         )
-
-
-def emitted_on_ranks(params: Mapping[str, Value]) -> bool:
-    """Whether bodies are in subdomains, and need no Newton's method."""
-    return bool(params["feti"]) and params.get("kinematics") != "finite"
