@@ -252,7 +252,7 @@ def _toml_value(where: str, value: Any) -> str:
                 f"{_toml_key(k)} = {_toml_value(f'{where}.{k}', v)}"
                 for k, v in value.items()
             ]
-            return f"{{ {', '.join(pairs)} }}"
+            return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
         case list() | tuple() | range():
             entries = [_toml_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
             return f"[{', '.join(entries)}]"
