@@ -147,7 +147,7 @@ class ExecutorPlugin(WorkerPlugin):
                 operators = merged("operator", operators, load_plugin(file).operators)
             commands = self._here(self._commands)
             executor = Executor(commands, scratch, scratch / "cases", operators)
-            stack.enter_context(executor)
+            stack.callback(executor.close)
             return _Open(
                 executor=executor,
                 cpu=cpu,
