@@ -15,7 +15,7 @@ import signal
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from multiprocessing import current_process, get_context, resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -104,7 +104,9 @@ def on_cluster(
                 _forget_lost_runs(client)
                 files = [file.resolved() for file in plugins]
                 sharing, packages = _sharing(client), packages_of(environment)
-                node = ExecutorPlugin(commands, files, operators, sharing, packages)
+                node = ExecutorPlugin(
+                    commands, files, dict(operators), sharing, packages
+                )
                 client.register_plugin(node, name=name)
                 ends.callback(_end, client, name)
                 nodes = Nodes(environment, keep, warn)
@@ -113,19 +115,14 @@ def on_cluster(
         yield opened
 
 
+@dataclass(eq=False)
 class Nodes:
     """What is known of the machines that have measured."""
 
-    def __init__(
-        self,
-        environment: Mapping[str, Any],
-        keep: Keep,
-        warn: Callable[[str], None],
-    ) -> None:
-        self._here = environment
-        self._keep = keep
-        self._warn = warn
-        self._seen: set[str] = set()
+    here: Mapping[str, Any]  #: environment of this process
+    keep: Keep
+    warn: Callable[[str], None]
+    _seen: set[str] = field(default_factory=set)  # digests
 
     def meet(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
         """Store an environment that is new, and tell how it differs from ours.
@@ -138,7 +135,7 @@ class Nodes:
         """
         if digest in self._seen:
             return
-        changed = list(differences(self._here, environment))
+        changed = list(differences(self.here, environment))
         for key, here, there in changed:
             if key.startswith(_CODE):
                 what = in_words([(key, here, there)], "here", "there")
@@ -147,10 +144,10 @@ class Nodes:
                     "same on every node"
                 )
         self._seen.add(digest)
-        self._keep(digest, environment)
+        self.keep(digest, environment)
         if changed:
             what = in_words(changed, "here", "there")
-            self._warn(
+            self.warn(
                 f"{node} measures under other conditions than this machine ({what}); "
                 f"its times are marked as those of environment {digest}"
             )
@@ -168,6 +165,7 @@ class _Begun:
     lost: int = 0  #: workers that it has cost
 
 
+@dataclass(eq=False)
 class _Cluster:
     """The engine: every Dask worker measures one block, a turn of a solver at a time.
 
@@ -175,22 +173,14 @@ class _Cluster:
     worker was lost is known here to be another part, measured elsewhere or later.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        name: str,
-        nodes: Nodes,
-        address: str,
-        warn: Callable[[str], None],
-    ) -> None:
-        self._client = client
-        self._name = name
-        self._nodes = nodes
-        self._address = address
-        self._warn = warn
-        self._done: SimpleQueue[Any] = SimpleQueue()  # futures
-        self._under_way: dict[Any, _Begun] = {}  # by the future of a turn
-        self._left: deque[_Begun] = deque()
+    client: Any
+    name: str  #: of the plug-in of this run
+    nodes: Nodes
+    address: str
+    warn: Callable[[str], None]
+    _done: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
+    _under_way: dict[Any, _Begun] = field(default_factory=dict)  # by their futures
+    _left: deque[_Begun] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
@@ -199,11 +189,11 @@ class _Cluster:
                 try:
                     yield from self._measured(self._done.get(timeout=LOOK_SECONDS))
                 except Empty:
-                    if self._client.status != "running":
+                    if self.client.status != "running":
                         raise _SchedulerGoneError from None
                     # a worker may be busy with a run whose parent has died, and the
                     # scheduler have noticed only now
-                    _forget_lost_runs(self._client)
+                    _forget_lost_runs(self.client)
                 yield from self._recovered()
         finally:
             for future in self._under_way:
@@ -218,8 +208,8 @@ class _Cluster:
             if not self._left:
                 return bool(self._under_way)
             if not idle:
-                self._warn(f"waiting for Dask workers to join {self._address}")
-                self._client.wait_for_workers(1)
+                self.warn(f"waiting for Dask workers to join {self.address}")
+                self.client.wait_for_workers(1)
                 idle = self._workers()
             if idle:
                 begun = self._left.popleft()
@@ -230,7 +220,7 @@ class _Cluster:
     def _workers(self) -> set[str]:
         """List the addresses of the workers that are there."""
         try:
-            return set(self._client.nthreads())
+            return set(self.client.nthreads())
         except OSError as e:
             raise _SchedulerGoneError from e
 
@@ -239,8 +229,8 @@ class _Cluster:
         from mortarbench.harness.running.dask_worker import execute
 
         turn = replace(begun.block, turns=(begun.left[0],))
-        future = self._client.submit(
-            execute, self._name, turn, workers=[begun.worker], pure=False
+        future = self.client.submit(
+            execute, self.name, turn, workers=[begun.worker], pure=False
         )
         self._under_way[future] = begun
         future.add_done_callback(self._done.put)
@@ -260,7 +250,7 @@ class _Cluster:
             return
         del self._under_way[future], begun.left[0]
         begun.is_measured = True
-        self._nodes.meet(delivery.node, delivery.digest, delivery.environment)
+        self.nodes.meet(delivery.node, delivery.digest, delivery.environment)
         for outcome in delivery.outcomes:
             match outcome:
                 case Unbuilt():

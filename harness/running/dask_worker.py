@@ -42,6 +42,7 @@ class Delivery:
     environment: dict[str, Any]
 
 
+@dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
     """Opens an executor in every Dask worker, those that join later included.
 
@@ -53,22 +54,14 @@ class ExecutorPlugin(WorkerPlugin):
     packages : whose versions the environment of a node has
     """
 
-    def __init__(
-        self,
-        commands: Commands,
-        plugins: Sequence[PluginFile],
-        operators: Mapping[str, Maker],
-        sharing: int,
-        packages: Sequence[str],
-    ) -> None:
-        self._commands = commands
-        self._plugins = plugins
-        self._operators = dict(operators)
-        self._sharing = sharing
-        self._packages = packages
-        self._python = sys.executable
-        self._open: _Open | None = None
-        self._ended = False
+    commands: Commands
+    plugins: Sequence[PluginFile]
+    operators: Mapping[str, Maker]
+    sharing: int
+    packages: Sequence[str]
+    _python: str = sys.executable
+    _open: _Open | None = None
+    _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
         """Open nothing yet: a block does, in the thread that it runs in.
@@ -129,23 +122,23 @@ class ExecutorPlugin(WorkerPlugin):
         )
 
     def _opened(self) -> _Open:
-        for file in self._plugins:
+        for file in self.plugins:
             if not file.path.is_file():
                 raise InputError(
                     f"{platform.node()}: no plug-in {file.path}; "
                     "expected the same files under the same paths on every node"
                 )
-        environment = capture_in(ONE_THREAD, self._plugins, self._packages)
-        if self._sharing > 1:
-            environment["machine"]["shared_by_workers"] = self._sharing
+        environment = capture_in(ONE_THREAD, self.plugins, self.packages)
+        if self.sharing > 1:
+            environment["machine"]["shared_by_workers"] = self.sharing
         with ExitStack() as stack:
             cpu = stack.enter_context(cpu_of(self._worker.id))
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
-            operators: Mapping[str, Maker] = self._operators
-            for file in self._plugins:
+            operators: Mapping[str, Maker] = self.operators
+            for file in self.plugins:
                 operators = merged("operator", operators, load_plugin(file).operators)
-            commands = self._here(self._commands)
+            commands = self._here(self.commands)
             executor = Executor(commands, scratch, scratch / "cases", operators)
             stack.callback(executor.close)
             return _Open(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
 from math import inf
@@ -39,6 +40,7 @@ _MOST_PROVEN = 1000  #: small QPs whose optima are kept
 LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
 
 
+@dataclass(eq=False)
 class Executor:
     """Carries out blocks one after the other, with one worker process per solver.
 
@@ -48,27 +50,24 @@ class Executor:
     operators : what puts an operator P together, see `harness.operators`
     """
 
-    def __init__(
-        self,
-        commands: Commands,
-        scratch: Path,
-        cases: Path,
-        operators: Mapping[str, Maker] = NO_MAKERS,
-    ) -> None:
-        self._commands = commands
-        self._scratch = scratch
-        self._cases = cases
-        self._operators = operators
+    commands: Commands
+    scratch: Path
+    cases: Path
+    operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
+    _workers: dict[str, WorkerProcess] = field(default_factory=dict)
+    _number: int = -1  # of the last block
+    _entries: tuple[Entry, ...] = ()  # of that, once they are built
+    _end: str = ""  # why there are fewer than its sequence asked for
+    _loaded: dict[str, QP] = field(default_factory=dict)  # theirs, by digest
+    #: of small QPs, by digest
+    _optima: dict[str, Optimum | None] = field(default_factory=dict)
+    #: whether ranks emit the QP, by case
+    _emitted: dict[str, bool] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
-            commands.case_worker, scratch / "case-worker.log"
+            self.commands.case_worker, self.scratch / "case-worker.log"
         )
-        self._workers: dict[str, WorkerProcess] = {}
-        self._number = -1  # of the last block
-        self._entries: tuple[Entry, ...] = ()  # of that, once they are built
-        self._end = ""  # why there are fewer than its sequence asked for
-        self._loaded: dict[str, QP] = {}  # theirs, by digest
-        self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
-        self._emitted: dict[str, bool] = {}  # whether ranks emit the QP, by case
 
     def close(self) -> None:
         """End the processes."""
@@ -84,7 +83,7 @@ class Executor:
             When the disk is full.
 
         """
-        with full_disk_told(self._scratch):
+        with full_disk_told(self.scratch):
             try:
                 if block.number != self._number:  # else it goes on with its next turns
                     self._number, self._entries = block.number, ()
@@ -109,7 +108,7 @@ class Executor:
                 return
             except (FaultError, OSError) as e:
                 reason = _in_a_line(e)
-                refuse_full_disk(self._scratch, reason)
+                refuse_full_disk(self.scratch, reason)
             self._start_anew(turn[0].solver)
             missing = [record for record in turn if record.run_id not in made]
             for record in missing[: 1 if tried_again else None]:
@@ -128,7 +127,7 @@ class Executor:
 
         """
         emits = self._is_emitted(turn[0])
-        evaluates = emits and self._commands.own_code_only
+        evaluates = emits and self.commands.own_code_only
         if not evaluates:
             self._build(block, turn)
         there = turn[: len(self._entries)] if not evaluates else turn
@@ -148,7 +147,7 @@ class Executor:
                 prove=proven,
             )  # fmt: skip
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self._scratch, "")  # whatever it died of
+                refuse_full_disk(self.scratch, "")  # whatever it died of
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or is_undescribed:
                 yield self._described(block, record, solution)
@@ -219,7 +218,7 @@ class Executor:
         if solution is None or not has_point(solution):
             return Result(record=record)
         first = record.verdict is Verdict.VERIFIED and record.repeat == 0
-        fields = self._scratch / "fields.npz"
+        fields = self.scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
             "describe": _case(record),
@@ -249,7 +248,7 @@ class Executor:
             return meta
 
         r = record
-        return entry(self._cases, [r.family, r.params, r.form, r.environment], make)
+        return entry(self.cases, [r.family, r.params, r.form, r.environment], make)
 
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
@@ -261,13 +260,13 @@ class Executor:
             if reply.answer is not None:
                 break
         else:
-            refuse_full_disk(self._scratch, reply.message)
+            refuse_full_disk(self.scratch, reply.message)
             if reply.fault:
                 raise FaultError(reply.message)
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:
-            refuse_full_disk(self._scratch, reply.answer["unbuilt"])
+            refuse_full_disk(self.scratch, reply.answer["unbuilt"])
             answer = reply.answer
             raise _UnbuiltError(
                 answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
@@ -294,7 +293,7 @@ class Executor:
             When it died, or a file between us failed.
 
         """
-        point = self._scratch / "reference.npz"
+        point = self.scratch / "reference.npz"
         request = {"solve": str(at.qp), "point": str(point)}
         reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
         if reply.answer is None:
@@ -305,25 +304,25 @@ class Executor:
 
     def _worker(self, label: str) -> WorkerProcess:
         if label not in self._workers:
-            log = self._scratch / f"worker-{len(self._workers)}.log"
-            self._workers[label] = WorkerProcess(self._commands.solvers[label], log)
+            log = self.scratch / f"worker-{len(self._workers)}.log"
+            self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
 
     def _start_anew(self, label: str) -> None:
         """Have files that may be lost made again, and a worker started."""
         self._entries = ()
         with suppress(FileNotFoundError):  # the whole result folder has gone
-            self._scratch.mkdir(exist_ok=True)
+            self.scratch.mkdir(exist_ok=True)
         self._worker(label).close()
 
     def _qp(self, at: Entry) -> QP:
         if at.digest not in self._loaded:
-            self._loaded[at.digest] = load_qp(at.qp, operators=self._operators)[0]
+            self._loaded[at.digest] = load_qp(at.qp, operators=self.operators)[0]
         return self._loaded[at.digest]
 
     @property
     def _point(self) -> Path:
-        return self._scratch / "point.npz"
+        return self.scratch / "point.npz"
 
 
 @contextmanager
