@@ -45,7 +45,6 @@ from mortarbench.harness.names import CaseId, emitted_by_ranks, unbuilt
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
-from mortarbench.harness.qp import QP
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
@@ -138,13 +137,10 @@ class CaseWorker:
 
     def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
-            write_point(point, self.reference(self._loaded(qp)))
+            write_point(point, self.reference(load_qp(qp, operators=self.operators)[0]))
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
             return {"found": False}
         return {"found": True}
-
-    def _loaded(self, qp: Path) -> QP:
-        return load_qp(qp, operators=self.operators)[0]
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)

@@ -172,7 +172,9 @@ class WorkerProcess:
         memory_limit : MiB, of all its processes together
         """
         self._peak_mib, self._emitted = 0.0, None
-        self._stop_others()
+        cpu = max(os.sched_getaffinity(0))
+        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
+            worker._stop()
         was_busy = self._resume()
         notes = [REPLACED] if was_busy else []
         while True:
@@ -444,12 +446,6 @@ class WorkerProcess:
         with suppress(OSError):  # it may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
-
-    def _stop_others(self) -> None:
-        """Stop the workers that share our CPU until they are asked again."""
-        cpu = max(os.sched_getaffinity(0))
-        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
-            worker._stop()
 
     def _stop(self) -> None:
         if self._process is None or self._is_stopped:

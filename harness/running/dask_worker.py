@@ -138,7 +138,15 @@ class ExecutorPlugin(WorkerPlugin):
             operators: Mapping[str, Maker] = self.operators
             for file in self.plugins:
                 operators = merged("operator", operators, load_plugin(file).operators)
-            commands = self._here(self.commands)
+
+            def here(command: list[str]) -> list[str]:
+                return [sys.executable if w == self._python else w for w in command]
+
+            commands = replace(
+                self.commands,
+                solvers={label: here(c) for label, c in self.commands.solvers.items()},
+                case_worker=here(self.commands.case_worker),
+            )
             executor = Executor(commands, scratch, scratch / "cases", operators)
             stack.callback(executor.close)
             return _Open(
@@ -148,18 +156,6 @@ class ExecutorPlugin(WorkerPlugin):
                 digest=digest(environment),
                 stack=stack.pop_all(),
             )
-
-    def _here(self, commands: Commands) -> Commands:
-        """Start processes with the Python that runs the Dask worker."""
-
-        def here(command: list[str]) -> list[str]:
-            return [sys.executable if w == self._python else w for w in command]
-
-        return replace(
-            commands,
-            solvers={label: here(c) for label, c in commands.solvers.items()},
-            case_worker=here(commands.case_worker),
-        )
 
 
 def execute(name: str, block: WorkUnit) -> Delivery:

@@ -109,7 +109,11 @@ class Executor:
             except (FaultError, OSError) as e:
                 reason = _in_a_line(e)
                 refuse_full_disk(self.scratch, reason)
-            self._start_anew(turn[0].solver)
+            label = turn[0].solver
+            self._entries = ()
+            with suppress(FileNotFoundError):  # the whole result folder has gone
+                self.scratch.mkdir(exist_ok=True)
+            self._worker(label).close()
             missing = [record for record in turn if record.run_id not in made]
             for record in missing[: 1 if tried_again else None]:
                 yield Unmade(record=record, reason=reason, tried_again=tried_again)
@@ -307,13 +311,6 @@ class Executor:
             log = self.scratch / f"worker-{len(self._workers)}.log"
             self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
-
-    def _start_anew(self, label: str) -> None:
-        """Have files that may be lost made again, and a worker started."""
-        self._entries = ()
-        with suppress(FileNotFoundError):  # the whole result folder has gone
-            self.scratch.mkdir(exist_ok=True)
-        self._worker(label).close()
 
     def _qp(self, at: Entry) -> QP:
         if at.digest not in self._loaded:

@@ -66,7 +66,9 @@ class _Parser(argparse.ArgumentParser):
 def main(registries: Registries, argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     _open_standard_streams()
-    _show_what_can_be_shown()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         return _run(registries, argv)
     except InputError as e:
@@ -79,7 +81,15 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
         _print_no_more()
         return 0
     except OSError as e:
-        return _told(e)
+        # late: a help text needs no files
+        from mortarbench.harness.files.durable import FULL
+
+        if e.filename is not None:
+            return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
+        if e.errno in FULL:
+            return _complain(f"a file could not be written: {e.strerror}")
+        traceback.print_exc()
+        return 3
     except Exception:
         traceback.print_exc()
         return 3
@@ -115,20 +125,6 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
     return code
 
 
-def _told(e: OSError) -> int:
-    """Name the file that something is wrong with, or the disk that is full."""
-    from mortarbench.harness.files.durable import (
-        FULL,  # late: a help text needs no files
-    )
-
-    if e.filename is not None:
-        return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
-    if e.errno in FULL:
-        return _complain(f"a file could not be written: {e.strerror}")
-    traceback.print_exc()
-    return 3
-
-
 def _remedied(e: OSError, path: Path) -> str:
     """Say what is wrong with a file, and what would be right where that is plain."""
     if isinstance(e, FileExistsError | NotADirectoryError):
@@ -155,13 +151,6 @@ def _open_standard_streams() -> None:
     for fd, (name, mode) in enumerate(_STREAMS.items()):
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(fd, mode, closefd=False))
-
-
-def _show_what_can_be_shown() -> None:
-    """Have a terminal of few characters show a question mark instead of a λ."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
 
 
 def _print_no_more() -> None:
