@@ -279,48 +279,10 @@ def as_family(offered: Any) -> Family:
     if isinstance(offered, Family):
         return offered
     kind = type(offered)
-    wrapper = type(kind.__name__, (_Offered,), {"__doc__": kind.__doc__})
-    wrapped: Family = wrapper(offered)
+    parts = [name for name in dir(Family) if not name.startswith("_")]
+    own = {name: getattr(offered, name) for name in parts if hasattr(offered, name)}
+    required = ("name", "defaults", "forms", "build")
+    own |= {name: getattr(offered, name, None) for name in required}
+    own = {k: staticmethod(v) if callable(v) else v for k, v in own.items()}
+    wrapped: Family = type(kind.__name__, (Family,), {"__doc__": kind.__doc__, **own})()
     return wrapped
-
-
-class _Offered(Family):
-    """A family whose class does not inherit from `Family`."""
-
-    def __init__(self, offered: Any) -> None:
-        self._offered = offered
-        self.name, self.defaults = offered.name, offered.defaults
-        self.forms = offered.forms
-        self.path_suffix = getattr(offered, "path_suffix", Family.path_suffix)
-        self.singular = getattr(offered, "singular", Family.singular)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        case: Case = self._offered.build(form, params, reference)
-        return case
-
-    def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        params: Mapping[str, Value] = self._own("complete")(given)
-        return params
-
-    def check(self, params: Mapping[str, Value]) -> None:
-        self._own("check")(params)
-
-    def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        finer: Mapping[str, Value] | None = self._own("refined")(params)
-        return finer
-
-    def unrefined(self, params: Mapping[str, Value]) -> str:
-        words: str = self._own("unrefined")(params)
-        return words
-
-    def emission(
-        self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
-        emit: Callable[[Ranks, ReferenceOverRanks], Emitted] | None
-        emit = self._own("emission")(form, params)
-        return emit
-
-    def _own(self, method: str) -> Any:
-        return getattr(self._offered, method, getattr(super(), method))

@@ -30,7 +30,7 @@ from mortarbench.harness.crossval.validation import validated
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.files.durable import full_disk_told, replace_file
 from mortarbench.harness.names import CaseId, assemble
-from mortarbench.harness.plugin import Family, Reference, Solver
+from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.measurement import scratch_folder
 from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.supervisor import WorkerProcess
@@ -67,6 +67,7 @@ class Validation:
         return f"<pre>{escape(repr(self))}</pre>"
 
 
+@one_thread()
 def validate(
     folder: str | Path,
     *,
@@ -96,16 +97,6 @@ def validate(
     checked_budget(budget)
     checked.function("progress", progress)
     registries = known(plugins, registries)
-    with one_thread():
-        return _validated(path, budget, progress, registries)
-
-
-def _validated(
-    path: Path,
-    budget: float,
-    progress: Callable[[str], None],
-    registries: Registries,
-) -> Validation:
     families = registries.families_with_copies(path)
     found = validated(path, families, registries.reference, progress)
     data = as_data(found, path.resolve().name, ours=OURS)
@@ -116,31 +107,21 @@ def _validated(
     with full_disk_told(path):
         replace_file(path / "validation.json", text.encode())
     pages = registries.validation_page(path, data, ())
-    meshes = _meshes(families, registries.reference, path, budget, progress)
-    if meshes:  # the page was there while they were solved; now it tells of them, too
+    records = {r.case: r for r in read_journal(path, progress)}
+    cases = []
+    for r in records.values():
+        if r.family in families:
+            # a case of another version is listed as not validated
+            with suppress(InputError):
+                case = assemble(families[r.family], r.params, r.form)
+                if r.energy_bound is not None or _refines(case):
+                    cases.append(case)
+    meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
+    if meshes:  # the page was there while they were solved
         pages = registries.validation_page(path, data, meshes)
     return Validation(
         agreed=found.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
     )
-
-
-def _meshes(
-    families: Mapping[str, Family],
-    reference: Reference,
-    folder: Path,
-    seconds: float,
-    progress: Callable[[str], None],
-) -> list[Discretisation]:
-    """Solve the folder's elastic cases on finer meshes, or say why there are none."""
-    records = {r.case: r for r in read_journal(folder, progress)}
-    cases = []
-    for r in records.values():
-        if r.family in families:
-            with suppress(InputError):  # of another version: listed as not validated
-                case = assemble(families[r.family], r.params, r.form)
-                if r.energy_bound is not None or _refines(case):
-                    cases.append(case)
-    return discretisation_errors(cases, reference, folder, seconds, progress)
 
 
 def _refines(case: CaseId) -> bool:

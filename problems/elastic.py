@@ -108,7 +108,7 @@ def one_step(
     """
     if form not in FORMS:
         raise InputError(f"form {form!r}; expected one of {', '.join(FORMS)}")
-    one_of("one_step", {"glue": glue}, GLUES)
+    GLUES["glue"].check("one_step", "glue", {"glue": glue})
     if parts and form != "dual":
         raise InputError(
             f"parts with form {form} is not built; expected form dual, or parts=0"

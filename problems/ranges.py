@@ -1,8 +1,13 @@
-"""Checks of the keys of a family, with the one line that says what would be right."""
+"""Keys of families, declared: defaults, ranges, and conditions between several keys.
+
+Every check raises InputError with the one line that says what would be right.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness import InputError
@@ -14,48 +19,112 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
-#: values of the keys that choose the method; node-to-segment takes no notice of basis
-METHODS = {"contact": ("nts", "mortar"), "basis": ("dual", "standard")}
-PLANES = {"plane": ("strain", "stress")}
-#: the keys of bodies in subdomains: H/h, 0 for one piece per body, and `GLUES`
-DECOMPOSITION: Mapping[str, Value] = {"feti": 0, "glue": "orthonormal"}
+SHORTEST = 0.1  #: stretch that a body is pressed to
+LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
+MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
+COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """One key of a family: its default, and the values that it may have."""
+
+    default: Value
+    least: int | None = None
+    most: int | None = None
+    values: tuple[Value, ...] = ()  #: all that it may have; empty: no such list
+    is_size: bool = False  #: positive, and of a usual size in SI units
+
+    def but(self, default: Value) -> Key:
+        """Return the same key with another default."""
+        return replace(self, default=default)
+
+    def check(self, family: str, key: str, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless the value of `key` is in its range."""
+        if self.least is not None:
+            at_least(self.least, family, params, (key,))
+        if self.most is not None:
+            at_most(self.most, family, params, (key,))
+        if self.is_size:
+            positive(family, params, (key,))
+        if self.values:
+            one_of(family, params, {key: self.values})
+
+
+Keys = Mapping[str, Key]
+
+
+def key(default: Value, least: int | None = None, most: int | None = None) -> Key:
+    """Declare a key with a range of integers, or none."""
+    return Key(default=default, least=least, most=most)
+
+
+def choice(*values: Value) -> Key:
+    """Declare a key with a list of values, of which the first is the default."""
+    return Key(default=values[0], values=values)
+
+
+def size(default: float) -> Key:
+    """Declare a key that is a physical size."""
+    return Key(default=default, is_size=True)
+
+
+def declared(**keys: Key) -> Keys:
+    """Declare the keys of a family, in the order of canonical names."""
+    return MappingProxyType(keys)
+
+
+def defaults_of(keys: Keys) -> dict[str, Value]:
+    """Return the default of every key."""
+    return {name: key.default for name, key in keys.items()}
+
+
+HALVINGS = key(0, 0, 30)
+STEPS = key(10, 1, MOST_STEPS)
+#: the keys that choose the method; node-to-segment takes no notice of basis
+METHODS = declared(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
+PLANES = declared(plane=choice("strain", "stress"))
 #: how copies of a node are held together, `problems.feti.gluing`
-GLUES = {"glue": ("orthonormal", "chain", "redundant")}
-#: the keys of friction with their defaults; -1 is no bound and no mu
-LAW: Mapping[str, Value] = {
-    "friction": "none", "bound": -1.0, "mu": -1.0, "loading": "quasi-static"
-}  # fmt: skip
-FRICTION: Mapping[str, Value] = {**LAW, "iterate": 0}
-#: the keys of large deformation with their defaults; newton: 0 is the last iteration
-KINEMATICS: Mapping[str, Value] = {
-    "kinematics": "linear", "material": "neo-hooke", "newton": 0
-}  # fmt: skip
+GLUES = declared(glue=choice("orthonormal", "chain", "redundant"))
+#: the keys of bodies in subdomains: H/h, 0 for one piece per body, and `GLUES`
+DECOMPOSITION = declared(feti=key(0, 0), **GLUES)
+#: the laws of friction, each with the key that it needs
+LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
+NEEDED = {
+    "bound": "a traction of 0 or more, Pa",
+    "mu": "a coefficient of friction of 0 or more",
+}
+#: the keys of friction; -1 is no bound and no mu
+LAW = declared(
+    friction=choice(*LAWS),
+    bound=key(-1.0),
+    mu=key(-1.0),
+    loading=choice("quasi-static", "static"),
+)
+FRICTION = declared(**LAW, iterate=key(0, 0))
+#: the keys of large deformation; newton: 0 is the last iteration
+KINEMATICS = declared(
+    kinematics=choice("linear", "finite"),
+    material=choice("neo-hooke", "svk"),
+    newton=key(0, 0),
+)
 #: whether second derivatives of the gaps join the tangent
-CONTACT_STIFFNESS: Mapping[str, Value] = {"contact_stiffness": "none"}
-FINITE = {
-    "kinematics": ("linear", "finite"), "material": ("neo-hooke", "svk"),
-    "contact_stiffness": ("none", "geometric"),
-}  # fmt: skip
+CONTACT_STIFFNESS = declared(contact_stiffness=choice("none", "geometric"))
 #: what is not built at finite strain, where a family has the key
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0, "parts": 0, "friction": "none", "plane": "strain", "relin": 1
 }  # fmt: skip
 #: what the name of a case of bodies may set, with the value where its file says nothing
-SETTINGS: Mapping[str, Value] = {
-    "contact": "nts", "basis": "dual", "plane": "strain", "steps": 10, "relin": 1,
-    **LAW, "kinematics": "linear", "material": "neo-hooke", **CONTACT_STIFFNESS,
-}  # fmt: skip
-#: the laws of friction, each with the key that it needs
-LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
-LOADINGS = {"loading": ("quasi-static", "static")}
-NEEDED = {
-    "bound": "a traction of 0 or more, Pa",
-    "mu": "a coefficient of friction of 0 or more",
-}
-SHORTEST = 0.1  #: stretch that a body is pressed to
-LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
-MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
-COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
+SETTINGS = declared(
+    **METHODS,
+    **PLANES,
+    steps=STEPS,
+    relin=key(1, 1, MOST_STEPS),
+    **LAW,
+    kinematics=KINEMATICS["kinematics"],
+    material=KINEMATICS["material"],
+    **CONTACT_STIFFNESS,
+)
 
 
 def at_least(
@@ -118,27 +187,28 @@ def fits(family: str, components: int) -> None:
         )
 
 
-def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) -> None:
+def check_friction(
+    family: str, params: Mapping[str, Value], *, elsewhere: bool = False
+) -> None:
     """Raise InputError unless the keys of friction fit together.
 
     elsewhere : whether pairs of sides may have laws of their own
     """
-    one_of(family, params, {"friction": tuple(LAWS), **LOADINGS})
     law = str(params["friction"])
     for key, what in NEEDED.items():
-        value = float(params[key])
-        if key != LAWS[law] and value != FRICTION[key]:
+        value, default = float(params[key]), LAW[key].default
+        if key != LAWS[law] and value != default:
             (user,) = (other for other, needed in LAWS.items() if needed == key)
             raise InputError(
                 f"{family}: {key}={value:g} is not used by friction={law}; expected "
                 f"no {key}, or friction={user}"
             )
-        if key == LAWS[law] and value == FRICTION[key] and not elsewhere:
+        if key == LAWS[law] and value == default and not elsewhere:
             raise InputError(f"{family}: friction={law} needs {key}, {what}")
-        if value != FRICTION[key] and not (value == 0 or LEAST <= value <= MOST):
+        if value != default and not (value == 0 or LEAST <= value <= MOST):
             raise InputError(f"{family}: {key}={value:g}; expected {what}")
-    at_least(0, family, params, ("iterate",))
-    if law == "none" and not elsewhere and params["loading"] != FRICTION["loading"]:
+    unused = params["loading"] != LAW["loading"].default
+    if law == "none" and not elsewhere and unused:
         raise InputError(
             f"{family}: loading={params['loading']} is not used by friction=none; "
             "expected no loading, or friction=tresca or friction=coulomb"
@@ -150,7 +220,7 @@ def rough(family: str, params: Mapping[str, Value], *, elsewhere: bool = False) 
         )
 
 
-def torn_by(
+def check_decomposition(
     family: str,
     params: Mapping[str, Value],
     *,
@@ -161,22 +231,17 @@ def torn_by(
 
     key, what : that asks for subdomains, and what it is the number of
     """
-    at_least(0, family, params, (key,))
-    one_of(family, params, GLUES)
-    if not params[key] and params["glue"] != DECOMPOSITION["glue"]:
+    if not params[key] and params["glue"] != GLUES["glue"].default:
         raise InputError(
             f"{family}: glue={params['glue']} is not used by {key}=0, one piece per "
             f"body; expected no glue, or {key}, {what}"
         )
 
 
-def deformed(family: str, params: Mapping[str, Value]) -> None:
+def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError unless the keys of large deformation fit together."""
-    own = {**KINEMATICS, **CONTACT_STIFFNESS}
-    one_of(family, params, {k: v for k, v in FINITE.items() if k in params})
-    at_least(0, family, params, ("newton",))
     if params["kinematics"] == "linear":
-        for key, default in own.items():
+        for key, default in defaults_of({**KINEMATICS, **CONTACT_STIFFNESS}).items():
             if params.get(key, default) != default:
                 raise InputError(
                     f"{family}: {key}={params[key]} is not used by kinematics=linear; "
@@ -270,9 +335,3 @@ def fits_dense(family: str, n: int) -> None:
             f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
             "what there is"
         )
-
-
-def divided(params: Mapping[str, Value]) -> bool:
-    """Whether bodies are in subdomains, and need no Newton's method."""
-    cut = params.get("feti") or params.get("parts")
-    return bool(cut) and params.get("kinematics") != "finite"

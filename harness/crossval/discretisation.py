@@ -207,38 +207,36 @@ def _write(path: Path, found: Iterable[Discretisation]) -> None:
         replace_file(path, text.encode())
 
 
+@dataclass(eq=False)
 class _Halving:
     """Solves a case on finer and finer meshes, and remembers why it stopped."""
 
-    def __init__(
-        self, family: Family, reference: Reference, references: Path, end: float
-    ) -> None:
-        self._family = family
-        self._reference = reference
-        self._references = references
-        self._end = end
-        self._coarse: tuple[Grid, Extended] | None = None
-        self.why = ""
-        self.late = False  #: stopped for lack of time
+    family: Family
+    reference: Reference
+    references: Path
+    end: float
+    why: str = ""
+    late: bool = False  #: stopped for lack of time
+    _coarse: tuple[Grid, Extended] | None = None
 
     def levels(self, case: CaseId) -> Iterator[Level]:
         """Yield the levels that can be afforded, coarsest first."""
-        form = "primal" if "primal" in self._family.forms else case.form
+        form = "primal" if "primal" in self.family.forms else case.form
         sizes: list[int] = []
         seconds = 0.0
         try:
-            params = None if self._family.refined(case.params) is None else case.params
+            params = None if self.family.refined(case.params) is None else case.params
         except InputError as e:
             self.why = str(e)
             return
         while len(sizes) < LEVELS:
             if params is None:
-                self.why = f"the family {self._family.name} offers no refined mesh"
+                self.why = f"the family {self.family.name} offers no refined mesh"
                 return
             growth = sizes[-1] / sizes[-2] if len(sizes) > 1 else GROWTH
             if sizes and self._refused(growth * sizes[-1]):
                 return
-            left = self._end - perf_counter()
+            left = self.end - perf_counter()
             if not left > seconds * growth**POWER:
                 self.late = True
                 self.why = "the next mesh would take more time than was left"
@@ -253,8 +251,8 @@ class _Halving:
             yield level
             sizes.append(level.unknowns)
             seconds = perf_counter() - start
-            complete = assemble(self._family, params, form).params
-            params = self._family.refined(complete)
+            complete = assemble(self.family, params, form).params
+            params = self.family.refined(complete)
 
     def _refused(self, size: float) -> bool:
         if size <= MOST_UNKNOWNS:
@@ -269,11 +267,11 @@ class _Halving:
         self, params: Mapping[str, object], form: str, *, first: bool
     ) -> Level | None:
         """Solve one mesh; None, with the reason, where that is impossible."""
-        text = self._family.name
+        text = self.family.name
         try:
-            case = assemble(self._family, params, form)
+            case = assemble(self.family, params, form)
             text = case.name
-            mechanics = case.build(self._reference).mechanics
+            mechanics = case.build(self.reference).mechanics
             if mechanics is None:
                 self.why = "there is no elastic problem behind it"
                 return None
@@ -283,7 +281,7 @@ class _Halving:
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):
                 return None  # before it is solved
-            point = reference_point(mechanics, self._reference, self._references)
+            point = reference_point(mechanics, self.reference, self.references)
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
             self.why = f"{text} has no reference solution: {e}"

@@ -140,7 +140,11 @@ def validated(
         unanswered=tuple(
             _listed(r, _ending(r))
             for r in records
-            if _silent(r) and r.run_id not in {x.run_id for x in false_claims}
+            if (
+                r.claimed != Status.SOLVED
+                and not (r.verdict.is_verified or r.verdict is Verdict.DECLINED)
+            )
+            and r.run_id not in {x.run_id for x in false_claims}
         ),
         not_validated=tuple(x for part in parts for x in part.lost),
         declined=sum(r.verdict is Verdict.DECLINED for r in records),
@@ -153,7 +157,7 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
         if r.verdict is not Verdict.DECLINED:
-            groups.setdefault(_physical(r), []).append(r)
+            groups.setdefault(r.case.removesuffix(f"/{r.form}"), []).append(r)
     return groups
 
 
@@ -227,7 +231,9 @@ def _given(
     found: dict[tuple[str, str, float, str], Given] = {}
     lost: list[Listed] = []
     for r in records:
-        if not r.vectors or not _stands(r):
+        if not r.vectors or not (
+            r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
+        ):
             continue
         key = (r.solver, r.case, r.asked_tol, r.vectors)
         if key in found:
@@ -255,11 +261,6 @@ def _twin(folder: _Folder, r: Record) -> str:
     return min(others, default="")
 
 
-def _stands(r: Record) -> bool:
-    """Whether a record has an answer to judge: claimed, or verified all the same."""
-    return r.claimed == Status.SOLVED or r.verdict is Verdict.VERIFIED
-
-
 def _is_proven(r: Record) -> bool:
     """Return whether a claim of infeasibility was proven when it was measured."""
     return r.verdict is Verdict.VERIFIED_INFEASIBLE
@@ -269,13 +270,6 @@ def _is_infeasible(qp: QP) -> bool:
     """Return whether a certificate is found; that of the solver is not stored."""
     claim = Solution.without_point(qp, Status.INFEASIBLE)
     return infeasibility_margin(qp, claim) is not None
-
-
-def _silent(r: Record) -> bool:
-    """Whether a record neither claims success nor is verified."""
-    return r.claimed != Status.SOLVED and not (
-        r.verdict.is_verified or r.verdict is Verdict.DECLINED
-    )
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
@@ -309,10 +303,6 @@ def _called(name: str, given: Sequence[Given], problems: int) -> str:
     if problems == 1:
         return name
     return f"{name} ({', '.join(dict.fromkeys(g.record.form for g in given))})"
-
-
-def _physical(r: Record) -> str:
-    return r.case.removesuffix(f"/{r.form}")
 
 
 def _apart(r: Record) -> Record:

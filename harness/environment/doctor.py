@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
+from functools import partial
 from typing import Any
 
 from rich.text import Text
@@ -31,6 +32,7 @@ class Level(StrEnum):
     UNKNOWN = "unknown"  #: the machine does not tell
 
 
+_SWITCH = {True: "on", False: "off", None: None}
 _STYLES = {Level.OK: "green", Level.WARN: "bold yellow", Level.UNKNOWN: "dim"}
 
 
@@ -50,15 +52,8 @@ def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
 
     environment : as `harness.environment.environment.capture` returns it
     """
-    machine, now = environment["machine"], environment["now"]
     return [
-        _processor(machine),
-        _cpu_limit(machine["cpu_limit"]),
-        _governor(machine),
-        _turbo(machine),
-        _siblings(machine["smt"]),
-        _load(now["load"]),
-        _memory(machine["memory_mib"], now["available_memory_mib"]),
+        *_machine(environment["machine"], environment["now"]),
         *_blas(environment),
         *_threads(environment["threads"]),
         *_clock(noise),
@@ -96,70 +91,55 @@ def _check(section: str, name: str, value: object, advice: str = "") -> Check:
     return Check(section=section, name=name, value=shown, level=level, advice=advice)
 
 
-def _processor(machine: Mapping[str, Any]) -> Check:
+def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Check]:
+    check = partial(_check, "Machine")
     cores, usable = machine["physical_cores"] or "?", machine["usable_cores"]
     virtual = ", a virtual machine" if machine["virtual"] else ""
-    value = (
+    yield check(
+        "processor",
         f"{machine['cpu'] or machine['architecture']} ({cores} physical cores, "
-        f"{usable} usable{virtual})"
+        f"{usable} usable{virtual})",
+        "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch",
     )
-    advice = "" if usable > 1 else "Give it 2 cores: one to measure on, one to watch"
-    return _check("Machine", "processor", value, advice)
-
-
-def _cpu_limit(limit: float | None) -> Check:
-    if limit is None:
-        return _check("Machine", "cpu limit", "none")
-    advice = (
+    limit = machine["cpu_limit"]
+    throttled = limit is not None and limit < 2
+    yield check(
+        "cpu limit",
+        "none" if limit is None else f"{limit:g} cores",
         "The container is throttled: give it 2 cores or more (docker run --cpus=2)"
-        if limit < 2
-        else ""
+        * throttled,
     )
-    return _check("Machine", "cpu limit", f"{limit:g} cores", advice)
-
-
-def _governor(machine: Mapping[str, Any]) -> Check:
-    governor = machine["governor"]
-    advice = "Fix the frequency: sudo cpupower frequency-set -g performance"
-    good = governor in (None, "performance")
-    return _check("Machine", "governor", governor, "" if good else advice)
-
-
-def _turbo(machine: Mapping[str, Any]) -> Check:
-    if not machine["turbo"]:
-        value = None if machine["turbo"] is None else "off"
-        return _check("Machine", "turbo", value)
-    advice = (
+    yield check(
+        "governor",
+        machine["governor"],
+        "Fix the frequency: sudo cpupower frequency-set -g performance"
+        * (machine["governor"] not in (None, "performance")),
+    )
+    yield check(
+        "turbo",
+        _SWITCH[machine["turbo"]],
         "Frequencies above the nominal one depend on temperature and on neighbours: "
         "echo 0 | sudo tee /sys/devices/system/cpu/cpufreq/boost "
         "(Intel: echo 1 | sudo tee /sys/devices/system/cpu/intel_pstate/no_turbo)"
+        * bool(machine["turbo"]),
     )
-    return _check("Machine", "turbo", "on", advice)
-
-
-def _siblings(smt: bool | None) -> Check:
-    if not smt:
-        return _check("Machine", "hyper-threads", None if smt is None else "off")
-    advice = (
+    yield check(
+        "hyper-threads",
+        _SWITCH[machine["smt"]],
         "Two programs share a core: keep the machine free of others, or "
         "echo off | sudo tee /sys/devices/system/cpu/smt/control"
+        * bool(machine["smt"]),
     )
-    return _check("Machine", "hyper-threads", "on", advice)
-
-
-def _load(load: float) -> Check:
-    return _check("Machine", "load", f"{load:.2f} cores busy", load_advice(load))
-
-
-def _memory(total: int | None, available: int | None) -> Check:
-    if total is None or available is None:
-        return _check("Machine", "memory", None)
-    advice = (
+    load = now["load"]
+    yield check("load", f"{load:.2f} cores busy", load_advice(load))
+    total, available = machine["memory_mib"], now["available_memory_mib"]
+    is_known = total is not None and available is not None
+    yield check(
+        "memory",
+        f"{available} of {total} MiB free" if is_known else None,
         f"Make room for {ENOUGH_MEMORY_MIB} MiB, or lower memory_limit in the suite"
-        if available < ENOUGH_MEMORY_MIB
-        else ""
+        * (is_known and available < ENOUGH_MEMORY_MIB),
     )
-    return _check("Machine", "memory", f"{available} of {total} MiB free", advice)
 
 
 def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:

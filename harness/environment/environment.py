@@ -74,7 +74,22 @@ def capture(
     )
     mapped = mapped_libraries()
     return {
-        "machine": _machine(),
+        "machine": {
+            "cpu": next(iter(_cpuinfo("model name")), None),
+            "physical_cores": _physical_cores(),
+            "logical_cores": os.cpu_count(),
+            "usable_cores": _usable_cores(),
+            "cpu_limit": _cpu_limit(),
+            "memory_mib": _meminfo("MemTotal"),
+            "architecture": platform.machine(),
+            "system": platform.system(),
+            "kernel": platform.release(),
+            "libc": " ".join(platform.libc_ver()).strip() or None,
+            "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
+            "governor": _governor(),
+            "turbo": _turbo(),
+            "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
+        },
         "versions": {"python": platform.python_version()}
         | {name: _version(name) for name in (*PACKAGES, *packages)},
         "source": source(Path(__file__).resolve().parents[2]),
@@ -188,7 +203,11 @@ def system_blas(
     names = {Path(file).name for file in mapped if not _in_foreign_wheel(file)}
     for stem, title in BLAS_LIBRARIES:
         if any(name.startswith(stem) for name in names):
-            return _with_details(title, stem, pools)
+            for pool in pools:
+                if pool["library"].startswith(stem) and pool["owner"] in CHOLMOD_OWNERS:
+                    layer = f"({pool['layer']})" if pool["layer"] else None
+                    return " ".join(filter(None, (title, pool["version"], layer)))
+            return title
     return None
 
 
@@ -200,36 +219,9 @@ def cholmod_version(mapped: Iterable[str]) -> str | None:
     return None
 
 
-def _with_details(title: str, stem: str, pools: Iterable[Mapping[str, Any]]) -> str:
-    for pool in pools:
-        if pool["library"].startswith(stem) and pool["owner"] in CHOLMOD_OWNERS:
-            layer = f"({pool['layer']})" if pool["layer"] else None
-            return " ".join(filter(None, (title, pool["version"], layer)))
-    return title
-
-
 def _in_foreign_wheel(path: str) -> bool:
     found = re.search(r"/(?:site|dist)-packages/([^/]+)", path)
     return found is not None and not found[1].startswith(("scikit_sparse", "sksparse"))
-
-
-def _machine() -> dict[str, Any]:
-    return {
-        "cpu": next(iter(_cpuinfo("model name")), None),
-        "physical_cores": _physical_cores(),
-        "logical_cores": os.cpu_count(),
-        "usable_cores": _usable_cores(),
-        "cpu_limit": _cpu_limit(),
-        "memory_mib": _meminfo("MemTotal"),
-        "architecture": platform.machine(),
-        "system": platform.system(),
-        "kernel": platform.release(),
-        "libc": " ".join(platform.libc_ver()).strip() or None,
-        "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-        "governor": _governor(),
-        "turbo": _turbo(),
-        "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
-    }
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,12 +12,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import exp
-from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
-
-from mortarbench.harness.qp import Vector
 
 _SIDE = 120  #: of the kernel's square grid: its matrix has 14 400 rows
 _PRODUCTS = 10  #: about 1 ms
@@ -51,7 +48,25 @@ def noise_floor(
     clock : returns seconds
     """
     with _on_the_workers_cpu():
-        a, b = _paired_times(seconds, clock)
+        one = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(_SIDE, _SIDE))
+        K = csr_array(kron(one, eye_array(_SIDE)) + kron(eye_array(_SIDE), one))
+
+        def timed() -> float:
+            v = np.ones(K.shape[0])
+            start = clock()
+            for _ in range(_PRODUCTS):
+                v = K @ v
+                v /= np.abs(v).max()
+            return clock() - start
+
+        timed()  # finds cold caches
+        arms: tuple[list[float], list[float]] = ([], [])
+        end = clock() + seconds
+        while clock() < end or not arms[0]:
+            for first in (0, 1):
+                arms[first].append(timed())
+                arms[1 - first].append(timed())
+        a, b = np.array(arms[0]), np.array(arms[1])
     singles = np.log(a / b)
     balanced = singles.reshape(-1, 2).mean(axis=1)
     blocks = np.array_split(balanced, min(_BLOCKS, balanced.size))
@@ -79,34 +94,6 @@ def _on_the_workers_cpu() -> Iterator[None]:
         yield
     finally:
         os.sched_setaffinity(0, usable)
-
-
-def _paired_times(seconds: float, clock: Callable[[], float]) -> tuple[Vector, Vector]:
-    """Time arms A and B of the same kernel; returns arrays of one, even length."""
-    K = _laplacian(_SIDE)
-
-    def timed() -> float:
-        v = np.ones(K.shape[0])
-        start = clock()
-        for _ in range(_PRODUCTS):
-            v = K @ v
-            v /= np.abs(v).max()
-        return clock() - start
-
-    timed()  # finds cold caches
-    arms: tuple[list[float], list[float]] = ([], [])
-    end = clock() + seconds
-    while clock() < end or not arms[0]:
-        for first in (0, 1):
-            arms[first].append(timed())
-            arms[1 - first].append(timed())
-    return np.array(arms[0]), np.array(arms[1])
-
-
-def _laplacian(side: int) -> Any:
-    """Make the five-point stencil on a square of `side`² nodes."""
-    one = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(side, side))
-    return csr_array(kron(one, eye_array(side)) + kron(eye_array(side), one))
 
 
 def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:

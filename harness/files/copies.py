@@ -85,7 +85,13 @@ class Copies:
         here = _digest_if_there(Path(source.path))
         if here == source.sha256:
             return Path(source.path)
-        copy = self._copy_of(source)
+        name = f"{source.sha256}{source.suffix}"
+        if not _COPY.fullmatch(name):  # it could lead out of the folder
+            raise InputError(
+                f"{shortened(source.path)}: {shortened(source.sha256)!r} is no digest; "
+                f"expected {_DIGITS} hex digits"
+            )
+        copy = self._folder / name
         if not os.path.lexists(copy):
             raise self._missing(source.path, source.sha256, here)
         check_copy(copy, source.sha256, f"put the file back at {source.path}")
@@ -118,15 +124,6 @@ class Copies:
 
     def _entries(self) -> list[_Entry]:
         return _entries(self._folder)
-
-    def _copy_of(self, source: SourceFile) -> Path:
-        name = f"{source.sha256}{source.suffix}"
-        if not _COPY.fullmatch(name):  # it could lead out of the folder
-            raise InputError(
-                f"{shortened(source.path)}: {shortened(source.sha256)!r} is no digest; "
-                f"expected {_DIGITS} hex digits"
-            )
-        return self._folder / name
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
         """Name a file that is neither here nor among the copies."""

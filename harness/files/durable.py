@@ -58,7 +58,7 @@ def move_file(whole: Path, path: Path) -> None:
 
 
 def _sync(file: IO[bytes]) -> None:
-    """Have all that was written on the disk."""
+    """Flush and fsync."""
     file.flush()
     os.fsync(file.fileno())
 
@@ -116,17 +116,12 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
         if os.strerror(code) in failure:
             raise InputError(_full(folder, code))
     with full_disk_told(folder):
-        _probe(folder)
-
-
-def _probe(folder: Path) -> None:
-    """Write and delete a small file."""
-    path = folder / _UNFINISHED.replace("*", token_hex(8))
-    try:
-        with suppress(FileNotFoundError), path.open("xb") as file:  # no such folder
-            file.write(bytes(_PROBE_BYTES))
-    finally:
-        path.unlink(missing_ok=True)
+        path = folder / _UNFINISHED.replace("*", token_hex(8))
+        try:
+            with suppress(FileNotFoundError), path.open("xb") as file:  # no such folder
+                file.write(bytes(_PROBE_BYTES))
+        finally:
+            path.unlink(missing_ok=True)
 
 
 def _full(path: Path, code: int) -> str:

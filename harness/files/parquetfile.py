@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Container, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -100,7 +100,22 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
     try:
         meta = json_object(text)
         dense = listed_dense(meta) if "dense" in meta else set(_MATRICES)
-        qp = _qp(flat, dense)
+        P, q = flat["P"], flat["q"]
+        if P is None or q is None:
+            raise ValueError("P or q is null; expected lists of numbers")
+        n = q.size
+        parts: dict[str, Any] = {"q": q}
+        for name in _MATRICES:
+            M = flat[name]
+            parts[name] = (
+                no_rows(n) if M is None else _matrix(name, M, n, name in dense)
+            )
+        for name in _RIGHT_HAND_SIDE.values():
+            parts[name] = np.zeros(0) if (rhs := flat[name]) is None else rhs
+        for name, absent in (("lb", -np.inf), ("ub", np.inf)):
+            bound = flat[name]
+            parts[name] = np.full(n, absent) if bound is None else bound
+        qp = QP(**parts)
         check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
@@ -139,24 +154,6 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
         flat[name] = None if count is None else np.frombuffer(numbers[begin:end])
         begin = end
     return flat, told["meta"]
-
-
-def _qp(flat: Mapping[str, Vector | None], dense: Container[str]) -> QP:
-    """Put a QP together from lists, None where they are absent."""
-    P, q = flat["P"], flat["q"]
-    if P is None or q is None:
-        raise ValueError("P or q is null; expected lists of numbers")
-    n = q.size
-    parts: dict[str, Any] = {"q": q}
-    for name in _MATRICES:
-        M = flat[name]
-        parts[name] = no_rows(n) if M is None else _matrix(name, M, n, name in dense)
-    for name in _RIGHT_HAND_SIDE.values():
-        parts[name] = np.zeros(0) if (rhs := flat[name]) is None else rhs
-    for name, absent in (("lb", -np.inf), ("ub", np.inf)):
-        bound = flat[name]
-        parts[name] = np.full(n, absent) if bound is None else bound
-    return QP(**parts)
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:

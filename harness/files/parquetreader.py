@@ -36,7 +36,10 @@ def main(most: int, key: str, wanted: list[str]) -> None:
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
     told = file.metadata
-    size = _declared(told)
+    # a page can say "the same value a billion times" in few bytes: values count, too
+    groups = [told.row_group(i) for i in range(told.num_row_groups)]
+    chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
+    size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
     names = file.schema_arrow.names
     meta = (file.schema_arrow.metadata or {}).get(key.encode(), b"{}")
     head: dict[str, Any] = {
@@ -60,16 +63,6 @@ def main(most: int, key: str, wanted: list[str]) -> None:
     for values in found.values():
         if values is not None and values.ndim == 1:
             sys.stdout.buffer.write(values.astype("<f8").tobytes())
-
-
-def _declared(told: Any) -> int:
-    """Add up what the parts of a file will take, as its footer has it.
-
-    A page can say "the same value a billion times" in few bytes, so values count, too.
-    """
-    groups = [told.row_group(i) for i in range(told.num_row_groups)]
-    chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
-    return sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
 
 
 def _bound(room: int) -> None:

@@ -158,7 +158,10 @@ def load_qp(
     if lacking:
         raise InputError(f"{path}: {', '.join(lacking)} missing")
     try:
-        meta = _meta(arrays["meta"])
+        array = arrays["meta"]
+        if array.dtype.kind != "U" or array.size != 1:
+            raise ValueError("meta is no text")
+        meta = json_object(str(array.item()))
         vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
         dense = listed_dense(meta)
@@ -166,7 +169,11 @@ def load_qp(
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            matrices[name] = _dense(matrices[name])
+            # the values of a full one are viewed, not copied
+            M = matrices[name]
+            rows, columns = M.shape
+            full = M.nnz == rows * columns and M.has_canonical_format
+            matrices[name] = M.data.reshape(columns, rows).T if full else M.toarray()
         if operators is not None and "maker" in meta:
             n, maker = vectors["q"].size, str(meta["maker"])
             matrices["P"] = SerialisableOperator(
@@ -263,12 +270,6 @@ def _check_foreign(
         check_dense(name, matrices[name])
 
 
-def _meta(array: NDArray[Any]) -> dict[str, Any]:
-    if array.dtype.kind != "U" or array.size != 1:
-        raise ValueError("meta is no text")
-    return json_object(str(array.item()))
-
-
 def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     parts = [f"{name}_{part}" for name in _STRUCTURE for part in _PARTS]
     if missing := [name for name in parts if name not in arrays]:
@@ -298,13 +299,6 @@ def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
     with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
         return arrays[name].astype(float, copy=False)
-
-
-def _dense(M: Any) -> Matrix:
-    """Make a dense matrix; the values of a full one are viewed, not copied."""
-    rows, columns = M.shape
-    full = M.nnz == rows * columns and M.has_canonical_format
-    return M.data.reshape(columns, rows).T if full else M.toarray()
 
 
 def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:

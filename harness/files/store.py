@@ -36,11 +36,6 @@ _SOME = ("push", "shear", "friction", "exact")
 _HISTORY = "history_"
 
 
-def save_solution(folder: Path, solution: Solution) -> str:
-    """Store a primal-dual point and its history; return the digest of both."""
-    return save(folder, point_arrays(solution))
-
-
 def load_solution(folder: Path, digest: str, status: Status) -> Solution:
     """Load a stored point as a `Solution` that claims `status`.
 

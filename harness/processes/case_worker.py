@@ -24,6 +24,7 @@ from __future__ import annotations
 
 import traceback
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -44,7 +45,6 @@ from mortarbench.harness.names import CaseId, emitted_by_ranks, unbuilt
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
-from mortarbench.harness.qp import QP
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
@@ -57,31 +57,28 @@ MOST_CERTIFIED = 10_000  #: points whose bounds are kept
 WARM_UP = 10.0
 
 
+@dataclass(eq=False)
 class CaseWorker:
     """Builds cases of `families`, with the injected `reference` solve."""
 
-    def __init__(
-        self,
-        families: Mapping[str, Family],
-        reference: Reference,
-        operators: Mapping[str, Maker] = NO_MAKERS,
-    ) -> None:
-        self._families = families
-        self._operators = operators
-        self._reference = reference
-        self._cases: dict[str, Case] = {}  # by canonical name, the last one used last
-        self._build_seconds = 0.0  # of the last case that was built
-        self._warm = False  # whether a dual case has been built
-        self._bounds: dict[
-            tuple[str, str], tuple[dict[str, Any], str]
-        ] = {}  # certified
+    families: Mapping[str, Family]
+    reference: Reference
+    operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
+    #: by canonical name, the last one used last
+    _cases: dict[str, Case] = field(default_factory=dict)
+    _build_seconds: float = 0.0  # of the last case that was built
+    _warm: bool = False  # whether a dual case has been built
+    #: certified
+    _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
+        default_factory=dict
+    )
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request, whatever the family's code does."""
         if "solve" in request:
             return self._solved(Path(request["solve"]), Path(request["point"]))
         asked = request.get("build") or request.get("describe") or request["emits"]
-        name = CaseId(**{**asked, "family": self._families[asked["family"]]})
+        name = CaseId(**{**asked, "family": self.families[asked["family"]]})
         if "emits" in request:
             return {"emits": emitted_by_ranks(name)}
         try:
@@ -140,13 +137,10 @@ class CaseWorker:
 
     def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
-            write_point(point, self._reference(self._loaded(qp)))
+            write_point(point, self.reference(load_qp(qp, operators=self.operators)[0]))
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
             return {"found": False}
         return {"found": True}
-
-    def _loaded(self, qp: Path) -> QP:
-        return load_qp(qp, operators=self._operators)[0]
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
@@ -163,7 +157,7 @@ class CaseWorker:
 
     def _built(self, name: CaseId) -> Case:
         start = perf_counter()
-        case = name.build(self._reference)
+        case = name.build(self.reference)
         self._build_seconds = perf_counter() - start
         return case
 

@@ -33,7 +33,13 @@ class Footprint:
         """
         tree = list(tree)
         self.notice(tree)
-        files = self._files()
+        sizes: dict[int, int] = {}
+        for made in self._left():
+            for path in (made, *made.rglob("*")):
+                with suppress(OSError):
+                    at = path.lstat()
+                    sizes[at.st_ino] = 512 * at.st_blocks
+        files = sum(sizes.values()) / 2**20
         own, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
         held = own + max(mapped, files)
         if held > limit and len(tree) > 1:
@@ -71,16 +77,6 @@ class Footprint:
                 if at.st_ino == inode and at.st_uid == os.getuid():
                     left.append(SHARED / name)
         return left
-
-    def _files(self) -> float:
-        """Sum up the files that the tree has made; in MiB."""
-        sizes: dict[int, int] = {}
-        for made in self._left():
-            for path in (made, *made.rglob("*")):
-                with suppress(OSError):
-                    at = path.lstat()
-                    sizes[at.st_ino] = 512 * at.st_blocks
-        return sum(sizes.values()) / 2**20
 
 
 def _open_files(process: int) -> list[str]:

@@ -96,20 +96,16 @@ def fork(
         for number in (signal.SIGTERM, signal.SIGHUP):  # which may unwind the parent
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, signal.SIG_DFL)
-        _keep_open(theirs, log, pipes)
+        for fd, at in ((theirs, 0), (log, 1), (log, 2)):
+            os.dup2(fd, at)
+        for fd in map(int, os.listdir("/proc/self/fd")):
+            if fd > 2 and fd not in pipes:
+                with suppress(OSError):  # that of the list itself
+                    os.close(fd)
         os.environ.update(environment)
         reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)
     finally:  # whatever happens: only the parent goes back to where it came from
         os._exit(1)
-
-
-def _keep_open(stdin: int, log: int, pipes: tuple[int, int]) -> None:
-    for fd, at in ((stdin, 0), (log, 1), (log, 2)):
-        os.dup2(fd, at)
-    for fd in map(int, os.listdir("/proc/self/fd")):
-        if fd > 2 and fd not in pipes:
-            with suppress(OSError):  # that of the list itself
-                os.close(fd)
 
 
 def _serve(serve: Serve, pipes: tuple[int, int]) -> None:

@@ -115,7 +115,15 @@ def measured(
             record = record.but(sizes=qp.sizes)
         if reply.answer is None:
             return Measured(record.but(verdict=reply.verdict), None)
-        solution = _solution(out, reply.answer)
+        solution = replace(
+            read_point(out, Status(reply.answer["claimed"])),
+            iterations=reply.answer["iterations"],
+            counts=reply.answer["counts"],
+            reported={
+                k: v for k, v in reply.answer["reported"].items() if v is not None
+            },
+            message=reply.answer["message"],
+        )
     except InputError as e:
         raise FaultError(f"{record.solver} on {record.case}: {e}") from None
     except OSError as e:
@@ -127,7 +135,11 @@ def measured(
     found = reply.answer["evaluated"] if by_ranks else None
     notes += found["notes"] if found is not None else []
     if found is not None and found["values"] is not None:
-        record = _evaluated(judged(record, qp, solution, found=found["values"]), found)
+        record = judged(record, qp, solution, found=found["values"]).but(
+            quantities=found["quantities"] or {},
+            recover_seconds=found["recover_seconds"],
+            **(found["bounds"] or {}),
+        )
     elif is_pointless:
         record = judged(record, qp, solution, found=_NO_POINT)
     else:
@@ -158,15 +170,6 @@ def _timed(
     return record.but(**asdict(cost)), *notes
 
 
-def _evaluated(record: Record, found: Mapping[str, Any]) -> Record:
-    """Fill in what ranks tell of the answer, besides the residuals."""
-    return record.but(
-        quantities=found["quantities"] or {},
-        recover_seconds=found["recover_seconds"],
-        **(found["bounds"] or {}),
-    )
-
-
 def emission_request(record: Record) -> dict[str, Any]:
     """Ask ranks to emit the QP of a record's case."""
     case = {
@@ -182,17 +185,6 @@ def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Rec
     sizes = emitted["sizes"]
     return without_content(sizes["variables"], sizes["equalities"]), record.but(
         sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
-    )
-
-
-def _solution(path: Path, answer: Mapping[str, Any]) -> Solution:
-    """Combine the point that a worker wrote with the rest of its answer."""
-    return replace(
-        read_point(path, Status(answer["claimed"])),
-        iterations=answer["iterations"],
-        counts=answer["counts"],
-        reported={k: v for k, v in answer["reported"].items() if v is not None},
-        message=answer["message"],
     )
 
 

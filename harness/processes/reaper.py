@@ -32,7 +32,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
@@ -148,17 +148,6 @@ def segments() -> dict[int, int]:
     return found
 
 
-def _remove_segments(creators: Collection[int], before: Collection[int]) -> None:
-    """Remove the System V segments of processes that have ended.
-
-    creators : their numbers; one that belongs to a living process is not theirs now
-    before : segments that were there before them
-    """
-    for segment, creator in segments().items():
-        if segment not in before and creator in creators and not lives(creator):
-            ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
-
-
 def _reap() -> dict[int, int]:
     """Take note of the children that ended: their wait statuses."""
     ended = {}
@@ -194,7 +183,11 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         os.close(woken)
         os.close(wakes)
-        _detach(cpu)
+        os.setsid()
+        null = os.open(os.devnull, os.O_RDONLY)
+        os.dup2(null, 0)
+        os.close(null)
+        os.sched_setaffinity(0, {cpu})
         begin()
     for fd in pipes:
         os.close(fd)
@@ -215,7 +208,11 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
     end_all(reaper)
     _reap()  # or they stay in the table of processes where init collects nothing
-    _remove_segments(creators, before)
+    # System V segments of processes that have ended; a number that belongs to a living
+    # process is not theirs any longer
+    for segment, creator in segments().items():
+        if segment not in before and creator in creators and not lives(creator):
+            ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
     _end_as(status)
 
 
@@ -246,14 +243,6 @@ def _mortal_fork() -> int:
         if os.getppid() != parent:
             os._exit(_NOT_STARTED)
     return child
-
-
-def _detach(cpu: int) -> None:
-    os.setsid()
-    null = os.open(os.devnull, os.O_RDONLY)
-    os.dup2(null, 0)
-    os.close(null)
-    os.sched_setaffinity(0, {cpu})
 
 
 def _execute(command: list[str]) -> NoReturn:

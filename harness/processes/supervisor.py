@@ -23,8 +23,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Hashable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Hashable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -138,11 +138,8 @@ class WorkerProcess:
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # what was told of the QP
-        self._add()
-
-    @_TURN
-    def _add(self) -> None:
-        self._all.add(self)
+        with _TURN:
+            self._all.add(self)
 
     @_TURN
     def fork(self, serve: Serve) -> None:
@@ -175,7 +172,9 @@ class WorkerProcess:
         memory_limit : MiB, of all its processes together
         """
         self._peak_mib, self._emitted = 0.0, None
-        self._stop_others()
+        cpu = max(os.sched_getaffinity(0))
+        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
+            worker._stop()
         was_busy = self._resume()
         notes = [REPLACED] if was_busy else []
         while True:
@@ -239,8 +238,9 @@ class WorkerProcess:
         asked = time.monotonic()
         self._send(request)
         if emits(request):
-            with _stage("emission"):
-                self._emitted = self._await("emitted", time_limit, memory_limit)
+            self._emitted = self._await(
+                "emitted", time_limit, memory_limit, stage="emission: "
+            )
         self._await("start", START_SECONDS, memory_limit)
         started, used = time.monotonic(), self._cpu_seconds()
         oom_kills = _oom_kills()
@@ -258,7 +258,13 @@ class WorkerProcess:
                 self._send({"go": True})
             if emits(request):
                 self._await("measured", POINT_SECONDS, memory_limit)
-                answer = self._evaluated(max(time_limit, POINT_SECONDS))
+                peak = self._peak_mib  # what evaluating takes is not limited
+                stage = "evaluation of the answer: "
+                limit = max(time_limit, POINT_SECONDS)
+                try:
+                    answer = self._await("done", limit, inf, stage=stage)
+                finally:
+                    self._peak_mib = peak
             else:
                 limit = POINT_SECONDS if measures(request) else time_limit
                 answer = self._await("done", limit, memory_limit)
@@ -267,15 +273,6 @@ class WorkerProcess:
             raise
         self._trim_log()
         return answer, clock
-
-    def _evaluated(self, limit: float) -> dict[str, Any]:
-        """Wait until ranks have evaluated the answer; what they hold is not limited."""
-        peak = self._peak_mib
-        try:
-            with _stage("evaluation of the answer"):
-                return self._await("done", limit, inf)
-        finally:
-            self._peak_mib = peak
 
     def _ended(self, end: _EndedError, memory_limit: float) -> Reply:
         """Tell a solver's end from one that the machine or somebody brought about."""
@@ -368,34 +365,46 @@ class WorkerProcess:
         with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
-    def _await(self, event: str, limit: float, memory_limit: float) -> dict[str, Any]:
-        """Wait for an event; whatever else happens is raised as `_EndedError`."""
+    def _await(
+        self, event: str, limit: float, memory_limit: float, *, stage: str = ""
+    ) -> dict[str, Any]:
+        """Wait for an event; whatever else happens is raised as `_EndedError`.
+
+        stage : of a measurement, which the error then begins with
+        """
+
+        def ended(verdict: Verdict, how: str, *more: int) -> _EndedError:
+            return _EndedError(event, verdict, how, *more, stage=stage)
+
         deadline = time.monotonic() + limit
         while True:
             dead = self._is_dead()  # before reading: it may reply and then die
             has_more = self._read(0 if dead else POLL_SECONDS)
-            if (line := self._next_line()) is not None:
-                return self._understood(line, event)
+            line, newline, rest = self._unread.partition(b"\n")
+            if newline:
+                self._unread = rest
+                break
             if len(self._unread) > LONGEST_REPLY:
                 how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
-                raise _EndedError(event, Verdict.FAILED, how)
+                raise ended(Verdict.FAILED, how)
             if dead and not has_more:
-                raise _EndedError(event, Verdict.CRASHED, *self._death())
+                raise ended(Verdict.CRASHED, *self._death())
             if time.monotonic() > deadline:
-                raise _EndedError(
-                    event, Verdict.TIME_LIMIT, f"killed after {limit:g} s"
-                )
-            self._check_memory(event, memory_limit)
+                raise ended(Verdict.TIME_LIMIT, f"killed after {limit:g} s")
+            held = self._footprint.mib(self._tree(), memory_limit)
+            self._peak_mib = max(self._peak_mib, held)
+            if held > memory_limit:
+                how = f"killed at {held:.0f} MiB, above the limit of {memory_limit:g}"
+                raise ended(Verdict.MEMORY_LIMIT, f"{how} MiB")
             self._trim_log()
-
-    def _understood(self, line: bytes, event: str) -> dict[str, Any]:
         try:
-            reply = event_of(line, event)
+            reply = event_of(bytes(line), event)
         except ForeignReplyError as e:
-            raise _EndedError(event, Verdict.FAILED, str(e)) from None
+            raise ended(Verdict.FAILED, str(e)) from None
         if reply.pop("event") == "fault":
-            how = one_line(reply["what"])
-            raise _EndedError(event, Verdict.FAILED, how, is_fault=True)
+            end = ended(Verdict.FAILED, one_line(reply["what"]))
+            end.is_fault = True
+            raise end
         return reply
 
     def _trim_log(self) -> None:
@@ -422,20 +431,6 @@ class WorkerProcess:
                 break
         return has_more
 
-    def _next_line(self) -> bytes | None:
-        line, newline, rest = self._unread.partition(b"\n")
-        if not newline:
-            return None
-        self._unread = rest
-        return bytes(line)
-
-    def _check_memory(self, event: str, limit: float) -> None:
-        held = self._footprint.mib(self._tree(), limit)
-        self._peak_mib = max(self._peak_mib, held)
-        if held > limit:
-            how = f"killed at {held:.0f} MiB, above the limit of {limit:g} MiB"
-            raise _EndedError(event, Verdict.MEMORY_LIMIT, how)
-
     def _tree(self) -> list[int]:
         """List the worker, what it has started, and what these have."""
         if self._process is None:
@@ -451,12 +446,6 @@ class WorkerProcess:
         with suppress(OSError):  # it may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
-
-    def _stop_others(self) -> None:
-        """Stop the workers that share our CPU until they are asked again."""
-        cpu = max(os.sched_getaffinity(0))
-        for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
-            worker._stop()
 
     def _stop(self) -> None:
         if self._process is None or self._is_stopped:
@@ -624,34 +613,20 @@ class _EndedError(Exception):
     event : that
     verdict : on the solver, if it was after the start
     number : of the signal that ended it, or 0
-    is_fault : it says itself that our own code failed
+    stage : what the message begins with
     """
 
     def __init__(
-        self,
-        event: str,
-        verdict: Verdict,
-        how: str,
-        number: int = 0,
-        *,
-        is_fault: bool = False,
+        self, event: str, verdict: Verdict, how: str, number: int = 0, *, stage: str
     ) -> None:
         self.is_early = event not in ("emitted", "timed", "measured", "done")
-        super().__init__(f"before solving: {how}" if self.is_early else how)
-        self.verdict = _BEFORE.get(verdict, verdict) if self.is_early else verdict
+        super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
+        if self.is_early and verdict is Verdict.TIME_LIMIT:
+            verdict = Verdict.FAILED  # no fault of the solver's speed
+        self.verdict = verdict
         self.signal = number
-        self.is_fault = is_fault
+        self.is_fault = False  #: it says itself that our own code failed
         self.is_oom = False
-
-
-@contextmanager
-def _stage(name: str) -> Iterator[None]:
-    """Say of the end of a worker in which stage of a measurement it came."""
-    try:
-        yield
-    except _EndedError as end:
-        end.args = (f"{name}: {end}",)
-        raise
 
 
 def _facts(told: Mapping[str, Any]) -> dict[str, Any]:
@@ -690,7 +665,3 @@ def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     """
     near = peak_mib is not None and peak_mib >= NEAR * limit
     return near or _EXHAUSTION.search(message) is not None
-
-
-#: running out of time before the clock started is no fault of the solver's speed
-_BEFORE = {Verdict.TIME_LIMIT: Verdict.FAILED}

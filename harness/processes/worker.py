@@ -127,7 +127,15 @@ class _Bench:
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        self._shift_heap()
+        # Arrays lie elsewhere than they did during the last measurement. Where they
+        # begin relative to a cache line is chance, but would be the same for as long as
+        # the process lives: two processes of one solver then differ by 10 % and more,
+        # however often they are measured (Mytkowicz et al., ASPLOS 2009). Varied, it is
+        # scatter, which intervals know.
+        self._ballast = np.empty(0)
+        with suppress(AttributeError):  # glibc only
+            ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
+        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
         if "case" in request:
             qp = self._emitted(request, events)
         else:
@@ -182,19 +190,6 @@ class _Bench:
         if self.on_ranks is not None:
             self.on_ranks.takes(path, request.get("memory_limit"))
         return qp
-
-    def _shift_heap(self) -> None:
-        """Have arrays lie elsewhere than they did during the last measurement.
-
-        Where they begin relative to a cache line is chance, but would be the same for
-        as long as the process lives: two processes of one solver then differ by 10 %
-        and more, however often they are measured (Mytkowicz et al., ASPLOS 2009).
-        Varied, it is scatter, which intervals know.
-        """
-        self._ballast = np.empty(0)
-        with suppress(AttributeError):  # glibc only
-            ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
-        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
         """Begin a sequence at its first step, and go on with it at the others."""

@@ -56,7 +56,9 @@ class _Union:
             return True
         self._known[record.run_id, record.environment] = record
         if record.run_id in self.records:
-            record = record.but(run_id=_run_id_of(record))
+            record = record.but(
+                run_id=hex_digest([f"{record.run_id} {record.environment}".encode()])
+            )
         if record.run_id in self.records:
             return True
         self._known[record.run_id, record.environment] = record
@@ -163,11 +165,6 @@ def _refuse_run(out: Path) -> None:
             f"{out} holds measurements of a run (journal/{min(others)}); expected a "
             "new folder, or one that was merged before; choose another --out"
         )
-
-
-def _run_id_of(record: Record) -> str:
-    """Name a measurement whose run_id another environment has taken."""
-    return hex_digest([f"{record.run_id} {record.environment}".encode()])
 
 
 def _united_suite(folders: Sequence[Path]) -> str:

@@ -1,9 +1,10 @@
 """More than one machine: the blocks of a run as tasks of Dask distributed.
 
 Every Dask worker carries out one block at a time, with the supervisor that a run on one
-machine uses, and gives back each measurement as soon as it is made, before it makes the
-next. What a worker that is lost has not given back is done by another one, as a block
-of its own. The parent alone writes the result folder.
+machine uses. A task is one turn of a block: one solver, measured on one case, or on the
+steps of one sequence. The parent writes its records before it submits the next turn.
+What a worker that is lost has not returned is measured by another one, as a block of
+its own. The parent alone writes the result folder.
 """
 
 from __future__ import annotations
@@ -20,12 +21,12 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import current_thread, main_thread
 from typing import TYPE_CHECKING, Any
-from uuid import uuid4
 
 from mortarbench.harness.environment.environment import packages_of
 from mortarbench.harness.environment.labels import in_words
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.operators import Maker
+from mortarbench.harness.record import Record
 from mortarbench.harness.registry import PluginFile
 from mortarbench.harness.results.folder import differences
 from mortarbench.harness.results.work_unit import (
@@ -103,7 +104,9 @@ def on_cluster(
                 _forget_lost_runs(client)
                 files = [file.resolved() for file in plugins]
                 sharing, packages = _sharing(client), packages_of(environment)
-                node = ExecutorPlugin(commands, files, operators, sharing, packages)
+                node = ExecutorPlugin(
+                    commands, files, dict(operators), sharing, packages
+                )
                 client.register_plugin(node, name=name)
                 ends.callback(_end, client, name)
                 nodes = Nodes(environment, keep, warn)
@@ -112,19 +115,14 @@ def on_cluster(
         yield opened
 
 
+@dataclass(eq=False)
 class Nodes:
     """What is known of the machines that have measured."""
 
-    def __init__(
-        self,
-        environment: Mapping[str, Any],
-        keep: Keep,
-        warn: Callable[[str], None],
-    ) -> None:
-        self._here = environment
-        self._keep = keep
-        self._warn = warn
-        self._seen: set[str] = set()
+    here: Mapping[str, Any]  #: environment of this process
+    keep: Keep
+    warn: Callable[[str], None]
+    _seen: set[str] = field(default_factory=set)  # digests
 
     def meet(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
         """Store an environment that is new, and tell how it differs from ours.
@@ -137,7 +135,7 @@ class Nodes:
         """
         if digest in self._seen:
             return
-        changed = list(differences(self._here, environment))
+        changed = list(differences(self.here, environment))
         for key, here, there in changed:
             if key.startswith(_CODE):
                 what = in_words([(key, here, there)], "here", "there")
@@ -146,202 +144,141 @@ class Nodes:
                     "same on every node"
                 )
         self._seen.add(digest)
-        self._keep(digest, environment)
+        self.keep(digest, environment)
         if changed:
             what = in_words(changed, "here", "there")
-            self._warn(
+            self.warn(
                 f"{node} measures under other conditions than this machine ({what}); "
                 f"its times are marked as those of environment {digest}"
             )
 
 
 @dataclass(eq=False, kw_only=True)
-class _Task:
-    """A block, or what is left of one, with the Dask worker that it was given to."""
+class _Begun:
+    """A block, of which one turn at a time is a task of Dask."""
 
     block: WorkUnit
-    part: int = 0  #: one more whenever a worker was lost after the first results
+    left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
+    worker: str = ""  #: address of the Dask worker that measures it
+    part: int = 0  #: one more whenever a worker was lost after its first turn
+    is_measured: bool = False  #: in part: the worker has returned a turn
     lost: int = 0  #: workers that it has cost
-    delivered: set[str] = field(default_factory=set)  #: run ids, of all parts
-    worker: str = ""  #: its address
-    future: Any = None
-    key: str = field(default_factory=lambda: f"mortarbench-{uuid4().hex}")  #: in Dask
-
-    def rest(self) -> _Task | None:
-        """Make the task of what was not delivered; None where nothing is left.
-
-        Of a sequence begun, all steps are left: what the solver carried is lost.
-        """
-        ids = [{record.run_id for record in turn} for turn in self.block.turns]
-        pairs = zip(self.block.turns, ids, strict=True)
-        turns = tuple(turn for turn, own in pairs if not own <= self.delivered)
-        if not turns:
-            return None
-        has_begun = any(own & self.delivered for own in ids)
-        return _Task(
-            block=replace(self.block, turns=turns),
-            part=self.part + has_begun,
-            lost=self.lost + 1,
-            delivered=self.delivered,
-        )
 
 
+@dataclass(eq=False)
 class _Cluster:
-    """The engine: every Dask worker has one block, and gives back each measurement.
+    """The engine: every Dask worker measures one block, a turn of a solver at a time.
 
-    Blocks are bound to their workers, so that what is left of a block whose worker was
-    lost is known here to be another block, measured elsewhere or later.
+    Tasks are bound to the worker of their block, so that the rest of a block whose
+    worker was lost is known here to be another part, measured elsewhere or later.
     """
 
-    def __init__(
-        self,
-        client: Any,
-        name: str,
-        nodes: Nodes,
-        address: str,
-        warn: Callable[[str], None],
-    ) -> None:
-        self._client = client
-        self._name = name
-        self._nodes = nodes
-        self._address = address
-        self._warn = warn
-        self._told: SimpleQueue[str] = SimpleQueue()  # keys that have something to give
-        self._under_way: dict[str, _Task] = {}
-        self._left: deque[_Task] = deque()
-        client.subscribe_topic(name, lambda event: self._told.put(event[1]))
+    client: Any
+    name: str  #: of the plug-in of this run
+    nodes: Nodes
+    address: str
+    warn: Callable[[str], None]
+    _done: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
+    _under_way: dict[Any, _Begun] = field(default_factory=dict)  # by their futures
+    _left: deque[_Begun] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
         try:
             while self._top_up(blocks):
-                for task in self._with_news():
-                    yield from self._collected(task)
-                    if task.key in self._under_way and task.future.done():
-                        yield from self._ended(task)
+                try:
+                    yield from self._measured(self._done.get(timeout=LOOK_SECONDS))
+                except Empty:
+                    if self.client.status != "running":
+                        raise _SchedulerGoneError from None
+                    # a worker may be busy with a run whose parent has died, and the
+                    # scheduler have noticed only now
+                    _forget_lost_runs(self.client)
                 yield from self._recovered()
         finally:
-            for task in self._under_way.values():
-                task.future.cancel()
+            for future in self._under_way:
+                future.cancel()
 
     def _top_up(self, blocks: Iterator[WorkUnit]) -> bool:
         """Give every idle worker a block to do; False when all blocks are done."""
-        idle = self._workers() - {task.worker for task in self._under_way.values()}
-        while True:
+        idle = self._workers() - {begun.worker for begun in self._under_way.values()}
+        while idle or not self._under_way:
             if not self._left and (block := next(blocks, None)) is not None:
-                self._left.append(_Task(block=block))
-            if not self._left or (not idle and self._under_way):
-                return bool(self._left or self._under_way)
+                self._left.append(_Begun(block=block, left=list(block.turns)))
+            if not self._left:
+                return bool(self._under_way)
             if not idle:
-                self._warn(f"waiting for Dask workers to join {self._address}")
-                self._client.wait_for_workers(1)
+                self.warn(f"waiting for Dask workers to join {self.address}")
+                self.client.wait_for_workers(1)
                 idle = self._workers()
-            elif idle:
-                self._submit(self._left.popleft(), idle.pop())
+            if idle:
+                begun = self._left.popleft()
+                begun.worker = idle.pop()
+                self._submit(begun)
+        return True
 
     def _workers(self) -> set[str]:
         """List the addresses of the workers that are there."""
         try:
-            return set(self._client.nthreads())
+            return set(self.client.nthreads())
         except OSError as e:
             raise _SchedulerGoneError from e
 
-    def _submit(self, task: _Task, worker: str) -> None:
+    def _submit(self, begun: _Begun) -> None:
+        """Submit the next turn of a block to its worker."""
         from mortarbench.harness.running.dask_worker import execute
 
-        key = task.key
-        task.worker = worker
-        task.future = self._client.submit(
-            execute,
-            self._name,
-            key,
-            task.block,
-            key=key,
-            workers=[worker],
-            pure=False,
+        turn = replace(begun.block, turns=(begun.left[0],))
+        future = self.client.submit(
+            execute, self.name, turn, workers=[begun.worker], pure=False
         )
-        self._under_way[key] = task
-        task.future.add_done_callback(lambda _: self._told.put(key))
+        self._under_way[future] = begun
+        future.add_done_callback(self._done.put)
 
-    def _with_news(self) -> Iterator[_Task]:
-        """Wait a moment for something to come from a block; list those with news.
+    def _measured(self, future: Any) -> Iterator[Outcome]:
+        """Give back what came of a turn, and submit the next one of its block."""
+        from distributed import CancelledError
 
-        Where nothing comes, a worker may be busy with a run whose parent has died, and
-        the scheduler have noticed only now.
-        """
-        keys: dict[str, None] = {}
-        with suppress(Empty):
-            keys[self._told.get(timeout=LOOK_SECONDS)] = None
-            while not self._told.empty():
-                keys[self._told.get()] = None
-        for key in keys:
-            if key in self._under_way:
-                yield self._under_way[key]
-        if self._client.status != "running":
-            raise _SchedulerGoneError
-        if not keys:
-            _forget_lost_runs(self._client)
-
-    def _collected(self, task: _Task) -> Iterator[Outcome]:
-        """Fetch what a worker has measured; nothing if it cannot be reached."""
-        from mortarbench.harness.running.dask_worker import collect
-
-        with suppress(OSError):  # it is lost, or about to be found so
-            found = self._client.run(
-                collect, self._name, task.key, workers=[task.worker], on_error="ignore"
-            )
-            yield from self._given(task, found.get(task.worker))
-
-    def _ended(self, task: _Task) -> Iterator[Outcome]:
-        """Take the last of a block; what it lacks is measured elsewhere."""
-        from distributed import KilledWorker
-
-        del self._under_way[task.key]
-        if task.future.status not in ("cancelled", "lost"):
-            with suppress(KilledWorker):
-                yield from self._given(task, task.future.result())
-        yield from self._again(task)
-
-    def _recovered(self) -> Iterator[Outcome]:
-        """Give the blocks of workers that were lost to others."""
-        there = self._workers()
-        for task in [t for t in self._under_way.values() if t.worker not in there]:
-            del self._under_way[task.key]
-            task.future.cancel()
-            yield from self._again(task)
-
-    def _again(self, task: _Task) -> Iterator[Outcome]:
-        """Have done what a block still lacks, unless it has cost too many workers."""
-        rest = task.rest()
-        if rest is None:
+        if (begun := self._under_way.get(future)) is None:  # its worker was lost
             return
-        if rest.lost < MOST_LOST:
-            self._left.append(rest)
+        try:
+            delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
+        except CancelledError as e:  # with the connection
+            raise _SchedulerGoneError from e
+        except TimeoutError:  # the worker is lost, or about to be found so
+            self._done.put(future)
             return
-        case = rest.block.turns[0][0].case
-        reason = f"{case} was given up: every Dask worker that took it was lost"
-        yield Unbuilt(block=rest.block, reason=reason)
-
-    def _given(self, task: _Task, delivery: Delivery | None) -> Iterator[Outcome]:
-        """Give back what is new of a delivery."""
-        if delivery is None:
-            return
-        self._nodes.meet(delivery.node, delivery.digest, delivery.environment)
+        del self._under_way[future], begun.left[0]
+        begun.is_measured = True
+        self.nodes.meet(delivery.node, delivery.digest, delivery.environment)
         for outcome in delivery.outcomes:
             match outcome:
                 case Unbuilt():
-                    task.delivered |= {
-                        r.run_id for turn in task.block.turns for r in turn
-                    }
-                case Unmade(tried_again=True):
-                    pass
-                case Result() | Unmade():
-                    if outcome.record.run_id in task.delivered:
-                        continue
-                    task.delivered.add(outcome.record.run_id)
-            if isinstance(outcome, Result):
-                outcome = replace(outcome, part=task.part)
-            yield outcome
+                    yield replace(outcome, block=begun.block)
+                    return
+                case Result():
+                    yield replace(outcome, part=begun.part)
+                case Unmade():
+                    yield outcome
+        if begun.left:
+            self._submit(begun)
+
+    def _recovered(self) -> Iterator[Outcome]:
+        """Leave the blocks of workers that were lost to others."""
+        there = self._workers()
+        lost = {f: b for f, b in self._under_way.items() if b.worker not in there}
+        for future, begun in lost.items():
+            del self._under_way[future]
+            future.cancel()
+            begun.lost += 1
+            begun.part += begun.is_measured
+            begun.is_measured = False
+            if begun.lost < MOST_LOST:
+                self._left.append(begun)
+            else:
+                case = begun.block.turns[0][0].case
+                reason = f"{case} was given up: every Dask worker that took it was lost"
+                yield Unbuilt(block=begun.block, reason=reason)
 
 
 class _SchedulerGoneError(Exception):

@@ -11,12 +11,12 @@ import os
 import platform
 import stat
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
-from threading import Event, Lock
+from threading import Lock
 from typing import Any, cast
 
 from distributed import Worker, get_worker
@@ -30,19 +30,19 @@ from mortarbench.harness.registry import PluginFile, load_plugin, merged
 from mortarbench.harness.results.work_unit import Commands, Outcome, WorkUnit
 from mortarbench.harness.running.executor import Executor
 
-COLLECT_SECONDS = 10.0  #: that a worker waits for its parent to fetch a result
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Delivery:
-    """What came of a block since the last delivery, and where."""
+    """Outcomes of a block, and where they were measured."""
 
     outcomes: list[Outcome]
+    worker: str  #: address of the Dask worker
     node: str  #: host name
     digest: str  #: of the environment
     environment: dict[str, Any]
 
 
+@dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
     """Opens an executor in every Dask worker, those that join later included.
 
@@ -54,33 +54,22 @@ class ExecutorPlugin(WorkerPlugin):
     packages : whose versions the environment of a node has
     """
 
-    def __init__(
-        self,
-        commands: Commands,
-        plugins: Sequence[PluginFile],
-        operators: Mapping[str, Maker],
-        sharing: int,
-        packages: Sequence[str],
-    ) -> None:
-        self._commands = commands
-        self._plugins = plugins
-        self._operators = dict(operators)
-        self._sharing = sharing
-        self._packages = packages
-        self._python = sys.executable
-        self._open: _Open | None = None
-        self._ended = False
+    commands: Commands
+    plugins: Sequence[PluginFile]
+    operators: Mapping[str, Maker]
+    sharing: int
+    packages: Sequence[str]
+    _python: str = sys.executable
+    _open: _Open | None = None
+    _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
         """Open nothing yet: a block does, in the thread that it runs in.
 
         The kernel kills solver processes with the thread that started them.
         """
-        self._worker = worker.id
+        self._worker = worker
         self._busy = Lock()
-        self._outcomes: list[Outcome] = []  # of the block `_key`, not yet fetched
-        self._key = ""
-        self._fetched = Event()
 
     def teardown(self, worker: Worker | None = None) -> None:
         """End the processes of the executor, at the latest when a measurement is made.
@@ -88,7 +77,6 @@ class ExecutorPlugin(WorkerPlugin):
         Dask cannot stop a block that is being carried out; its thread comes here last.
         """
         self._ended = True
-        self._fetched.set()
         if not self._busy.acquire(blocking=False):
             return
         if self._open is not None:
@@ -96,14 +84,8 @@ class ExecutorPlugin(WorkerPlugin):
             self._open = None
         self._busy.release()
 
-    def execute(self, key: str, block: WorkUnit, tell: Callable[[], None]) -> Delivery:
+    def execute(self, block: WorkUnit) -> Delivery:
         """Measure a block, or what can be measured of it before the run ends.
-
-        Returns what was not fetched meanwhile. After each measurement it waits a while
-        for that, so that the next one is not disturbed by it.
-
-        key : of the block, for `collect`
-        tell : called when there is something to fetch
 
         Raises
         ------
@@ -113,73 +95,60 @@ class ExecutorPlugin(WorkerPlugin):
         """
         try:
             with self._busy:
-                return self._carried_out(key, block, tell)
+                return self._carried_out(block)
         finally:
             if self._ended:
                 self.teardown()
 
-    def collect(self, key: str) -> Delivery | None:
-        """Give away what a block has come to since the last time; runs in Dask's loop.
-
-        None where that block is not the one under way.
-        """
-        if key != self._key or self._open is None:
-            return None
-        outcomes = []
-        while self._outcomes:  # `_carried_out` may add one meanwhile
-            outcomes.append(self._outcomes.pop(0))
-        self._fetched.set()
-        return Delivery(
-            outcomes=outcomes,
-            node=platform.node(),
-            digest=self._open.digest,
-            environment=self._open.environment,
-        )
-
-    def _carried_out(
-        self, key: str, block: WorkUnit, tell: Callable[[], None]
-    ) -> Delivery:
+    def _carried_out(self, block: WorkUnit) -> Delivery:
         opened = self._open = self._open or self._opened()
         os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
-        self._key, self._outcomes = key, []
-        is_fetched = True
+        outcomes = []
         try:
             for outcome in opened.executor.execute(replace(block, turns=turns)):
-                self._fetched.clear()
-                self._outcomes.append(outcome)
-                tell()
-                if is_fetched:  # else nobody is there any longer
-                    is_fetched = self._fetched.wait(COLLECT_SECONDS)
+                outcomes.append(outcome)
                 if self._ended:
                     break
         except InputError as e:  # its disk is full
             raise InputError(f"{platform.node()}: {e}") from None
-        delivery = self.collect(key)
-        assert delivery is not None
-        return delivery
+        return Delivery(
+            outcomes=outcomes,
+            worker=self._worker.address,
+            node=platform.node(),
+            digest=opened.digest,
+            environment=opened.environment,
+        )
 
     def _opened(self) -> _Open:
-        for file in self._plugins:
+        for file in self.plugins:
             if not file.path.is_file():
                 raise InputError(
                     f"{platform.node()}: no plug-in {file.path}; "
                     "expected the same files under the same paths on every node"
                 )
-        environment = capture_in(ONE_THREAD, self._plugins, self._packages)
-        if self._sharing > 1:
-            environment["machine"]["shared_by_workers"] = self._sharing
+        environment = capture_in(ONE_THREAD, self.plugins, self.packages)
+        if self.sharing > 1:
+            environment["machine"]["shared_by_workers"] = self.sharing
         with ExitStack() as stack:
-            cpu = stack.enter_context(cpu_of(self._worker))
+            cpu = stack.enter_context(cpu_of(self._worker.id))
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
-            operators: Mapping[str, Maker] = self._operators
-            for file in self._plugins:
+            operators: Mapping[str, Maker] = self.operators
+            for file in self.plugins:
                 operators = merged("operator", operators, load_plugin(file).operators)
-            commands = self._here(self._commands)
+
+            def here(command: list[str]) -> list[str]:
+                return [sys.executable if w == self._python else w for w in command]
+
+            commands = replace(
+                self.commands,
+                solvers={label: here(c) for label, c in self.commands.solvers.items()},
+                case_worker=here(self.commands.case_worker),
+            )
             executor = Executor(commands, scratch, scratch / "cases", operators)
-            stack.enter_context(executor)
+            stack.callback(executor.close)
             return _Open(
                 executor=executor,
                 cpu=cpu,
@@ -188,23 +157,9 @@ class ExecutorPlugin(WorkerPlugin):
                 stack=stack.pop_all(),
             )
 
-    def _here(self, commands: Commands) -> Commands:
-        """Start processes with the Python that runs the Dask worker."""
 
-        def here(command: list[str]) -> list[str]:
-            return [sys.executable if w == self._python else w for w in command]
-
-        return replace(
-            commands,
-            solvers={label: here(c) for label, c in commands.solvers.items()},
-            case_worker=here(commands.case_worker),
-        )
-
-
-def execute(name: str, key: str, block: WorkUnit) -> Delivery:
-    """Have the node plug-in of that name measure a block; runs in a Dask worker.
-
-    Whenever there is something to `collect`, it says so under the topic `name`.
+def execute(name: str, block: WorkUnit) -> Delivery:
+    """Measure a block by the node plug-in of that name; runs in a Dask worker.
 
     Raises
     ------
@@ -219,14 +174,7 @@ def execute(name: str, key: str, block: WorkUnit) -> Delivery:
             f"{worker.state.nthreads} blocks at a time, so that they would disturb "
             "each other; start it with --nthreads 1"
         )
-    node = cast(ExecutorPlugin, worker.plugins[name])
-    return node.execute(key, block, lambda: worker.log_event(name, key))
-
-
-def collect(name: str, key: str, dask_worker: Worker) -> Delivery | None:
-    """Fetch what that block has come to since the last time; runs in Dask's loop."""
-    node = cast(ExecutorPlugin | None, dask_worker.plugins.get(name))
-    return None if node is None else node.collect(key)
+    return cast(ExecutorPlugin, worker.plugins[name]).execute(block)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from math import inf
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files.durable import full_disk_told, refuse_full_disk
@@ -23,6 +24,7 @@ from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES
 from mortarbench.harness.results.work_unit import (
     Commands,
+    Engine,
     Outcome,
     Result,
     Unbuilt,
@@ -38,6 +40,7 @@ _MOST_PROVEN = 1000  #: small QPs whose optima are kept
 LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
 
 
+@dataclass(eq=False)
 class Executor:
     """Carries out blocks one after the other, with one worker process per solver.
 
@@ -47,36 +50,27 @@ class Executor:
     operators : what puts an operator P together, see `harness.operators`
     """
 
-    def __init__(
-        self,
-        commands: Commands,
-        scratch: Path,
-        cases: Path,
-        operators: Mapping[str, Maker] = NO_MAKERS,
-    ) -> None:
-        self._commands = commands
-        self._scratch = scratch
-        self._cases = cases
-        self._operators = operators
+    commands: Commands
+    scratch: Path
+    cases: Path
+    operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
+    _workers: dict[str, WorkerProcess] = field(default_factory=dict)
+    _number: int = -1  # of the last block
+    _entries: tuple[Entry, ...] = ()  # of that, once they are built
+    _end: str = ""  # why there are fewer than its sequence asked for
+    _loaded: dict[str, QP] = field(default_factory=dict)  # theirs, by digest
+    #: of small QPs, by digest
+    _optima: dict[str, Optimum | None] = field(default_factory=dict)
+    #: whether ranks emit the QP, by case
+    _emitted: dict[str, bool] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
-            commands.case_worker, scratch / "case-worker.log"
+            self.commands.case_worker, self.scratch / "case-worker.log"
         )
-        self._workers: dict[str, WorkerProcess] = {}
-        self._entries: tuple[Entry, ...] = ()  # of the last block, once they are built
-        self._end = ""  # why there are fewer than its sequence asked for
-        self._loaded: dict[str, QP] = {}  # theirs, by digest
-        self._optima: dict[str, Optimum | None] = {}  # of small QPs, by digest
-        self._emitted: dict[str, bool] = {}  # whether ranks emit the QP, by case
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def close(self) -> None:
+        """End the processes."""
         for process in (*self._workers.values(), self._case_worker):
             process.close()
 
@@ -89,9 +83,10 @@ class Executor:
             When the disk is full.
 
         """
-        with full_disk_told(self._scratch):
+        with full_disk_told(self.scratch):
             try:
-                self._entries = ()
+                if block.number != self._number:  # else it goes on with its next turns
+                    self._number, self._entries = block.number, ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _UnbuiltError as e:
@@ -113,14 +108,21 @@ class Executor:
                 return
             except (FaultError, OSError) as e:
                 reason = _in_a_line(e)
-                refuse_full_disk(self._scratch, reason)
-            self._start_anew(turn[0].solver)
+                refuse_full_disk(self.scratch, reason)
+            label = turn[0].solver
+            self._entries = ()
+            with suppress(FileNotFoundError):  # the whole result folder has gone
+                self.scratch.mkdir(exist_ok=True)
+            self._worker(label).close()
             missing = [record for record in turn if record.run_id not in made]
             for record in missing[: 1 if tried_again else None]:
                 yield Unmade(record=record, reason=reason, tried_again=tried_again)
 
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
+
+        Ranks that emit a QP evaluate its answer, too, where no code but ours runs in
+        them. The case is built then only where they cannot tell something of it.
 
         Raises
         ------
@@ -129,74 +131,60 @@ class Executor:
 
         """
         emits = self._is_emitted(turn[0])
-        if emits and self._commands.own_code_only:
-            yield self._by_ranks(block, turn)
-            return
-        self._build(block, turn)
-        worker = self._worker(turn[0].solver)
-        there, beyond = turn[: len(self._entries)], turn[len(self._entries) :]
-        for step, (record, at) in enumerate(zip(there, self._entries, strict=True)):
-            emitted = {**emission_request(record), "evaluates": False}
-            request = {
-                **(emitted if emits else {"qp": str(at.qp), "digest": at.digest}),
-                "out": str(self._point),
-                "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
-                **({"step": step} if block.is_sequence else {}),
-                **({"tightens": True} if record.tighten else {}),
-            }
-            record, solution, _ = measured(
-                worker,
-                partial(self._qp, at),
-                record.but(
-                    qp=at.meta.get("qp"),
-                    build_seconds=at.meta.get("build_seconds"),
-                    dualise_seconds=at.meta.get("dualise_seconds"),
-                    step_tol=_step_tol(record, at),
-                ),
-                request,
-                time_limit=block.time_limit,
-                memory_limit=block.memory_limit,
-                prove=partial(self._optimum, at),
-            )
+        evaluates = emits and self.commands.own_code_only
+        if not evaluates:
+            self._build(block, turn)
+        there = turn[: len(self._entries)] if not evaluates else turn
+        for step, record in enumerate(there):
+            request, record = self._request(block, record, step, emits, evaluates)
+
+            def whole(step: int = step) -> QP:
+                self._build(block, turn)
+                return self._qp(self._entries[step])
+
+            def proven(qp: QP, step: int = step) -> Optimum | None:
+                return self._optimum(self._entries[step], qp)
+
+            record, solution, is_undescribed = measured(
+                self._worker(turn[0].solver), whole, record, request,
+                time_limit=block.time_limit, memory_limit=block.memory_limit,
+                prove=proven,
+            )  # fmt: skip
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self._scratch, "")  # whatever it died of
-            yield self._described(block, record, solution)
-            stopped = record.verdict is not Verdict.DECLINED and (
-                solution is None or not has_point(solution)
-            )
+                refuse_full_disk(self.scratch, "")  # whatever it died of
+            is_pointless = solution is None or not has_point(solution)
+            if solution is None or is_pointless or is_undescribed:
+                yield self._described(block, record, solution)
+            else:
+                yield Result(record=record, point=point_arrays(solution))
+            stopped = is_pointless and record.verdict is not Verdict.DECLINED
             if block.is_sequence and stopped:  # what it carried is lost
                 yield from _broken(there[step + 1 :], record)
                 break
-        for record in beyond:
+        for record in turn[len(there) :]:
             declined = record.but(verdict=Verdict.DECLINED, message=self._end)
             yield Result(record=declined)
 
-    def _by_ranks(self, block: WorkUnit, turn: tuple[Record, ...]) -> Result:
-        """Measure on ranks that emit the QP and evaluate the answer themselves.
-
-        The case is built where they cannot tell something of the answer.
-        """
-
-        def whole() -> QP:
-            self._build(block, turn)
-            return self._qp(self._entries[0])
-
-        def proven(qp: QP) -> Optimum | None:
-            return self._optimum(self._entries[0], qp)
-
+    def _request(
+        self, block: WorkUnit, record: Record, step: int, emits: bool, evaluates: bool
+    ) -> tuple[dict[str, Any], Record]:
+        """Ask for a measurement, and fill in what is known of its case before."""
         request = {
-            **emission_request(turn[0]), "evaluates": True, "out": str(self._point),
-            "sample_seconds": SAMPLE_SECONDS,
-        }  # fmt: skip
-        record, solution, is_undescribed = measured(
-            self._worker(turn[0].solver), whole, turn[0], request,
-            time_limit=block.time_limit, memory_limit=block.memory_limit, prove=proven,
-        )  # fmt: skip
-        if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-            refuse_full_disk(self._scratch, "")
-        if is_undescribed or solution is None or not has_point(solution):
-            return self._described(block, record, solution)
-        return Result(record=record, point=point_arrays(solution))
+            "out": str(self._point),
+            "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
+            **({"step": step} if block.is_sequence else {}),
+            **({"tightens": True} if record.tighten else {}),
+        }
+        if emits:
+            request |= {**emission_request(record), "evaluates": evaluates}
+        if evaluates:
+            return request, record
+        at = self._entries[step]
+        if not emits:
+            request |= {"qp": str(at.qp), "digest": at.digest}
+        keys = ("qp", "build_seconds", "dualise_seconds")
+        known = {key: at.meta.get(key) for key in keys}
+        return request, record.but(**known, step_tol=_step_tol(record, at))
 
     def _is_emitted(self, record: Record) -> bool:
         """Whether the QP of a record is emitted by the ranks that solve it."""
@@ -211,24 +199,21 @@ class Executor:
         return self._emitted[record.case]
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
-        """Have the cases of a block built, unless they are."""
-        if not self._entries:
-            self._entries, self._end = self._built(block, turn)
-            self._loaded = {e.digest: self._qp(e) for e in self._entries}
-
-    def _built(
-        self, block: WorkUnit, turn: tuple[Record, ...]
-    ) -> tuple[tuple[Entry, ...], str]:
-        """Have the cases built; of a sequence those that there are, and why no more."""
+        """Build the cases of a block, of a sequence as many as there are; once."""
+        if self._entries:
+            return
         entries: list[Entry] = []
+        self._end = ""
         for record in turn:
             try:
                 entries.append(self._entry(record, block))
             except _UnbuiltError as e:
                 if not entries or not e.past_end:
                     raise
-                return tuple(entries), e.reason
-        return tuple(entries), ""
+                self._end = e.reason
+                break
+        self._entries = tuple(entries)
+        self._loaded = {e.digest: self._qp(e) for e in entries}
 
     def _described(
         self, block: WorkUnit, record: Record, solution: Solution | None
@@ -237,7 +222,7 @@ class Executor:
         if solution is None or not has_point(solution):
             return Result(record=record)
         first = record.verdict is Verdict.VERIFIED and record.repeat == 0
-        fields = self._scratch / "fields.npz"
+        fields = self.scratch / "fields.npz"
         fields.unlink(missing_ok=True)
         request = {
             "describe": _case(record),
@@ -267,7 +252,7 @@ class Executor:
             return meta
 
         r = record
-        return entry(self._cases, [r.family, r.params, r.form, r.environment], make)
+        return entry(self.cases, [r.family, r.params, r.form, r.environment], make)
 
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
@@ -279,13 +264,13 @@ class Executor:
             if reply.answer is not None:
                 break
         else:
-            refuse_full_disk(self._scratch, reply.message)
+            refuse_full_disk(self.scratch, reply.message)
             if reply.fault:
                 raise FaultError(reply.message)
             case = block.turns[0][0].case
             raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:
-            refuse_full_disk(self._scratch, reply.answer["unbuilt"])
+            refuse_full_disk(self.scratch, reply.answer["unbuilt"])
             answer = reply.answer
             raise _UnbuiltError(
                 answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
@@ -312,7 +297,7 @@ class Executor:
             When it died, or a file between us failed.
 
         """
-        point = self._scratch / "reference.npz"
+        point = self.scratch / "reference.npz"
         request = {"solve": str(at.qp), "point": str(point)}
         reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
         if reply.answer is None:
@@ -323,28 +308,18 @@ class Executor:
 
     def _worker(self, label: str) -> WorkerProcess:
         if label not in self._workers:
-            log = self._scratch / f"worker-{len(self._workers)}.log"
-            self._workers[label] = WorkerProcess(self._commands.solvers[label], log)
+            log = self.scratch / f"worker-{len(self._workers)}.log"
+            self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
-
-    def _start_anew(self, label: str) -> None:
-        """Have files that may be lost made again, and a worker started."""
-        self._entries = ()
-        with suppress(FileNotFoundError):  # the whole result folder has gone
-            self._scratch.mkdir(exist_ok=True)
-        self._worker(label).close()
 
     def _qp(self, at: Entry) -> QP:
         if at.digest not in self._loaded:
-            self._loaded[at.digest] = self._read(at)
+            self._loaded[at.digest] = load_qp(at.qp, operators=self.operators)[0]
         return self._loaded[at.digest]
-
-    def _read(self, at: Entry) -> QP:
-        return load_qp(at.qp, operators=self._operators)[0]
 
     @property
     def _point(self) -> Path:
-        return self._scratch / "point.npz"
+        return self.scratch / "point.npz"
 
 
 @contextmanager
@@ -354,22 +329,10 @@ def one_by_one(
     cases: Path,
     *,
     operators: Mapping[str, Maker] = NO_MAKERS,
-) -> Iterator[OneByOne]:
-    """Open the engine that carries out one block at a time on this machine."""
-    with Executor(commands, scratch, cases, operators) as executor:
-        yield OneByOne(executor)
-
-
-class OneByOne:
-    """The engine of a run on one machine: a block is made when the last one is done."""
-
-    def __init__(self, executor: Executor) -> None:
-        self._executor = executor
-
-    def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Carry out all of `blocks`."""
-        for block in blocks:
-            yield from self._executor.execute(block)
+) -> Iterator[Engine]:
+    """Open the engine of one machine: it makes a block when the last one is done."""
+    with closing(Executor(commands, scratch, cases, operators)) as executor:
+        yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
 
 
 def _step_tol(record: Record, at: Entry) -> float | None:

@@ -102,7 +102,8 @@ def run(
         past: list[Record] = []
         if not fresh:
             grown = refuse_other(out, suite, environment)
-            past = _measured(out)
+            there = next((out / "journal").glob("*.jsonl"), None) is not None
+            past = read_journal(out) if there else []
             _check_same(out, past, suite, options)
             if grown:
                 _check_steps(out, past, suite)
@@ -237,12 +238,6 @@ def _continuation_told(progress: Progress) -> Iterator[None]:
     except TerminatedError:
         progress.warn("terminated; the same command continues")
         raise
-
-
-def _measured(out: Path) -> list[Record]:
-    """Read what a folder holds; nothing where no run came so far."""
-    there = next((out / "journal").glob("*.jsonl"), None) is not None
-    return read_journal(out) if there else []
 
 
 def _check_same(

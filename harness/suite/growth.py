@@ -8,14 +8,12 @@ that are alike in this sense, one can be made.
 
 from __future__ import annotations
 
-import json
-import re
 from collections.abc import Iterator, Mapping
 from itertools import chain
 from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
-from mortarbench.harness.suite.suite import DEFAULTS
+from mortarbench.harness.suite.suite import DEFAULTS, suite_text
 
 SAME = ("time_limit", "memory_limit", "accuracy")  #: what a verdict or time depends on
 RAISED = ("repeats", "max_repeats", "budget")  #: may grow
@@ -145,30 +143,6 @@ def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
 
 def as_toml(table: Table) -> str:
     """Write a suite as TOML: what is nested stands in one line."""
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in table.items() if k != "problems"]
-    for block in table.get("problems", ()):
-        lines += [
-            "",
-            "[[problems]]",
-            *(f"{_key(k)} = {_value(v)}" for k, v in block.items()),
-        ]
-    return "\n".join(lines) + "\n"
-
-
-def _value(value: object) -> str:
-    match value:
-        case Mapping():
-            inner = ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items())
-            return f"{{ {inner} }}" if inner else "{}"
-        case list() | tuple():
-            return f"[{', '.join(map(_value, value))}]"
-        case bool():
-            return str(value).lower()
-        case str():
-            return json.dumps(value).replace("\x7f", "\\u007f")
-        case _:
-            return str(value)
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[\w-]+", key, re.ASCII) else _value(key)
+    blocks = table.get("problems", ())
+    head = suite_text({k: v for k, v in table.items() if k != "problems"})
+    return "\n[[problems]]\n".join([head, *map(suite_text, blocks)])

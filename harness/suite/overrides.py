@@ -43,7 +43,16 @@ def with_overrides(
     """
     changes: dict[str, Any] = {}
     if solvers:
-        changes["solvers"] = _chosen_solvers(suite, solvers, registry)
+        chosen = {spec.label: spec for spec in suite.solvers}
+        known = {label: resolve(spec, registry) for label, spec in chosen.items()}
+        for name in solvers:
+            if name not in chosen:
+                chosen[name] = SolverSpec(name=name, label=name)
+                with checked.located("--solver"):
+                    resolve(chosen[name], {**known, **registry})
+        kept = dict.fromkeys(solvers)
+        null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
+        changes["solvers"] = tuple(chosen[name] for name in (*kept, *null))
     if options:
         asked = changes.get("solvers", suite.solvers)
         changes["solvers"] = swept(asked, options, registry)
@@ -69,21 +78,6 @@ def _with_limit(text: str, key: str, limit: float) -> str:
     if key not in toml(text):
         return f"{line}\n{text}"
     return re.sub(rf"^[ \t]*{key}[ \t]*=.*$", line, text, count=1, flags=re.MULTILINE)
-
-
-def _chosen_solvers(
-    suite: Suite, names: Sequence[str], registry: Mapping[str, Solver]
-) -> tuple[SolverSpec, ...]:
-    chosen = {spec.label: spec for spec in suite.solvers}
-    known = {label: resolve(spec, registry) for label, spec in chosen.items()}
-    for name in names:
-        if name not in chosen:
-            chosen[name] = SolverSpec(name=name, label=name)
-            with checked.located("--solver"):
-                resolve(chosen[name], {**known, **registry})
-    kept = dict.fromkeys(names)
-    null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
-    return tuple(chosen[name] for name in (*kept, *null))
 
 
 def _chosen_cases(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,14 +36,35 @@ DEFAULTS: Mapping[str, Any] = {
     "copies": False,
     "max_cases": 100_000,
 }
-_NUMBERS = tuple(
-    key for key, value in DEFAULTS.items()
-    if not isinstance(value, bool | list) and key != "null_arm"
-)  # fmt: skip
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
 NULL = " (A/A)"  #: after the label of a solver that is measured once more
+
+
+def _between(key: str, value: Any) -> float | None:
+    """Take nothing, or a number between 0 and 1."""
+    if value is None:
+        return None
+    if not checked.is_number(value) or not 0 < value < 1:
+        raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
+    return float(value)
+
+
+#: checks of the keys that are numbers
+_NUMBERS: Mapping[str, Callable[[str, Any], float | None]] = {
+    "repeats": checked.at_least_one,
+    "time_limit": checked.positive,
+    "memory_limit": checked.positive,
+    "precision": _between,
+    "max_repeats": checked.at_least_one,
+    "budget": checked.positive,
+    "accuracy": _between,
+}
+
+
+def _most_cases(table: Mapping[str, Any]) -> int:
+    return checked.at_least_one("max_cases", table["max_cases"], most=10**9)
 
 
 class Group(NamedTuple):
@@ -138,35 +159,19 @@ def parse_suite(
                 "expected letters, digits, '.', '-' and '_'"
             )
         cases, sequences = planned(
-            table["problems"],
-            families,
-            folder,
-            checked.at_least_one("max_cases", table["max_cases"], most=10**9),
+            table["problems"], families, folder, _most_cases(table)
         )
+        numbers: dict[str, Any] = {
+            key: check(key, table[key]) for key, check in _NUMBERS.items()
+        }
+        asked = _solvers(table["solvers"], solvers)
+        asked = _on_ranks(asked, table, solvers, sequences)
+        every = frozenset(case.name for group in (cases, *sequences) for case in group)
         return Suite(
-            name=table["name"],
-            tolerances=_tolerances(table["tolerances"]),
-            repeats=checked.at_least_one("repeats", table["repeats"]),
-            time_limit=checked.positive("time_limit", table["time_limit"]),
-            memory_limit=checked.positive("memory_limit", table["memory_limit"]),
-            solvers=_with_null(
-                _on_ranks(
-                    _solvers(table["solvers"], solvers), table, solvers, sequences
-                ),
-                table["null_arm"],
-            ),
-            cases=cases,
-            sequences=sequences,
-            every=frozenset(
-                case.name for group in ((cases, *sequences)) for case in group
-            ),
-            precision=_between("precision", table["precision"]),
-            max_repeats=checked.at_least_one("max_repeats", table["max_repeats"]),
-            budget=checked.positive("budget", table["budget"]),
-            accuracy=_between("accuracy", table["accuracy"]),
-            tighten=_tightening(table, sequences),
-            text=text,
-        )
+            name=table["name"], tolerances=_tolerances(table["tolerances"]), text=text,
+            solvers=_with_null(asked, table["null_arm"]), cases=cases, every=every,
+            sequences=sequences, tighten=_tightening(table, sequences), **numbers,
+        )  # fmt: skip
 
 
 def name_in(text: str) -> str:
@@ -195,7 +200,7 @@ def read_stored(path: Path) -> dict[str, Any]:
             numbers = checked.any_list(key, table.get(key, []))
             if not all(map(_is_finite, numbers)):
                 raise InputError(f"{key} = {shown(numbers)}; expected numbers")
-        for key in _NUMBERS:
+        for key in ("max_cases", *_NUMBERS):
             if key in table and not _is_finite(table[key]):
                 raise InputError(f"{key} = {shown(table[key])}; expected a number")
         for key in ("name", "null_arm"):
@@ -252,7 +257,7 @@ def _toml_value(where: str, value: Any) -> str:
                 f"{_toml_key(k)} = {_toml_value(f'{where}.{k}', v)}"
                 for k, v in value.items()
             ]
-            return f"{{ {', '.join(pairs)} }}"
+            return f"{{ {', '.join(pairs)} }}" if pairs else "{}"
         case list() | tuple() | range():
             entries = [_toml_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
             return f"[{', '.join(entries)}]"
@@ -281,8 +286,8 @@ def steps_up_to(
 
     """
     table = {**DEFAULTS, **toml(text)}
-    most = checked.at_least_one("max_cases", table["max_cases"], most=10**9)
-    for steps in planned(table.get("problems"), families, Path(), most)[1]:
+    _, sequences = planned(table.get("problems"), families, Path(), _most_cases(table))
+    for steps in sequences:
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")
@@ -376,15 +381,6 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
     if (label := checked.text("null_arm", label)) not in known:
         raise unknown("null_arm", label, known)
     return (*specs, replace(known[label], label=f"{label}{NULL}", role="null"))
-
-
-def _between(key: str, value: Any) -> float | None:
-    """Take nothing, or a number between 0 and 1."""
-    if value is None:
-        return None
-    if not checked.is_number(value) or not 0 < value < 1:
-        raise InputError(f"{key} = {shown(value)}; expected a number between 0 and 1")
-    return float(value)
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:

@@ -82,7 +82,7 @@ def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
 def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str:
     facts = listing.about(solvers[names[0]])
     title = facts.title if facts else kind.__name__
-    lines = [f"## {title}", "", *_docstring(kind)]
+    lines = [f"## {title}", "", dedent(inspect.getdoc(kind) or ""), ""]
     if facts:
         rows = {
             "Install": f"`pip install {facts.package}`" if facts.package else "",
@@ -100,18 +100,16 @@ def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str
     return "\n".join(lines)
 
 
-def _docstring(kind: type) -> list[str]:
-    """Give the paragraphs of a class's docstring, indented blocks as code."""
-    return [dedent(inspect.getdoc(kind) or ""), ""]
-
-
 def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
     """Tabulate the options: a column of values per name in the registry."""
     columns = {name: options_of(solvers[name]) for name in names}
     options = list(columns[names[0]])
     if not options:
         return []
-    meanings = _meanings(kind)
+    known: dict[str, str] = {}
+    for base in kind.__mro__:
+        known = {**_own_meanings(base), **known}
+    meanings = known
     heads = [f"`{name}`" for name in names]
     lines = [
         f"| option | {' | '.join(heads)} | |",
@@ -121,14 +119,6 @@ def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> lis
         values = " | ".join(f"{columns[name][option]!r}" for name in names)
         lines.append(f"| `{option}` | {values} | {meanings.get(option, '')} |")
     return [*lines, ""]
-
-
-def _meanings(kind: type) -> dict[str, str]:
-    """Read the `#:` comments behind the fields of a dataclass and of its bases."""
-    known: dict[str, str] = {}
-    for base in kind.__mro__:
-        known = {**_own_meanings(base), **known}
-    return known
 
 
 @cache

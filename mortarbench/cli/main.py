@@ -13,13 +13,13 @@ import os
 import re
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from difflib import get_close_matches
 from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from mortarbench.arguments import FORMATS, GATES
 from mortarbench.harness.errors import InputError, one_line
@@ -66,7 +66,9 @@ class _Parser(argparse.ArgumentParser):
 def main(registries: Registries, argv: Sequence[str]) -> int:
     """Run one command and return its exit code."""
     _open_standard_streams()
-    _show_what_can_be_shown()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
     try:
         return _run(registries, argv)
     except InputError as e:
@@ -79,7 +81,15 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
         _print_no_more()
         return 0
     except OSError as e:
-        return _told(e)
+        # late: a help text needs no files
+        from mortarbench.harness.files.durable import FULL
+
+        if e.filename is not None:
+            return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
+        if e.errno in FULL:
+            return _complain(f"a file could not be written: {e.strerror}")
+        traceback.print_exc()
+        return 3
     except Exception:
         traceback.print_exc()
         return 3
@@ -115,20 +125,6 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
     return code
 
 
-def _told(e: OSError) -> int:
-    """Name the file that something is wrong with, or the disk that is full."""
-    from mortarbench.harness.files.durable import (
-        FULL,  # late: a help text needs no files
-    )
-
-    if e.filename is not None:
-        return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
-    if e.errno in FULL:
-        return _complain(f"a file could not be written: {e.strerror}")
-    traceback.print_exc()
-    return 3
-
-
 def _remedied(e: OSError, path: Path) -> str:
     """Say what is wrong with a file, and what would be right where that is plain."""
     if isinstance(e, FileExistsError | NotADirectoryError):
@@ -157,13 +153,6 @@ def _open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(fd, mode, closefd=False))
 
 
-def _show_what_can_be_shown() -> None:
-    """Have a terminal of few characters show a question mark instead of a λ."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")
-
-
 def _print_no_more() -> None:
     """Make the last flush of the streams, when Python ends, succeed."""
     for stream in filter(None, (sys.stdout, sys.stderr)):
@@ -175,8 +164,6 @@ _STREAMS = {
     "stdout": "w",
     "stderr": "w",
 }  #: in the order of their numbers
-_CASE = "FAMILY/key=value/…/FORM, as beam-ring/Nr=4/Nh=3/dual; see docs/cases.md"
-_RESULTS = "a result folder, as `run` writes it"
 
 
 class _Version(argparse.Action):
@@ -187,6 +174,248 @@ class _Version(argparse.Action):
 
         print(f"mortarbench {version('mortarbench')}")
         parser.exit()
+
+
+class _Option(NamedTuple):
+    """One argument of a command: an option, or a position where it has no dashes."""
+
+    names: str  #: separated by spaces
+    metavar: str  #: empty: a flag, or one of `choices`
+    what: str  #: its help
+    settings: Mapping[str, Any] = {}  #: of argparse, beside those of the metavar
+
+    def add_to(self, command: argparse._ActionsContainer) -> None:
+        """Declare it to argparse."""
+        settings: dict[str, Any] = {"help": self.what, **self.settings}
+        if self.metavar:
+            kind = _KINDS.get(self.metavar)
+            settings = {"metavar": self.metavar, **({"type": kind} if kind else {}),
+                        **settings}  # fmt: skip
+        elif "choices" not in settings:
+            settings["action"] = "store_true"
+        command.add_argument(*self.names.split(), **settings)
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise InputError("--out is empty; expected a folder")
+    return Path(text)
+
+
+#: types of arguments, by their metavar; others are texts
+_KINDS: Mapping[str, Callable[[str], Any]] = {
+    "DIR": Path, "DIR2": Path, "FILE.npz|mat|parquet|qps": Path,
+    "FILE.png|pdf|svg": Path, "FILE.vtu": Path, "[LABEL=]FILE.py": PluginFile.of,
+    "T": float, "S": float, "F": float, "SECONDS": float, "MIB": float, "N": int,
+}  # fmt: skip
+_SEVERAL = {"action": "append", "default": []}
+_JSON = _Option("--json", "", "print JSON")
+_MARKDOWN = "--markdown"
+_PLUGIN = _Option(
+    "--plugin",
+    "[LABEL=]FILE.py",
+    "load solvers or problems of your own from a file; may be repeated; solvers of "
+    "LABEL=FILE.py are called LABEL:NAME",
+    _SEVERAL,
+)
+_CASE = _Option(
+    "case", "CASE", "FAMILY/key=value/…/FORM, as beam-ring/Nr=4/Nh=3/dual; see "
+    "docs/cases.md",
+)  # fmt: skip
+_RESULTS = _Option("folder", "DIR", "a result folder, as `run` writes it")
+_INSTEAD = "for each measurement, instead of the suite's"
+
+
+def _option(what: str) -> _Option:
+    return _Option("--option", "KEY=VALUE", what, _SEVERAL)
+
+
+class _Command(NamedTuple):
+    """One command: its module in `mortarbench.cli`, help, and arguments."""
+
+    module: str
+    what: str
+    options: Sequence[_Option]
+    more: str = ""  #: behind `what` in its own help
+    excluding: Sequence[_Option] = ()  #: of which one can be given
+
+
+_COMMANDS = {
+    "list": _Command(
+        "list_",
+        "show which problems, solvers or suites there are",
+        [
+            _Option("what", "", "what to show",
+                    {"choices": ("problems", "solvers", "suites")}),
+            _Option(_MARKDOWN, "", "solvers: all about them, as in docs/"),
+            _PLUGIN,
+            _JSON,
+        ],
+    ),
+    "run": _Command(
+        "run",
+        "measure what a suite asks for, and write a report on it",
+        [
+            _Option("suite", "SUITE.toml", "a file, or a name of `list suites`"),
+            _Option("--out", "DIR", "result folder; default: out/NAME-OF-SUITE",
+                    {"type": _folder}),
+            _Option("--solver", "NAME", "measure only this solver; may be repeated",
+                    _SEVERAL),
+            _Option("--case", "PATTERN",
+                    "measure only these cases, e.g. '*/dual'; may be repeated",
+                    _SEVERAL),
+            _option("an option of every solver that has it; several values are "
+                    "measured each"),
+            _PLUGIN,
+            _Option("--repeats", "N", "instead of the suite's"),
+            _Option("--time-limit", "SECONDS", _INSTEAD),
+            _Option("--memory-limit", "MIB", _INSTEAD),
+            _Option("--fresh", "", "delete first what the folder holds"),
+            _Option("--dask", "ADDRESS|local", "measure on the workers of a Dask "
+                    "scheduler, or on several processes of this machine; see "
+                    "docs/cluster.md"),
+            _Option("--strict", "", "exit with 1 where a claim is refuted or a solver "
+                    "failed"),
+            _Option("--quiet", "", "print only warnings and what could not be "
+                    "measured"),
+            _JSON,
+        ],
+        "Results go to a folder. The same command continues a run that was "
+        "interrupted, and measures nothing twice.",
+    ),
+    "solve": _Command(
+        "solve",
+        "run one solver on one case once, and judge its answer",
+        [
+            _CASE,
+            _Option("--solver", "NAME", "a name of `list solvers`",
+                    {"required": True}),
+            _Option("--tol", "T", "relative accuracy that the solver is asked for; "
+                    "default: 1e-8", {"default": 1e-8}),
+            _option("an option of the solver, instead of its default"),
+            _Option("--mpi --ranks", "N", "solve on N processes of MPI; a case with "
+                    "feti, form dual; default: 1", {"default": 1}),
+            _Option("--plot", "FILE.png|pdf|svg", "draw the deformed bodies with their "
+                    "stresses, and each contact enlarged"),
+            _Option("--scale", "S", "multiply the displacement in the picture; "
+                    "default: 1 where it can be seen, else a round factor that the "
+                    "picture states; above 1, bodies in contact may seem to overlap"),
+            _Option("--vtu", "FILE.vtu", "write them for ParaView, and a CSV along "
+                    "each contact; FILE.pvd: all load steps up to this one"),
+            _Option("--mesh-error", "", "estimate the error of the mesh, too, from "
+                    "finer ones (at most a minute)"),
+            _PLUGIN,
+            _JSON,
+        ],
+        "Exit code 1: the answer was not verified.",
+    ),
+    "export": _Command(
+        "export",
+        "write the QP of a case to a file for other programs",
+        [
+            _CASE,
+            _Option("file", "FILE.npz|mat|parquet|qps", "for NumPy, MATLAB and "
+                    "Octave, qpbenchmark, or what reads QPS"),
+            _PLUGIN,
+        ],
+    ),
+    "validate": _Command(
+        "validate",
+        "check the answers in a result folder against each other and the truth",
+        [
+            _RESULTS,
+            _Option("--budget", "SECONDS", "time to spend on finer meshes, which tell "
+                    "how large the errors of the meshes are; default: 300",
+                    {"default": 300.0}),
+            _PLUGIN,
+            _JSON,
+        ],
+        "Exit code 1: a claim was refuted, or answers contradict each other.",
+    ),
+    "report": _Command(
+        "report",
+        "write the report on a result folder, or on what changed between several",
+        [
+            _RESULTS,
+            _Option("others", "DIR2", "what changed from DIR to DIR2, and to each "
+                    "further one, into DIR2/report/against-DIR", {"nargs": "*"}),
+            _Option("--format", ",".join(FORMATS), "what to write; default: all",
+                    {"default": ",".join(FORMATS)}),
+            _Option("--factor", "F", "call an answer verified if every residual is "
+                    "within F times the tolerance; default: 10"),
+            _Option("--pool-forms", "", "compare solvers over the cases of all forms "
+                    "together (means, ranks and profiles); otherwise each form is "
+                    "compared apart"),
+            _Option("--fail-on", ",".join(GATES), "exit with 1 where a verdict became "
+                    "worse, or a solver slower beyond chance, from DIR to DIR2"),
+            _Option("--verbose", "", "print the path of every file that was written, "
+                    "not of the page alone"),
+            _JSON,
+        ],
+    ),
+    "replay": _Command(
+        "replay",
+        "repeat one stored measurement, and compare",
+        [
+            _RESULTS,
+            _Option("run_id", "RUN_ID", "which measurement: the run_id of a journal "
+                    "line, or its first digits; a report shows it where one points at "
+                    "a number"),
+            _PLUGIN,
+            _JSON,
+        ],
+    ),
+    "merge": _Command(
+        "merge",
+        "make one result folder of several",
+        [
+            _Option("folders", "DIR", "result folders, each as `run` or `merge` writes "
+                    "it", {"nargs": "+"}),
+            _Option("--out", "DIR", "a new folder, or one that was merged before, "
+                    "which is added to", {"type": _folder, "required": True}),
+        ],
+        "A measurement that several of them hold is taken once; environments stay "
+        "apart.",
+    ),
+    "test-solver": _Command(
+        "test_solver",
+        "check whether a solver keeps the contract, on QPs with known solutions",
+        [
+            _Option("solver", "NAME", "a solver, or a pattern such as 'p*'",
+                    {"nargs": "+"}),
+            _PLUGIN,
+        ],
+        excluding=[
+            _Option(_MARKDOWN, "", "show only what equivalent formulations change, as "
+                    "docs/weaknesses.md"),
+            _JSON,
+        ],
+    ),
+    "paper": _Command(
+        "paper",
+        "make every figure and table of the paper again",
+        [
+            _Option("--out", "DIR", "where to write them; default: out/paper",
+                    {"default": Path("out/paper")}),
+            _Option("--quick", "", "fewer sizes and repeats: a minute or so"),
+        ],
+    ),
+    "doctor": _Command(
+        "doctor",
+        "say whether this machine is fit for measuring times, and what to change",
+        [_JSON],
+    ),
+    "new": _Command(
+        "new",
+        "write a solver, a problem or a suite to start from",
+        [
+            _Option("kind", "", "what to write",
+                    {"choices": ("solver", "problem", "suite")}),
+            _Option("name", "NAME", "the file is NAME.py, of a suite NAME.toml"),
+        ],
+        "The file passes its checks as it is. Nothing is written over.",
+    ),
+}  # fmt: skip
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -204,379 +433,16 @@ def _parser() -> argparse.ArgumentParser:
     found = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_Parser
     )
-
-    def add(name: str, what: str, module: str, more: str = "") -> _Parser:
-        command: _Parser = found.add_parser(
-            name,
-            help=what,
-            description=f"{what[0].upper()}{what[1:]}.{more and f' {more}'}",
-            allow_abbrev=False,
+    for name, of in _COMMANDS.items():
+        text = f"{of.what[0].upper()}{of.what[1:]}.{of.more and f' {of.more}'}"
+        command = found.add_parser(
+            name, help=of.what, description=text, allow_abbrev=False
         )
-        command.set_defaults(module=f"mortarbench.cli.{module}", parser=command)
-        return command
-
-    _add_list_options(
-        add("list", "show which problems, solvers or suites there are", "list_")
-    )
-    _add_run_options(
-        add(
-            "run",
-            "measure what a suite asks for, and write a report on it",
-            "run",
-            "Results go to a folder. The same command continues a run that was "
-            "interrupted, and measures nothing twice.",
-        )
-    )
-    _add_solve_options(
-        add(
-            "solve",
-            "run one solver on one case once, and judge its answer",
-            "solve",
-            "Exit code 1: the answer was not verified.",
-        )
-    )
-    _add_export_options(
-        add("export", "write the QP of a case to a file for other programs", "export")
-    )
-    _add_validate_options(
-        add(
-            "validate",
-            "check the answers in a result folder against each other and the truth",
-            "validate",
-            "Exit code 1: a claim was refuted, or answers contradict each other.",
-        )
-    )
-    _add_report_options(
-        add(
-            "report",
-            "write the report on a result folder, or on what changed between several",
-            "report",
-        )
-    )
-    _add_replay_options(
-        add("replay", "repeat one stored measurement, and compare", "replay")
-    )
-    _add_merge_options(
-        add(
-            "merge",
-            "make one result folder of several",
-            "merge",
-            "A measurement that several of them hold is taken once; environments stay "
-            "apart.",
-        )
-    )
-    _add_test_options(
-        add(
-            "test-solver",
-            "check whether a solver keeps the contract, on QPs with known solutions",
-            "test_solver",
-        )
-    )
-    _add_paper_options(
-        add("paper", "make every figure and table of the paper again", "paper")
-    )
-    _add_json(
-        add(
-            "doctor",
-            "say whether this machine is fit for measuring times, and what to change",
-            "doctor",
-        )
-    )
-    _add_new_options(
-        add(
-            "new",
-            "write a solver, a problem or a suite to start from",
-            "new",
-            "The file passes its checks as it is. Nothing is written over.",
-        )
-    )
+        command.set_defaults(module=f"mortarbench.cli.{of.module}", parser=command)
+        for option in of.options:
+            option.add_to(command)
+        if of.excluding:
+            group = command.add_mutually_exclusive_group()
+            for option in of.excluding:
+                option.add_to(group)
     return parser
-
-
-def _add_list_options(command: _Parser) -> None:
-    command.add_argument(
-        "what", choices=("problems", "solvers", "suites"), help="what to show"
-    )
-    command.add_argument(
-        "--markdown", action="store_true", help="solvers: all about them, as in docs/"
-    )
-    _add_plugin(command)
-    _add_json(command)
-
-
-def _add_solve_options(command: _Parser) -> None:
-    command.add_argument("case", metavar="CASE", help=_CASE)
-    command.add_argument(
-        "--solver", metavar="NAME", required=True, help="a name of `list solvers`"
-    )
-    command.add_argument(
-        "--tol",
-        metavar="T",
-        type=float,
-        default=1e-8,
-        help="relative accuracy that the solver is asked for; default: 1e-8",
-    )
-    _add_option(command, "an option of the solver, instead of its default")
-    command.add_argument(
-        "--mpi",
-        "--ranks",
-        metavar="N",
-        type=int,
-        default=1,
-        help="solve on N processes of MPI; a case with feti, form dual; default: 1",
-    )
-    command.add_argument(
-        "--plot",
-        metavar="FILE.png|pdf|svg",
-        type=Path,
-        help="draw the deformed bodies with their stresses, and each contact enlarged",
-    )
-    command.add_argument(
-        "--scale",
-        metavar="S",
-        type=float,
-        help="multiply the displacement in the picture; default: 1 where it can be "
-        "seen, else a round factor that the picture states; above 1, bodies in "
-        "contact may seem to overlap",
-    )
-    command.add_argument(
-        "--vtu",
-        metavar="FILE.vtu",
-        type=Path,
-        help="write them for ParaView, and a CSV along each contact; FILE.pvd: all "
-        "load steps up to this one",
-    )
-    command.add_argument(
-        "--mesh-error",
-        action="store_true",
-        help="estimate the error of the mesh, too, from finer ones (at most a minute)",
-    )
-    _add_plugin(command)
-    _add_json(command)
-
-
-def _add_export_options(command: _Parser) -> None:
-    command.add_argument("case", metavar="CASE", help=_CASE)
-    command.add_argument(
-        "file",
-        metavar="FILE.npz|mat|parquet|qps",
-        type=Path,
-        help="for NumPy, MATLAB and Octave, qpbenchmark, or what reads QPS",
-    )
-    _add_plugin(command)
-
-
-def _add_validate_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
-    command.add_argument(
-        "--budget",
-        metavar="SECONDS",
-        type=float,
-        default=300.0,
-        help="time to spend on finer meshes, which tell how large the errors of the "
-        "meshes are; default: 300",
-    )
-    _add_plugin(command)
-    _add_json(command)
-
-
-def _add_report_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
-    command.add_argument(
-        "others",
-        metavar="DIR2",
-        type=Path,
-        nargs="*",
-        help="what changed from DIR to DIR2, and to each further one, into "
-        "DIR2/report/against-DIR",
-    )
-    command.add_argument(
-        "--format",
-        metavar=",".join(FORMATS),
-        default=",".join(FORMATS),
-        help="what to write; default: all",
-    )
-    command.add_argument(
-        "--factor",
-        metavar="F",
-        type=float,
-        help="call an answer verified if every residual is within F times the "
-        "tolerance; default: 10",
-    )
-    command.add_argument(
-        "--pool-forms",
-        action="store_true",
-        help="compare solvers over the cases of all forms together (means, ranks and "
-        "profiles); otherwise each form is compared apart",
-    )
-    command.add_argument(
-        "--fail-on",
-        metavar=",".join(GATES),
-        help="exit with 1 where a verdict became worse, or a solver slower beyond "
-        "chance, from DIR to DIR2",
-    )
-    command.add_argument(
-        "--verbose",
-        action="store_true",
-        help="print the path of every file that was written, not of the page alone",
-    )
-    _add_json(command)
-
-
-def _add_merge_options(command: _Parser) -> None:
-    command.add_argument(
-        "folders",
-        metavar="DIR",
-        type=Path,
-        nargs="+",
-        help="result folders, each as `run` or `merge` writes it",
-    )
-    command.add_argument(
-        "--out",
-        metavar="DIR",
-        type=_folder,
-        required=True,
-        help="a new folder, or one that was merged before, which is added to",
-    )
-
-
-def _add_replay_options(command: _Parser) -> None:
-    command.add_argument("folder", metavar="DIR", type=Path, help=_RESULTS)
-    command.add_argument(
-        "run_id",
-        metavar="RUN_ID",
-        help="which measurement: the run_id of a journal line, or its first digits; a "
-        "report shows it where one points at a number",
-    )
-    _add_plugin(command)
-    _add_json(command)
-
-
-def _add_test_options(command: _Parser) -> None:
-    command.add_argument(
-        "solver", metavar="NAME", nargs="+", help="a solver, or a pattern such as 'p*'"
-    )
-    _add_plugin(command)
-    shown = command.add_mutually_exclusive_group()
-    shown.add_argument(
-        "--markdown",
-        action="store_true",
-        help="show only what equivalent formulations change, as docs/weaknesses.md",
-    )
-    _add_json(shown)
-
-
-def _add_new_options(command: _Parser) -> None:
-    command.add_argument(
-        "kind", choices=("solver", "problem", "suite"), help="what to write"
-    )
-    command.add_argument(
-        "name", metavar="NAME", help="the file is NAME.py, of a suite NAME.toml"
-    )
-
-
-def _add_paper_options(command: _Parser) -> None:
-    command.add_argument(
-        "--out",
-        metavar="DIR",
-        type=Path,
-        default=Path("out/paper"),
-        help="where to write them; default: out/paper",
-    )
-    command.add_argument(
-        "--quick", action="store_true", help="fewer sizes and repeats: a minute or so"
-    )
-
-
-def _add_run_options(command: _Parser) -> None:
-    command.add_argument(
-        "suite", metavar="SUITE.toml", help="a file, or a name of `list suites`"
-    )
-    command.add_argument(
-        "--out",
-        metavar="DIR",
-        type=_folder,
-        help="result folder; default: out/NAME-OF-SUITE",
-    )
-    command.add_argument(
-        "--solver",
-        metavar="NAME",
-        action="append",
-        default=[],
-        help="measure only this solver; may be repeated",
-    )
-    command.add_argument(
-        "--case",
-        metavar="PATTERN",
-        action="append",
-        default=[],
-        help="measure only these cases, e.g. '*/dual'; may be repeated",
-    )
-    _add_option(
-        command,
-        "an option of every solver that has it; several values are measured each",
-    )
-    _add_plugin(command)
-    command.add_argument(
-        "--repeats", metavar="N", type=int, help="instead of the suite's"
-    )
-    command.add_argument(
-        "--time-limit",
-        metavar="SECONDS",
-        type=float,
-        help="for each measurement, instead of the suite's",
-    )
-    command.add_argument(
-        "--memory-limit",
-        metavar="MIB",
-        type=float,
-        help="for each measurement, instead of the suite's",
-    )
-    command.add_argument(
-        "--fresh", action="store_true", help="delete first what the folder holds"
-    )
-    command.add_argument(
-        "--dask",
-        metavar="ADDRESS|local",
-        help="measure on the workers of a Dask scheduler, or on several processes of "
-        "this machine; see docs/cluster.md",
-    )
-    command.add_argument(
-        "--strict",
-        action="store_true",
-        help="exit with 1 where a claim is refuted or a solver failed",
-    )
-    command.add_argument(
-        "--quiet",
-        action="store_true",
-        help="print only warnings and what could not be measured",
-    )
-    _add_json(command)
-
-
-def _folder(text: str) -> Path:
-    if not text:
-        raise InputError("--out is empty; expected a folder")
-    return Path(text)
-
-
-def _add_option(command: _Parser, what: str) -> None:
-    command.add_argument(
-        "--option", metavar="KEY=VALUE", action="append", default=[], help=what
-    )
-
-
-def _add_plugin(command: _Parser) -> None:
-    command.add_argument(
-        "--plugin",
-        metavar="[LABEL=]FILE.py",
-        type=PluginFile.of,
-        action="append",
-        default=[],
-        help="load solvers or problems of your own from a file; may be repeated; "
-        "solvers of LABEL=FILE.py are called LABEL:NAME",
-    )
-
-
-def _add_json(command: argparse._ActionsContainer) -> None:
-    command.add_argument("--json", action="store_true", help="print JSON")

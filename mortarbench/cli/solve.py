@@ -26,7 +26,18 @@ if TYPE_CHECKING:
 
 def run(registries: Registries, options: Namespace) -> int:
     """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
-    _check(options)
+    tolerance(options.tol, "--tol")
+    if options.plot is not None:
+        writable(options.plot, PICTURES)
+    if options.scale is not None:
+        drawn_scale(options.scale, "--scale")
+    if options.plot is None and options.scale is not None:
+        raise InputError(
+            f"--scale {options.scale:g} without --plot; expected a picture"
+        )
+    if options.vtu is not None:
+        writable(options.vtu, GRIDS)
+    ranks_asked(options.mpi, "--mpi")
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
     check_name(options.solver, registries.solvers)
@@ -53,22 +64,6 @@ def run(registries: Registries, options: Namespace) -> int:
     return 0 if answer.verdict.is_verified else 1
 
 
-def _check(options: Namespace) -> None:
-    """Refuse options out of range, before any work is done."""
-    tolerance(options.tol, "--tol")
-    if options.plot is not None:
-        writable(options.plot, PICTURES)
-    if options.scale is not None:
-        drawn_scale(options.scale, "--scale")
-    if options.plot is None and options.scale is not None:
-        raise InputError(
-            f"--scale {options.scale:g} without --plot; expected a picture"
-        )
-    if options.vtu is not None:
-        writable(options.vtu, GRIDS)
-    ranks_asked(options.mpi, "--mpi")
-
-
 def _print(answer: Answer, options: Namespace) -> None:
     """Print the answer, and the error of the mesh where it was asked for."""
     from mortarbench.harness.record import Verdict
@@ -82,7 +77,12 @@ def _print(answer: Answer, options: Namespace) -> None:
         print(answer)
         if mesh is not None:
             print(f"error of the mesh, relative, in the energy norm: {mesh}")
-        _show_iterations(answer)
+        from mortarbench.text import convergence, legend
+
+        if table := convergence(answer.history):
+            print(f"\n{table}")
+            if words := legend(answer.history):
+                print(f"\n{words}")
     if record.verdict is Verdict.DECLINED:
         say(f"{record.solver} declines {record.case}: {record.message}{_hint(answer)}")
 
@@ -129,15 +129,6 @@ def _loads_from_here() -> bool:
     """
     first, *others = sys.path
     return first in ("", os.getcwd()) and first not in others
-
-
-def _show_iterations(answer: Answer) -> None:
-    from mortarbench.text import convergence, legend
-
-    if table := convergence(answer.history):
-        print(f"\n{table}")
-        if words := legend(answer.history):
-            print(f"\n{words}")
 
 
 def _draw(answer: Answer, options: Namespace) -> None:

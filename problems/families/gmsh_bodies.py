@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -11,31 +11,28 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.harness import InputError
 from mortarbench.harness.checked import located
 from mortarbench.harness.files.copies import content_digest
-from mortarbench.problems.families.in_subdomains import ContactFamily
+from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.files.file_digest import check_digest
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
-    DECOMPOSITION,
+    FRICTION,
+    GLUES,
+    HALVINGS,
+    KINEMATICS,
     LAW,
-    METHODS,
-    MOST_STEPS,
-    PLANES,
     SETTINGS,
-    at_least,
-    at_most,
-    deformed,
+    check_decomposition,
+    check_friction,
+    check_kinematics,
+    declared,
+    key,
     minimised,
-    one_of,
-    one_state,
-    rough,
-    torn_by,
 )
 
 if TYPE_CHECKING:
     from mortarbench.harness import Case, Reference, Value
 
 
-@dataclass(frozen=True)
 class GmshBodies(ContactFamily):
     """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
@@ -43,17 +40,23 @@ class GmshBodies(ContactFamily):
     changed file is not taken for the one that was measured.
     """
 
-    model = "gmsh_bodies"
-    name: str = "bodies"
-    path_suffix: str = ".toml"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({
-            "path": "", "sha256": "", **SETTINGS, "step": 0, "iterate": 0, "newton": 0,
-            "parts": 0, "glue": DECOMPOSITION["glue"], "halvings": 0,
-        }),
-        hash=False,
-    )  # fmt: skip
-    forms: tuple[str, ...] = CONTACT_FORMS
+    name = "bodies"
+    path_suffix = ".toml"
+    keys = declared(
+        path=key(""),
+        sha256=key(""),
+        **SETTINGS,
+        step=key(0, 1),
+        iterate=FRICTION["iterate"],
+        newton=KINEMATICS["newton"],
+        parts=key(0, 0),
+        **GLUES,
+        halvings=HALVINGS,
+    )
+    forms = CONTACT_FORMS
+    problem = "gmsh_bodies.problem"
+    model = "gmsh_bodies.newton_step"
+    conditions = MappingProxyType({"kinematics": check_kinematics})
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in what the file says, its digest, and step, by default steps."""
@@ -79,21 +82,13 @@ class GmshBodies(ContactFamily):
         p: Any = params
         if not p["path"]:
             raise InputError(f"{self.name}: path is missing; expected bodies:PATH.toml")
-        at_least(1, self.name, params, ("steps", "step", "relin"))
-        at_most(MOST_STEPS, self.name, params, ("steps", "relin"))
-        at_least(0, self.name, params, ("halvings",))
-        at_most(30, self.name, params, ("halvings",))
-        if p["step"] > p["steps"]:
-            raise InputError(
-                f"{self.name}: step={p['step']} must be in 1..steps={p['steps']}"
-            )
-        one_of(self.name, params, METHODS | PLANES)
-        torn_by(self.name, params, key="parts", what="the number of subdomains")
+        super().check(params)
+        what = "the number of subdomains"
+        check_decomposition(self.name, params, key="parts", what=what)
         path = Path(p["path"])
         table = read_description(path)
         own = any(key in entry for entry in table["contacts"] for key in LAW)
-        rough(self.name, p, elsewhere=own)
-        deformed(self.name, p)
+        check_friction(self.name, p, elsewhere=own)
         with located(str(path)):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
@@ -103,10 +98,10 @@ class GmshBodies(ContactFamily):
         """Return the case with every edge of the mesh halved."""
         from mortarbench.problems.models.gmsh_bodies import laws_of
 
-        one_state(self.name, params)
+        finer = super().refined(params)
         laws = [law.kind for law in laws_of(params)]
         minimised(self.name, laws, "halvings=0, 1 and 2")
-        return {**params, "halvings": int(params["halvings"]) + 1}
+        return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Name the arcs of contact sides, whose chords halving leaves as they are."""

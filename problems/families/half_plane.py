@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from mortarbench.harness import Family, InputError
-from mortarbench.problems.ranges import at_least, fits_dense, one_of, tangential
+from mortarbench.harness import InputError
+from mortarbench.problems.families.declared import DeclaredFamily
+from mortarbench.problems.ranges import choice, declared, fits_dense, key, tangential
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.harness import Value
 
 
-@dataclass(frozen=True)
-class HalfPlane(Family):
+class HalfPlane(DeclaredFamily):
     """Line contact without a mesh: Hertz, or Cattaneo and Mindlin with friction."""
 
-    name: str = "half-plane"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({
-            "n": 100, "law": "hertz", "Q": 0.0, "peak": 0.0,
-        }),
-        hash=False,
-    )  # fmt: skip
-    forms: tuple[str, ...] = ("dual",)
+    name = "half-plane"
+    keys = declared(
+        n=key(100, 2),
+        law=choice("hertz", "cattaneo"),
+        Q=key(0.0),
+        peak=key(0.0),
+    )
+    forms = ("dual",)
+    model = "half_plane.half_planes"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Let the tangential force never have been larger than it is."""
@@ -33,9 +32,8 @@ class HalfPlane(Family):
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless the law has these forces, and they do not slide."""
-        at_least(2, self.name, params, ("n",))
+        super().check(params)
         fits_dense(self.name, int(params["n"]))
-        one_of(self.name, params, {"law": ("hertz", "cattaneo")})
         if params["law"] == "cattaneo":
             tangential(self.name, params)
         elif key := next((key for key in ("Q", "peak") if params[key]), ""):
@@ -43,13 +41,3 @@ class HalfPlane(Family):
                 f"{self.name}: {key}={params[key]} needs law=cattaneo; law=hertz has "
                 "no tangential force"
             )
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP."""
-        from mortarbench.problems.models.half_plane import half_planes
-
-        del form, reference
-        self.check(params)
-        return half_planes(params)

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
-from mortarbench.problems.families.in_subdomains import ContactFamily
+from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
@@ -16,53 +14,48 @@ from mortarbench.problems.ranges import (
     METHODS,
     PLANES,
     SHORTEST,
-    at_least,
-    deformed,
+    choice,
+    declared,
     doubled,
     fits,
+    key,
     minimised,
-    one_of,
-    one_state,
-    positive,
-    rough,
-    torn_by,
+    size,
 )
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 
-@dataclass(frozen=True)
 class ContactPatch(ContactFamily):
     """Contact patch test: two blocks on each other under uniform pressure."""
 
-    model = "patch"
-    name: str = "contact-patch"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({
-            "lower": 6, "upper": 4, "slave": "upper", "ratio": 1.0,
-            "contact": "mortar", "basis": "dual", "plane": "strain",
-            **FRICTION, **DECOMPOSITION, **KINEMATICS, "stretch": 1.0,
-        }),
-        hash=False,
-    )  # fmt: skip
-    forms: tuple[str, ...] = ("primal", "dual")
+    name = "contact-patch"
+    keys = declared(
+        lower=key(6, 1),
+        upper=key(4, 1),
+        slave=choice("lower", "upper").but("upper"),
+        ratio=size(1.0),
+        contact=METHODS["contact"].but("mortar"),
+        basis=METHODS["basis"],
+        **PLANES,
+        **FRICTION,
+        **DECOMPOSITION,
+        **KINEMATICS,
+        stretch=key(1.0),
+    )
+    forms = ("primal", "dual")
+    problem = "patch.problem"
+    model = "patch.newton_step"
+    cells = ("lower", "upper")
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range."""
-        at_least(1, self.name, params, ("lower", "upper"))
-        fits(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
-        positive(self.name, params, ("ratio",))
-        one_of(self.name, params, {
-            "slave": ("lower", "upper"), **METHODS, **PLANES,
-        })  # fmt: skip
-        rough(self.name, params)
-        torn_by(self.name, params)
-        deformed(self.name, params)
-        self._check_stretch(params)
+        """Raise InputError unless every key is in its range.
 
-    def _check_stretch(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless a stretch is given that pressure can bring about."""
+        A stretch must be one that pressure can bring about.
+        """
+        super().check(params)
+        fits(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
         stretch = float(params["stretch"])
         if stretch == self.defaults["stretch"]:
             return
@@ -80,11 +73,9 @@ class ContactPatch(ContactFamily):
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; the odd row of cells is not.
 
-        Coulomb's law is refused: its solutions minimise nothing. At finite strain there
-        is none: the QP of another mesh is linearised at another state.
+        Coulomb's law is refused: its solutions minimise nothing.
         """
-        one_state(self.name, params)
-        finer = doubled(params, "lower", "upper")
-        meshes = "/".join(f"{key}={n}" for key, n in finer.items())
+        finer = doubled(params, *self.cells)
+        meshes = "/".join(f"{name}={n}" for name, n in finer.items())
         minimised(self.name, [str(params["friction"])], meshes)
-        return {**params, **finer}
+        return super().refined(params)

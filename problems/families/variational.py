@@ -3,97 +3,57 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from mortarbench.harness import Family, InputError
-from mortarbench.problems.ranges import at_least, fits, positive
+from mortarbench.harness import InputError
+from mortarbench.problems.families.declared import DeclaredFamily
+from mortarbench.problems.ranges import declared, fits, key, size
 
 if TYPE_CHECKING:
-    from mortarbench.harness import Case, Reference, Value
+    from mortarbench.harness import Value
 
 
-@dataclass(frozen=True)
-class String(Family):
+class String(DeclaredFamily):
     """A string over a sine-shaped obstacle: PERMON's first tutorial."""
 
-    name: str = "string"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"n": 100}), hash=False
-    )
-    forms: tuple[str, ...] = ("primal",)
+    name = "string"
+    keys = declared(n=key(100, 3))
+    forms = ("primal",)
+    model = "variational.string"
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless there are three points or more."""
-        at_least(3, self.name, params, ("n",))
+        super().check(params)
         fits(self.name, int(params["n"]))
 
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP."""
-        from mortarbench.problems.models.variational import string
 
-        del form, reference
-        self.check(params)
-        return string(int(params["n"]))
-
-
-@dataclass(frozen=True)
-class JournalBearing(Family):
+class JournalBearing(DeclaredFamily):
     """The pressure in a journal bearing, not negative: MINPACK-2."""
 
-    name: str = "journal-bearing"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"n": 50, "eccentricity": 0.1}),
-        hash=False,
-    )
-    forms: tuple[str, ...] = ("primal",)
+    name = "journal-bearing"
+    keys = declared(n=key(50, 2), eccentricity=size(0.1))
+    forms = ("primal",)
+    model = "variational.journal_bearing"
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless the shaft turns inside of the bearing."""
-        at_least(2, self.name, params, ("n",))
-        positive(self.name, params, ("eccentricity",))
+        super().check(params)
         if float(params["eccentricity"]) >= 1:
             raise InputError(
                 f"{self.name}: eccentricity={params['eccentricity']} must be below 1"
             )
         fits(self.name, int(params["n"]) ** 2)
 
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP."""
-        from mortarbench.problems.models.variational import journal_bearing
 
-        del form, reference
-        self.check(params)
-        return journal_bearing(int(params["n"]), float(params["eccentricity"]))
-
-
-@dataclass(frozen=True)
-class Torsion(Family):
+class Torsion(DeclaredFamily):
     """Elastic-plastic torsion of a square bar, bounds on both sides: MINPACK-2."""
 
-    name: str = "torsion"
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"n": 50, "twist": 5.0}), hash=False
-    )
-    forms: tuple[str, ...] = ("primal",)
+    name = "torsion"
+    keys = declared(n=key(50, 2), twist=size(5.0))
+    forms = ("primal",)
+    model = "variational.torsion"
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless there are two nodes a side and a twist."""
-        at_least(2, self.name, params, ("n",))
-        positive(self.name, params, ("twist",))
+        super().check(params)
         fits(self.name, int(params["n"]) ** 2)
-
-    def build(
-        self, form: str, params: Mapping[str, Value], reference: Reference
-    ) -> Case:
-        """Emit the QP."""
-        from mortarbench.problems.models.variational import torsion
-
-        del form, reference
-        self.check(params)
-        return torsion(int(params["n"]), float(params["twist"]))

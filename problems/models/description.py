@@ -47,7 +47,7 @@ the slip that of the whole load.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,9 +68,8 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
-    FINITE,
+    CONTACT_STIFFNESS,
     LAWS,
-    LOADINGS,
     METHODS,
     MOST_STEPS,
     NEEDED,
@@ -122,11 +121,10 @@ def read_description(path: Path) -> dict[str, Any]:
         if unit not in LENGTH_UNITS:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
-            checked.at_least_one(key, table.get(key, SETTINGS[key]), MOST_STEPS)
-        for key, known in (METHODS | PLANES | FINITE).items():
-            value = checked.text(key, table.get(key, SETTINGS[key]))
-            if value not in known:
-                raise unknown(f"value of {key}", value, known)
+            default = SETTINGS[key].default
+            checked.at_least_one(key, table.get(key, default), MOST_STEPS)
+        chosen = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
+        _check_choices(table, chosen)
         for entry in checked.filled_list("contacts", table["contacts"]):
             checked.table("contacts", entry)
         _friction(table)
@@ -282,11 +280,17 @@ def _check_felt(
             )
 
 
+def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
+    """Refuse values that the keys of cases do not have either."""
+    for key in keys:
+        known = SETTINGS[key].values
+        if key in entry and checked.text(key, entry[key]) not in known:
+            raise unknown(f"value of {key}", entry[key], map(str, known))
+
+
 def _friction(entry: Mapping[str, Any]) -> None:
     """Check the values of what an entry says of friction."""
-    for key, known in {"friction": tuple(LAWS), **LOADINGS}.items():
-        if key in entry and checked.text(key, entry[key]) not in known:
-            raise unknown(f"value of {key}", entry[key], known)
+    _check_choices(entry, ("friction", "loading"))
     for key, what in NEEDED.items():
         if key in entry and physical(key, entry[key]) < 0:
             raise InputError(f"{key} = {shown(entry[key])}; expected {what}")

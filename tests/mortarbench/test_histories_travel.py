@@ -17,7 +17,6 @@ from mortarbench.harness.files.store import (
     load_history,
     load_solution,
     save,
-    save_solution,
 )
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
@@ -25,6 +24,7 @@ from mortarbench.harness.verify.measure import measure
 from mortarbench.registries import Registries
 from mortarbench.text import convergence
 from tests.support import HISTORIES, TOY_PROBLEM
+from tests.support.stored import save_solution
 
 PLUGIN = load_plugin(HISTORIES)
 TOLD = {

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Record, Solution, Status, Verdict
-from mortarbench.harness.files.store import save_solution
 from mortarbench.harness.results.journal import Journal
 from mortarbench.reports import write_report
 from mortarbench.reports.data.evidence import read_evidence
@@ -20,6 +19,7 @@ from mortarbench.reports.figures import convergence
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.saving import draw
 from mortarbench.reports.render.writing import write_page
+from tests.support.stored import save_solution
 
 KNOWN = {
     "step": ["c", "p", "e", "c"], "outer": [1, 1, 2, 2], "products": [2, 4, 6, 7],

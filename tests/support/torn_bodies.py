@@ -17,7 +17,7 @@ from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.divided import described
 from mortarbench.problems.duality.problem import chosen, stated
 from mortarbench.problems.duality.undivided import primal_qp, whole_path
-from mortarbench.problems.families.in_subdomains import ContactFamily
+from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_parts
 from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
 from mortarbench.problems.feti.torn import Torn

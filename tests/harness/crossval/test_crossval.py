@@ -15,7 +15,7 @@ from mortarbench.harness.crossval.comparison import brief, compared
 from mortarbench.harness.crossval.discretisation import read_discretisation
 from mortarbench.harness.crossval.ground_truth import Given, ground_truth_of
 from mortarbench.harness.files.qpfile import qp_digest, save_qp
-from mortarbench.harness.files.store import save_solution, write_point
+from mortarbench.harness.files.store import write_point
 from mortarbench.harness.names import parse
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.registry import SolverSpec, load_plugin
@@ -29,6 +29,7 @@ from mortarbench.reports.render.writing import write_text
 from mortarbench.reports.validation.report import compose, write_validation
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import FALSE_CLAIMS
+from tests.support.stored import save_solution
 
 pytestmark = pytest.mark.together
 

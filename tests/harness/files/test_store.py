@@ -11,8 +11,8 @@ from mortarbench.harness.files.store import (
     load_fields,
     load_solution,
     save_fields,
-    save_solution,
 )
+from tests.support.stored import save_solution
 
 
 @pytest.fixture

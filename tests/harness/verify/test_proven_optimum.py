@@ -16,7 +16,6 @@ from mortarbench.harness import (
     no_rows,
     verdict,
 )
-from mortarbench.harness.conformance.hard_qps import KINDS, hard
 from mortarbench.harness.record import Record
 from mortarbench.harness.verify.kkt import ROUNDING, Residuals, rejudged, tightened
 from mortarbench.harness.verify.optimum import (
@@ -30,6 +29,7 @@ from mortarbench.harness.verify.optimum import (
 )
 from mortarbench.harness.verify.verdicts import judged
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.hard_qps import KINDS, hard
 
 TOL = 1e-8
 INF = np.inf

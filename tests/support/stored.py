@@ -1,0 +1,8 @@
+"""Points in the folder of vectors, as a run stores them."""
+
+from mortarbench.harness.files.store import point_arrays, save
+
+
+def save_solution(folder, solution):
+    """Store a primal-dual point and its history; return the digest of both."""
+    return save(folder, point_arrays(solution))
