@@ -37,10 +37,8 @@ from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
-    MAX_CANCELLATION,
     NEGLIGIBLE,
     ROUNDING,
-    TERMS_FACTOR,
     Residuals,
     allowed,
     energy_at,
@@ -51,6 +49,7 @@ from mortarbench.harness.verify.kkt import (
     violation,
 )
 from mortarbench.harness.verify.rational import rational, solutions
+from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
 #: Coupled variables and rows of a QP that is solved once more; the dense reference
 #: solve takes a few times as long as that of a solver.
