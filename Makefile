@@ -18,7 +18,7 @@ help:  ## show this help
 
 setup: .venv/.ready  ## make .venv: system packages, Python packages
 
-.venv/.ready: pyproject.toml constraints.txt tools/extensions.py $(shell find harness problems solvers -name "*.pyx" -o -name "*.pxi" -o -name "*.h")
+.venv/.ready: pyproject.toml constraints.txt tools/extensions.py $(shell find harness problems solvers -name "*.pyx" -o -name "*.pxi" -o -name "*.pxd" -o -name "*.h")
 	@tools/setup.sh $(PYTHON)
 	@touch $@
 

@@ -12,13 +12,17 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
+SCALES = ROOT / "harness" / "verify"  #: scales.h and scales.pxd, of solvers too
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 MODULES = {
     "mortarbench.harness.verify.products": [],
+    # residuals have the same digits everywhere
+    "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
     # the digits of a stiffness, and the order of its factor, are the same everywhere
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
@@ -60,8 +64,13 @@ def _extension(name: str, flags: list[str]) -> Extension:
     return Extension(
         name,
         [str(source)],
-        depends=[str(p) for p in source.parent.iterdir() if p.suffix in (".h", ".pxi")],
-        include_dirs=[str(source.parent)],
+        depends=[
+            str(p)
+            for folder in (source.parent, SCALES)
+            for p in folder.iterdir()
+            if p.suffix in (".h", ".pxi", ".pxd")
+        ],
+        include_dirs=[str(source.parent), str(SCALES), np.get_include()],
         extra_compile_args=FLAGS + flags,
     )
 

@@ -22,6 +22,7 @@ from mortarbench.harness.qp import QP, Matrix, Vector
 from mortarbench.harness.record import VERIFIED_FACTOR, Record, Verdict
 from mortarbench.harness.sets.convex import Limits, Sum, admissible, hull
 from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify import scales
 
 #: Rounding of a sum, relative to the sum of its absolute terms: errors of k terms grow
 #: like √k·2⁻⁵³, so that this covers k = 256. A row of zero fails without it
@@ -33,10 +34,6 @@ ROUNDING = 8 * float(np.finfo(float).eps)
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9, the
 #: rounded solutions of `test_what_is_left_when_terms_cancel_is_known_exactly`.
 NEGLIGIBLE = 2e-4
-#: Largest ratio of the terms of the objective to itself that counts: 10·tol of the
-#: terms is then 1e-3 of the objective at tol 1e-8, three digits. Without it,
-#: `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails.
-MAX_CANCELLATION = 1e4
 #: Least scale of energy, relative to a natural energy. A solution with more than this
 #: share of it has an energy of its own; the errors of one that vanishes are divided by
 #: this: `test_rounding_errors_about_a_zero_solution_are_small` fails with 1e-3.
@@ -49,14 +46,6 @@ NO_ENERGY = 1e-6
 #: Rounding in a load, relative to the largest: 400 terms of 2⁻⁵² each. Without it,
 #: loads of 1e-17 count (`test_a_right_point_is_verified_by_its_residuals`, case 11).
 LOAD_ROUNDING = 1e-13
-#: Violations, and errors of the objective, are compared with this times their terms: an
-#: answer is wrong beyond 100·tol of its terms, and residuals are allowed 10·tol. With
-#: 100, `test_a_narrow_box_lends_no_length_to_a_row` fails.
-TERMS_FACTOR = 10.0
-#: Largest size of a variable, in lengths over which the energy changes by all of it.
-#: `test_a_wrong_point_is_refuted_by_its_residuals` (case 15) fails with 1e5,
-#: `test_a_row_between_variables_that_are_long_is_met_to_their_digits` with 10.
-MAX_LENGTHS = 1e3
 #: Passes over the rows that give a size to variables without curvature and cost, each
 #: to the neighbours of those before: a limit of time.
 #: `test_a_chain_of_idle_variables_is_as_long_as_its_first_row` fails with 3.
@@ -144,9 +133,10 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
     E, X = _scales(
         qp, s.x, _energy(qp, t, generous), t.curvature, has_diagonal=t.has_diagonal
     )
-    own = TERMS_FACTOR * (t.x + _shifts(s.x, t.Px, t.curvature))
     return Residuals(
-        _violation(t.constraints, X, own),
+        _violation(
+            t.constraints, X, scales.own_sizes(t.Px, t.curvature, s.x, dtype=float)
+        ),
         _dual(qp, s, t, E, X),
         _complementarity(qp, s, t.constraints, E, most_rounding),
         _excess(t.energies.sum(keepdims=True), t.energies_size, E, most_rounding),
@@ -217,19 +207,14 @@ def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
     return _largest(
         0.0,
         *(
-            _violated(error, c.size, c.terms, c.sized(X), c.sized(own))
+            _excess(
+                error,
+                c.size + c.terms,
+                scales.row_scales(c.size, c.sized(X), c.sized(own), dtype=float),
+            )
             for c, error in errors
         ),
     )
-
-
-def _violated(
-    error: Vector, rhs: Vector, terms: Vector, sizes: Vector, own: Vector
-) -> float:
-    """Divide by |bᵢ| + Σ|aᵢⱼ|Xⱼ or, where bᵢ ≠ 0, by own terms that are smaller."""
-    scale = rhs + sizes
-    own_scale = np.where(rhs > 0, TERMS_FACTOR * rhs + own, np.inf)
-    return _excess(error, rhs + terms, np.minimum(scale, own_scale))
 
 
 def own_sizes(qp: QP, x: Vector) -> Vector:
@@ -238,13 +223,9 @@ def own_sizes(qp: QP, x: Vector) -> Vector:
     The larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other variables
     shift the minimum along j.
     """
-    return np.maximum(TERMS_FACTOR * np.abs(x), _shifts(x, qp.P @ x, _curvature(qp)[0]))
-
-
-def _shifts(x: Vector, Px: Vector, d: Vector) -> Vector:
-    """Return |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j; 0 without curvature."""
-    is_curved = d > 0
-    return np.where(is_curved, np.abs(Px - d * x) / np.where(is_curved, d, 1), 0)
+    shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
+    sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
+    return sizes
 
 
 def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
@@ -254,7 +235,6 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     size = t.Px_size + np.abs(qp.q) + t.forces_size
     own = np.maximum.reduce([np.abs(t.Px), np.abs(qp.q), np.abs(t.forces)])
     r = np.abs(t.residual)
-    own_r = np.maximum(r - ROUNDING * size, 0)
     # the minimum along a variable without curvature and cost is undetermined: Xᵢ
     is_idle = (t.curvature == 0) & (qp.q == 0)
     # an operator without diagonal: x gives one curvature of it, unless x is zero
@@ -262,13 +242,15 @@ def _dual(qp: QP, s: Solution, t: _Terms, E: float, X: Vector) -> float:
     step = np.where(is_idle, np.maximum(t.x, X), step)
     lower, upper = hull(qp.sets, qp.q.size)
     room = np.where(t.residual > 0, s.x - lower, upper - s.x)  # downhill
-    step = np.minimum(np.maximum(t.x, step), np.maximum(room, 0))
-    gain = np.where(own_r > 0, own_r * step, 0.0)
     signed = (s.z >= 0).all()  # False where z holds NaN
     pulling = 0.0 if signed else _ratio(np.minimum(s.z, 0) * _row_maxima(qp.G), S)
     return _largest(
         _excess(r, size, S),
-        _sup(np.minimum(_ratios(own_r, own), _ratios(gain, E))),
+        _sup(
+            scales.balance_errors(
+                r, ROUNDING * size, own, step, s.x, room, E, dtype=float
+            )
+        ),
         pulling,
         _ratio(t.excess, S),
     )
@@ -301,9 +283,8 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
 
     The largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + bounds|: sums, since multipliers that
     cancel could make their parts arbitrarily large; but at most `MAX_CANCELLATION`
-    times the objective, or 1/`MAX_CANCELLATION` of itself where the objective vanishes.
-    At least `LEAST_ENERGY` times the smallest natural energy of a variable
-    (`_natural_energies`).
+    times the objective (`energy_scale` in scales.h). At least `LEAST_ENERGY` times the
+    smallest natural energy of a variable (`_natural_energies`).
 
     generous : ignore cancellation, and pick the median of natural energies, all of it
         where the point has no energy of its own
@@ -311,8 +292,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     terms = _sup(t.energies)
     if np.isnan(terms):
         return terms
-    value = abs(float(t.energies[0] / 2 + t.energies[1]))
-    capped = min(terms, max(MAX_CANCELLATION * value, terms / MAX_CANCELLATION))
+    capped = float(scales.energy_scales(*t.energies, dtype=float))
     E, pick = (terms, _median) if generous else (capped, _least)
     bounds = hull(qp.sets, qp.q.size)
     longest = max(_sup(qp.b), _sup(qp.h), *map(_finite_sup, bounds))
@@ -427,13 +407,11 @@ def scales_at(qp: QP, x: Vector, E: float) -> Scales:
 
 def _scales(qp: QP, x: Vector, E: float, d: Vector, *, has_diagonal: bool) -> Scales:
     x, E = x.astype(float), float(E)
-    size = np.abs(x)
-    length = np.minimum(np.sqrt(_over(E, d)), _over(E, np.abs(qp.q)))
-    has_length = np.isfinite(length)
-    X = np.maximum(np.minimum(size, MAX_LENGTHS * length), length)
+    X = scales.variable_sizes(E, qp.q, d, x)
+    has_length = ~np.isinf(X)
     X = np.where(has_length, X, 0)
     if not has_diagonal:
-        X = np.minimum(X, np.maximum(size, _sup(x)))
+        X = np.minimum(X, np.maximum(np.abs(x), _sup(x)))
     if not has_length.all():
         X = _sizes_from_rows(qp, x, X, has_length)
     return Scales(E, X)
@@ -562,17 +540,10 @@ def _largest(*values: float) -> float:
     return max(values, key=lambda value: np.inf if np.isnan(value) else value)
 
 
-def _ratios(error: Vector, scale: Vector | float) -> Vector:
-    """Return |error|/scale with 0/0 = 0; inf where the scale overflowed."""
-    error = np.abs(error)
-    safe = np.where(error == 0, 1.0, scale)
-    return np.where(np.isinf(safe), np.inf, error / safe)
-
-
 def _ratio(error: Vector, scale: Vector | float) -> float:
     if isinstance(scale, float) and 0 < scale < np.inf:  # rounding is monotonic
         return float(np.abs(error).max(initial=0.0) / scale)
-    return float(_ratios(error, scale).max(initial=0.0))
+    return float(scales.excesses(error, 0.0, scale, dtype=float).max(initial=0.0))
 
 
 def _excess(
@@ -587,8 +558,7 @@ def _excess(
     most_rounding : largest share of the scale that is subtracted as rounding
     """
     rounding = np.minimum(ROUNDING * size, most_rounding * scale)
-    rounding = np.where(np.isfinite(rounding), rounding, 0)
-    return _ratio(np.maximum(np.abs(error) - rounding, 0), scale)
+    return float(scales.excesses(error, rounding, scale, dtype=float).max(initial=0.0))
 
 
 def _row_maxima(M: Matrix) -> Vector:

@@ -35,12 +35,11 @@ from mortarbench.harness.operators import assembled
 from mortarbench.harness.plugin import Reference
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import admissible
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import (
-    MAX_CANCELLATION,
     NEGLIGIBLE,
     ROUNDING,
-    TERMS_FACTOR,
     Residuals,
     allowed,
     energy_at,
@@ -51,6 +50,7 @@ from mortarbench.harness.verify.kkt import (
     violation,
 )
 from mortarbench.harness.verify.rational import rational, solutions
+from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
 #: Coupled variables and rows of a QP that is solved once more; the dense reference
 #: solve takes a few times as long as that of a solver.
@@ -99,7 +99,7 @@ def decided(
     """Measure a point against the proven optimum; None where residuals decide.
 
     They decide where they exceed 10·tol even against the most generous scales, where
-    the QP is large or has other sets than bounds, or where nothing could be proven.
+    the QP is large, or where nothing could be proven.
 
     prove : returns the optimum, see `proves`
 
@@ -109,7 +109,7 @@ def decided(
     the optimum: for the error, 10 times the smaller of the terms of f* and 500·|f*|
 
     """
-    if len(qp.sets) > 1 or not is_small(qp):
+    if not is_small(qp):
         return None
     most = allowed(tol)
     if not qp.is_explicit:  # the rounding of its products is unknown
@@ -137,8 +137,10 @@ def is_small(qp: QP) -> bool:
 
 
 def coupled(qp: QP) -> NDArray[np.bool_]:
-    """Mark the variables (n,) that P, a matrix, or a row couples to others."""
+    """Mark the variables (n,) that P, a matrix, a row or a set couples to others."""
     is_coupled = np.zeros(qp.q.size, dtype=bool)
+    for one in qp.sets[1:]:
+        is_coupled[one.block] = True
     P = coo_array(qp.P)
     for j in (P.row, P.col):
         is_coupled[j[(P.row != P.col) & (P.data != 0)]] = True
@@ -178,9 +180,12 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
             return None
         s = exact.solution
     f = _objective(qp, s.x)
-    bound = np.where(s.z_box < 0, qp.lb, qp.ub)
-    pulls = s.z_box[s.z_box != 0] * (s.x - bound)[s.z_box != 0]
-    value = f + s.y @ (qp.A @ s.x - qp.b) + s.z @ (qp.G @ s.x - qp.h) + pulls.sum()
+    gaps = sum(
+        gap.value.sum()
+        for one in qp.sets
+        for gap in one.support_gaps(s.x, s.z_box, one.limits(s.x))
+    )
+    value = f + s.y @ (qp.A @ s.x - qp.b) + s.z @ (qp.G @ s.x - qp.h) - gaps
     r = np.abs(qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z + s.z_box)
     generous = energy_at(qp, s, generous=True)
     X = scales_at(qp, s.x.astype(float), generous).x
@@ -225,9 +230,7 @@ def _reference_point(qp: QP, solve: Reference) -> Solution | None:
         point,
         x=point.x.astype(np.longdouble), y=point.y.astype(np.longdouble),
         z=np.maximum(point.z, 0).astype(np.longdouble),
-        z_box=np.where(point.z_box < 0, np.where(np.isfinite(qp.lb), point.z_box, 0),
-                       np.where(np.isfinite(qp.ub), point.z_box, 0)
-                       ).astype(np.longdouble),
+        z_box=admissible(qp.sets, point.z_box).astype(np.longdouble),
     )  # fmt: skip
     return s if kkt_residuals(qp, s, generous=True).worst <= MAX_RESIDUAL else None
 
@@ -242,11 +245,15 @@ class ExactOptimum(NamedTuple):
 def exact_optimum(qp: QP, s: Solution) -> ExactOptimum | None:
     """Compute an optimum in rational arithmetic; None where none is proven.
 
+    Other sets than bounds have no linear equations: their optima are rarely rational.
+
     The rows with a multiplier in `s` become equations. Unknowns that these leave
     undetermined are set to zero; if that is not an optimum, multipliers close to the
     least ones (`_least_multipliers`) are tried, and then all values of `s`. The
     solution of the equations has to satisfy the KKT conditions of all rows exactly.
     """
+    if len(qp.sets) > 1:
+        return None
     if qp.q.size > MAX_RATIONAL and not (is_coupled := coupled(qp)).all():
         return _with_others(qp, s, is_coupled)
     for point in _exact_points(qp, s):
@@ -261,6 +268,8 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
     Rows with multipliers of the wrong sign leave the set, violated ones enter it.
     Returns None when a set recurs, since the same sets would follow for ever.
     """
+    if len(qp.sets) > 1:
+        return None
     s = Solution.without_point(qp, Status.FAILED)
     s = replace(s, x=0 * qp.q, y=0 * qp.b, z=0 * qp.h, z_box=0 * qp.q)
     visited = set[bytes]()
@@ -403,8 +412,11 @@ def _least_multipliers(qp: QP, s: Solution) -> Solution:
 
     For the rows with a multiplier in `s`, those with the least sum of squares of λᵢ
     times the terms of row i; rows whose sign would change get none. Returns `s` if the
-    remaining rows do not balance the gradient, up to a negligible part.
+    remaining rows do not balance the gradient, up to a negligible part, or if there are
+    other sets than bounds.
     """
+    if len(qp.sets) > 1:
+        return s
     x, is_fixed = np.abs(s.x).astype(float), qp.lb == qp.ub
     pressed, at_bound = s.z > 0, (s.z_box != 0) | is_fixed
     B = np.vstack([_dense(qp.A), _dense(qp.G)[pressed], np.eye(x.size)[at_bound]])
@@ -438,5 +450,5 @@ def _size(qp: QP, s: Solution) -> float:
     x = np.abs(s.x)
     rows = ((qp.A, qp.b, s.y), (qp.G, qp.h, s.z))
     work = sum(np.abs(m) @ (abs(M) @ x + np.abs(c)) for M, c, m in rows if c.size)
-    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + work + 2 * np.abs(s.z_box) @ x
-    return float(total)
+    total = x @ np.abs(qp.P @ s.x) + np.abs(qp.q) @ x + work + np.abs(s.z_box) @ x
+    return float(total + sum(one.support(s.z_box).terms for one in qp.sets))

@@ -11,6 +11,8 @@ method as far as tells the active constraints from the others
 (`interior`), and the equations of the active set are refined in
 extended precision (`polish`). What is handed back is the point with
 the least KKT residuals, as the harness measures them on the QP as given.
+
+A QP with sets other than bounds is solved by the projections on them (`projection`).
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
 from mortarbench.solvers.reference.equilibrate import equilibrated
 from mortarbench.solvers.reference.interior import interior_point
 from mortarbench.solvers.reference.polish import polished
+from mortarbench.solvers.reference.projection import projected
 
 NEAR = 1e-3  #: KKT residual of a start: from farther off refinement ends, where the
 #: solutions are many, at one that is far off, and other starts are tried
@@ -60,7 +63,8 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices, got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    for candidates in (_candidates(qp), _tamed_candidates(qp), _weak_candidates(qp)):
+    ways = (_candidates(qp), _tamed_candidates(qp), _weak_candidates(qp))
+    for candidates in (_projected_candidates(qp),) if len(qp.sets) > 1 else ways:
         residuals = list[float]()
         for point in candidates:
             residuals.append(worst := _residual(qp, point))
@@ -94,6 +98,14 @@ def _candidates(qp: QP) -> Iterator[Solution]:
     start = interior_point(scaled.qp)
     yield scaled.recover(start)
     yield from map(scaled.recover, polished(scaled.qp, start))
+
+
+def _projected_candidates(qp: QP) -> Iterator[Solution]:
+    """Give points over sets of any kind, until rounding is all that is left."""
+    for point in projected(qp):
+        yield point
+        if _residual(qp, point) <= MAX_RESIDUAL:
+            return
 
 
 def _tamed_candidates(qp: QP) -> Iterator[Solution]:

@@ -38,6 +38,8 @@ from scipy.linalg.cython_lapack cimport (
     dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
+from mortarbench.harness.verify cimport scales
+
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
@@ -135,17 +137,16 @@ cdef extern from "vectors.h" nogil:
                            const double *z, const double *Fx, const double *lb,
                            const double *ub, const double *forces, double *size,
                            Py_ssize_t n, double *sums, double *most)
-    void known_sizes(double energy, const double *q, const double *diagonal,
-                     const double *x, double *size, Py_ssize_t n)
     double worst_of_forces(double energy, double largest, const double *q,
                            const double *diagonal, const double *x, const double *Fx,
                            const double *lb, const double *ub, const double *size,
                            double *forces, Py_ssize_t n, double worst)
-    void own_sizes(const double *diagonal, const double *x, const double *Fx, double *own,
-                   Py_ssize_t n)
+    void sizes_of_variables(double energy, const double *q, const double *diagonal,
+                            const double *x, const double *Fx, double *size,
+                            double *own, Py_ssize_t n)
     void terms_of_rows(const double *rows, const double *e, const double *x,
                        const double *own_size, const double *size, Py_ssize_t m,
-                       Py_ssize_t n, double *missed, double *terms, double *known)
+                       Py_ssize_t n, double *missed, double *own, double *known)
 
 include "operations.pxi"
 include "preparation.pxi"

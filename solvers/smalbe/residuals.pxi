@@ -1,14 +1,5 @@
-# The KKT residuals of the problem as given, bounded without a product.
-#
-# Energy and sizes are those of `harness.verify.kkt`, whose constants these are; that no
-# point has residuals above the bound is tested against it.
-
-
-# Largest ratio of the terms of the objective to itself that counts, as in
-# `harness.verify.kkt`.
-cdef double MAX_CANCELLATION = 1e4
-# A row with a right-hand side is compared with this times its own terms, as there.
-cdef double TERMS_FACTOR = 10.0
+# A bound of the KKT residuals of the problem as given, without a product. Scales and errors
+# are those of `harness.verify.kkt`, from `harness/verify/scales.h`.
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
@@ -27,7 +18,7 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     cdef list held = []
     cdef double sums[3]
     cdef double most[2]
-    cdef double least, terms, energy, worst, size_of_all
+    cdef double least, energy, worst, size_of_all
     if not over.any(n > 0):
         return INFINITY
     cdef Room room = Room(3 * n + 3 * m)
@@ -59,9 +50,7 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     most[0], most[1] = -over.least(-most[0]), -over.least(-most[1])
     for i in range(m):
         sums[2] += e[i] * y[i]
-    terms = fmax(fmax(fabs(sums[0]), fabs(sums[1])), fabs(sums[2]))
-    energy = fmax(MAX_CANCELLATION * fabs(sums[0] / 2 + sums[1]), terms / MAX_CANCELLATION)
-    energy = fmin(terms, energy)
+    energy = scales.energy_scale(sums[0], sums[1], sums[2])
     if least < 0 or not energy > 0:
         return INFINITY
     # 2. Complementarity, the gap, and stationarity.
@@ -75,21 +64,19 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     if not m:
         return worst if isfinite(worst) else INFINITY
     # 3. The rows.
-    known_sizes(energy, q, d, x, size, n)
-    own_sizes(d, x, Fx, own_size, n)
+    sizes_of_variables(energy, q, d, x, Fx, size, own_size, n)
     if is_dense:
         terms_of_rows(read(G, held), e, x, own_size, size, m, n, missed, own, known)
     else:
         take(G @ s.x - qp.b, m, missed, "Gx − e")
-        size_of_rows, e_size = abs(G), np.abs(qp.b)
+        size_of_rows = abs(G)
         own_x, known_x = over.vector(seen(own_size, n)), over.vector(seen(size, n))
-        take(size_of_rows @ own_x + e_size, m, own, "own terms")
-        take(size_of_rows @ known_x + e_size, m, known, "known terms")
+        take(size_of_rows @ own_x, m, own, "own terms")
+        take(size_of_rows @ known_x, m, known, "known terms")
     for i in range(m):
         if not isfinite(missed[i]):
             return INFINITY
-        if missed[i] != 0:
-            worst = fmax(worst, fabs(missed[i]) / known[i])
-            if e[i] != 0:
-                worst = fmax(worst, fabs(missed[i]) / (TERMS_FACTOR * own[i]))
+        worst = fmax(worst, scales.ratio(
+            missed[i], scales.row_scale(fabs(e[i]), known[i], own[i])
+        ))
     return worst if isfinite(worst) else INFINITY

@@ -8,6 +8,8 @@
 #include <math.h>
 #include <string.h>
 
+#include "scales.h"
+
 #if defined(__x86_64__) && defined(__gnu_linux__) && !defined(__clang__) && __GNUC__ >= 12
 #define TWICE __attribute__((target_clones("arch=x86-64-v3", "default")))
 #else
@@ -995,19 +997,6 @@ TWICE static void masked(in free, in a, out t, Py_ssize_t n)
         t[i] = free[i] * a[i];
 }
 
-/* The sizes of variables that an energy knows of, as `harness.verify.kkt` says; zero
-   where it knows of none. */
-TWICE static void known_sizes(double energy, in q, in diagonal, in x, out size, Py_ssize_t n)
-{
-    for (Py_ssize_t j = 0; j < n; j++) {
-        double step = diagonal[j] > 0 ? sqrt(energy / diagonal[j]) : INFINITY;
-        double other = q[j] != 0 ? energy / fabs(q[j]) : INFINITY;
-        step = SMALLER(step, other);
-        other = SMALLER(fabs(x[j]), 1e3 * step);
-        size[j] = step < INFINITY ? LARGER(other, step) : 0;
-    }
-}
-
 /* Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components where the gradient leads into the box, and is
    more than `noise`. */
 TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
@@ -1067,46 +1056,44 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
         all += fabs(forces[i]);
     }
     for (Py_ssize_t i = 0; i < n; i++) {
-        double r = fabs(forces[i]), own;
+        double r = fabs(forces[i]), step, room;
         worst = LARGER(worst, r / largest);
         if (!(r > worst * size[i]))
             continue;
-        own = r / size[i];
-        if (diagonal[i] > 0) {
-            double known = LARGER(fabs(x[i]), r / diagonal[i]);
-            double way = forces[i] > 0 ? x[i] - lb[i] : ub[i] - x[i];
-            known = SMALLER(known, way);
-            own = SMALLER(own, r * known / energy);
-        }
-        worst = LARGER(worst, own);
+        step = diagonal[i] > 0 ? r / diagonal[i] : INFINITY;
+        room = forces[i] > 0 ? x[i] - lb[i] : ub[i] - x[i];
+        r = balance_error(r, size[i], step, x[i], room, energy);
+        worst = LARGER(worst, r);
     }
     return isfinite(all) ? worst : INFINITY;
 }
 
-/* The sizes of variables without an energy: |x|, and as far as the others push each. */
-TWICE static void own_sizes(in diagonal, in x, in Fx, out own, Py_ssize_t n)
+/* The sizes of variables by an energy, zero where it knows of none, and without one. */
+TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in Fx, out size,
+                                     out own, Py_ssize_t n)
 {
     for (Py_ssize_t j = 0; j < n; j++) {
-        double d = diagonal[j] > 0 ? diagonal[j] : 1;
-        own[j] = fabs(x[j]) + (diagonal[j] > 0 ? fabs(Fx[j] - d * x[j]) / d : 0);
+        double known = variable_size(energy, q[j], diagonal[j], x[j]);
+        size[j] = known < INFINITY ? known : 0;
+        own[j] = own_size(Fx[j], diagonal[j], x[j]);
     }
 }
 
-/* Gx - e, and the sizes |e| + |G| own and |e| + |G| size of its terms, of rows G (m, n). */
+/* Gx - e, and the sums |G| own_size and |G| size of rows G (m, n). */
 TWICE static void
 terms_of_rows(in rows, in e, in x, in own_size, in size, Py_ssize_t m, Py_ssize_t n,
-              out missed, out terms, out known)
+              out missed, out own, out known)
 {
     for (Py_ssize_t i = 0; i < m; i++) {
         in row = rows + i * n;
-        double error = -e[i], own = fabs(e[i]), sized = own;
+        double error = -e[i], own_terms = 0, terms = 0;
         for (Py_ssize_t j = 0; j < n; j++) {
             error += row[j] * x[j];
-            own += fabs(row[j]) * own_size[j];
-            sized += fabs(row[j]) * size[j];
+            own_terms += fabs(row[j]) * own_size[j];
+            terms += fabs(row[j]) * size[j];
         }
         missed[i] = error;
-        terms[i] = own;
-        known[i] = sized;
+        own[i] = own_terms;
+        known[i] = terms;
     }
 }

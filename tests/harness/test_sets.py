@@ -12,8 +12,8 @@ from mortarbench.harness.conformance.metamorphic import change_units, permute_un
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import ReasonError, reason_to_decline
-from mortarbench.harness.verify.multipliers import with_multipliers
-from mortarbench.harness.verify.optimum import decided
+from mortarbench.harness.verify.optimum import decided, proves
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.balls import Balls
 
 N = 8
@@ -260,14 +260,14 @@ def test_any_vector_is_normal_to_a_point():
     assert kkt_residuals(moved, replace(s, z_box=z)).worst <= 1e-14
 
 
-def test_other_sets_are_left_to_the_residuals():
-    """No reference is asked: it knows bounds alone."""
+def test_points_over_other_sets_are_compared_with_a_proven_optimum():
     qp, s = with_solution(0)
-    residuals = kkt_residuals(qp, s)
+    prove = proves(reference_solution)
+    near = replace(s, x=s.x * (1 + 1e-7))
+    errors = [decided(qp, p, kkt_residuals(qp, p), 1e-6, prove) for p in (s, near)]
 
-    assert decided(qp, s, residuals, 1e-8, lambda _: pytest.fail("asked")) is None
-    with pytest.raises(InputError, match="expected it beside x"):
-        with_multipliers(qp, s.x)
+    assert errors[0] <= 1e-14
+    assert 1e-10 < errors[1] < 1e-5
 
 
 def test_a_ball_without_a_point_beyond_a_row_is_infeasible():

@@ -107,6 +107,21 @@ def test_scaled_repeated_and_zero_rows_of_G_change_no_answer(dual, seed):
     assert mix.T @ mixed.y == pytest.approx(qp.A.T @ plain.y, abs=1e-7)
 
 
+def test_rows_that_contradict_each_other_by_rounding_end_the_solve():
+    """Nearly parallel rows, 10⁻¹² apart: no penalty brings ‖Cν‖ to its tolerance."""
+    n = 6
+    A = np.vstack([np.ones(n), 1 + 1e-9 * np.arange(n)])
+    qp = QP(
+        P=np.eye(n), q=np.ones(n), A=A, b=np.array([1, 1 - 1e-12]), G=no_rows(n),
+        h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf),
+    )  # fmt: skip
+    s = SMALBE().prepare(qp, 1e-8)()
+
+    assert s.status is Status.ITERATION_LIMIT
+    assert "stagnated" in s.message
+    assert s.counts["P_products"] <= 20
+
+
 def test_rows_that_contradict_each_other_are_reported():
     qp = bounded(np.eye(3), np.ones(3), [[1, 1, 0], [2, 2, 0]], [1, 3])
     s = SMALBE().prepare(qp, 1e-8)()

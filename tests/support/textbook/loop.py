@@ -26,7 +26,6 @@ from tests.support.textbook.outer_loop import (
 from tests.support.textbook.projected import Projected
 
 KEPT = 200  #: directions of CG on a face
-LEAST_RHO = 10.0  #: of the model of the penalty: with less, nothing is projected
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ def face_preconditioner(
     assert M is not None
 
     def in_face(free: Mask, rho: float) -> Operator:
-        of_penalty = problem.penalty(max(rho, LEAST_RHO)).inverse_in(free)
+        of_penalty = problem.penalty(max(rho, 1.0)).inverse_in(free)
 
         def apply(v: Vector) -> Vector:
             problem.counts["preconditioner_applies"] += 1

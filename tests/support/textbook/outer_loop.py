@@ -17,8 +17,8 @@ What the gradient means in the energy norm is estimated, too (`Projected.energy_
 more products, not more: where stiffnesses differ much, rounding can keep it away.
 
 Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ← 10ρ up to
-MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10 down to
-LEAST_M; and CᵀCν is tried as proof that there is no feasible point.
+MOST_RHO, or, where it is small enough and only the gradient is not, M ← M/10; and CᵀCν
+is tried as proof that there is no feasible point.
 """
 
 from __future__ import annotations
@@ -49,7 +49,6 @@ from tests.support.textbook.rows import met as are_met
 from tests.support.textbook.rows import violation
 
 FOR_ENERGY = 1.25  #: factor of the products spent that its error may still cost
-LEAST_M = 1e-10  #: beyond which M‖Cν‖ is rounding
 MOST_RHO = 1e10  #: beyond which rounding in ρQν is all that is left
 
 
@@ -187,7 +186,7 @@ def _accuracy(
 def _after_stall(problem: Projected, at: Iterate, *, met: bool) -> Iterate | None:
     """Be stricter with the rows, or, where they are `met`, with the gradient."""
     if met:
-        return at._replace(M=at.M / 10) if at.M >= LEAST_M else None
+        return at._replace(M=at.M / 10)
     if at.rho >= MOST_RHO:
         return None
     return _with_penalty(problem, at, min(10 * at.rho, MOST_RHO))

@@ -1,0 +1,99 @@
+/* Scales and errors of KKT residuals, number by number. `scales.pyx` applies them to
+   arrays; solvers call them in loops of their own. */
+
+#ifndef SCALES_H
+#define SCALES_H
+#include <math.h>
+
+enum {
+    /* Largest ratio of the terms of the objective to itself that counts: 10·tol of the
+       terms is then 1e-3 of the objective at tol 1e-8, three digits. Without it,
+       `test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms` fails. */
+    MAX_CANCELLATION = 10000,
+    /* Violations, and errors of the objective, are compared with this times their terms:
+       an answer is wrong beyond 100·tol of its terms, and residuals are allowed 10·tol.
+       With 100, `test_a_narrow_box_lends_no_length_to_a_row` fails. */
+    TERMS_FACTOR = 10,
+    /* Largest size of a variable, in lengths over which the energy changes by all of it.
+       `test_a_wrong_point_is_refuted_by_its_residuals` (case 15) fails with 1e5,
+       `test_a_row_between_variables_that_are_long_is_met_to_their_digits` with 10. */
+    MAX_LENGTHS = 1000
+};
+
+#define FORMULA static inline __attribute__((always_inline)) double
+
+/* The least and the largest of two numbers; NaN if either is NaN. */
+FORMULA least(double a, double b)
+{
+    return (a > b) | (b != b) ? b : a;
+}
+
+FORMULA largest(double a, double b)
+{
+    return (a < b) | (b != b) ? b : a;
+}
+
+/* The scale of energy of a point: the largest of |xᵀPx|, |qᵀx| and |bᵀy + hᵀz + σ(z_box)|,
+   but at most MAX_CANCELLATION times the objective, or 1/MAX_CANCELLATION of itself where
+   the objective vanishes. */
+FORMULA energy_scale(double quadratic, double linear, double work)
+{
+    double terms = largest(largest(fabs(quadratic), fabs(linear)), fabs(work));
+    double value = fabs(quadratic / 2 + linear);
+    return least(terms, largest(MAX_CANCELLATION * value, terms / MAX_CANCELLATION));
+}
+
+/* The size of a variable: |x|, at least the length l over which the energy E is spent, the
+   least of √(E/Pⱼⱼ) and E/|qⱼ|, and at most MAX_LENGTHS·l. Infinite without curvature and
+   cost. */
+FORMULA variable_size(double energy, double linear, double curvature, double x)
+{
+    double length = curvature > 0 ? sqrt(energy / curvature) : INFINITY;
+    length = least(length, linear != 0 ? energy / fabs(linear) : INFINITY);
+    return largest(least(fabs(x), MAX_LENGTHS * length), length);
+}
+
+/* |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which others shift the minimum along j; 0 without
+   curvature. */
+FORMULA minimum_shift(double Px, double curvature, double x)
+{
+    return curvature > 0 ? fabs(Px - curvature * x) / curvature : 0;
+}
+
+/* The size of a variable without any energy. */
+FORMULA own_size(double Px, double curvature, double x)
+{
+    return TERMS_FACTOR * (fabs(x) + minimum_shift(Px, curvature, x));
+}
+
+/* What the violation of a row or bound is compared with: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, where bᵢ ≠ 0,
+   own terms that are smaller; `sizes` and `own` are the sums of both kinds of sizes. */
+FORMULA row_scale(double rhs, double sizes, double own)
+{
+    return rhs > 0 ? least(rhs + sizes, TERMS_FACTOR * rhs + own) : rhs + sizes;
+}
+
+/* |error|/scale with 0/0 = 0; inf where the scale overflowed. */
+FORMULA ratio(double error, double scale)
+{
+    double size = scale < INFINITY || scale != scale ? fabs(error) / scale : INFINITY;
+    return error == 0 ? 0 : size;
+}
+
+/* What an error exceeds its rounding by; rounding beyond all bounds does not count. */
+FORMULA beyond(double error, double rounding)
+{
+    return largest(fabs(error) - (rounding < INFINITY ? rounding : 0), 0);
+}
+
+/* |rᵢ| relative to the largest of its terms, `own`, or the energy |rᵢ|Dᵢ relative to E if
+   that is less. Dᵢ is the larger of |xᵢ| and the `step` to the minimum along i, but no
+   more than the `room` to the bound in that direction. */
+FORMULA balance_error(double error, double own, double step, double x, double room,
+                      double energy)
+{
+    double gain = error * least(largest(fabs(x), step), largest(room, 0));
+    return least(ratio(error, own), ratio(error > 0 ? gain : 0, energy));
+}
+
+#endif
