@@ -79,7 +79,8 @@ def contact_case(
             )
         start = perf_counter()
         pieces = torn()
-        new, tear = torn_dual(pieces, primal, friction), partial(LocalProblems, pieces)
+        new = torn_dual(pieces, primal, friction)
+        tear = partial(LocalProblems, pieces, bodies.mesh.dim)
         seconds = perf_counter() - start
         subdomains = pieces.label
         matrices = torn_matrices(pieces, new.qp)
