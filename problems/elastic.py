@@ -33,6 +33,7 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
 from mortarbench.problems.fem.mesh import (
     Mesh,
+    dofs_of,
     half_disc,
     half_ring,
     join,
@@ -61,6 +62,7 @@ __all__ = [
     "assemble",
     "at_least",
     "at_most",
+    "dofs_of",
     "half_disc",
     "half_ring",
     "join",

@@ -8,13 +8,10 @@ order in the total displacement u, with slave and parameters held,
     (x_s − x_c)·n ≥ 0    ⟺    B u ≤ c,    B = [−n at s, +N_a n at a],  c = g + B u^k
 
 (the paper's B_M u ≤ c_M; its "Mortar" is this pointwise condition, which fails the
-contact patch test; problems.contact.mortar passes it). The normal is
-
-* "segment": of the segment that holds the closest point, and where that is a vertex the
-  averaged normal of the segments that meet. Where the closest point is inside a
-  segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment;
-* "averaged": interpolated between the averaged normals of the segment's ends,
-  n ∥ Σ N_a n_a, which does not jump when a node slides over a vertex.
+contact patch test; problems.contact.mortar passes it). The normal is that of the
+segment that holds the closest point, and where that is a vertex the averaged normal of
+the segments that meet. Where the closest point is inside a segment, x_s − x_c ∥ n, and
+the forces Bᵀλ have no moment.
 
 Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
@@ -32,29 +29,25 @@ may find no rest otherwise: the force of either segment pushes it onto the other
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.segment_search import Reach, nearest
+from mortarbench.problems.contact.segment_search import nearest
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
     current_positions,
     current_surface,
-    surface,
     tangents,
-    unit,
 )
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
 ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
-
-Normals = Literal["segment", "averaged"]
 
 
 class ContactRows(NamedTuple):
@@ -82,22 +75,19 @@ def node_to_segment(
     slave: Nodes,
     master: Nodes,
     *,
-    normals: Normals = "segment",
-    reach: Reach | None = None,
     tangential: bool = False,
     kept: Nodes | None = None,
 ) -> ContactRows:
     """Linearise the non-penetration of the slave nodes into the master boundary at u.
 
+    Every slave node has a row.
+
     Parameters
     ----------
-    points : (N, 2) reference positions X, m
-    u : (2N,) displacement u^k at which to linearise, m
+    points : (N, dim) reference positions X, m
+    u : (n,) displacement u^k at which to linearise, m
     slave : (s,) chain of nodes, its body on the left
     master : (v,) chain of nodes, its body on the left
-    normals : "segment" or "averaged", of the master
-    reach : drops the nodes that do not face their closest point or are too far from
-        it; None keeps a row for every slave node
     tangential : whether friction needs tangential rows
     kept : (s,) first node, in the master chain, of the segment that a slave node keeps;
         −1 where it is the closest one
@@ -110,7 +100,7 @@ def node_to_segment(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, normals, kept)
+    at = _opposite(x, line, kept)
     N = np.stack([1 - at.xi, at.xi], axis=1)
     ends = np.stack([at.segment, at.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
@@ -118,18 +108,15 @@ def node_to_segment(
 
     node = np.column_stack([slave, master[ends]])  # s, 1, 2
     weight = np.column_stack([-np.ones(len(slave)), N])
-    kept = np.arange(len(slave))
-    if reach is not None:
-        kept = np.flatnonzero(_in_reach(surface(x, "slave"), line, at, foot, reach))
-    node, weight, normal = node[kept], weight[kept], at.normal[kept]
-    B = rows_along(node, weight, normal, points.size)
+    B = rows_along(node, weight, at.normal, points.size)
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
-        directions = tangents(normal)
-        row = np.repeat(np.arange(kept.size), directions.shape[1])
+        directions = tangents(at.normal)
+        row = np.repeat(np.arange(slave.size), directions.shape[1])
         along = directions.reshape(-1, points.shape[1])
         T = rows_along(node[row], weight[row], along, points.size)
-    return ContactRows(B, gap[kept] + B @ u, T, row, nodal_lengths(x)[kept], kept)
+    place = np.arange(slave.size)
+    return ContactRows(B, gap + B @ u, T, row, nodal_lengths(x), place)
 
 
 def geometric_stiffness(
@@ -152,7 +139,7 @@ def geometric_stiffness(
 
     Parameters
     ----------
-    points, u, slave, master, kept : as of `node_to_segment`; normals are of segments
+    points, u, slave, master, kept : as of `node_to_segment`
     multipliers : (s,) λ, N/m
 
     Returns
@@ -163,7 +150,7 @@ def geometric_stiffness(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, "segment", kept)
+    at = _opposite(x, line, kept)
     x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
@@ -190,32 +177,23 @@ def geometric_stiffness(
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
-def closest_points(
-    x: Points, line: Surface, normals: Normals = "segment"
-) -> ClosestPoints:
+def closest_points(x: Points, line: Surface) -> ClosestPoints:
     """Find the closest points of x (s, 2) on a chain and its outward normals there."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
     at_first, at_second = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
-    n_1, n_2 = line.node_normal[first], line.node_normal[second]
-    normal = line.normal[segment]
-    if normals == "averaged":
-        normal = unit((1 - xi)[:, None] * n_1 + xi[:, None] * n_2, normal)
-    else:
-        normal = np.where(at_first[:, None], n_1, normal)
-        normal = np.where(at_second[:, None], n_2, normal)
+    normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
+    normal = np.where(at_second[:, None], line.node_normal[second], normal)
     return ClosestPoints(first, xi, normal)
 
 
-def _opposite(
-    x: Points, line: Surface, normals: Normals, kept: Nodes | None
-) -> ClosestPoints:
+def _opposite(x: Points, line: Surface, kept: Nodes | None) -> ClosestPoints:
     """Find what the slave nodes x (s, 2) stand against: the closest, or what is kept.
 
     On the line of a segment that is kept, ξ may be outside of [0, 1].
     """
-    at = closest_points(x, line, normals)
+    at = closest_points(x, line)
     if kept is None or not (own := kept >= 0).any():
         return at
     segment = np.where(own, kept, at.segment)
@@ -244,15 +222,3 @@ def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr
     B.sum_duplicates()
     B.eliminate_zeros()
     return B
-
-
-def _in_reach(
-    slave: Surface, master: Surface, at: ClosestPoints, foot: Points, reach: Reach
-) -> NDArray[np.bool_]:
-    """Say which slave nodes face their closest point and are near enough, (s,)."""
-    cosine = np.einsum("sx,sx->s", slave.node_normal, at.normal)
-    distance = np.linalg.norm(slave.x - foot, axis=1)
-    kept: NDArray[np.bool_] = (cosine <= reach.cosine) & (
-        distance <= reach.within(slave, master)
-    )
-    return kept

@@ -16,12 +16,11 @@ from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
-from mortarbench.problems.contact.surface import current_surface
+from mortarbench.problems.contact.surface import current_surface, surface
 from mortarbench.problems.fem.mesh import (
     Nodes,
     as_vectors,
     dofs_of,
-    nodal_lengths,
 )
 
 RIGID = "rigid"  #: name of a master that is no body
@@ -59,7 +58,7 @@ def contact_sides(
             force = friction.T[rough].T @ tangential[rough]
             rubbing -= as_vectors(force, dim)[pair.slave] * F
         side = current_surface(points, u, pair.slave, "slave")
-        length = nodal_lengths(points[pair.slave])
+        length = surface(points[pair.slave], "slave").areas
         normal = np.einsum("sx,sx->s", pressing, side.node_normal)
         gap, push = np.full((2, len(pair.slave)), np.nan)
         place, own = slave_places(B[rows], pair.slave, dim)

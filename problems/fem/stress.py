@@ -66,7 +66,8 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     for p, q in np.ndindex(terms, k):
         right[:, p, q] = np.bincount(nodes, basis[:, p] * values[cells, q], N)
 
-    interior = ~_on_boundary(mesh)
+    interior = np.ones(N, dtype=bool)
+    interior[boundary_facets(mesh.cells, dim)] = False
     polynomial = np.zeros((N, terms, k))
     polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
     known = interior
@@ -97,13 +98,6 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
     x, y, shear, z = np.moveaxis(stress, -1, 0)
     squares = ((x - y) ** 2 + (y - z) ** 2 + (z - x) ** 2) / 2 + 3 * shear**2
     return np.asarray(np.sqrt(squares))
-
-
-def _on_boundary(mesh: Mesh) -> NDArray[np.bool_]:
-    """Mark nodes on an edge that belongs to one cell only."""
-    mark = np.zeros(len(mesh.points), dtype=bool)
-    mark[boundary_facets(mesh.cells, mesh.dim)] = True
-    return mark
 
 
 def _neighbours(

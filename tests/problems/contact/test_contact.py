@@ -6,7 +6,6 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import node_to_segment as contact
 from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.segment_search import Reach
 from mortarbench.problems.contact.surface import surface
 
 #: a master below the slave: body under the chain means the chain runs right to left
@@ -16,19 +15,18 @@ MASTER = np.array([[4.0, 0.0], [2.0, 0.0], [0.0, 0.0]])
 #: above MASTER, its body on the left: it runs from left to right
 FLAT = np.array([[0.5, 0.25], [1.5, 0.25], [2.5, 0.25]])
 ROOF = np.array([[2.0, 0.0], [1.0, 1.0], [0.0, 0.0]])  # convex, apex on top
-ANY_ANGLE = 1.0
 
 
-def rows(slave, master, u=None, **options):
+def rows(slave, master, u=None):
     points = np.concatenate([slave, master])
     n = len(slave)
     u = np.zeros(points.size) if u is None else u
     chains = np.arange(n), np.arange(n, len(points))
-    return node_to_segment(points, u, *chains, **options)
+    return node_to_segment(points, u, *chains)
 
 
-def closest_points(x, chain, *normals):
-    return contact.closest_points(x, surface(chain, "master"), *normals)
+def closest_points(x, chain):
+    return contact.closest_points(x, surface(chain, "master"))
 
 
 def test_a_node_above_a_segment_may_descend_by_its_gap():
@@ -152,35 +150,24 @@ def test_a_master_of_one_segment_has_an_inside_and_two_ends():
     assert at.normal == pytest.approx(np.array([[0, 1]] * 3))
 
 
-@pytest.mark.parametrize("normals", ["segment", "averaged"])
-def test_segments_without_length_change_nothing(normals):
+def test_segments_without_length_change_nothing():
     """Every node of the roof occurs twice; forces go to one node of each place."""
     slave = np.array([[0.2, 0.5], [0.6, 1.1], [1.0, 1.2], [1.0, 1.2], [2.5, 0.0]])
-    once = rows(slave, ROOF, normals=normals)
-    twice = rows(slave, np.repeat(ROOF, 2, axis=0), normals=normals)
+    once = rows(slave, ROOF)
+    twice = rows(slave, np.repeat(ROOF, 2, axis=0))
 
     place = twice.B.toarray()[:, 10:].reshape(5, 3, 2, 2).sum(axis=2)
     assert twice.c == pytest.approx(once.c)
     assert place.reshape(5, 6) == pytest.approx(once.B.toarray()[:, 10:])
 
 
-def test_slave_segments_without_length_keep_their_nodes_in_reach():
-    near = Reach(distance=0.3)
-    B, c, *_ = rows(np.repeat(FLAT, 2, axis=0), MASTER, reach=near)
-
-    assert B.shape[0] == 6
-    assert c == pytest.approx(0.25)
-
-
 def test_a_master_that_folds_back_onto_itself_has_finite_rows():
     needle = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
-    for normals in ("segment", "averaged"):
-        B, c, *_ = rows(np.array([[1.0, 0.0], [1.5, 0.0], [0.5, 0.1]]), needle,
-                    normals=normals)  # fmt: skip
+    B, c, *_ = rows(np.array([[1.0, 0.0], [1.5, 0.0], [0.5, 0.1]]), needle)
 
-        assert np.isfinite(c).all()
-        on_slaves = B.toarray()[:, :6].reshape(3, 3, 2).sum(axis=1)
-        assert np.linalg.norm(on_slaves, axis=1) == pytest.approx(1)
+    assert np.isfinite(c).all()
+    on_slaves = B.toarray()[:, :6].reshape(3, 3, 2).sum(axis=1)
+    assert np.linalg.norm(on_slaves, axis=1) == pytest.approx(1)
 
 
 @pytest.mark.parametrize(
@@ -196,66 +183,6 @@ def test_a_master_without_a_segment_or_a_place_is_refused(master, message):
 def test_a_slave_that_has_flown_away_is_refused():
     with pytest.raises(InputError, match=r"slave: node 0 is at \[inf, 0.25\]"):
         rows(np.array([[np.inf, 0.25]]), MASTER)
-
-
-def test_averaged_normals_are_interpolated_along_a_segment():
-    """Half way from the apex (0, 1) to the foot of the roof (1, 1)/√2."""
-    at = closest_points(np.array([[2.0, 1.0]]), ROOF, "averaged")
-    mean = np.array([np.sqrt(0.5), 1 + np.sqrt(0.5)])
-
-    assert at.xi == pytest.approx([0.5])
-    assert at.normal[0] == pytest.approx(mean / np.linalg.norm(mean))
-
-
-def test_averaged_normals_do_not_jump_where_a_node_slides_over_a_vertex():
-    sides = 1.0 + np.array([-1e-6, 1e-6])  # just above either slope
-    x = np.column_stack([sides, 1.0 - abs(sides - 1) + 1e-7])
-    by_segment = closest_points(x, ROOF).normal
-    averaged = closest_points(x, ROOF, "averaged").normal
-
-    assert np.linalg.norm(by_segment[1] - by_segment[0]) == pytest.approx(np.sqrt(2))
-    assert np.linalg.norm(averaged[1] - averaged[0]) < 1e-5
-
-
-def test_averaged_normals_of_a_flat_master_are_its_normal():
-    slave = np.array([[0.3, 0.2], [2.0, 0.3], [4.5, 0.1]])
-    one, other = rows(slave, MASTER), rows(slave, MASTER, normals="averaged")
-
-    assert (one.B != other.B).nnz == 0
-    assert (one.c == other.c).all()
-
-
-@pytest.mark.parametrize(
-    ("reach", "kept"),
-    [(None, 3), (Reach(), 3), (Reach(distance=0.3), 3), (Reach(distance=0.2), 0)],
-)
-def test_nodes_farther_than_the_reach_get_no_row(reach, kept):
-    B, c, *_ = rows(FLAT, MASTER, reach=reach)
-
-    assert B.shape == (kept, 12)
-    assert c.shape == (kept,)
-
-
-def test_the_distance_is_to_the_closest_point_and_not_along_the_normal():
-    beside = np.array([[4.5, 0.25], [5.5, 0.25]])  # 0.56 and 1.52 off the end
-
-    assert rows(beside, MASTER, reach=Reach(distance=1.0)).B.shape[0] == 1
-
-
-def test_nodes_that_do_not_face_their_closest_point_get_no_row():
-    """The left flank of a box, its corner and its underside above a flat master."""
-    box = np.array([[1.0, 2.0], [1.0, 1.5], [1.0, 1.0], [2.0, 1.0], [3.0, 1.0]])
-
-    def slaves(reach):
-        return np.unique(rows(box, MASTER, reach=reach).B[:, :10].nonzero()[1] // 2)
-
-    assert slaves(Reach()).tolist() == [2, 3, 4]  # the corner is 45° off
-    assert slaves(Reach(cosine=-0.8)).tolist() == [3, 4]
-    assert slaves(Reach(cosine=ANY_ANGLE)).tolist() == [0, 1, 2, 3, 4]
-
-
-def test_a_slave_that_runs_the_wrong_way_is_out_of_reach_everywhere():
-    assert rows(FLAT[::-1], MASTER, reach=Reach()).B.shape == (0, 12)
 
 
 def test_a_node_that_is_also_on_the_master_has_one_entry_per_component():
