@@ -11,10 +11,10 @@ from mortarbench.reports.render.html_page import html
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.settings import definitions
-from mortarbench.reports.validation.report import _RULES
+from mortarbench.reports.validation.report import TEXT
 
 DEFINITIONS = definitions(Analysis(SimpleNamespace(factor=10.0)))
-RULES = Section(name="rules", title="Rules", points=_RULES)
+RULES = Section(name="rules", title="Rules", points=tuple(TEXT.parts("rules")))
 
 
 def page(section):
