@@ -11,16 +11,7 @@ from mortarbench.reports.compare.page import time_cell
 from mortarbench.reports.data.cells import answer_columns
 from mortarbench.reports.data.environment import dateline
 from mortarbench.reports.document.formatting import TIMED, clean
-from mortarbench.reports.document.layout import (
-    Cell,
-    Page,
-    Part,
-    Point,
-    Section,
-    Table,
-    name_cell,
-    number,
-)
+from mortarbench.reports.document.layout import Cell, Page, Part, Point, Section, Table
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 
@@ -54,7 +45,7 @@ def _summary(
         if ratio is None:
             return Cell(title="no cell with times in both folders")
         kind = "over" if side(ratio) > 0 else ""
-        return number(ratio, ratio_text, after=change_word(ratio), kind=kind)
+        return Cell.number(ratio, ratio_text, after=change_word(ratio), kind=kind)
 
     named = [*zip(names, found, strict=True)]
     yield from (Point(f"{name}: {headline(c)}") for name, c in named)
@@ -62,7 +53,7 @@ def _summary(
         f"Time over that in {first}, geometric mean over the cells that both hold "
         f"verified, with its {COVERAGE:.0%} bootstrap interval over cells.",
         dict.fromkeys(s for c in found for s in c.solvers),
-        (("solver", name_cell), *((name, partial(mean, c)) for name, c in named)),
+        (("solver", Cell.name), *((name, partial(mean, c)) for name, c in named)),
     )
 
 

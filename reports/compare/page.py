@@ -27,6 +27,7 @@ from mortarbench.reports.compare.figure import ratios_figure
 from mortarbench.reports.data.cells import (
     answer_columns,
     explained,
+    iterations_cell,
     source,
     verdict_cell,
 )
@@ -39,7 +40,6 @@ from mortarbench.reports.document.formatting import (
     power,
     seconds,
     significant,
-    span,
 )
 from mortarbench.reports.document.layout import (
     Cell,
@@ -50,10 +50,6 @@ from mortarbench.reports.document.layout import (
     Point,
     Section,
     Table,
-    name_cell,
-    number,
-    text_cell,
-    words,
 )
 from mortarbench.reports.document.templates import Sentences
 
@@ -90,7 +86,7 @@ def _summary(c: Comparison) -> Iterator[Part]:
     for solver in c.solvers:
         relative = relative_ratio(c, solver)
         means = _mean_cells(mean_ratio(c.of(solver)))
-        rows.append((name_cell(solver), *means, number(relative, ratio_text)))
+        rows.append((Cell.name(solver), *means, Cell.number(relative, ratio_text)))
     for name, mean in (("all", mean_ratio(c.pairs)), ("canary", canary_ratio(c.pairs))):
         if mean is not None:
             total = Cell(text=name, kind="total")
@@ -104,11 +100,11 @@ def _summary(c: Comparison) -> Iterator[Part]:
 
 def _mean_cells(mean: Mean | None, kind: str = "") -> tuple[Cell, ...]:
     if mean is None:
-        return number(0), Cell(), Cell()
+        return Cell.number(0), Cell(), Cell()
     way = side(mean)
     return (
-        number(mean.cells, kind=kind),
-        number(mean, ratio_text, kind=kind),
+        Cell.number(mean.cells, kind=kind),
+        Cell.number(mean, ratio_text, kind=kind),
         Cell(text=change_word(mean), value=way, kind="over" if way > 0 else kind),
     )
 
@@ -137,7 +133,7 @@ def _times(c: Comparison) -> Iterator[Part]:
 def _ratio(p: Pair) -> Cell:
     if p.ratio is None:
         return Cell()
-    return number(p.ratio, ratio_text, title=source(p.after))
+    return Cell.number(p.ratio, ratio_text, title=source(p.after))
 
 
 def _change(p: Pair) -> Cell:
@@ -152,7 +148,7 @@ def _change(p: Pair) -> Cell:
 
 def time_cell(outcome: Outcome, *, voided: bool) -> Cell:
     """Show a time, with the verdict where it is not verified."""
-    return number(
+    return Cell.number(
         outcome.seconds("total"),
         seconds,
         after="" if outcome.verified else VERDICTS[outcome.verdict][1],
@@ -181,19 +177,18 @@ def _verdicts(c: Comparison) -> Iterator[Part]:
 
 
 def _iterations(c: Comparison) -> Iterator[Part]:
-    def cell(o: Outcome) -> Cell:
-        its = o.iterations
-        return Cell(text=span(its), value=(its or (0,))[0], title=source(o))
-
+    columns = (
+        *_PAIR,
+        ("before", lambda p: iterations_cell(p.before)),
+        ("after", lambda p: iterations_cell(p.after)),
+    )
     changed = [p for p in c.pairs if p.other_iterations]
-    before, after = (lambda p: cell(p.before)), (lambda p: cell(p.after))
-    columns = (*_PAIR, ("before", before), ("after", after))
     return _listed(TEXT("iterations"), changed, columns)
 
 
 def _answers(c: Comparison) -> Iterator[Part]:
     def energy(k: int) -> Callable[[Pair], Cell]:
-        return lambda p: number(
+        return lambda p: Cell.number(
             p.answers and p.answers[k], lambda v: significant(v, 12)
         )
 
@@ -204,8 +199,8 @@ def _answers(c: Comparison) -> Iterator[Part]:
             *_PAIR,
             ("before", energy(0)),
             ("after", energy(1)),
-            ("difference", lambda p: number(p.answers and p.answers[2], power)),
-            ("allowed", lambda p: number(p.may_differ, power)),
+            ("difference", lambda p: Cell.power(p.answers and p.answers[2])),
+            ("allowed", lambda p: Cell.power(p.may_differ)),
         ),
     )
 
@@ -215,7 +210,7 @@ def _unpaired(c: Comparison) -> Iterator[Part]:
     alone += [("after", o) for o in c.only_after]
     columns = (
         *answer_columns(lambda each: each[1]),
-        ("only", lambda each: words(each[0])),
+        ("only", lambda each: Cell.words(each[0])),
         ("verdict", lambda each: verdict_cell(each[1])),
     )
     return _listed("Cells without a partner.", alone, columns)
@@ -242,7 +237,7 @@ def conditions_that_differ(c: Comparison) -> Iterator[Part]:
     others = [p for p in c.pairs if not p.same_qp]
     yield from TEXT.parts("conditions", any(found.values()), others)
     columns: tuple[Column, ...] = (
-        ("key", lambda each: text_cell(each[0], 96)),
+        ("key", lambda each: Cell.label(each[0], 96)),
         ("before", lambda each: _plain(each[1])),
         ("after", lambda each: _plain(each[2])),
     )
@@ -250,4 +245,4 @@ def conditions_that_differ(c: Comparison) -> Iterator[Part]:
 
 
 def _plain(value: object) -> Cell:
-    return words(ABSENT if value is None else clean(str(value), 120))
+    return Cell.words(ABSENT if value is None else clean(str(value), 120))

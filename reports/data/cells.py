@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import VERDICTS, clean, plural
-from mortarbench.reports.document.layout import (
-    Cell,
-    Column,
-    Table,
-    name_cell,
-    sources,
-    text_cell,
-    tolerance_cell,
-)
+from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
+from mortarbench.reports.document.layout import Cell, Column, Table, sources
 
 #: after a verdict that a proven optimum decided against the residuals
 BY_OPTIMUM = "⋆"
@@ -42,6 +35,13 @@ def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
         kind=outcome.verdict.value,
         title=source(outcome),
     )
+
+
+def iterations_cell(outcome: Outcome) -> Cell:
+    """Show iterations, or their range where repeats differ."""
+    its = outcome.iterations
+    least = its[0] if its else None
+    return Cell(text=span(its), value=least, title=source(outcome))
 
 
 def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
@@ -71,16 +71,23 @@ def answer_columns(
     of : what has these of an item, itself if it does
     """
     return (
-        ("case", lambda item: name_cell(of(item).case)),
-        ("solver", lambda item: text_cell(of(item).solver)),
-        ("tol", lambda item: tolerance_cell(of(item).tol)),
+        ("case", lambda item: Cell.name(of(item).case)),
+        ("solver", lambda item: Cell.label(of(item).solver)),
+        ("tol", lambda item: Cell.tolerance(of(item).tol)),
     )
+
+
+def solver_columns(
+    solvers: Iterable[str], cell: Callable[[str, Any], Cell]
+) -> Iterator[Column]:
+    """Make a column per solver: its cells are those of the solver and an item."""
+    return ((clean(s, 40), partial(cell, s)) for s in solvers)
 
 
 def case_cells(outcome: Outcome | Mapping[str, Outcome]) -> tuple[Cell, Cell]:
     """Make the two leading cells of a row: case and tolerance."""
     one = outcome if isinstance(outcome, Outcome) else next(iter(outcome.values()))
-    return name_cell(one.case), tolerance_cell(one.tol)
+    return Cell.name(one.case), Cell.tolerance(one.tol)
 
 
 def grid(

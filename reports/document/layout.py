@@ -9,7 +9,15 @@ from typing import Any
 from mortarbench.harness import Record
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
-from mortarbench.reports.document.formatting import ABSENT, clean, tolerance
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    clean,
+    estimate,
+    power,
+    seconds,
+    tolerance,
+)
+from mortarbench.reports.statistics.intervals import Interval
 
 _RUN = "run "  #: before the run_ids in a title
 
@@ -24,6 +32,51 @@ class Cell:
     kind: str = ""  #: a verdict, "best", "tied", "void" (not to be compared) or "total"
     title: str = ""  #: shown when pointed at; run_ids as `source` names them are links
     value: float | None = None  #: what to sort by; the text, if None
+
+    @classmethod
+    def name(cls, name: str) -> Cell:
+        """Show a name that may be long; all of it appears when pointed at."""
+        shown = clean(name)
+        return cls(text=shown, title="" if shown == name else clean(name, 2000))
+
+    @classmethod
+    def label(cls, text: str, limit: int = 40, title: str = "") -> Cell:
+        """Show foreign text in one line of at most `limit` characters."""
+        return cls(text=clean(text, limit), title=title)
+
+    @classmethod
+    def words(cls, text: str, title: str = "") -> Cell:
+        """Show words in a column of words."""
+        return cls(text=text, kind="words", title=title)
+
+    @classmethod
+    def number(cls, value: Any, show: Callable[[Any], str] = str, **more: Any) -> Cell:
+        """Show a number, or an interval by its value; "–" for None.
+
+        show : formats it, as the functions of `reports.document.formatting` do
+        """
+        text = ABSENT if value is None else show(value)
+        return cls(text=text, value=getattr(value, "value", value), **more)
+
+    @classmethod
+    def time(cls, interval: Interval | None, **more: str) -> Cell:
+        """Show a time with its uncertainty."""
+        return cls.number(interval, seconds, **more)
+
+    @classmethod
+    def ratio(cls, ratio: Any, **more: str) -> Cell:
+        """Show an estimate with its interval."""
+        return cls.number(ratio, estimate, **more)
+
+    @classmethod
+    def power(cls, value: float | None, **more: str) -> Cell:
+        """Show an order of magnitude."""
+        return cls.number(value, power, **more)
+
+    @classmethod
+    def tolerance(cls, tol: float) -> Cell:
+        """Show a tolerance."""
+        return cls.number(tol, tolerance)
 
 
 Column = tuple[str, Callable[[Any], Cell]]  #: its head, and the cell of an item
@@ -159,33 +212,3 @@ def short(run_id: str) -> str:
     """Print a run_id; ours are short, those of a foreign journal may not be."""
     is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
     return run_id if is_ours else clean(run_id, 40)
-
-
-def name_cell(name: str) -> Cell:
-    """Show a name that may be long; all of it appears when pointed at."""
-    shown = clean(name)
-    return Cell(text=shown, title="" if shown == name else clean(name, 2000))
-
-
-def text_cell(text: str, limit: int = 40, title: str = "") -> Cell:
-    """Show foreign text in one line of at most `limit` characters."""
-    return Cell(text=clean(text, limit), title=title)
-
-
-def words(text: str, title: str = "") -> Cell:
-    """Show words in a column of words."""
-    return Cell(text=text, kind="words", title=title)
-
-
-def number(value: Any, show: Callable[[Any], str] = str, **more: Any) -> Cell:
-    """Show a number, or an interval by its value; "–" for None.
-
-    show : formats it, as the functions of `reports.document.formatting` do
-    """
-    text = ABSENT if value is None else show(value)
-    return Cell(text=text, value=getattr(value, "value", value), **more)
-
-
-def tolerance_cell(tol: float) -> Cell:
-    """Show a tolerance."""
-    return number(tol, tolerance)

@@ -18,22 +18,9 @@ from mortarbench.reports.data.quantities import (
     spreads,
     unit,
 )
-from mortarbench.reports.document.formatting import (
-    clean,
-    power,
-    significant,
-    tolerance,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Picture,
-    Table,
-    name_cell,
-    number,
-    tolerance_cell,
-    words,
-)
+from mortarbench.reports.document.formatting import clean, power, significant, tolerance
+from mortarbench.reports.document.grouping import grouped
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.deformed import (
     PERCENTILE,
@@ -65,11 +52,11 @@ def agreement(a: Analysis) -> Iterator[Part]:
         TEXT("energies_caption"),
         found,
         (
-            ("physical case", lambda s: name_cell(s.answers[0].physical)),
-            ("tol", lambda s: tolerance_cell(s.answers[0].tol)),
+            ("physical case", lambda s: Cell.name(s.answers[0].physical)),
+            ("tol", lambda s: Cell.tolerance(s.answers[0].tol)),
             (
                 "answers",
-                lambda s: number(len(s.answers), title=source(*s.answers)),
+                lambda s: Cell.number(len(s.answers), title=source(*s.answers)),
             ),
             (
                 "energy",
@@ -82,11 +69,11 @@ def agreement(a: Analysis) -> Iterator[Part]:
             ),
             (
                 "largest relative difference",
-                lambda s: number(s.relative, power, title=source(*(s.pair or ()))),
+                lambda s: Cell.power(s.relative, title=source(*(s.pair or ()))),
             ),
             (
                 "between",
-                lambda s: words(
+                lambda s: Cell.words(
                     " and ".join(map(_who, s.pair or ())) or "nothing to compare with"
                 ),
             ),
@@ -105,15 +92,12 @@ def _who(outcome: Outcome) -> str:
 )  # fmt: skip
 def physics(a: Analysis) -> Iterator[Part]:
     """Show sizes and physical results, one verified answer per physical case."""
-    groups: dict[str, list[Outcome]] = {}
-    for o in a.evidence.flat:
-        if o.verified and o.quantities:
-            groups.setdefault(o.physical, []).append(o)
-    chosen = [(best_of(answers), answers) for answers in groups.values()]
+    answered = [o for o in a.evidence.flat if o.verified and o.quantities]
+    cases = grouped(answered, lambda o: o.physical).values()
+    chosen = [(best_of(answers), answers) for answers in cases]
     if chosen:
         yield from TEXT.parts("physics", any(elastic(best) for best, _ in chosen))
-    for family in dict.fromkeys(best.first.family for best, _ in chosen):
-        mine = [each for each in chosen if each[0].first.family == family]
+    for family, mine in grouped(chosen, lambda each: each[0].first.family).items():
         yield from _quantities(mine, family, sizes=True)
         yield from _quantities(mine, family, sizes=False)
 
@@ -131,8 +115,8 @@ def _quantities(
         peers = [leaves(o, sizes=sizes) for o in answers if o.tol == best.tol]
         cells = [quantity(path, best, own.get(path), peers) for path in paths]
         which = f"{_who(best)}, {power(best.worst)} at tol {tolerance(best.tol)}"
-        answer = [words(which, title=source(best))] * (not sizes)
-        rows.append((name_cell(best.physical), *cells, *answer))
+        answer = [Cell.words(which, title=source(best))] * (not sizes)
+        rows.append((Cell.name(best.physical), *cells, *answer))
     heads = (head(path, outcomes) for path in paths)
     yield Table(
         caption=TEXT(
@@ -172,11 +156,8 @@ def deformed(a: Analysis) -> Iterator[Part]:
 )  # fmt: skip
 def tractions(a: Analysis) -> Iterator[Part]:
     """Draw tractions along contacts, of each family those of the largest case."""
-    largest: dict[str, Outcome] = {}
-    for o in _drawable(a):
-        family = o.first.family
-        largest[family] = max(o, largest.get(family, o), key=_importance)
-    for family, chosen in largest.items():
+    for family, mine in grouped(_drawable(a), lambda o: o.first.family).items():
+        chosen = max(reversed(mine), key=_importance)
         try:
             fields = load_fields(a.evidence.directory, chosen.first.fields or "")
         except InputError:  # `deformed` says so

@@ -27,21 +27,8 @@ from mortarbench.reports.data.comparison_groups import (
     LARGEST_SHIFT,
     ComparisonGroup,
 )
-from mortarbench.reports.document.formatting import (
-    TIMED,
-    estimate,
-    seconds,
-    significant,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Picture,
-    Table,
-    name_cell,
-    number,
-    words,
-)
+from mortarbench.reports.document.formatting import TIMED, estimate, significant
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.profiles import (
     banded,
@@ -93,7 +80,7 @@ def _means_table(ranking: Ranking) -> Table:
     def mean(i: int) -> Cell:
         low, high = (float(end[i]) for end in ranking.intervals)
         value = Interval(float(ranking.means[i]), low, high, COVERAGE, len(group.cases))
-        return number(value, seconds, kind="best" if i == leader else "")
+        return Cell.time(value, kind="best" if i == leader else "")
 
     def ratio(i: int) -> Cell:
         found = [float(part[i]) for part in ranking.ratios]
@@ -103,20 +90,20 @@ def _means_table(ranking: Ranking) -> Table:
         value = float(common[i] / common[leader])
         if np.isnan(value):
             return Cell(title="too few cases that all solved")
-        return number(value, significant)
+        return Cell.number(value, significant)
 
     def restricted(i: int) -> Cell:
         found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
         censored = [f"{found.stopped} out of time"] * bool(found.stopped)
         censored += [f"{found.never} never"] * bool(found.never)
-        return number(found.mean, seconds, after=", ".join(censored))
+        return Cell.time(found.mean, after=", ".join(censored))
 
     return Table.of(
         TEXT("means_caption", group, rows.sum(), (~columns).sum()),
         map(int, ranking.order),
         (
-            ("solver", lambda i: name_cell(group.solvers[i])),
-            ("tier", lambda i: number(int(ranking.tiers[i]))),
+            ("solver", lambda i: Cell.name(group.solvers[i])),
+            ("tier", lambda i: Cell.number(int(ranking.tiers[i]))),
             (
                 "solved",
                 lambda i: Cell(
@@ -125,7 +112,7 @@ def _means_table(ranking: Ranking) -> Table:
             ),
             ("mean", lambda i: mean(i) if solved[i] else nothing),
             ("to the leader", ratio),
-            ("P(best)", lambda i: number(float(ranking.first[i]), _share)),
+            ("P(best)", lambda i: Cell.number(float(ranking.first[i]), _share)),
             (
                 "both solved, to the leader",
                 lambda i: Cell(text="1") if i == leader else _pairs(group, i, leader),
@@ -152,7 +139,7 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
     if ratio is None or ratio.pairs < CASES:
         return Cell(title=f"fewer than {CASES} cases that both solved")
     session = ", other session" * bool(group.apart.any() and group.apart[i, leader])
-    return number(ratio, estimate, after=f"n = {ratio.pairs}{session}")
+    return Cell.ratio(ratio, after=f"n = {ratio.pairs}{session}")
 
 
 @section(42, "ranking", "What ranks depend on")
@@ -175,7 +162,7 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     def changed(one: Changed, i: int) -> Cell:
         if np.isnan(one.ranks[i]):
             return Cell(title="takes no part in the comparison")
-        return number(
+        return Cell.number(
             float(one.ranks[i]), "{:.0f}".format,
             kind="over" if one.turned[i].any() else "",
         )  # fmt: skip
@@ -187,15 +174,15 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     def reading(i: int) -> Cell:
         told = ranking.faster[i] | ranking.faster[:, i]
         low, high = ranking.spans[i]
-        return words(_reading(ranked.turned[i], told, sure=low == high))
+        return Cell.words(_reading(ranked.turned[i], told, sure=low == high))
 
     return Table.of(
         TEXT("panel_caption", ranking.group),
         map(int, ranking.order),
         (
-            ("solver", lambda i: name_cell(ranking.group.solvers[i])),
-            ("tier", lambda i: number(int(ranking.tiers[i]))),
-            ("rank", lambda i: number(int(ranked.usual[i]))),
+            ("solver", lambda i: Cell.name(ranking.group.solvers[i])),
+            ("tier", lambda i: Cell.number(int(ranking.tiers[i]))),
+            ("rank", lambda i: Cell.number(int(ranked.usual[i]))),
             ("inside the noise", lambda i: _range(*ranking.spans[i])),
             *((name, partial(changed, one)) for name, one in ranked.single.items()),
             ("all", every),
@@ -256,7 +243,7 @@ def _profile_table(ranking: Ranking) -> Table:
         TEXT("shares_caption", group, int((~group.solved.any(axis=1)).sum())),
         map(int, ranking.order),
         (
-            ("solver", lambda i: name_cell(group.solvers[i])),
+            ("solver", lambda i: Cell.name(group.solvers[i])),
             *((head, partial(share, k)) for k, head in enumerate(heads)),
         ),
     )

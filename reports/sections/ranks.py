@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
-from mortarbench.reports.data.cells import answer_columns, source
+from mortarbench.reports.data.cells import answer_columns, iterations_cell, source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.rank_series import (
     ALIKE,
@@ -22,14 +22,8 @@ from mortarbench.reports.data.rank_series import (
 )
 from mortarbench.reports.document import layout
 from mortarbench.reports.document.figure import Figure
-from mortarbench.reports.document.formatting import (
-    TIMED,
-    bracketed,
-    seconds,
-    significant,
-    span,
-)
-from mortarbench.reports.document.layout import Cell, Column, Picture, Table, number
+from mortarbench.reports.document.formatting import TIMED, significant
+from mortarbench.reports.document.layout import Cell, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.ranks import (
     model_figure,
@@ -50,6 +44,7 @@ TEXT = Sentences(__name__, ALIKE=ALIKE, MISFIT=MISFIT, MOST_DRAWN=MOST_DRAWN)
 #: a series, a number of ranks, and the answer on them
 Solve = tuple[StrongSeries, int, Outcome]
 _ONE = Cell(text="1", value=1.0)
+_SERIES = ("case", "solver", "tol")
 
 
 @section(
@@ -81,33 +76,25 @@ def ranks(a: Analysis) -> Iterator[layout.Part]:
 def _ratio(interval: Interval | None, title: str, kind: str = "") -> Cell:
     if interval is None:
         return Cell()
-    one = interval.samples < 2
-    text = f"{significant(interval.value)} [1 run]" if one else bracketed(*interval[:3])
+    if interval.samples > 1:
+        return Cell.ratio(interval, title=title, kind=kind)
+    text = f"{significant(interval.value)} [1 run]"
     return Cell(text=text, value=interval.value, title=title, kind=kind)
 
 
-def _solve(o: Outcome, phase: str, kind: str) -> Cell:
-    return number(o.seconds(phase), seconds, title=source(o), kind=kind)
+def _ranks(n: int, kind: str) -> Cell:
+    return Cell.number(n, kind=kind, title=_CROWDED if kind else "")
 
 
-def _rank_count(n: int, *, crowded: bool) -> Cell:
-    return number(n, kind="quiet", title=_CROWDED) if crowded else number(n)
-
-
-def _iterations(o: Outcome) -> Cell:
-    its = o.iterations
-    return Cell(text=span(its), value=its[0] if its else None, title=source(o))
+def _series(s: StrongSeries) -> tuple[Cell, ...]:
+    return tuple(cell(s) for _, cell in answer_columns())
 
 
 def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
     def row(s: StrongSeries, n: int, o: Outcome) -> tuple[Cell, ...]:
         kind = "quiet" if s.crowded(n) else ""
-        shown = (
-            *(cell(s) for _, cell in answer_columns()),
-            _rank_count(n, crowded=s.crowded(n)),
-            _iterations(o),
-            _solve(o, phase, kind),
-        )
+        time = Cell.time(o.seconds(phase), title=source(o), kind=kind)
+        shown = (*_series(s), _ranks(n, kind), iterations_cell(o), time)
         if n == 1:
             return (*shown, _ONE, _ONE, Cell(), Cell())
         copies = [s.copies[n]] if n in s.copies else []
@@ -123,8 +110,8 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
     return Table(
         caption=TEXT("strong_caption", phase),
         columns=(
-            "case", "solver", "tol", "ranks", "iterations", "time", "speed-up",
-            "efficiency", "copies", "of copies",
+            *_SERIES, "ranks", "iterations", "time", "speed-up", "efficiency",
+            "copies", "of copies",
         ),
         rows=tuple(row(*each) for each in solves),
         text_columns=2,
@@ -133,18 +120,20 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
 
 
 def _weak_table(series: WeakSeries) -> Table:
-    first = series.members[0].answer
-
-    def ratios(m: Member, phase: str) -> tuple[Cell, ...]:
+    def row(m: Member) -> Iterator[Cell]:
         o, kind = m.answer, "quiet" if series.crowded(m.ranks) else ""
-        time = _solve(o, phase, kind)
-        if m.ranks == 1:
-            return time, _ONE, Cell()
-        return (
-            time,
-            _ratio(series.efficiency(m, phase), source(first, o), kind),
-            _ratio(series.against_copies(m, phase), source(o), kind),
-        )
+        runs = source(series.members[0].answer, o)
+        yield _ranks(m.ranks, kind)
+        yield Cell.number(m.dofs)
+        yield Cell.number(m.dofs // m.ranks)
+        yield iterations_cell(o)
+        for phase in PHASES:
+            yield Cell.time(o.seconds(phase), title=source(o), kind=kind)
+            if m.ranks == 1:
+                yield from (_ONE, Cell())
+            else:
+                yield _ratio(series.efficiency(m, phase), runs, kind)
+                yield _ratio(series.against_copies(m, phase), source(o), kind)
 
     return Table(
         caption=f"Weak scaling: {series.title}.",
@@ -152,14 +141,7 @@ def _weak_table(series: WeakSeries) -> Table:
             "ranks", "dofs", "dofs of a rank", "iterations", "prepare", "efficiency",
             "of copies", "solve", "efficiency", "of copies",
         ),
-        rows=tuple(
-            (
-                _rank_count(m.ranks, crowded=series.crowded(m.ranks)), number(m.dofs),
-                number(m.dofs // m.ranks), _iterations(m.answer),
-                *(cell for phase in PHASES for cell in ratios(m, phase)),
-            )
-            for m in series.members
-        ),
+        rows=tuple(tuple(row(m)) for m in series.members),
         text_columns=0,
         notes=(TIMED,),
     )  # fmt: skip
@@ -167,41 +149,42 @@ def _weak_table(series: WeakSeries) -> Table:
 
 def _part_tables(solves: Sequence[Solve]) -> Iterator[Table]:
     """Tabulate what ranks spent, sent and held; nothing where no record says so."""
-
-    def columns(of: Callable[[Outcome], Mapping[str, Part]]) -> list[Column]:
-        names = dict.fromkeys(name for _, _, o in solves for name in of(o))
-        return [(name, partial(part, of, name)) for name in names]
-
-    def part(
-        of: Callable[[Outcome], Mapping[str, Part]], name: str, each: Solve
-    ) -> Cell:
-        return _part(of(each[2]).get(name), each[2])
-
-    def rest(each: Solve) -> Cell:
-        time, parts = each[2].seconds("solve"), rank_parts(each[2])
-        if time is None or not parts:
-            return Cell()
-        spent = sum(part.mean for part in parts.values())
-        return number(max(time.value - spent, 0.0), significant)
-
-    def whole(each: Solve) -> Cell:
-        time = each[2].seconds("solve")
-        return number(time and time.value, significant, title=source(each[2]))
-
-    ranks: Column = ("ranks", lambda each: number(each[1]))
-    leading = (*answer_columns(lambda each: each[0]), ranks)
-    if parts := columns(rank_parts):
-        yield Table.of(
-            TEXT("parts_caption"),
-            solves,
-            (*leading, ("solve", whole), *parts, ("rest", rest)),
+    parts = [rank_parts(o) for *_, o in solves]
+    counts = [rank_counts(o) for *_, o in solves]
+    if any(parts):
+        names = dict.fromkeys(name for of in parts for name in of)
+        rows = []
+        for (s, n, o), of in zip(solves, parts, strict=True):
+            time = o.seconds("solve")
+            whole = Cell.number(time and time.value, significant, title=source(o))
+            spent = sum(part.mean for part in of.values())
+            rest = max(time.value - spent, 0.0) if time and of else None
+            shown = (_part(of.get(name), o) for name in names)
+            left = Cell.number(rest, significant)
+            rows.append((*_series(s), Cell.number(n), whole, *shown, left))
+        yield Table(
+            caption=TEXT("parts_caption"),
+            columns=(*_SERIES, "ranks", "solve", *names, "rest"),
+            rows=tuple(rows),
             text_columns=2,
             notes=(TEXT("parts_note"),),
         )
-    if counts := columns(rank_counts):
-        peak: Column = ("peak, MiB", lambda each: _part(rank_memory(each[2]), each[2]))
-        heads = (*leading, *counts, peak)
-        yield Table.of(TEXT("sent_caption"), solves, heads, text_columns=2)
+    if any(counts):
+        names = dict.fromkeys(name for of in counts for name in of)
+        yield Table(
+            caption=TEXT("sent_caption"),
+            columns=(*_SERIES, "ranks", *names, "peak, MiB"),
+            rows=tuple(
+                (
+                    *_series(s),
+                    Cell.number(n),
+                    *(_part(of.get(name), o) for name in names),
+                    _part(rank_memory(o), o),
+                )
+                for (s, n, o), of in zip(solves, counts, strict=True)
+            ),
+            text_columns=2,
+        )
 
 
 def _part(part: Part | None, o: Outcome) -> Cell:
@@ -215,59 +198,44 @@ def _model_tables(
     modelled: Sequence[StrongSeries], asked: Sequence[StrongSeries]
 ) -> Iterator[Table]:
     """Tabulate the terms of models, and what those that fit predict."""
-    models = [(s, s.model) for s in modelled if s.model is not None]
-    series = answer_columns(lambda each: each[0])
 
-    def runs(each: tuple[StrongSeries, CostModel]) -> str:
-        return source(*(each[0].answers[n] for n in each[1].measured))
-
-    def term(
-        of: Callable[[CostModel], float], each: tuple[StrongSeries, CostModel]
-    ) -> Cell:
-        return number(of(each[1]), significant, title=runs(each))
-
-    terms: dict[str, Callable[[CostModel], float]] = {
-        "W, s": lambda m: m.work,
-        "C, s": lambda m: m.alike,
-        "s": lambda m: m.slowdown,
-        "reductions, s": lambda m: m.communication[0],
-        "messages, s": lambda m: m.communication[1],
-        "bytes, s": lambda m: m.communication[2],
-    }
-    if models:
-        yield Table.of(
-            TEXT("model_caption"),
-            models,
-            (
-                *series,
-                (
-                    "fitted to ranks",
-                    lambda each: Cell(
-                        text=", ".join(map(str, each[1].measured)), title=runs(each)
-                    ),
-                ),
-                *((head, partial(term, of)) for head, of in terms.items()),
-                ("misfit", lambda each: number(each[1].misfit, "{:.1%}".format)),
-                (
-                    "half of N reached to N =",
-                    lambda each: number(each[1].ranks_at(0.5)),
-                ),
-            ),
-            text_columns=2,
-            notes=(TEXT("model_note"),),
+    def row(s: StrongSeries, m: CostModel) -> tuple[Cell, ...]:
+        runs = source(*(s.answers[n] for n in m.measured))
+        terms = (m.work, m.alike, m.slowdown, *m.communication)
+        return (
+            *_series(s),
+            Cell(text=", ".join(map(str, m.measured)), title=runs),
+            *(Cell.number(term, significant, title=runs) for term in terms),
+            Cell.number(m.misfit, "{:.1%}".format),
+            Cell.number(m.ranks_at(0.5)),
         )
 
-    def prediction(n: int, each: tuple[StrongSeries, CostModel]) -> Cell:
-        if n not in predicted(each[0]):
+    if modelled:
+        yield Table(
+            caption=TEXT("model_caption"),
+            columns=(
+                *_SERIES, "fitted to ranks", "W, s", "C, s", "s", "reductions, s",
+                "messages, s", "bytes, s", "misfit", "half of N reached to N =",
+            ),
+            rows=tuple(row(s, s.model) for s in modelled if s.model is not None),
+            text_columns=2,
+            notes=(TEXT("model_note"),),
+        )  # fmt: skip
+
+    def prediction(n: int, s: StrongSeries) -> Cell:
+        if s.model is None or n not in predicted(s):
             return Cell()
-        return _ratio(each[1].speed_up(n), "model, not measured", "quiet")
+        return _ratio(s.model.speed_up(n), "model, not measured", "quiet")
 
     if asked:
         beyond = sorted({n for s in asked for n in predicted(s)})
         yield Table.of(
             TEXT("prediction_caption"),
-            [each for each in models if each[0] in asked],
-            (*series, *((f"N = {n}", partial(prediction, n)) for n in beyond)),
+            asked,
+            (
+                *answer_columns(),
+                *((f"N = {n}", partial(prediction, n)) for n in beyond),
+            ),
             text_columns=2,
             notes=("There are no more ranks than subdomains.",),
         )

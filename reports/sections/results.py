@@ -13,21 +13,13 @@ from mortarbench.reports.data.cells import (
     case_cells,
     explained,
     grid,
+    iterations_cell,
     source,
     verdict_cell,
 )
 from mortarbench.reports.data.evidence import RESIDUALS, Outcome
-from mortarbench.reports.document.formatting import clean, plain_value, power, span
-from mortarbench.reports.document.layout import (
-    Cell,
-    Column,
-    Part,
-    Table,
-    name_cell,
-    number,
-    sources,
-    text_cell,
-)
+from mortarbench.reports.document.formatting import clean, plain_value, power
+from mortarbench.reports.document.layout import Cell, Column, Part, Table, sources
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.profiles import share
@@ -53,7 +45,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
 
     def counted(kind: tuple[bool, bool], solver: str) -> Cell:
         n = count[solver][kind]
-        return number(n, kind="over" if n and kind == (True, False) else "")
+        return Cell.number(n, kind="over" if n and kind == (True, False) else "")
 
     def held(solver: str) -> Cell:
         right, wrong = count[solver][True, True], count[solver][True, False]
@@ -67,7 +59,7 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
         "Claims beside verdicts.",
         a.evidence.solvers,
         (
-            ("solver", name_cell),
+            ("solver", Cell.name),
             *((name, partial(counted, kind)) for kind, name in KINDS.items()),
             ("claims that hold", held),
         ),
@@ -86,7 +78,7 @@ def claims(a: Analysis) -> Iterator[Part]:
             *answer_columns(),
             ("verdict", verdict_cell),
             ("evidence", _refutation),
-            ("its words", lambda o: text_cell(o.first.message, 60)),
+            ("its words", lambda o: Cell.label(o.first.message, 60)),
         )
         caption = TEXT("refuted_caption")
         yield explained(Table.of(caption, refuted, columns, text_columns=2))
@@ -138,14 +130,11 @@ def iterations(a: Analysis) -> Iterator[Part]:
 
 
 def _iterations(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
-    its = outcome.iterations
-    text = span(its)
-    return Cell(
-        text=text if outcome.verified or its is None else f"({text})",
-        kind="" if outcome.verified else "quiet",
-        title=source(outcome),
-        value=its[0] if its else None,
-    )
+    cell = iterations_cell(outcome)
+    if outcome.verified:
+        return cell
+    known = cell.value is not None
+    return replace(cell, text=f"({cell.text})" if known else cell.text, kind="quiet")
 
 
 def _counts(outcome: Outcome, names: Iterable[str]) -> Iterator[Cell]:
@@ -169,7 +158,7 @@ def errors(a: Analysis) -> Iterator[Part]:
     def residual(name: str, o: Outcome) -> Cell:
         value = o.largest(name)
         over = value is not None and value > o.allowed and name in RESIDUALS
-        return number(value, power, kind="over" if over else "", title=source(o))
+        return Cell.power(value, kind="over" if over else "", title=source(o))
 
     if answers:
         columns: tuple[Column, ...] = (

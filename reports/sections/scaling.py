@@ -6,25 +6,12 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
-from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.cells import iterations_cell, source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.size_series import SIZES as SERIES
 from mortarbench.reports.data.size_series import SizeSeries, Sweep, sweeps
-from mortarbench.reports.document.formatting import (
-    TIMED,
-    clean,
-    exponent,
-    seconds,
-    span,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Picture,
-    Table,
-    number,
-    text_cell,
-)
+from mortarbench.reports.document.formatting import TIMED, clean, exponent
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.scaling import MOST_SERIES, scaling_figure
 from mortarbench.reports.figures.steps import steps_figure, torn_figure
@@ -72,7 +59,7 @@ def _against_size(series: SizeSeries, quantity: str) -> Table:
         "iteration": (_iterations, series.iteration_law),
     }[quantity]
     rows = [
-        (number(n), number(m), *(show(row.get(s)) for s in series.solvers))
+        (Cell.number(n), Cell.number(m), *(show(row.get(s)) for s in series.solvers))
         for n, m, row in series.sizes
     ]
     runs = [source(*(o for _, o in series.curve(s))) for s in series.solvers]
@@ -92,14 +79,13 @@ def _against_size(series: SizeSeries, quantity: str) -> Table:
 def _time(outcome: Outcome | None) -> Cell:
     if outcome is None:
         return Cell(text="not verified", kind="quiet")
-    return number(outcome.seconds("total"), seconds, title=source(outcome))
+    return Cell.time(outcome.seconds("total"), title=source(outcome))
 
 
 def _iterations(outcome: Outcome | None) -> Cell:
     if outcome is None:
         return Cell(text="not verified", kind="quiet")
-    its = outcome.iterations
-    return Cell(text=span(its), title=source(outcome), value=its[0] if its else None)
+    return iterations_cell(outcome)
 
 
 def _exponent(law: PowerLaw | None, runs: str) -> Cell:
@@ -130,7 +116,7 @@ def _growth_table(series: SizeSeries) -> Table:
         if fit is None:
             return Cell(title="fewer than four verified sizes")
         try:
-            return number(fit.at(largest), seconds)
+            return Cell.time(fit.at(largest))
         except ValueError as e:
             return Cell(text="refused", kind="quiet", title=f"{e}")
 
@@ -138,8 +124,8 @@ def _growth_table(series: SizeSeries) -> Table:
         TEXT("growth_caption", largest, series.title),
         series.solvers,
         (
-            ("solver", text_cell),
-            ("sizes", lambda s: number(len(series.curve(s)))),
+            ("solver", Cell.label),
+            ("sizes", lambda s: Cell.number(len(series.curve(s)))),
             ("p of iterations [95 %]", lambda s: _fitted(fits[s])),
             ("per decade [95 %]", lambda s: _per_decade(fits[s])),
             ("iterations", lambda s: _trend(fits[s])),
@@ -234,7 +220,7 @@ def _step_table(series: SizeSeries, solver: str) -> Table:
             names, key=lambda name: FIRST.index(name) if name in FIRST else len(FIRST)
         ),
         (
-            ("count", text_cell),
+            ("count", Cell.label),
             *((f"n = {n}", partial(_count, o)) for n, o in curve),
             ("p [95 %]", law),
             ("per decade [95 %]", lambda name: _per_decade(fit(name))),
@@ -250,9 +236,9 @@ def _torn_table(sweep: Sweep) -> Table:
         TEXT("counts_caption", "H/h", sweep.solver, sweep.title),
         sweep.answers,
         (
-            ("H/h", lambda each: number(each[0])),
-            ("subdomains", lambda each: number(each[1].size("subdomains"))),
-            ("m", lambda each: number(each[1].size("multipliers"))),
+            ("H/h", lambda each: Cell.number(each[0])),
+            ("subdomains", lambda each: Cell.number(each[1].size("subdomains"))),
+            ("m", lambda each: Cell.number(each[1].size("multipliers"))),
             *((n, lambda each, n=n: _count(each[1], n)) for n in named),
             ("total time", lambda each: _time(each[1])),
         ),
@@ -262,4 +248,4 @@ def _torn_table(sweep: Sweep) -> Table:
 
 
 def _count(o: Outcome, name: str) -> Cell:
-    return number(o.counted(name), "{:.4g}".format, title=source(o))
+    return Cell.number(o.counted(name), "{:.4g}".format, title=source(o))

@@ -12,19 +12,9 @@ from typing import Any
 from mortarbench.reports.data.cells import source
 from mortarbench.reports.data.environment import flatten
 from mortarbench.reports.data.evidence import Outcome
-from mortarbench.reports.document.formatting import (
-    clean,
-    plain_value,
-    tolerance,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Table,
-    name_cell,
-    text_cell,
-    words,
-)
+from mortarbench.reports.document.formatting import clean, plain_value, tolerance
+from mortarbench.reports.document.grouping import grouped
+from mortarbench.reports.document.layout import Cell, Part, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
 
@@ -36,18 +26,13 @@ TEXT = Sentences(__name__)
 def cases(a: Analysis) -> Iterator[Part]:
     """List every case, one table per family; records hold defaults with the rest."""
     yield from TEXT.parts("cases")
-    measured: dict[str, list[Outcome]] = {}
-    for o in a.evidence.flat:
-        measured.setdefault(o.case, []).append(o)
-    families: dict[str, list[tuple[Outcome, str]]] = {}
-    for outcomes in measured.values():
+    found = [
         # the first that built the QP, or else the last
-        one = next((o for o in outcomes if o.first.sizes), outcomes[-1])
-        families.setdefault(outcomes[0].first.family, []).append(
-            (one, source(*outcomes))
-        )
-    for family, found in families.items():
-        yield _table(family, found)
+        (next((o for o in outcomes if o.first.sizes), outcomes[-1]), source(*outcomes))
+        for outcomes in grouped(a.evidence.flat, lambda o: o.case).values()
+    ]
+    for family, mine in grouped(found, lambda each: each[0].first.family).items():
+        yield _table(family, mine)
 
 
 def _table(family: str, found: Sequence[tuple[Outcome, str]]) -> Table:
@@ -65,8 +50,8 @@ def _table(family: str, found: Sequence[tuple[Outcome, str]]) -> Table:
         TEXT("family", family, len(found)),
         found,
         (
-            ("case", lambda each: name_cell(each[0].case)),
-            ("form", lambda each: text_cell(each[0].first.form, 24)),
+            ("case", lambda each: Cell.name(each[0].case)),
+            ("form", lambda each: Cell.label(each[0].first.form, 24)),
             *((clean(k, 40), partial(_parameter, k)) for k in keys if k not in fixed),
             *((name, partial(size, name)) for name in _SIZES),
         ),
@@ -125,8 +110,8 @@ def environment(a: Analysis) -> Iterator[Part]:
                 caption,
                 pairs,
                 (
-                    ("key", lambda pair: text_cell(pair[0], 96)),
-                    ("value", lambda pair: words(_plain(pair[1]))),
+                    ("key", lambda pair: Cell.label(pair[0], 96)),
+                    ("value", lambda pair: Cell.words(_plain(pair[1]))),
                 ),
             )
 

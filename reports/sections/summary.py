@@ -12,15 +12,7 @@ from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import ENDINGS, VERDICTS, clean
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Point,
-    Table,
-    name_cell,
-    number,
-    sources,
-)
+from mortarbench.reports.document.layout import Cell, Part, Point, Table, sources
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
 
@@ -63,20 +55,20 @@ def summary(a: Analysis) -> Iterator[Part]:
     mine = {s: [r for r in evidence.records if r.solver == s] for s in evidence.solvers}
 
     def measured(solver: str) -> Cell:
-        return number(sum(r.verdict is not Verdict.DECLINED for r in mine[solver]))
+        return Cell.number(sum(r.verdict is not Verdict.DECLINED for r in mine[solver]))
 
     def ended(verdicts: tuple[Verdict, ...], solver: str) -> Cell:
         those = [r for r in mine[solver] if r.verdict in verdicts]
         if not those:
-            return number(0, kind="none")
+            return Cell.number(0, kind="none")
         symbol, kind = VERDICTS[verdicts[0]][0], verdicts[0].value
-        return number(len(those), symbol=symbol, kind=kind, title=sources(those))
+        return Cell.number(len(those), symbol=symbol, kind=kind, title=sources(those))
 
     yield Table.of(
         TEXT("counts_caption"),
         evidence.solvers,
         (
-            ("solver", name_cell),
+            ("solver", Cell.name),
             ("measurements", measured),
             *((name, partial(ended, verdicts)) for name, verdicts in _GROUPS.items()),
         ),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.crossval.discretisation import (
     Discretisation,
     read_discretisation,
 )
-from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.cells import solver_columns, source
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.time_at_accuracy import (
     TimeAtAccuracy,
@@ -23,15 +25,8 @@ from mortarbench.reports.document.formatting import (
     seconds,
     tolerance,
 )
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Picture,
-    Table,
-    name_cell,
-    number,
-    tolerance_cell,
-)
+from mortarbench.reports.document.grouping import Name, grouped
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.sweeps import certified_figure, sweep_figure
 from mortarbench.reports.sections import Analysis, section
@@ -59,17 +54,13 @@ def accuracy(a: Analysis) -> Iterator[Part]:
         yield time_at_accuracy_table(certified, solvers)
         meshes = read_discretisation(a.evidence.directory)
         yield certified_picture(certified, solvers, meshes)
-    swept: dict[Key, dict[str, list[Outcome]]] = {}
-    for o in sorted(a.evidence.flat, key=lambda o: -o.tol):
-        if o.first.accuracy is not None:
-            row = swept.setdefault((o.case, o.first.accuracy), {})
-            row.setdefault(o.solver, []).append(o)
+    judged = [o for o in a.evidence.flat if o.first.accuracy is not None]
+    swept = by_solver(judged, lambda o: (o.case, o.first.judged_at))
+    swept = dict(sorted(swept.items()))
     if swept:
         yield from TEXT.parts("swept")
-        yield _table(dict(sorted(swept.items())), solvers)
-    rest = [
-        (case, row) for (case, _), row in sorted(swept.items()) if case not in certified
-    ]
+        yield _table(swept, solvers)
+    rest = [(case, row) for (case, _), row in swept.items() if case not in certified]
     if rest:
         caption = TEXT("sweep_caption", len(rest), _PANELS)
         figure = sweep_figure(rest[:_PANELS], solvers)
@@ -79,34 +70,48 @@ def accuracy(a: Analysis) -> Iterator[Part]:
 def _table(
     swept: Mapping[Key, Mapping[str, list[Outcome]]], solvers: Sequence[str]
 ) -> Table:
-    present = [s for s in solvers if any(s in row for row in swept.values())]
-    rows = []
-    for (case, at), row in swept.items():
-        cheapest = {s: _cheapest(outcomes) for s, outcomes in row.items()}
-        times = [each[0] for each in cheapest.values() if each]
-        best = min(times, default=None, key=lambda time: time.value)
-        cells = [
-            number(
-                found[0], seconds, title=source(found[1]),
-                after=f"tol {tolerance(found[1].tol)}",
-                kind="best" if best and found[0].value == best.value else "",
-            )
-            if (found := cheapest.get(s))
-            else _not_reached(row.get(s, ()))
-            for s in present
-        ]  # fmt: skip
-        rows.append((name_cell(case), tolerance_cell(at), *cells))
-    return Table(
-        caption=TEXT("swept_caption"),
+    cheapest = {key: _cheapest_of(row) for key, row in swept.items()}
+    best = {
+        key: min((time.value for time, _ in of.values()), default=0.0)
+        for key, of in cheapest.items()
+    }
+
+    def cell(solver: str, key: Key) -> Cell:
+        if solver not in cheapest[key]:
+            return _not_reached(swept[key].get(solver, ()))
+        time, outcome = cheapest[key][solver]
+        return Cell.time(
+            time, title=source(outcome), after=f"tol {tolerance(outcome.tol)}",
+            kind="best" if time.value == best[key] else "",
+        )  # fmt: skip
+
+    return Table.of(
+        TEXT("swept_caption"),
+        swept,
+        (
+            ("case", lambda key: Cell.name(key[0])),
+            ("accuracy", lambda key: Cell.tolerance(key[1])),
+            *solver_columns(_present(swept, solvers), cell),
+        ),
         notes=(TIMED,),
-        columns=("case", "accuracy", *(clean(s, 40) for s in present)),
-        rows=tuple(rows),
     )
 
 
-def _cheapest(outcomes: Sequence[Outcome]) -> tuple[Interval, Outcome] | None:
-    timed = [(t, o) for o in outcomes if o.verified and (t := o.seconds("total"))]
-    return min(timed, key=lambda each: each[0].value, default=None)
+def _present(
+    rows: Mapping[Any, Mapping[str, object]], solvers: Sequence[str]
+) -> list[str]:
+    return [s for s in solvers if any(s in row for row in rows.values())]
+
+
+def _cheapest_of(
+    row: Mapping[str, Sequence[Outcome]],
+) -> dict[str, tuple[Interval, Outcome]]:
+    """Choose the verified answer of each solver that took least."""
+    timed = {
+        s: [(t, o) for o in of if o.verified and (t := o.seconds("total"))]
+        for s, of in row.items()
+    }
+    return {s: min(of, key=lambda each: each[0].value) for s, of in timed.items() if of}
 
 
 def _not_reached(tried: Sequence[Outcome], after: str = "") -> Cell:
@@ -119,35 +124,50 @@ def _not_reached(tried: Sequence[Outcome], after: str = "") -> Cell:
 
 def certified_sweeps(evidence: Evidence) -> dict[str, dict[str, list[Outcome]]]:
     """Collect the cases with certified errors at three tolerances or more."""
-    found: dict[str, dict[str, list[Outcome]]] = {}
-    bounded: dict[str, set[float]] = {}
-    for o in sorted(evidence.flat, key=lambda o: -o.tol):
-        found.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-        if o.largest("energy_bound") is not None:
-            bounded.setdefault(o.case, set()).add(o.tol)
-    return {
-        case: found[case] for case in sorted(bounded) if len(bounded[case]) >= LEAST
-    }
+    bounded = (o for o in evidence.flat if o.largest("energy_bound") is not None)
+    tols = Counter(case for case, _ in {(o.case, o.tol) for o in bounded})
+    swept = (o for o in evidence.flat if tols[o.case] >= LEAST)
+    return dict(sorted(by_solver(swept, lambda o: o.case).items()))
+
+
+def by_solver(
+    outcomes: Iterable[Outcome], name: Callable[[Outcome], Name]
+) -> dict[Name, dict[str, list[Outcome]]]:
+    """Group by a name and by solver, loosest tolerance first."""
+    ordered = sorted(outcomes, key=lambda o: -o.tol)
+    groups = grouped(ordered, name).items()
+    return {key: grouped(of, lambda o: o.solver) for key, of in groups}
 
 
 def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     """Tabulate the times at matched certified errors."""
-    present = [s for s in solvers if any(s in row for row in swept.values())]
-    rows = []
-    for case, row in swept.items():
-        for error in ERRORS:
-            times = {s: time_at_accuracy(of, error) for s, of in row.items()}
-            kinds = places({s: t for s, t in times.items() if not row[s][0].first.role})
-            cells = [
-                _matched(times[s], row[s], kinds.get(s, "")) if s in row else Cell()
-                for s in present
-            ]
-            rows.append((name_cell(case), tolerance_cell(error), *cells))
-    return Table(
-        caption="Total time at matched certified error: relative, in the energy norm.",
+    times = {
+        (case, error): {s: time_at_accuracy(of, error) for s, of in row.items()}
+        for case, row in swept.items()
+        for error in ERRORS
+    }
+    kinds = {
+        (case, error): places(
+            {s: t for s, t in of.items() if not swept[case][s][0].first.role}
+        )
+        for (case, error), of in times.items()
+    }
+
+    def cell(solver: str, key: Key) -> Cell:
+        if solver not in times[key]:
+            return Cell()
+        kind = kinds[key].get(solver, "")
+        return _matched(times[key][solver], swept[key[0]][solver], kind)
+
+    return Table.of(
+        "Total time at matched certified error: relative, in the energy norm.",
+        times,
+        (
+            ("case", lambda key: Cell.name(key[0])),
+            ("error", lambda key: Cell.tolerance(key[1])),
+            *solver_columns(_present(swept, solvers), cell),
+        ),
         notes=(TEXT("matched_note"), TIMED),
-        columns=("case", "error", *(clean(s, 40) for s in present)),
-        rows=tuple(rows),
     )
 
 

@@ -16,25 +16,16 @@ import numpy as np
 from mortarbench.harness import Record
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
 from mortarbench.harness.suite.suite import NULL
-from mortarbench.reports.data.cells import BY_OPTIMUM, case_cells, grid, source
+from mortarbench.reports.data.cells import (
+    BY_OPTIMUM,
+    case_cells,
+    grid,
+    solver_columns,
+    source,
+)
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import (
-    TIMED,
-    VERDICTS,
-    clean,
-    estimate,
-    seconds,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Picture,
-    Table,
-    name_cell,
-    number,
-    text_cell,
-    tolerance_cell,
-)
+from mortarbench.reports.document.formatting import TIMED, VERDICTS, estimate, seconds
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.accuracy import accuracy_figure
 from mortarbench.reports.sections import Analysis, section
@@ -71,25 +62,29 @@ def _charged_table(
     charged: Sequence[Mapping[str, Outcome]], solvers: Sequence[str]
 ) -> Table:
     """Charge dualising to dual forms, where it was measured; primal forms have none."""
-    rows = []
-    for row in charged:
-        one = next(o for o in row.values() if o.dualising is not None)
+
+    def cell(solver: str, row: Mapping[str, Outcome]) -> Cell:
         totals = {s: o.with_dualising for s, o in row.items() if o.verified}
+        if (total := totals.get(solver)) is None:
+            return Cell(kind="quiet")
         ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
-        best = min(ranked, default=None)
-        cells = [
-            Cell(kind="quiet") if total is None
-            else number(
-                total, seconds, title=source(row[s]),
-                kind="best" if total.value == best else "",
-            )
-            for s in solvers
-            for total in [totals.get(s)]
-        ]  # fmt: skip
-        dualising = number(one.dualising, seconds, title=source(one))
-        rows.append((*case_cells(row), dualising, *cells))
-    heads = ("case", "tol", "dualising", *(clean(s, 40) for s in solvers))
-    return Table(caption=TEXT("charged_caption"), columns=heads, rows=tuple(rows))
+        kind = "best" if total.value == min(ranked, default=None) else ""
+        return Cell.time(total, kind=kind, title=source(row[solver]))
+
+    def dualising(row: Mapping[str, Outcome]) -> Cell:
+        one = next(o for o in row.values() if o.dualising is not None)
+        return Cell.time(one.dualising, title=source(one))
+
+    return Table.of(
+        TEXT("charged_caption"),
+        charged,
+        (
+            ("case", lambda row: case_cells(row)[0]),
+            ("tol", lambda row: case_cells(row)[1]),
+            ("dualising", dualising),
+            *solver_columns(solvers, cell),
+        ),
+    )
 
 
 def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
@@ -100,16 +95,16 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
     if not outcome.verified:
         return Cell(text=seconds(interval), after=ending, kind="void", title=title)
     if outcome.first.role:  # null arms do not compete
-        return number(interval, seconds, title=title)
+        return Cell.time(interval, title=title)
     rivals = [
         o.seconds("total") for o in row.values() if o.verified and not o.first.role
     ]
     fastest = min((i for i in rivals if i is not None), key=lambda i: i.value)
     if interval == fastest:
-        return number(interval, seconds, kind="best", title=title)
+        return Cell.time(interval, kind="best", title=title)
     if interval.low <= fastest.high and interval.samples > 1:
-        return number(interval, seconds, symbol="≈", kind="tied", title=title)
-    return number(interval, seconds, title=title)
+        return Cell.time(interval, symbol="≈", kind="tied", title=title)
+    return Cell.time(interval, title=title)
 
 
 @section(
@@ -140,7 +135,7 @@ def ratios(a: Analysis) -> Iterator[Part]:
         if found is None:
             return Cell(title="fewer than two blocks in common")
         tied = found.low <= 1 <= found.high
-        return number(
+        return Cell.number(
             found,
             estimate,
             symbol="≈" if tied else "",
@@ -190,12 +185,15 @@ def precision(a: Analysis) -> Iterator[Part]:
             TEXT("null_caption"),
             null,
             (
-                ("case", lambda t: name_cell(t.twin.case)),
-                ("tol", lambda t: tolerance_cell(t.twin.tol)),
-                ("solver", lambda t: text_cell(t.twin.solver)),
-                ("blocks", lambda t: number(t.ratio.pairs)),
-                ("ratio", lambda t: number(t.ratio, _ratio, title=source(t.null))),
-                ("half-width", lambda t: number(t.ratio.half_width, "{:.1%}".format)),
+                ("case", lambda t: Cell.name(t.twin.case)),
+                ("tol", lambda t: Cell.tolerance(t.twin.tol)),
+                ("solver", lambda t: Cell.label(t.twin.solver)),
+                ("blocks", lambda t: Cell.number(t.ratio.pairs)),
+                ("ratio", lambda t: Cell.number(t.ratio, _ratio, title=source(t.null))),
+                (
+                    "half-width",
+                    lambda t: Cell.number(t.ratio.half_width, "{:.1%}".format),
+                ),
                 (
                     "holds 1",
                     lambda t: (
@@ -242,9 +240,9 @@ def _canary_row(name: str, mine: Sequence[Record]) -> tuple[Cell, ...]:
     third = len(times) // _PARTS
     drift = median(times[-third:]) / median(times[:third]) - 1 if third else None
     return (
-        name_cell(name),
-        number(len(times)),
-        number(median_interval(times), seconds),
+        Cell.name(name),
+        Cell.number(len(times)),
+        Cell.time(median_interval(times)),
         span if len(times) > 1 else Cell(),
-        number(drift, "{:+.1%}".format),
+        Cell.number(drift, "{:+.1%}".format),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from statistics import median
 
 from mortarbench.harness.crossval.discretisation import (
@@ -11,28 +10,16 @@ from mortarbench.harness.crossval.discretisation import (
     read_discretisation,
 )
 from mortarbench.harness.running.pairs import ratio_of
-from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.cells import solver_columns, source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.time_at_accuracy import counts
-from mortarbench.reports.document.formatting import (
-    ABSENT,
-    TIMED,
-    clean,
-    power,
-    seconds,
-)
-from mortarbench.reports.document.layout import (
-    Cell,
-    Part,
-    Table,
-    name_cell,
-    number,
-    tolerance_cell,
-)
+from mortarbench.reports.document.formatting import ABSENT, TIMED, power
+from mortarbench.reports.document.layout import Cell, Part, Table
 from mortarbench.reports.document.mesh_errors import mesh_table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.sweeps import SHARE
 from mortarbench.reports.sections import Analysis, section
+from mortarbench.reports.sections.sweeps import by_solver
 
 TEXT = Sentences(__name__)
 _KNOWN = ("limit", "change")  #: kinds with an error to compare with
@@ -52,60 +39,44 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
     meshes = {name: known[name] for name in physical if name in known}
     if not meshes:
         return
-    #: case → solver → answers with a share, loosest first
-    priced: dict[str, dict[str, list[Outcome]]] = {}
-    for o in sorted(a.evidence.flat, key=lambda o: -o.tol):
-        mesh = meshes.get(o.physical)
-        if mesh and mesh.kind in _KNOWN and o.largest("energy_bound") is not None:
-            priced.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-    present = [
-        s for s in a.evidence.solvers if any(s in row for row in priced.values())
-    ]
+    shared = [o for o in a.evidence.flat if share_of(o, meshes) is not None]
+    priced = by_solver(shared, lambda o: o.case)
+    answers = {(o.case, o.tol, o.solver): o for o in shared}
     ends = {
-        (case, s): _ends(outcomes, meshes)
+        (case, s): pair
         for case, row in priced.items()
         for s, outcomes in row.items()
+        if (pair := _ends(outcomes, meshes)) is not None
     }
+    times = {key: [o.seconds("total") for o in pair] for key, pair in ends.items()}
     factors = [
-        tight.value / enough.value
-        for pair in ends.values()
-        if pair is not None
-        and (enough := pair[0].seconds("total")) is not None
-        and (tight := pair[1].seconds("total")) is not None
+        most.value / least.value for least, most in times.values() if least and most
     ]
     extremes = (median(factors), min(factors), max(factors)) if factors else ()
     yield from TEXT.parts("prose", len(factors), extremes)
     yield mesh_table(list(meshes.values()))
     if not priced:
         return
-    answers = {
-        (o.case, s, o.tol): o
-        for row in priced.values()
-        for s, of in row.items()
-        for o in of
-    }
+    present = [
+        s for s in a.evidence.solvers if any(s in row for row in priced.values())
+    ]
 
     def fraction(solver: str, at: tuple[str, float]) -> Cell:
-        outcome = answers.get((at[0], solver, at[1]))
-        if outcome is None:
+        if (outcome := answers.get((*at, solver))) is None:
             return Cell()
-        share = share_of(outcome, meshes)
-        assert share is not None
+        share = share_of(outcome, meshes) or 0.0
         text = power(share) if counts(outcome) else f"({power(share)})"
         kind = "over" if share > SHARE else ""
         return Cell(text=text, kind=kind, value=share, title=source(outcome))
 
     def price(solver: str, case: str) -> Cell:
-        pair = ends.get((case, solver))
-        if pair is None:
+        if (case, solver) not in ends:
             text = "never enough" if solver in priced[case] else ABSENT
             return Cell(text=text, kind="quiet")
-        enough, tightest = pair
+        enough, tightest = ends[case, solver]
         ratio = ratio_of(tightest.by_block, enough.by_block)
-        time = enough.seconds("total")
-        further = tightest.seconds("total")
-        after = TEXT("further", enough, tightest, ratio, time, further)
-        return number(time, seconds, after=after, title=source(enough))
+        after = TEXT("further", enough, tightest, ratio, *times[case, solver])
+        return Cell.time(times[case, solver][0], after=after, title=source(enough))
 
     yield Table.of(
         "Certified error of the solver over the discretisation error.",
@@ -115,19 +86,16 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
             for tol in sorted({o.tol for of in row.values() for o in of}, reverse=True)
         ],
         (
-            ("case", lambda at: name_cell(at[0])),
-            ("tol", lambda at: tolerance_cell(at[1])),
-            *((clean(s, 40), partial(fraction, s)) for s in present),
+            ("case", lambda at: Cell.name(at[0])),
+            ("tol", lambda at: Cell.tolerance(at[1])),
+            *solver_columns(present, fraction),
         ),
         notes=(TEXT("shares_note"),),
     )
     yield Table.of(
         TEXT("prices_caption"),
         priced,
-        (
-            ("case", name_cell),
-            *((clean(s, 40), partial(price, s)) for s in present),
-        ),
+        (("case", Cell.name), *solver_columns(present, price)),
         notes=(TEXT("prices_note"), TIMED),
     )
 

@@ -24,11 +24,6 @@ from mortarbench.reports.document.layout import (
     Picture,
     Section,
     Table,
-    name_cell,
-    number,
-    text_cell,
-    tolerance_cell,
-    words,
 )
 from mortarbench.reports.document.mesh_errors import mesh_table
 from mortarbench.reports.document.templates import Sentences
@@ -96,7 +91,7 @@ def _verdict(data: Data) -> Iterator[Part]:
             _column("answers"),
             (
                 "refuted",
-                lambda d: number(d["refuted"], kind="over" * bool(d["refuted"])),
+                lambda d: Cell.number(d["refuted"], kind="over" * bool(d["refuted"])),
             ),
             _column("unanswered"),
             _column("error, median", "error_median", power),
@@ -121,21 +116,24 @@ def _verdict(data: Data) -> Iterator[Part]:
 
 def _column(head: str, name: str = "", show: Callable[[Any], str] = str) -> Column:
     """Show a number of an entry."""
-    return head, lambda d: number(d[name or head], show)
+    return head, lambda d: Cell.number(d[name or head], show)
 
 
-_SOLVER: Column = ("solver", lambda d: text_cell(d["solver"]))
-_TOL: Column = ("tol", lambda d: tolerance_cell(d["tol"]))
+_SOLVER: Column = ("solver", lambda d: Cell.label(d["solver"]))
+_TOL: Column = ("tol", lambda d: Cell.tolerance(d["tol"]))
 _CASE: tuple[Column, ...] = (
-    ("solver", lambda d: text_cell(d["solver"], title=f"run {clean(d['run_id'], 40)}")),
-    ("case", lambda d: name_cell(d["case"])),
+    (
+        "solver",
+        lambda d: Cell.label(d["solver"], title=f"run {clean(d['run_id'], 40)}"),
+    ),
+    ("case", lambda d: Cell.name(d["case"])),
     _TOL,
 )
 
 
 def _worst_case(d: Data) -> Cell:
     case = d["worst_case"]
-    return words(clean(case, 60) or ABSENT, title=clean(case, 2000))
+    return Cell.words(clean(case, 60) or ABSENT, title=clean(case, 2000))
 
 
 def _disagreements(data: Data) -> Iterator[Part]:
@@ -146,10 +144,10 @@ def _disagreements(data: Data) -> Iterator[Part]:
             wrong,
             (
                 *_CASE,
-                ("claimed", lambda d: words(clean(d["claimed"], 20))),
+                ("claimed", lambda d: Cell.words(clean(d["claimed"], 20))),
                 ("verdict", _judged),
                 _column("error", show=power),
-                ("why", lambda d: words(clean(TEXT("why", d), 400))),
+                ("why", lambda d: Cell.words(clean(TEXT("why", d), 400))),
             ),
             text_columns=2,
         )
@@ -158,8 +156,8 @@ def _disagreements(data: Data) -> Iterator[Part]:
             "Answers that contradict each other, neither refuted.",
             apart,
             (
-                ("problem", lambda d: name_cell(d["problem"])),
-                ("between", lambda d: text_cell(" and ".join(d["between"]), 120)),
+                ("problem", lambda d: Cell.name(d["problem"])),
+                ("between", lambda d: Cell.label(" and ".join(d["between"]), 120)),
                 _TOL,
                 _column("distance", show=power),
                 _column("allowed", show=power),
@@ -170,7 +168,7 @@ def _disagreements(data: Data) -> Iterator[Part]:
         yield Table.of(
             "Certificates that the reference contradicts: our fault.",
             broken,
-            (*_CASE, ("what", lambda d: words(clean(d["text"], 240)))),
+            (*_CASE, ("what", lambda d: Cell.words(clean(d["text"], 240)))),
             text_columns=2,
         )
 
@@ -186,7 +184,7 @@ def _problems(data: Data) -> Iterator[Part]:
     def largest(name: str) -> Callable[[Data], Cell]:
         def cell(p: Data) -> Cell:
             known = [pair[name] for pair in p["pairs"] if pair[name] is not None]
-            return number(max(known, default=None), power)
+            return Cell.power(max(known, default=None))
 
         return cell
 
@@ -197,22 +195,22 @@ def _problems(data: Data) -> Iterator[Part]:
     def between(p: Data) -> Cell:
         farthest = max(p["pairs"], key=distance, default=None)
         if farthest is None:
-            return words(ABSENT)
+            return Cell.words(ABSENT)
         two = (p["answers"][farthest[k]] for k in ("a", "b"))
         text = " and ".join(f"{a['solver']} on {a['form']}" for a in two)
-        return words(clean(text, 80))
+        return Cell.words(clean(text, 80))
 
     def doubt(p: Data) -> Cell:
         truth = "" if p["truth"] == "reference" else clean(p["truth"] or "none", 40)
-        return number(p["doubt"], power, after=truth)
+        return Cell.power(p["doubt"], after=truth)
 
     yield Table.of(
         "Every problem: all pairs of answers, of each solver and form.",
         data["problems"],
         (
-            ("problem", lambda p: name_cell(p["name"])),
-            ("answers", lambda p: number(len(p["answers"]))),
-            ("pairs", lambda p: number(len(p["pairs"]))),
+            ("problem", lambda p: Cell.name(p["name"])),
+            ("answers", lambda p: Cell.number(len(p["answers"]))),
+            ("pairs", lambda p: Cell.number(len(p["pairs"]))),
             _column("closed rows", "closed"),
             ("error of the reference", doubt),
             ("largest distance", largest("distance")),
@@ -237,11 +235,14 @@ def _remarks(data: Data) -> Iterator[Part]:
             "Answers within what they claim that stand out from the others.",
             grouped,
             (
-                ("solver", text_cell),
-                ("answers", lambda s: number(len({d["run_id"] for d in grouped[s]}))),
-                ("largest error", lambda s: number(worst[s]["error"], power)),
-                ("on", lambda s: words(clean(worst[s]["case"]))),
-                ("what", lambda s: words(clean(worst[s]["text"], 200))),
+                ("solver", Cell.label),
+                (
+                    "answers",
+                    lambda s: Cell.number(len({d["run_id"] for d in grouped[s]})),
+                ),
+                ("largest error", lambda s: Cell.power(worst[s]["error"])),
+                ("on", lambda s: Cell.words(clean(worst[s]["case"]))),
+                ("what", lambda s: Cell.words(clean(worst[s]["text"], 200))),
             ),
         )
 
@@ -267,9 +268,9 @@ def _left_out(data: Data) -> Iterator[Part]:
                 caption,
                 grouped.items(),
                 (
-                    ("solver", lambda each: text_cell(each[0][0])),
-                    ("times", lambda each: number(len(each[1]))),
-                    ("what", lambda each: words(clean(each[0][1], 240))),
+                    ("solver", lambda each: Cell.label(each[0][0])),
+                    ("times", lambda each: Cell.number(len(each[1]))),
+                    ("what", lambda each: Cell.words(clean(each[0][1], 240))),
                     ("on", lambda each: _cases(list(dict.fromkeys(each[1])))),
                 ),
             )
@@ -277,4 +278,4 @@ def _left_out(data: Data) -> Iterator[Part]:
 
 
 def _cases(names: Sequence[str]) -> Cell:
-    return words(listing(names, 2), title=clean(", ".join(names), 2000))
+    return Cell.words(listing(names, 2), title=clean(", ".join(names), 2000))
