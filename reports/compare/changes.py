@@ -6,7 +6,7 @@ and after are of different sessions: two samples, that nothing pairs.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from scipy.special import ndtri, stdtrit
 from mortarbench.harness.running.pairs import Ratio, unpaired_ratio
 from mortarbench.reports.compare.conditions import hardware
 from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Outcome
+from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
@@ -167,7 +168,7 @@ def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
 
     folders : that are compared with `before`, `after` included
     """
-    a, b = _cells(before), _cells(after)
+    a, b = ({_key(o): o for o in e.flat} for e in (before, after))
     machines = hardware(before) | hardware(after)
 
     def same(key: Key) -> bool:
@@ -190,8 +191,7 @@ def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
     """Average the ratios of times over cells; see `mean_of`. None without any time."""
-    timed = [(p, p.log) for p in pairs if p.log is not None]
-    return mean_of([log for _, log in timed], [str(_key(p.after)) for p, _ in timed])
+    return _over_cells((p, p.log) for p in pairs)
 
 
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
@@ -200,29 +200,39 @@ def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     Per case and tolerance its ratio is divided by the geometric mean of theirs: what
     slows a whole run down cancels. None where no other solver has times on its cells.
     """
-    others: dict[tuple[str, float], list[float]] = {}
-    for p in c.pairs:
-        other = p.after.solver != solver and not p.after.first.role
-        if p.log is not None and other:
-            others.setdefault((p.after.case, p.after.tol), []).append(p.log)
-    logs, names = [], []
+    competing = (p for p in c.pairs if p.after.solver != solver)
+    rivals = grouped(
+        (p for p in competing if not p.after.first.role),
+        lambda p: (p.after.case, p.after.tol),
+    )
+    found = []
     for p in c.of(solver):
-        rivals = others.get((p.after.case, p.after.tol))
-        if p.log is not None and rivals:
-            logs.append(p.log - float(np.mean(rivals)))
-            names.append(str(_key(p.after)))
-    return mean_of(logs, names)
+        others = rivals.get((p.after.case, p.after.tol), ())
+        logs = [other.log for other in others if other.log is not None]
+        if p.log is not None and logs:
+            found.append((p, p.log - float(np.mean(logs))))
+    return _over_cells(found)
 
 
 def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:
     """Average the same of the canary, which is no solver: what the machine did."""
-    logs, names = [], []
-    for p in pairs:
-        a, b = _canaries(p.after), _canaries(p.before)
-        if p.same_machine and a and b:
-            logs.append(float(np.mean(np.log(a)) - np.mean(np.log(b))))
-            names.append(str(_key(p.after)))
-    return mean_of(logs, names)
+
+    def log(p: Pair) -> float | None:
+        sides = [
+            [r.canary_seconds for r in o.records if r.canary_seconds]
+            for o in (p.after, p.before)
+        ]
+        if not (p.same_machine and all(sides)):
+            return None
+        after, before = (float(np.mean(np.log(times))) for times in sides)
+        return after - before
+
+    return _over_cells((p, log(p)) for p in pairs)
+
+
+def _over_cells(changes: Iterable[tuple[Pair, float | None]]) -> Mean | None:
+    known = [(log, str(_key(p.after))) for p, log in changes if log is not None]
+    return mean_of([log for log, _ in known], [name for _, name in known])
 
 
 def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
@@ -267,10 +277,6 @@ def resolved(interval: Ratio | Mean) -> bool:
     return side(interval) != 0 or 1 / ALIKE < interval.low <= interval.high < ALIKE
 
 
-def _cells(evidence: Evidence) -> dict[Key, Outcome]:
-    return {_key(o): o for o in evidence.flat}
-
-
 def _key(outcome: Outcome) -> Key:
     r = outcome.first
     case = r.qp if r.family == FROM_FILE and r.qp is not None else outcome.case
@@ -279,7 +285,3 @@ def _key(outcome: Outcome) -> Key:
 
 def _seconds(outcome: Outcome) -> list[float]:
     return [*outcome.by_block.values()]
-
-
-def _canaries(outcome: Outcome) -> list[float]:
-    return [r.canary_seconds for r in outcome.records if r.canary_seconds]

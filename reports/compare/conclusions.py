@@ -15,53 +15,80 @@ from mortarbench.reports.compare.changes import (
     side,
 )
 from mortarbench.reports.compare.conditions import environments, machines_differ
-from mortarbench.reports.compare.regressions import Slower, regressions
+from mortarbench.reports.compare.regressions import regressions
 from mortarbench.reports.data.environment import busy_with, dateline
-from mortarbench.reports.document.formatting import (
-    VERDICTS,
-    clean,
-    plural,
-    power,
-    tolerance,
-)
+from mortarbench.reports.document.formatting import VERDICTS, plural
+from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 NAMED = 8  #: changes that are named; tables have all
 WORDS = ("slower", "faster", "no change seen", "not resolved")
 
 
+_CONDITIONS = ("same_folder", "conditions", "residuals", "busy")
+
+
 def verdict_lines(c: Comparison) -> list[str]:
     """Say in a few lines of plain text how the comparison ended."""
     if not c.pairs:
-        return [_nothing(c)]
-    first = (_same(c), _environments(c), _residuals(c), _busy(c))
-    lines = [*filter(None, first), _counted_times(c), _slower(c)]
-    means = [(s, mean_ratio(c.of(s))) for s in c.solvers]
+        return [TEXT("nothing", c)]
+    said = _said(c)
+    means = [(solver, mean_ratio(c.of(solver))) for solver in c.solvers]
+    lines = [*(said[name] for name in (*_CONDITIONS, "times", "slower"))]
     lines += [
-        f"  {s}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
+        f"  {solver}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
         f"{change_word(mean)}"
-        for s, mean in means
+        for solver, mean in means
         if mean is not None
     ]
-    lines += [*filter(None, [_shared(c)]), _counted_verdicts(c), _counted_others(c)]
-    return lines + [f"  {point}" for point in named(c)]
+    lines += [said["shared"], said["verdicts"], said["others"]]
+    return [*filter(None, lines), *(f"  {point}" for point in named(c))]
 
 
 def headline(c: Comparison) -> str:
     """Say how the comparison ended in whole sentences, beside a table of ratios."""
     if not c.pairs:
-        return _nothing(c)
-    said = (
-        _same(c),
-        _slower(c),
-        _shared(c),
-        _counted_verdicts(c),
-        _counted_others(c),
-        _environments(c),
-        _residuals(c),
-        _busy(c),
-    )
-    return " ".join(filter(None, said))
+        return TEXT("nothing", c)
+    said = _said(c)
+    order = ("same_folder", "slower", "shared", "verdicts", "others", *_CONDITIONS[1:])
+    return " ".join(said[name] for name in order if said[name])
+
+
+def sentences(c: Comparison) -> tuple[str, ...]:
+    """Say how the conditions compare, and count what changed."""
+    if not c.pairs:
+        return (TEXT("nothing", c),)
+    said = _said(c)
+    lines = [said[name] for name in (*_CONDITIONS, "times", "slower", "shared")]
+    return (*filter(None, lines), f"{said['verdicts']} {said['others']}")
+
+
+def _said(c: Comparison) -> dict[str, str]:
+    """Write all sentences on a comparison, by name; empty where one has no cause."""
+    keys = [key for key, *_ in environments(c.before, c.after)]
+    schemas = [sorted({r.schema for r in e.records}) for e in (c.before, c.after)]
+    loads = [
+        f"{load:.2f} {when}"
+        for when, e in (("before", c.before), ("after", c.after))
+        if (load := busy_with(e)) is not None
+    ]
+    everything = mean_ratio(c.pairs)
+    relative = [relative_ratio(c, s) for s in c.solvers]
+    apart = None in relative or any(map(side, relative))
+    alike = everything is not None and side(everything) and not apart
+    same = c.before.directory.resolve() == c.after.directory.resolve()
+    equal = schemas[0] == schemas[1] and len(schemas[0]) == 1
+    return {
+        "same_folder": TEXT("same_folder") if same else "",
+        "conditions": TEXT("conditions", c, keys, machines_differ(c.before, c.after)),
+        "residuals": "" if equal else TEXT("residuals", *schemas),
+        "busy": TEXT("busy", loads) if loads else "",
+        "times": TEXT("times", [change_word(p.ratio) for p in c.timed if p.ratio]),
+        "slower": TEXT("slower", regressions(c)),
+        "shared": TEXT("shared", everything) if alike else "",
+        "verdicts": TEXT("verdicts", c),
+        "others": TEXT("others", c),
+    }
 
 
 def dates(c: Comparison) -> str:
@@ -74,40 +101,6 @@ def dates(c: Comparison) -> str:
     return f"before: {then} · {there}, after: {now} · {here}"
 
 
-def sentences(c: Comparison) -> tuple[str, ...]:
-    """Say how the conditions compare, and count what changed."""
-    if not c.pairs:
-        return (_nothing(c),)
-    counted = f"{_counted_verdicts(c)} {_counted_others(c)}"
-    said = (
-        _same(c),
-        _environments(c),
-        _residuals(c),
-        _busy(c),
-        _counted_times(c),
-        _slower(c),
-        _shared(c),
-        counted,
-    )
-    return tuple(filter(None, said))
-
-
-def _same(c: Comparison) -> str:
-    """Tell who compares a folder with itself that this says nothing."""
-    if c.before.directory.resolve() != c.after.directory.resolve():
-        return ""
-    return "Before and after are the same folder: nothing in it can have changed."
-
-
-def _nothing(c: Comparison) -> str:
-    """Say that there is nothing to compare."""
-    return (
-        "No cell is in both folders (a solver on a case at a tolerance), so there is "
-        f"nothing to compare: {plural(len(c.only_before), 'cell')} before, "
-        f"{len(c.only_after)} after."
-    )
-
-
 def change_word(interval: Ratio | Mean) -> str:
     """Say what an interval tells; "no change" only if it could have told one."""
     if way := side(interval):
@@ -115,149 +108,21 @@ def change_word(interval: Ratio | Mean) -> str:
     return "no change seen" if resolved(interval) else "not resolved"
 
 
-def _environments(c: Comparison) -> str:
-    """Say whether the conditions were equal, and so what times may tell."""
-    keys = [key for key, *_ in environments(c.before, c.after)]
-    named = ", ".join(clean(k, 40) for k in keys[:6]) + (" …" if keys[6:] else "")
-    if machines_differ(c.before, c.after):
-        kept = sum(p.same_machine for p in c.pairs)
-        what = f" ({named})" if named else ""
-        return (
-            f"Environments differ{what}: not all was measured on equal machines. "
-            f"Times of {kept} of {plural(len(c.pairs), 'cell')} are compared, those "
-            "whose machine, threads and BLAS were the same before and after."
-        )
-    if keys:
-        return (
-            f"The machine is the same; what differs is {named}. A change below may be "
-            "due to that, or to the run."
-        )
-    return "The environments are the same: machine, versions and code."
-
-
-def _counted_times(c: Comparison) -> str:
-    timed = c.timed
-    if not timed:
-        return "Times: no cell has two verified repeats in both folders to compare."
-    words = [change_word(p.ratio) for p in timed if p.ratio is not None]
-    counted = ", ".join(f"{words.count(word)} {word}" for word in WORDS)
-    chance = (1 - COVERAGE) * len(timed)
-    return (
-        f"Times: {counted}, of {plural(len(timed), 'cell')}; not resolved: the "
-        f"interval holds 1, and a factor of {ALIKE:g} or its inverse as well. Of "
-        f"intervals that hold {COVERAGE:.0%}, {chance:.1f} would show a change by "
-        "chance."
-    )
-
-
-def _slower(c: Comparison) -> str:
-    """Say what is slower by intervals that hold all together."""
-    found = regressions(c)
-    if found.why_not:
-        return f"Slower, beyond chance and the machine: not judged, {found.why_not}."
-    named = [slower_text(one) for one in found.slower[:NAMED]]
-    rest = len(found.slower) - len(named)
-    more = [f"and {rest} more"] * (rest > 0)
-    told = "; ".join([*named, *more]) or "none"
-    judged = f"{plural(found.solvers, 'solver')} and {plural(found.cells, 'cell')}"
-    return (
-        f"Slower, beyond chance and the machine: {told} ({judged} judged, all "
-        f"intervals together at {COVERAGE:.0%})."
-        + "".join(f" {clean(text, 400)}." for text in found.unverified)
-    )
-
-
-def slower_text(one: Slower) -> str:
-    """Name what is slower, with its ratio and that relative to the other solvers."""
-    name = clean(one.solver, 40)
-    if one.case and one.tol is not None:
-        name += f" on {clean(one.case)} at {tolerance(one.tol)}"
-    return (
-        f"{name} {ratio_text(one.ratio)} times as long, relative to the others "
-        f"{ratio_text(one.relative)}"
-    )
-
-
-def _busy(c: Comparison) -> str:
-    """Warn of a machine that other programs used when one of the runs began."""
-    loads = [busy_with(e) for e in (c.before, c.after)]
-    named = [
-        f"{load:.2f} {when}"
-        for load, when in zip(loads, ("before", "after"), strict=True)
-        if load is not None
-    ]
-    if not named:
-        return ""
-    return (
-        f"Warning: the machine was not idle when measuring began (load average "
-        f"{', '.join(named)}): a change below may be its own."
-    )
-
-
-def _shared(c: Comparison) -> str:
-    """Warn of a change that no solver has more of than the others."""
-    everything = mean_ratio(c.pairs)
-    relative = [relative_ratio(c, s) for s in c.solvers]
-    apart = None in relative or any(map(side, relative))
-    if everything is None or not side(everything) or apart:
-        return ""
-    return (
-        f"All solvers changed alike, together {ratio_text(everything)}: rather the "
-        "machine than a solver."
-    )
-
-
-def _residuals(c: Comparison) -> str:
-    """Say so where the two folders hold residuals of different definitions."""
-    then, now = ({r.schema for r in e.records} for e in (c.before, c.after))
-    if then == now and len(now) == 1:
-        return ""
-    before, after = (" and ".join(map(str, sorted(s))) for s in (then, now))
-    return (
-        f"Residuals are defined differently: journal schema {before} before, {after} "
-        "after. A verdict may have changed with the definition, not with the answer."
-    )
-
-
-def _counted_verdicts(c: Comparison) -> str:
-    worse, better = (sum(p.turn == way for p in c.pairs) for way in (1, -1))
-    factor = c.after.factor
-    at = "" if factor == VERIFIED_FACTOR else f" at {factor:g} × tolerance"
-    return f"Verdicts{at}: {worse} worse, {better} better, of {len(c.pairs)}."
-
-
-def _counted_others(c: Comparison) -> str:
-    iterations = sum(p.other_iterations for p in c.pairs)
-    answers = sum(p.other_answer for p in c.pairs)
-    return (
-        f"Iterations: {iterations} changed. Answers: {answers} differ. In one folder "
-        f"only: {plural(len(c.only_before), 'cell')} before, {len(c.only_after)} after."
-    )
-
-
 def named(c: Comparison) -> list[str]:
     """Name what became worse: verdicts, answers, then times, the largest first."""
-    worse = [
-        f"{cell_name(p)}: {VERDICTS[p.before.verdict][1]} before, "
-        f"{VERDICTS[p.after.verdict][1]} after"
-        for p in c.worse
-    ]
-    worse += [
-        f"{cell_name(p)}: another answer, {power(p.answers[2])} apart"
-        for p in c.pairs
-        if p.other_answer and p.answers is not None
-    ]
-    slower = [(p, p.ratio) for p in c.timed if p.ratio and p.change > 0]
-    slower.sort(key=lambda each: each[1].low, reverse=True)
-    worse += [f"{cell_name(p)}: {ratio_text(r)} times as long" for p, r in slower]
+    slower = [(p.ratio.low, p) for p in c.timed if p.ratio and p.change > 0]
+    slower.sort(key=lambda each: each[0], reverse=True)
+    worse = [("worse", p) for p in c.worse]
+    worse += [("apart", p) for p in c.pairs if p.other_answer]
+    worse += [("longer", p) for _, p in slower]
+    points = [TEXT(macro, p) for macro, p in worse[:NAMED]]
     rest = len(worse) - NAMED
-    return [*worse[:NAMED], f"and {rest} more, see the tables"] if rest > 0 else worse
+    return [*points, f"and {rest} more, see the tables"] if rest > 0 else points
 
 
 def cell_name(pair: Pair) -> str:
     """Name solver, case and tolerance."""
-    o = pair.after
-    return f"{clean(o.solver, 40)} on {clean(o.case)} at {tolerance(o.tol)}"
+    return TEXT("cell", pair.after)
 
 
 def ratio_text(ratio: Ratio | Mean) -> str:
@@ -265,3 +130,9 @@ def ratio_text(ratio: Ratio | Mean) -> str:
     if ratio.low == 0:
         return f"{ratio.value:.3f} [too few cells]"
     return f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
+
+
+TEXT = Sentences(
+    __name__, ALIKE=ALIKE, FACTOR=VERIFIED_FACTOR, MISS=1 - COVERAGE, NAMED=NAMED,
+    VERDICTS=VERDICTS, WORDS=WORDS, ratio_text=ratio_text,
+)  # fmt: skip

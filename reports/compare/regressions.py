@@ -23,16 +23,21 @@ References
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import stdtrit
 
-from mortarbench.harness.running.pairs import Block, Ratio, unpaired_ratio
-from mortarbench.reports.compare.changes import FEWEST, Comparison, Pair
+from mortarbench.harness.running.pairs import Ratio, unpaired_ratio
+from mortarbench.reports.compare.changes import FEWEST, Comparison
 from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
+
+Floats = NDArray[np.float64]
 
 CELLS = 8  #: that it takes to know how much they scatter
 _NORMAL = 1.4826  #: standard deviation of a normal law over its median distance
@@ -60,29 +65,12 @@ class Regressions:
     unverified: tuple[str, ...] = ()  #: solvers without a verified answer in one folder
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Change:
+class _Change(NamedTuple):
     """Logarithms of the times of one cell, and the same relative to other solvers."""
 
-    pair: Pair
-    before: tuple[float, ...]
-    after: tuple[float, ...]
-    relative_before: tuple[float, ...]
-    relative_after: tuple[float, ...]
-
-    @property
-    def own(self) -> float:
-        return float(np.mean(self.after) - np.mean(self.before))
-
-    @property
-    def relative(self) -> float:
-        return float(np.mean(self.relative_after) - np.mean(self.relative_before))
-
-    @property
-    def error(self) -> float:
-        """Standard error of `relative`, of the repeats alone."""
-        sides = (self.relative_after, self.relative_before)
-        return float(np.sqrt(sum(np.var(x, ddof=1) / len(x) for x in sides)))
+    outcome: Outcome
+    own: tuple[Floats, Floats]  #: after, before
+    relative: tuple[Floats, Floats]
 
 
 def regressions(c: Comparison) -> Regressions:
@@ -91,32 +79,27 @@ def regressions(c: Comparison) -> Regressions:
     Where several folders are compared with one, the intervals of all hold together.
     """
     changes = _changes(c)
-    if not changes:
-        return Regressions(slower=(), solvers=0, cells=0, why_not=_why_not(c))
-    by_solver: dict[str, list[_Change]] = {}
-    for change in changes:
-        by_solver.setdefault(change.pair.after.solver, []).append(change)
-    judged = {s: own for s, own in by_solver.items() if len(_by_case(own)) >= FEWEST}
+    by_solver = grouped(changes, lambda change: change.outcome.solver)
+    cases = {s: grouped(of, lambda x: x.outcome.case) for s, of in by_solver.items()}
+    judged = {s: of.values() for s, of in cases.items() if len(of) >= FEWEST}
     cells = changes if len(changes) >= CELLS else []
     if not judged and not cells:
         why = f"fewer than {FEWEST} cases of a solver, and of {CELLS} cells in all"
+        why = why if changes else _why_not(c)
         return Regressions(slower=(), solvers=0, cells=0, why_not=why)
     miss = (1 - COVERAGE) / 2 / c.folders
-    found = [
-        one
-        for solver, own in judged.items()
-        if (one := _of_solver(solver, own, miss / len(judged))) is not None
-    ]
+    found = [_of_solver(s, of, miss / len(judged)) for s, of in judged.items()]
     if cells:
-        scatter = _scatter(by_solver.values())
+        scatter = _NORMAL * float(np.median([
+            abs(mean - float(np.median(means)))
+            for of in by_solver.values()
+            for means in [[_mean(change.relative) for change in of]]
+            for mean in means
+        ]))  # fmt: skip
         freedom = max(len(cells) - len(by_solver), 1)
-        found += [
-            one
-            for change in cells
-            if (one := _of_cell(change, scatter, freedom, miss / len(cells)))
-        ]
+        found += [_of_cell(x, scatter, freedom, miss / len(cells)) for x in cells]
     return Regressions(
-        slower=tuple(found),
+        slower=tuple(x for x in found if min(x.ratio.low, x.relative.low) > 1),
         solvers=len(judged),
         cells=len(cells),
         unverified=_unverified(c, folders=1),
@@ -161,92 +144,69 @@ def _why_not(c: Comparison) -> str:
 
 def _changes(c: Comparison) -> list[_Change]:
     """Take the cells that have times in both folders, and other solvers beside them."""
-    rows: dict[tuple[str, float, str], list[Pair]] = {}
-    for p in c.pairs:
-        if p.ratio is not None and not p.after.first.role:
-            key = (p.after.case, p.after.tol, p.after.first.mode)
-            rows.setdefault(key, []).append(p)
-    found = [
-        _change(p, [o for o in row if o is not p]) for row in rows.values() for p in row
-    ]
-    return [change for change in found if change is not None]
+    timed = [p for p in c.timed if not p.after.first.role]
+    rows = grouped(timed, lambda p: (p.after.case, p.after.tol, p.after.first.mode))
+    found = []
+    for row in rows.values():
+        for p in row:
+            others = [o for o in row if o is not p]
+            relative = (
+                _relative(p.after, [o.after for o in others]),
+                _relative(p.before, [o.before for o in others]),
+            )
+            if min(map(len, relative)) > 1:
+                own = _logs(p.after), _logs(p.before)
+                found.append(_Change(p.after, own, relative))
+    return found
 
 
-def _change(p: Pair, others: Sequence[Pair]) -> _Change | None:
-    before = _relative(p.before, [o.before for o in others])
-    after = _relative(p.after, [o.after for o in others])
-    if min(len(before), len(after)) < 2:
-        return None
-    own = [tuple(np.log([*o.by_block.values()])) for o in (p.before, p.after)]
-    return _Change(
-        pair=p, before=own[0], after=own[1],
-        relative_before=before, relative_after=after,
-    )  # fmt: skip
+def _logs(outcome: Outcome) -> Floats:
+    return np.log([*outcome.by_block.values()])
 
 
-def _relative(own: Outcome, others: Sequence[Outcome]) -> tuple[float, ...]:
+def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
     """Logarithms of time over the geometric mean of the others, block by block."""
-    times: list[Mapping[Block, float]] = [o.by_block for o in others]
-    return tuple(
-        float(np.log(seconds) - np.mean([np.log(of[block]) for of in times]))
+    times = [o.by_block for o in others]
+    return np.array([
+        np.log(seconds) - np.mean([np.log(of[block]) for of in times])
         for block, seconds in own.by_block.items()
         if times and all(block in of for of in times)
-    )
+    ])  # fmt: skip
 
 
-def _by_case(changes: Sequence[_Change]) -> dict[str, list[_Change]]:
-    cases: dict[str, list[_Change]] = {}
-    for change in changes:
-        cases.setdefault(change.pair.after.case, []).append(change)
-    return cases
+def _mean(logs: tuple[Floats, Floats]) -> float:
+    """Mean after less mean before."""
+    return float(np.mean(logs[0]) - np.mean(logs[1]))
 
 
-def _of_solver(solver: str, changes: Sequence[_Change], miss: float) -> Slower | None:
-    cases = _by_case(changes).values()
-    own = _student([float(np.mean([c.own for c in of])) for of in cases], miss)
-    relative = _student(
-        [float(np.mean([c.relative for c in of])) for of in cases], miss
-    )
-    if min(own.low, relative.low) <= 1:
-        return None
-    return Slower(solver=solver, ratio=own, relative=relative)
-
-
-def _student(logs: Sequence[float], miss: float) -> Ratio:
-    """Average logarithms of ratios over cases.
+def _of_solver(
+    solver: str, cases: Collection[Sequence[_Change]], miss: float
+) -> Slower:
+    """Average logarithms of ratios over cases, with Student's interval.
 
     miss : probability that the interval does not hold the mean, on either side
     """
-    x = np.asarray(logs)
-    half = stdtrit(x.size - 1, 1 - miss / 2) * x.std(ddof=1) / np.sqrt(x.size)
-    return _ratio(float(x.mean()), float(half), x.size)
+
+    def student(x: Floats) -> Ratio:
+        half = stdtrit(x.size - 1, 1 - miss / 2) * x.std(ddof=1) / np.sqrt(x.size)
+        return _ratio(float(x.mean()), float(half), x.size)
+
+    own = np.array([np.mean([_mean(x.own) for x in of]) for of in cases])
+    relative = np.array([np.mean([_mean(x.relative) for x in of]) for of in cases])
+    return Slower(solver=solver, ratio=student(own), relative=student(relative))
 
 
-def _of_cell(
-    change: _Change, scatter: float, freedom: int, miss: float
-) -> Slower | None:
-    own = unpaired_ratio(np.exp(change.after), np.exp(change.before), 1 - miss)
+def _of_cell(change: _Change, scatter: float, freedom: int, miss: float) -> Slower:
+    after, before = map(np.exp, change.own)
+    own = unpaired_ratio(after, before, 1 - miss)
     assert own is not None  # there are two repeats of each
-    error = max(scatter, change.error)
-    repeats = min(len(change.relative_after), len(change.relative_before))
+    variances = (np.var(x, ddof=1) / len(x) for x in change.relative)
+    error = max(scatter, float(np.sqrt(sum(variances))))
     half = float(stdtrit(freedom, 1 - miss / 2)) * error
-    relative = _ratio(change.relative, half, repeats)
-    if min(own.low, relative.low) <= 1:
-        return None
-    o = change.pair.after
-    return Slower(
-        solver=o.solver, case=o.case, tol=o.tol, ratio=own, relative=relative
-    )  # fmt: skip
-
-
-def _scatter(solvers: Iterable[Sequence[_Change]]) -> float:
-    """Estimate how much the changes of cells scatter about those of their solvers."""
-    distances = [
-        abs(change.relative - float(np.median([c.relative for c in own])))
-        for own in solvers
-        for change in own
-    ]
-    return _NORMAL * float(np.median(distances))
+    repeats = min(map(len, change.relative))
+    relative = _ratio(_mean(change.relative), half, repeats)
+    o = change.outcome
+    return Slower(solver=o.solver, case=o.case, tol=o.tol, ratio=own, relative=relative)
 
 
 def _ratio(log: float, half: float, of: int) -> Ratio:

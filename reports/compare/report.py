@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,64 +99,50 @@ def write_comparisons(
     return found, said, written
 
 
+#: columns of a cell of one folder, by their names there: type, and the value
+_SIDE: dict[str, tuple[str, Callable[[Outcome], Any]]] = {
+    "verdict": ("string", lambda o: o.verdict.value),
+    "seconds": ("float64", lambda o: t.value if (t := o.seconds("total")) else None),
+    "iterations_min": ("Int64", lambda o: o.iterations[0] if o.iterations else None),
+    "iterations_max": ("Int64", lambda o: o.iterations[1] if o.iterations else None),
+    "energy": ("float64", lambda o: o.energy),
+    "objective": ("float64", lambda o: o.first.objective),
+}
+#: columns of a cell that both folders hold
+_BOTH: dict[str, tuple[str, Callable[[Pair], Any]]] = {
+    "ratio": ("float64", lambda p: p.ratio and p.ratio.value),
+    "ratio_low": ("float64", lambda p: p.ratio and p.ratio.low),
+    "ratio_high": ("float64", lambda p: p.ratio and p.ratio.high),
+    "pairs": ("Int64", lambda p: p.ratio and p.ratio.pairs),
+    "change": ("string", lambda p: p.ratio and ("none", "slower", "faster")[p.change]),
+    "answers_apart": ("float64", lambda p: p.answers and p.answers[2]),
+    "same_machine": ("boolean", lambda p: p.same_machine),
+    "same_qp": ("boolean", lambda p: p.same_qp),
+}
+
+
 def changes_frame(c: Comparison) -> pd.DataFrame:
     """Make a row per cell of either folder, at full precision."""
-    rows = [_paired(p) for p in c.pairs]
-    rows += [
-        {**_cell(o), **_side(o, where)}
-        for where, alone in (("before", c.only_before), ("after", c.only_after))
-        for o in alone
+
+    def row(
+        before: Outcome | None, after: Outcome | None, **both: Any
+    ) -> dict[str, Any]:
+        one = after or before
+        assert one is not None
+        cell = {"case": one.case, "solver": one.solver, "tol": one.tol}
+        for where, o in (("before", before), ("after", after)):
+            if o is not None:
+                cell |= {f"{name}_{where}": of(o) for name, (_, of) in _SIDE.items()}
+        return cell | both
+
+    rows = [
+        row(p.before, p.after, **{name: of(p) for name, (_, of) in _BOTH.items()})
+        for p in c.pairs
     ]
-    frame = pd.DataFrame(rows, columns=list(_COLUMNS))
-    return frame.astype(_COLUMNS)
-
-
-def _paired(p: Pair) -> dict[str, Any]:
-    ratio, answers = p.ratio, p.answers
-    return {
-        **_cell(p.after),
-        **_side(p.before, "before"),
-        **_side(p.after, "after"),
-        "ratio": ratio.value if ratio else None,
-        "ratio_low": ratio.low if ratio else None,
-        "ratio_high": ratio.high if ratio else None,
-        "pairs": ratio.pairs if ratio else None,
-        "change": {1: "slower", 0: "none", -1: "faster"}[p.change] if ratio else None,
-        "answers_apart": answers[2] if answers else None,
-        "same_machine": p.same_machine,
-        "same_qp": p.same_qp,
-    }
-
-
-def _cell(o: Outcome) -> dict[str, Any]:
-    return {"case": o.case, "solver": o.solver, "tol": o.tol}
-
-
-def _side(o: Outcome, where: str) -> dict[str, Any]:
-    time = o.seconds("total")
-    least, most = o.iterations or (None, None)
-    return {
-        f"verdict_{where}": o.verdict.value,
-        f"seconds_{where}": time.value if time else None,
-        f"iterations_min_{where}": least,
-        f"iterations_max_{where}": most,
-        f"energy_{where}": o.energy,
-        f"objective_{where}": o.first.objective,
-    }
-
-
-_COLUMNS: dict[str, str] = {
-    "case": "string", "solver": "string", "tol": "float64",
-    **{
-        f"{name}_{where}": kind
-        for name, kind in (
-            ("verdict", "string"), ("seconds", "float64"),
-            ("iterations_min", "Int64"), ("iterations_max", "Int64"),
-            ("energy", "float64"), ("objective", "float64"),
-        )
-        for where in ("before", "after")
-    },
-    "ratio": "float64", "ratio_low": "float64", "ratio_high": "float64",
-    "pairs": "Int64", "change": "string", "answers_apart": "float64",
-    "same_machine": "boolean", "same_qp": "boolean",
-}  # fmt: skip
+    rows += [row(o, None) for o in c.only_before]
+    rows += [row(None, o) for o in c.only_after]
+    kinds = {"case": "string", "solver": "string", "tol": "float64"}
+    for name, (kind, _) in _SIDE.items():
+        kinds |= {f"{name}_before": kind, f"{name}_after": kind}
+    kinds |= {name: kind for name, (kind, _) in _BOTH.items()}
+    return pd.DataFrame(rows, columns=list(kinds)).astype(kinds)

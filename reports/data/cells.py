@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Any
 
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import (
-    ABSENT,
-    VERDICTS,
-    clean,
-    plural,
-    tolerance,
-)
-from mortarbench.reports.document.layout import Cell, Table, name_cell, sources
+from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
+from mortarbench.reports.document.layout import Cell, Column, Table, sources
 
 #: after a verdict that a proven optimum decided against the residuals
 BY_OPTIMUM = "⋆"
@@ -40,6 +37,13 @@ def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
     )
 
 
+def iterations_cell(outcome: Outcome) -> Cell:
+    """Show iterations, or their range where repeats differ."""
+    its = outcome.iterations
+    least = its[0] if its else None
+    return Cell(text=span(its), value=least, title=source(outcome))
+
+
 def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
     """Explain the mark of a proven optimum as a note, if a verdict in a table has it.
 
@@ -54,10 +58,36 @@ def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
     return (note,) if marked else ()
 
 
+def explained(table: Table) -> Table:
+    """Add a note on the mark of a proven optimum, if a verdict in the table has it."""
+    return replace(table, notes=(*table.notes, *legend(table.rows)))
+
+
+def answer_columns(
+    of: Callable[[Any], Any] = lambda item: item,
+) -> tuple[Column, ...]:
+    """Return the leading columns of tables of answers: case, solver and tolerance.
+
+    of : what has these of an item, itself if it does
+    """
+    return (
+        ("case", lambda item: Cell.name(of(item).case)),
+        ("solver", lambda item: Cell.label(of(item).solver)),
+        ("tol", lambda item: Cell.tolerance(of(item).tol)),
+    )
+
+
+def solver_columns(
+    solvers: Iterable[str], cell: Callable[[str, Any], Cell]
+) -> Iterator[Column]:
+    """Make a column per solver: its cells are those of the solver and an item."""
+    return ((clean(s, 40), partial(cell, s)) for s in solvers)
+
+
 def case_cells(outcome: Outcome | Mapping[str, Outcome]) -> tuple[Cell, Cell]:
     """Make the two leading cells of a row: case and tolerance."""
     one = outcome if isinstance(outcome, Outcome) else next(iter(outcome.values()))
-    return name_cell(one.case), Cell(text=tolerance(one.tol), value=one.tol)
+    return Cell.name(one.case), Cell.tolerance(one.tol)
 
 
 def grid(
@@ -66,16 +96,13 @@ def grid(
     show: Callable[[Outcome, Mapping[str, Outcome]], Cell],
 ) -> Table:
     """Make a table with a row per (case, tol) and a column per solver."""
-    rows = []
-    for row in evidence.outcomes.values():
-        cells = [
-            show(row[s], row) if s in row else Cell(text=ABSENT, title="not run")
-            for s in evidence.solvers
-        ]
-        rows.append((*case_cells(row), *cells))
-    return Table(
-        caption=caption,
-        notes=legend(rows),
-        columns=("case", "tol", *(clean(s, 40) for s in evidence.solvers)),
-        rows=tuple(rows),
+    absent = Cell(title="not run")
+    rows = tuple(
+        (
+            *case_cells(row),
+            *(show(row[s], row) if s in row else absent for s in evidence.solvers),
+        )
+        for row in evidence.outcomes.values()
     )
+    heads = ("case", "tol", *(clean(s, 40) for s in evidence.solvers))
+    return explained(Table(caption=caption, columns=heads, rows=rows))

@@ -153,6 +153,11 @@ def bracketed(value: float, low: float, high: float) -> str:
     return f"{significant(value)} [{significant(low)}, {significant(high)}]"
 
 
+def estimate(of: Sequence[float]) -> str:
+    """Print a value and its interval, the first three of what describes an estimate."""
+    return bracketed(*of[:3])
+
+
 def span(least_most: tuple[int, int] | None) -> str:
     """Print a count, or its range where repeats differ."""
     if least_most is None:

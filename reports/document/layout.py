@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from mortarbench.harness import Record
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
-from mortarbench.reports.document.formatting import ABSENT, clean
+from mortarbench.reports.document.formatting import (
+    ABSENT,
+    clean,
+    estimate,
+    power,
+    seconds,
+    tolerance,
+)
+from mortarbench.reports.statistics.intervals import Interval
 
 _RUN = "run "  #: before the run_ids in a title
 
@@ -24,6 +33,54 @@ class Cell:
     title: str = ""  #: shown when pointed at; run_ids as `source` names them are links
     value: float | None = None  #: what to sort by; the text, if None
 
+    @classmethod
+    def name(cls, name: str) -> Cell:
+        """Show a name that may be long; all of it appears when pointed at."""
+        shown = clean(name)
+        return cls(text=shown, title="" if shown == name else clean(name, 2000))
+
+    @classmethod
+    def label(cls, text: str, limit: int = 40, title: str = "") -> Cell:
+        """Show foreign text in one line of at most `limit` characters."""
+        return cls(text=clean(text, limit), title=title)
+
+    @classmethod
+    def words(cls, text: str, title: str = "") -> Cell:
+        """Show words in a column of words."""
+        return cls(text=text, kind="words", title=title)
+
+    @classmethod
+    def number(cls, value: Any, show: Callable[[Any], str] = str, **more: Any) -> Cell:
+        """Show a number, or an interval by its value; "–" for None.
+
+        show : formats it, as the functions of `reports.document.formatting` do
+        """
+        text = ABSENT if value is None else show(value)
+        return cls(text=text, value=getattr(value, "value", value), **more)
+
+    @classmethod
+    def time(cls, interval: Interval | None, **more: str) -> Cell:
+        """Show a time with its uncertainty."""
+        return cls.number(interval, seconds, **more)
+
+    @classmethod
+    def ratio(cls, ratio: Any, **more: str) -> Cell:
+        """Show an estimate with its interval."""
+        return cls.number(ratio, estimate, **more)
+
+    @classmethod
+    def power(cls, value: float | None, **more: str) -> Cell:
+        """Show an order of magnitude."""
+        return cls.number(value, power, **more)
+
+    @classmethod
+    def tolerance(cls, tol: float) -> Cell:
+        """Show a tolerance."""
+        return cls.number(tol, tolerance)
+
+
+Column = tuple[str, Callable[[Any], Cell]]  #: its head, and the cell of an item
+
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
@@ -35,6 +92,15 @@ class Table:
     text_columns: int = 1  #: how many columns from the left hold names, not numbers
     notes: tuple[str, ...] = ()  #: what must be known to read it; after the caption
     solver: str = ""  #: the only one that it is about: a reader may hide both
+
+    @classmethod
+    def of(
+        cls, caption: str, items: Iterable[Any], columns: Iterable[Column], **more: Any
+    ) -> Table:
+        """Make a row of every item."""
+        heads, cells = zip(*columns, strict=True)
+        rows = tuple(tuple(cell(item) for cell in cells) for item in items)
+        return cls(caption=caption, columns=heads, rows=rows, **more)
 
     def wordy(self, column: int) -> bool:
         """Whether a column holds words, which begin at the left, not numbers."""
@@ -74,6 +140,15 @@ class Statement:
         return [f"{self.subject}: {text}" for text in (*self.claims, *self.remarks)]
 
 
+class Point(str):
+    """An entry of a list, where other strings are paragraphs."""
+
+    __slots__ = ()
+
+
+Part = Statement | str | Point | Table | Picture
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Section:
     """One part of the report; `name` is its anchor and the stem of its files."""
@@ -85,6 +160,23 @@ class Section:
     points: tuple[str, ...] = ()
     tables: tuple[Table, ...] = ()
     pictures: tuple[Picture, ...] = ()
+
+    @classmethod
+    def of(cls, name: str, title: str, parts: Iterable[Part]) -> Section | None:
+        """Sort parts by their type; None where there are no parts."""
+        kinds: dict[type, list[Any]] = {}
+        for part in parts:
+            kinds.setdefault(type(part), []).append(part)
+        if not kinds:
+            return None
+        fields = (Statement, str, Point, Table, Picture)
+        statements, prose, points, tables, pictures = (
+            tuple(kinds.get(kind, ())) for kind in fields
+        )
+        return cls(
+            name=name, title=title, statements=statements, prose=prose, points=points,
+            tables=tables, pictures=pictures,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,9 +212,3 @@ def short(run_id: str) -> str:
     """Print a run_id; ours are short, those of a foreign journal may not be."""
     is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
     return run_id if is_ours else clean(run_id, 40)
-
-
-def name_cell(name: str) -> Cell:
-    """Show a name that may be long; all of it appears when pointed at."""
-    shown = clean(name)
-    return Cell(text=shown, title="" if shown == name else clean(name, 2000))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from mortarbench.harness.crossval.discretisation import Discretisation
 from mortarbench.reports.document.formatting import ABSENT, clean, power
-from mortarbench.reports.document.layout import Cell, Table, name_cell
+from mortarbench.reports.document.layout import Cell, Table
 
 
 def mesh_table(found: Sequence[Discretisation]) -> Table:
@@ -32,7 +32,7 @@ def _mesh(d: Discretisation) -> tuple[Cell, ...]:
     }.get(d.kind, d.note)
     less = "< " if d.kind == "rounding" else ""
     return (
-        name_cell(d.case),
+        Cell.name(d.case),
         _count(sizes[0] if sizes else None),
         Cell(text=less + power(d.error) if d.error else ABSENT, value=d.error),
         Cell(text=ABSENT if d.rate is None else f"{d.rate / 2:.2f}", value=d.rate),

@@ -1,1 +1,143 @@
-"""The sections of a report, one per module, and the cells that they share."""
+"""The sections of a report: each registers itself, with its place among the others.
+
+A module NAME.py holds sections that belong together, and NAME.j2 their sentences. A new
+section is a generator of its parts under `@section`, in any module of this room.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from importlib import import_module
+from pkgutil import iter_modules
+from typing import NamedTuple
+
+from mortarbench.reports.data.aggregation import Ranking, ranking_of
+from mortarbench.reports.data.comparison_groups import ComparisonGroup, all_groups
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.data.fastest import (
+    Answers,
+    FastestSolver,
+    answers_of,
+    fastest_solvers,
+)
+from mortarbench.reports.data.size_series import SizeSeries, size_series
+from mortarbench.reports.data.ways import Ways, compare_ways
+from mortarbench.reports.document.layout import Part, Section
+
+
+class Analysis:
+    """The evidence of a folder, and what several sections compute from it.
+
+    pool_forms : means, ranks and profiles are over the cases of all forms together
+    """
+
+    def __init__(self, evidence: Evidence, *, pool_forms: bool = False) -> None:
+        self.evidence = evidence
+        self.pool_forms = pool_forms
+
+    @cached_property
+    def sizes(self) -> list[SizeSeries]:
+        """Series of cases that differ in size only."""
+        return size_series(self.evidence)
+
+    @cached_property
+    def forms(self) -> tuple[ComparisonGroup, ...]:
+        """Groups of cases whose times are compared, form by form."""
+        return tuple(all_groups(self.evidence))
+
+    @cached_property
+    def pooled(self) -> tuple[ComparisonGroup, ...]:
+        """The same with the cases of all forms together."""
+        return tuple(all_groups(self.evidence, pool_forms=True))
+
+    @property
+    def groups(self) -> tuple[ComparisonGroup, ...]:
+        """Groups that means, ranks and profiles are over."""
+        return self.pooled if self.pool_forms else self.forms
+
+    @cached_property
+    def ways(self) -> Ways:
+        """The comparison of ways from the mesh to the answer, over all forms."""
+        return compare_ways(self.evidence)
+
+    @cached_property
+    def answers(self) -> Answers:
+        """The answer of every solver to every case, form by form."""
+        return answers_of(self.evidence)
+
+    @cached_property
+    def fastest(self) -> tuple[FastestSolver, ...]:
+        """The comparison of solvers, form by form."""
+        return fastest_solvers(self.answers, self.forms)
+
+    @cached_property
+    def rankings(self) -> list[Ranking]:
+        """Rankings of the groups that are large enough."""
+        return [ranking_of(group) for group in self.groups if group.comparable]
+
+
+Write = Callable[[Analysis], Iterator[Part]]
+
+
+class _Entry(NamedTuple):
+    place: float
+    compose: Callable[[Analysis], Section | None]
+    needs: str
+
+
+_ENTRIES: list[_Entry] = []
+EVIDENCE = 10  #: place after the sections that answer the reader's question
+APPENDIX = 90  #: place of conditions and definitions
+
+
+def section(
+    place: float, name: str, title: str | Callable[[Analysis], str], needs: str = ""
+) -> Callable[[Write], Callable[[Analysis], Section | None]]:
+    """Register a generator of the parts of a section; without parts there is none.
+
+    place : position in the report, in increasing order
+    name : anchor, and stem of the section's files
+    needs : its title and the measurements that it takes, for reports without it
+    """
+
+    def register(write: Write) -> Callable[[Analysis], Section | None]:
+        def compose(analysis: Analysis) -> Section | None:
+            parts = write(analysis)
+            shown = title if isinstance(title, str) else title(analysis)
+            return Section.of(name, shown, parts)
+
+        _ENTRIES.append(_Entry(place, compose, needs))
+        return compose
+
+    return register
+
+
+def sections(analysis: Analysis) -> Iterator[Section]:
+    """Compose all sections; before the appendix, list those that the report lacks."""
+    missing: list[str] = []
+    for entry in _entries():
+        if entry.place >= APPENDIX and missing:
+            prose = (
+                "Sections for which there are no measurements, and what they need.",
+            )
+            title = "Not in this report"
+            yield Section(name="absent", title=title, prose=prose, points=(*missing,))
+            missing = []
+        composed = entry.compose(analysis)
+        if composed is not None:
+            yield composed
+        elif entry.needs:
+            missing.append(entry.needs)
+
+
+def opening(analysis: Analysis) -> list[Section]:
+    """Compose the sections that answer the reader's question; the rest is evidence."""
+    found = [e.compose(analysis) for e in _entries() if e.place < EVIDENCE]
+    return [one for one in found if one is not None]
+
+
+def _entries() -> list[_Entry]:
+    for module in iter_modules(__path__):
+        import_module(f"{__name__}.{module.name}")
+    return sorted(_ENTRIES, key=lambda entry: entry.place)

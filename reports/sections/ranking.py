@@ -1,8 +1,9 @@
-"""Times over cases: means, ranks, and what they depend on."""
+"""Times over cases: means, ranks, what they depend on, and profiles."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,154 +19,109 @@ from mortarbench.reports.data.aggregation import (
     Panel,
     Ranking,
     common_cases,
+    geometric_means,
     panel,
 )
-from mortarbench.reports.data.aggregation import geometric_means as means_by
 from mortarbench.reports.data.comparison_groups import (
     CASES,
     LARGEST_SHIFT,
     ComparisonGroup,
 )
-from mortarbench.reports.document.formatting import (
-    ABSENT,
-    TIMED,
-    bracketed,
-    plural,
-    seconds,
-    significant,
+from mortarbench.reports.document.formatting import TIMED, estimate, significant
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
+from mortarbench.reports.document.templates import Sentences
+from mortarbench.reports.figures.profiles import (
+    banded,
+    pairwise_figure,
+    profile_figure,
+    rivals,
+    rows_of,
 )
-from mortarbench.reports.document.layout import Cell, Section, Table, name_cell
+from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.censoring import restricted_mean
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.statistics.profiles import performance_ratios, solved_within
 
-_LACKING = 6  #: groups that are named as not compared
-_COLUMNS = (
-    "solver", "tier", "solved", "mean", "to the leader", "P(best)",
-    "both solved, to the leader", "common cases, to the leader", "mean up to the limit",
+DRAWN = 4  #: groups whose profiles are drawn; all are tabulated
+FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table of profiles
+TEXT = Sentences(
+    __name__, CASES=CASES, EVERY=EVERY, LARGEST_SHIFT=LARGEST_SHIFT,
+    PENALTIES=PENALTIES, SHIFTS=SHIFTS, USUAL=USUAL,
 )  # fmt: skip
 
 
-def left_out(groups: Sequence[ComparisonGroup], *, poolable: bool) -> tuple[str, ...]:
-    """Say of which groups nothing is said over cases, and what they lack.
-
-    Empty where every group is comparable.
-
-    poolable : whether all forms together would make a group that is
-    """
-    lacking = [group for group in groups if not group.comparable]
+def not_compared(a: Analysis) -> list[str]:
+    """Name the groups that are not compared over cases, and what they lack."""
+    lacking = [group for group in a.groups if not group.comparable]
     if not lacking:
-        return ()
-    some = len(lacking) < len(groups)
-    counted = [f"{group.title}: {group.lack}" for group in lacking[:_LACKING]]
-    counted += [f"and {len(lacking) - _LACKING} more"] * (len(lacking) > _LACKING)
-    one_of = "" if any(group.forms for group in groups) else " of one form"
-    text = (
-        f"{'Not compared here' if some else 'Nothing is compared here'}: "
-        f"{'; '.join(counted)}. At least {CASES} cases{one_of} at one accuracy are "
-        "needed, two solvers that were measured on them, and a verified answer: with "
-        "fewer cases no two solvers can be told apart."
-    )
-    hint = (
-        ' "mortarbench report DIR --pool-forms" puts the cases of all forms together.'
-    )
-    return (text + hint * poolable,)
+        return []
+    poolable = not a.pool_forms and len(a.pooled) < len(a.groups) and any(
+        group.comparable for group in a.pooled
+    )  # fmt: skip
+    return TEXT.parts("not_compared", a.groups, lacking, poolable)
 
 
-def means(rankings: Sequence[Ranking], left: tuple[str, ...] = ()) -> Section:
-    """Tabulate the means of every group.
-
-    left : what `left_out` says
-    """
-    name, title = "means", "Means over cases"
-    if not rankings:
-        return Section(name=name, title=title, prose=left)
-    return Section(
-        name=name,
-        title=title,
-        prose=(
-            "Shifted geometric means exp(mean log(t + s)) − s of the median times of "
-            "verified answers, one time per case. The shift s is the median over the "
-            f"cases of the best time (at most {LARGEST_SHIFT:g} s): a fixed one of "
-            "seconds would make the mean of milliseconds an arithmetic one. An "
-            f"unsolved case is charged {USUAL.penalty:g} limits; next to that stand "
-            "two comparisons that charge nothing, and the arithmetic mean of times cut "
-            "at the limit. "
-            + (
-                "Forms are compared together, as asked for."
-                if any(ranking.group.forms for ranking in rankings)
-                else "Forms are compared apart, "
-                f"and only where there are at least {CASES} cases."
-            ),
-            "Intervals (95 %) are over the cases: they say what other cases of the "
-            "same kind might have given. A solver is in the first tier whose head "
-            "these cases do not tell to be faster: within a tier, ranks are inside the "
-            "noise. "
-            "What is told apart is so with 95 % for all pairs at once. P(best) is the "
-            "share of resampled sets of cases in which a solver has the least mean. "
-            "Formulas, sources and limits are in docs/statistics.md.",
-            *left,
-        ),
-        tables=tuple(map(_table, rankings)),
-    )
+@section(40, "means", "Means over cases")
+def means(a: Analysis) -> Iterator[Part]:
+    """Tabulate the means of every group."""
+    if a.rankings:
+        yield from TEXT.parts("means", any(r.group.forms for r in a.rankings))
+    yield from not_compared(a)
+    yield from map(_means_table, a.rankings)
 
 
-def described(group: ComparisonGroup) -> str:
-    """Name a group of cases with the numbers that its means depend on."""
-    return (
-        f"{group.title}: {plural(len(group.cases), 'case')}, shift "
-        f"{significant(group.shift)} s, limit {significant(group.limit)} s."
-    )
-
-
-def _table(ranking: Ranking) -> Table:
-    group = ranking.group
+def _means_table(ranking: Ranking) -> Table:
+    group, leader = ranking.group, ranking.leader
     rows, columns = common_cases(group)
-    left = [s for s, used in zip(group.solvers, columns, strict=True) if not used]
-    common = f"Common cases: {rows.sum()}, solved by all"
-    common += (
-        f" but {plural(len(left), 'solver')} with less than half solved."
-        if left
-        else "."
-    )
-    return Table(
-        caption=f"Times over cases, {described(group)} {common} Both solved: "
-        "geometric mean of the ratios on cases that the solver and the leader solved.",
+    common = geometric_means(group, Convention(common=True))
+    solved = group.solved.sum(axis=0)
+    nothing = Cell(text="none solved", kind="quiet")
+
+    def mean(i: int) -> Cell:
+        low, high = (float(end[i]) for end in ranking.intervals)
+        value = Interval(float(ranking.means[i]), low, high, COVERAGE, len(group.cases))
+        return Cell.time(value, kind="best" if i == leader else "")
+
+    def ratio(i: int) -> Cell:
+        found = [float(part[i]) for part in ranking.ratios]
+        return Cell(text="1" if i == leader else estimate(found), value=found[0])
+
+    def common_ratio(i: int) -> Cell:
+        value = float(common[i] / common[leader])
+        if np.isnan(value):
+            return Cell(title="too few cases that all solved")
+        return Cell.number(value, significant)
+
+    def restricted(i: int) -> Cell:
+        found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
+        censored = [f"{found.stopped} out of time"] * bool(found.stopped)
+        censored += [f"{found.never} never"] * bool(found.never)
+        return Cell.time(found.mean, after=", ".join(censored))
+
+    return Table.of(
+        TEXT("means_caption", group, rows.sum(), (~columns).sum()),
+        map(int, ranking.order),
+        (
+            ("solver", lambda i: Cell.name(group.solvers[i])),
+            ("tier", lambda i: Cell.number(int(ranking.tiers[i]))),
+            (
+                "solved",
+                lambda i: Cell(
+                    text=f"{solved[i]} of {len(group.cases)}", value=solved[i]
+                ),
+            ),
+            ("mean", lambda i: mean(i) if solved[i] else nothing),
+            ("to the leader", ratio),
+            ("P(best)", lambda i: Cell.number(float(ranking.first[i]), _share)),
+            (
+                "both solved, to the leader",
+                lambda i: Cell(text="1") if i == leader else _pairs(group, i, leader),
+            ),
+            ("common cases, to the leader", common_ratio),
+            ("mean up to the limit", lambda i: restricted(i) if solved[i] else nothing),
+        ),
         notes=(*group.notes, TIMED),
-        columns=_COLUMNS,
-        rows=tuple(_row(ranking, int(i)) for i in ranking.order),
     )
-
-
-def _row(ranking: Ranking, i: int) -> tuple[Cell, ...]:
-    group, leads = ranking.group, i == ranking.leader
-    solved = int(group.solved[:, i].sum())
-    tier = int(ranking.tiers[i])
-    return (
-        name_cell(group.solvers[i]),
-        Cell(text=str(tier), value=tier),
-        Cell(text=f"{solved} of {len(group.cases)}", value=solved),
-        _mean(ranking, i) if solved else Cell(text="none solved", kind="quiet"),
-        _ratio(ranking, i),
-        Cell(text=_share(float(ranking.first[i])), value=float(ranking.first[i])),
-        Cell(text="1") if leads else _pairs(group, i, ranking.leader),
-        _common(ranking, i),
-        _restricted(group, i) if solved else Cell(text="none solved", kind="quiet"),
-    )
-
-
-def _mean(ranking: Ranking, i: int) -> Cell:
-    value = float(ranking.means[i])
-    low, high = (float(end[i]) for end in ranking.intervals)
-    mean = Interval(value, low, high, COVERAGE, len(ranking.group.cases))
-    kind = "best" if i == ranking.leader else ""
-    return Cell(text=seconds(mean), value=value, kind=kind)
-
-
-def _ratio(ranking: Ranking, i: int) -> Cell:
-    value, low, high = (float(part[i]) for part in ranking.ratios)
-    if i == ranking.leader:
-        return Cell(text="1", value=1.0)
-    return Cell(text=bracketed(value, low, high), value=value)
 
 
 def _share(p: float) -> str:
@@ -181,128 +137,58 @@ def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
     )
     ratio = paired_ratio(mine, its)
     if ratio is None or ratio.pairs < CASES:
-        return Cell(text=ABSENT, title=f"fewer than {CASES} cases that both solved")
-    return Cell(
-        text=bracketed(ratio.value, ratio.low, ratio.high),
-        after=f"n = {ratio.pairs}{_session(group, i, leader)}",
-        value=ratio.value,
-    )
+        return Cell(title=f"fewer than {CASES} cases that both solved")
+    session = ", other session" * bool(group.apart.any() and group.apart[i, leader])
+    return Cell.ratio(ratio, after=f"n = {ratio.pairs}{session}")
 
 
-def _session(group: ComparisonGroup, i: int, j: int) -> str:
-    """Mark two solvers that were not measured within the same blocks."""
-    return ", other session" if group.apart.any() and group.apart[i, j] else ""
-
-
-def _common(ranking: Ranking, i: int) -> Cell:
-    """Ratio to the leader where all solved."""
-    found = means_by(ranking.group, Convention(common=True))
-    value = float(found[i] / found[ranking.leader])
-    if np.isnan(value):
-        return Cell(text=ABSENT, title="too few cases that all solved")
-    return Cell(text=significant(value), value=value)
-
-
-def _restricted(group: ComparisonGroup, i: int) -> Cell:
-    """Mean of the times cut at the limit, with what is censored."""
-    found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
-    known = [
-        f"{count} {what}"
-        for count, what in ((found.stopped, "out of time"), (found.never, "never"))
-        if count
-    ]
-    return Cell(
-        text=seconds(found.mean), after=", ".join(known), value=found.mean.value
-    )
-
-
-def ranking(rankings: Sequence[Ranking], left: tuple[str, ...] = ()) -> Section:
-    """Tabulate the panel of every group.
-
-    left : what `left_out` says
-    """
-    name, title = "ranking", "What ranks depend on"
-    if not rankings:
-        return Section(name=name, title=title, prose=left)
-    panels = [(ranking, panel(ranking.group)) for ranking in rankings]
-    return Section(
-        name=name,
-        title=title,
-        prose=(
-            "Ranks by the means above, and what becomes of them when one convention is "
-            f"changed: the shift ({_listed(SHIFTS)} times the fitted one), the limits "
-            f"charged for an unsolved case ({_listed(PENALTIES)}), whether the "
-            "solver's claim is taken for a solution, or only cases that all solved. "
-            f"All: the ranks under the {len(EVERY)} combinations of shift, penalty and "
-            "gate. Emphasised: the order to some other solver is turned.",
-            "Inside the noise: from the number of solvers told faster, plus one, to "
-            "that of all but those told slower; together these ranges hold the true "
-            "ranks of all solvers with 95 %. Where a range is longer than one rank, "
-            "the rank is inside the noise.",
-            *left,
-        ),
-        points=tuple(_worth(*each) for each in panels),
-        tables=tuple(_panel_table(*each) for each in panels),
-    )
-
-
-def _listed(values: Sequence[float]) -> str:
-    return ", ".join(f"{v:g}" for v in values)
-
-
-def _worth(ranking: Ranking, ranked: Panel) -> str:
-    """Say in a sentence what the ranking of one group is worth."""
-    upper = np.triu(np.ones_like(ranked.turned), 1)
-    told = (ranking.faster | ranking.faster.T) & upper
-    turned = ranked.turned & upper
-    n = len(ranking.group.solvers)
-    turns = (
-        f"conventions turn the order of {turned.sum()}, among them "
-        f"{(turned & told).sum()} that are told apart"
-        if turned.any()
-        else "no convention turns an order"
-    )
-    return (
-        f"{ranking.group.title}: {plural(n, 'solver')} in "
-        f"{plural(int(ranking.tiers.max()), 'tier')}; of "
-        f"{plural(n * (n - 1) // 2, 'pair')} {told.sum()} told apart; {turns}."
-    )
+@section(42, "ranking", "What ranks depend on")
+def ranking(a: Analysis) -> Iterator[Part]:
+    """Tabulate the ranks of every group under changed conventions."""
+    if a.rankings:
+        yield from TEXT.parts("ranking")
+    yield from not_compared(a)
+    for one in a.rankings:
+        ranked = panel(one.group)
+        upper = np.triu(np.ones_like(ranked.turned), 1)
+        told = (one.faster | one.faster.T) & upper
+        turned = ranked.turned & upper
+        counts = int(one.tiers.max()), told.sum(), turned.sum(), (turned & told).sum()
+        yield from TEXT.parts("order", one.group, *counts)
+        yield _panel_table(one, ranked)
 
 
 def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
-    return Table(
-        caption=f"Ranks under changed conventions, {described(ranking.group)} "
-        f"Usual: {USUAL.penalty:g} limits for an unsolved case, verified answers.",
-        columns=(
-            "solver", "tier", "rank", "inside the noise", *ranked.single, "all",
-            "reading",
+    def changed(one: Changed, i: int) -> Cell:
+        if np.isnan(one.ranks[i]):
+            return Cell(title="takes no part in the comparison")
+        return Cell.number(
+            float(one.ranks[i]), "{:.0f}".format,
+            kind="over" if one.turned[i].any() else "",
+        )  # fmt: skip
+
+    def every(i: int) -> Cell:
+        found = [int(one.ranks[i]) for one in ranked.every]
+        return _range(min(found), max(found))
+
+    def reading(i: int) -> Cell:
+        told = ranking.faster[i] | ranking.faster[:, i]
+        low, high = ranking.spans[i]
+        return Cell.words(_reading(ranked.turned[i], told, sure=low == high))
+
+    return Table.of(
+        TEXT("panel_caption", ranking.group),
+        map(int, ranking.order),
+        (
+            ("solver", lambda i: Cell.name(ranking.group.solvers[i])),
+            ("tier", lambda i: Cell.number(int(ranking.tiers[i]))),
+            ("rank", lambda i: Cell.number(int(ranked.usual[i]))),
+            ("inside the noise", lambda i: _range(*ranking.spans[i])),
+            *((name, partial(changed, one)) for name, one in ranked.single.items()),
+            ("all", every),
+            ("reading", reading),
         ),
-        rows=tuple(_panel_row(ranking, ranked, int(i)) for i in ranking.order),
-    )  # fmt: skip
-
-
-def _panel_row(ranking: Ranking, ranked: Panel, i: int) -> tuple[Cell, ...]:
-    tier, rank = int(ranking.tiers[i]), int(ranked.usual[i])
-    low, high = ranking.spans[i]
-    every = [int(changed.ranks[i]) for changed in ranked.every]
-    told = ranking.faster[i] | ranking.faster[:, i]
-    return (
-        name_cell(ranking.group.solvers[i]),
-        Cell(text=str(tier), value=tier),
-        Cell(text=str(rank), value=rank),
-        Cell(text=_range(low, high), value=low),
-        *(_changed(changed, i) for changed in ranked.single.values()),
-        Cell(text=_range(min(every), max(every)), value=min(every)),
-        Cell(text=_reading(ranked.turned[i], told, sure=low == high), kind="words"),
     )
-
-
-def _changed(changed: Changed, i: int) -> Cell:
-    rank = changed.ranks[i]
-    if np.isnan(rank):
-        return Cell(text=ABSENT, title="takes no part in the comparison")
-    kind = "over" if changed.turned[i].any() else ""
-    return Cell(text=str(int(rank)), value=float(rank), kind=kind)
 
 
 def _reading(turned: NDArray[np.bool_], told: NDArray[np.bool_], *, sure: bool) -> str:
@@ -314,5 +200,50 @@ def _reading(turned: NDArray[np.bool_], told: NDArray[np.bool_], *, sure: bool) 
     return "the same under all" if sure else "the same under all, inside the noise"
 
 
-def _range(low: int, high: int) -> str:
-    return str(low) if low == high else f"{low}–{high}"
+def _range(low: int, high: int) -> Cell:
+    return Cell(text=str(low) if low == high else f"{low}–{high}", value=low)
+
+
+@section(44, "profiles", "Profiles")
+def profiles(a: Analysis) -> Iterator[Part]:
+    """Draw and tabulate the profiles of every group."""
+    if a.rankings:
+        yield from TEXT.parts("profiles", len(a.rankings), DRAWN)
+    yield from not_compared(a)
+    yield from map(_profile_table, a.rankings)
+    solvers = a.evidence.solvers
+    for k, ranking in enumerate(a.rankings[:DRAWN], 1):
+        rows = rows_of(ranking, solvers)
+        behind = len(ranking.group.solvers) - sum(map(len, rows))
+        yield Picture(
+            name=f"profiles-{k}",
+            caption=TEXT("drawn", ranking.group, len(rows), behind, banded(ranking)),
+            figure=profile_figure(ranking, solvers),
+        )
+        if len(ranking.group.solvers) > 2:
+            yield Picture(
+                name=f"pairwise-{k}",
+                caption=TEXT("pairwise", ranking, len(rivals(ranking))),
+                figure=pairwise_figure(ranking, solvers),
+            )
+
+
+def _profile_table(ranking: Ranking) -> Table:
+    group = ranking.group
+    ratios = performance_ratios(group.times)
+    within = (*FACTORS, np.finfo(float).max)
+    heads = ("best", *(f"within {f:g} ×" for f in FACTORS[1:]), "at all")
+    shares = [list(zip(*solved_within(of, within), strict=True)) for of in ratios.T]
+
+    def share(k: int, i: int) -> Cell:
+        value, low, high = shares[i][k]
+        return Cell(text=f"{value:.2f} [{low:.2f}, {high:.2f}]", value=float(value))
+
+    return Table.of(
+        TEXT("shares_caption", group, int((~group.solved.any(axis=1)).sum())),
+        map(int, ranking.order),
+        (
+            ("solver", lambda i: Cell.name(group.solvers[i])),
+            *((head, partial(share, k)) for k, head in enumerate(heads)),
+        ),
+    )

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from functools import partial
 
 from mortarbench.harness import Verdict
 from mortarbench.reports.data.cells import (
+    answer_columns,
     case_cells,
+    explained,
     grid,
-    legend,
+    iterations_cell,
     source,
     verdict_cell,
 )
-from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
-from mortarbench.reports.document.formatting import (
-    ABSENT,
-    clean,
-    plain_value,
-    power,
-    span,
-)
-from mortarbench.reports.document.layout import Cell, Section, Table, name_cell, sources
+from mortarbench.reports.data.evidence import RESIDUALS, Outcome
+from mortarbench.reports.document.formatting import clean, plain_value, power
+from mortarbench.reports.document.layout import Cell, Column, Part, Table, sources
+from mortarbench.reports.document.templates import Sentences
+from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.profiles import share
 
+TEXT = Sentences(__name__)
 #: (claimed to be solved, verified) and what that is called
 KINDS = {
     (True, True): "claimed, verified",
@@ -33,111 +34,67 @@ KINDS = {
 }
 
 
-def claim_counts(evidence: Evidence) -> Section:
+@section(16, "tally", "Claims and verdicts, counted")
+def claim_counts(a: Analysis) -> Iterator[Part]:
     """Count, for every solver, what it claimed and what was found."""
     count: dict[str, Counter[tuple[bool, bool]]] = defaultdict(Counter)
-    for o in evidence.flat:
+    for o in a.evidence.flat:
         if o.verdict is not Verdict.DECLINED:
             claimed = o.claims == ("solved",) or all(r.claims_answer for r in o.records)
             count[o.solver][claimed, o.verified] += 1
-    return Section(
-        name="tally",
-        title="Claims and verdicts, counted",
-        prose=(
-            "Answers, one per case and tolerance, by what the solver said of them and "
-            "what we found; of several repeats, all have to be claimed to be solved, "
-            "and all to be verified; a proven claim of infeasibility counts as such an "
-            "answer. Claims that hold: the share of such claims that "
-            "were verified, with its 95 % interval (Clopper and Pearson).",
-        ),
-        tables=(
-            Table(
-                caption="Claims beside verdicts.",
-                columns=("solver", *KINDS.values(), "claims that hold"),
-                rows=tuple(_claim_row(s, count[s]) for s in evidence.solvers),
-            ),
-        ),
-    )
 
+    def counted(kind: tuple[bool, bool], solver: str) -> Cell:
+        n = count[solver][kind]
+        return Cell.number(n, kind="over" if n and kind == (True, False) else "")
 
-def _claim_row(solver: str, count: Counter[tuple[bool, bool]]) -> tuple[Cell, ...]:
-    cells = [
-        Cell(
-            text=str(count[kind]),
-            value=count[kind],
-            kind="over" if count[kind] and kind == (True, False) else "",
-        )
-        for kind in KINDS
-    ]
-    held, claimed = count[True, True], count[True, True] + count[True, False]
-    if not claimed:
-        return (name_cell(solver), *cells, Cell(text=ABSENT))
-    value, low, high = (float(part) for part in share(held, claimed))
-    text = f"{value:.2f} [{low:.2f}, {high:.2f}]"
-    return (name_cell(solver), *cells, Cell(text=text, value=value))
+    def held(solver: str) -> Cell:
+        right, wrong = count[solver][True, True], count[solver][True, False]
+        if not right + wrong:
+            return Cell()
+        value, low, high = (float(part) for part in share(right, right + wrong))
+        return Cell(text=f"{value:.2f} [{low:.2f}, {high:.2f}]", value=value)
 
-
-def claims(evidence: Evidence) -> Section:
-    """Set what each solver claimed beside what we found."""
-    return Section(
-        name="verdicts",
-        title="Claimed against verified",
-        prose=(
-            "Our verdict on each answer, with the largest of its four residuals. What "
-            "the solver said of itself is added where it differs from the verdict; "
-            "inaccurate and wrong answers were claimed to be solved.",
-        ),
-        tables=(
-            grid(evidence, "Verdicts and worst residuals.", _verdict),
-            *_refuted(evidence),
+    yield from TEXT.parts("claim_counts")
+    yield Table.of(
+        "Claims beside verdicts.",
+        a.evidence.solvers,
+        (
+            ("solver", Cell.name),
+            *((name, partial(counted, kind)) for kind, name in KINDS.items()),
+            ("claims that hold", held),
         ),
     )
 
 
-def _refuted(evidence: Evidence) -> list[Table]:
-    """List every claim that our evaluation refutes, with what refutes it."""
-    refuted = [
-        o for o in evidence.flat
-        if o.verdict in (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
-    ]  # fmt: skip
-    if not refuted:
-        return []
-    rows = tuple(_refutation(o) for o in refuted)
-    return [
-        Table(
-            caption="Refuted claims: what the solver said, and the residual that says "
-            "otherwise, with what verification allows.",
-            notes=legend(rows),
-            columns=("case", "solver", "tol", "verdict", "evidence", "its words"),
-            rows=rows,
-            text_columns=2,
+@section(18, "verdicts", "Claimed against verified")
+def claims(a: Analysis) -> Iterator[Part]:
+    """Set what each solver claimed beside what we found, and list refuted claims."""
+    yield from TEXT.parts("claims")
+    yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
+    kinds = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
+    refuted = [o for o in a.evidence.flat if o.verdict in kinds]
+    if refuted:
+        columns = (
+            *answer_columns(),
+            ("verdict", verdict_cell),
+            ("evidence", _refutation),
+            ("its words", lambda o: Cell.label(o.first.message, 60)),
         )
-    ]
+        caption = TEXT("refuted_caption")
+        yield explained(Table.of(caption, refuted, columns, text_columns=2))
 
 
-def _refutation(outcome: Outcome) -> tuple[Cell, ...]:
-    """Make one row of the table of refuted claims."""
+def _refutation(outcome: Outcome) -> Cell:
+    """Name the residual or the distance that refutes a claim."""
     values = {name: outcome.largest(name) for name in RESIDUALS}
-    known = {name: v for name, v in values.items() if v is not None}
-    name = max(known, key=lambda n: known[n], default=None)
-    error = outcome.largest("optimum_error")
-    if error is not None:
-        evidence = (
-            f"off the proven optimum by {power(error)} > {power(outcome.allowed)}"
-        )
-    elif name is None:
-        evidence = "no point"
-    else:
-        evidence = f"{name} {power(known[name])} > {power(outcome.allowed)}"
-    case, tol = case_cells(outcome)
-    return (
-        case,
-        Cell(text=clean(outcome.solver, 40)),
-        tol,
-        verdict_cell(outcome),
-        Cell(text=evidence, title=source(outcome)),
-        Cell(text=clean(outcome.first.message, 60)),
-    )
+    known = {name: value for name, value in values.items() if value is not None}
+    if (error := outcome.largest("optimum_error")) is not None:
+        known = {"off the proven optimum by": error}
+    if not known:
+        return Cell(text="no point", title=source(outcome))
+    name = max(known, key=lambda n: known[n])
+    text = f"{name} {power(known[name])} > {power(outcome.allowed)}"
+    return Cell(text=text, title=source(outcome))
 
 
 def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
@@ -151,120 +108,66 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
         after.append("claimed " + clean(", ".join(claimed).replace("_", " "), 40))
     cell = verdict_cell(outcome, ", ".join(after))
     message = clean(outcome.first.message, 240)
-    return Cell(**{**vars(cell), "title": f"{message} · {cell.title}".lstrip(" ·")})
+    return replace(cell, title=f"{message} · {cell.title}".lstrip(" ·"))
 
 
-def iterations(evidence: Evidence) -> Section:
-    """Show iterations, and whatever else the solvers count."""
-    return Section(
-        name="iterations",
-        title="Iterations and counts",
-        prose=(
-            "Iterations of different methods cost differently; the counts say what "
-            "they are made of. In parentheses: the answer was not verified.",
-        ),
-        tables=(
-            grid(evidence, "Iterations, as each solver counts them.", _iterations),
-            *_counts(evidence),
-        ),
-    )
+@section(50, "iterations", "Iterations and counts")
+def iterations(a: Analysis) -> Iterator[Part]:
+    """Show iterations, and a table per solver of what else it counts."""
+    yield from TEXT.parts("iterations")
+    caption = "Iterations, as each solver counts them."
+    yield grid(a.evidence, caption, _iterations)
+    for solver in a.evidence.solvers:
+        mine = [o for o in a.evidence.flat if o.solver == solver and o.first.counts]
+        if names := dict.fromkeys(k for o in mine for k in o.first.counts):
+            heads = (clean(name.replace("_", " "), 40) for name in names)
+            yield Table(
+                caption=f"Counts of {clean(solver, 40)}, first repeat.",
+                columns=("case", "tol", *heads),
+                rows=tuple((*case_cells(o), *_counts(o, names)) for o in mine),
+                solver=solver,
+            )
 
 
 def _iterations(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
-    its = outcome.iterations
-    text = span(its)
-    return Cell(
-        text=text if outcome.verified or its is None else f"({text})",
-        kind="" if outcome.verified else "quiet",
-        title=source(outcome),
-        value=its[0] if its else None,
-    )
+    cell = iterations_cell(outcome)
+    if outcome.verified:
+        return cell
+    known = cell.value is not None
+    return replace(cell, text=f"({cell.text})" if known else cell.text, kind="quiet")
 
 
-def _counts(evidence: Evidence) -> list[Table]:
-    """Make one table per solver that counts something."""
-    tables = []
-    for solver in evidence.solvers:
-        mine = [o for o in evidence.flat if o.solver == solver]
-        names = list(dict.fromkeys(k for o in mine for k in o.first.counts))
-        rows = [
-            (*case_cells(o), *(_count(o, name) for name in names))
-            for o in mine
-            if o.first.counts
-        ]
-        if names:
-            heads = tuple(clean(name.replace("_", " "), 40) for name in names)
-            tables.append(
-                Table(
-                    caption=f"Counts of {clean(solver, 40)}, first repeat.",
-                    columns=("case", "tol", *heads),
-                    rows=tuple(rows),
-                    solver=solver,
-                )
-            )
-    return tables
+def _counts(outcome: Outcome, names: Iterable[str]) -> Iterator[Cell]:
+    for name in names:
+        n = outcome.first.counts.get(name)
+        if n is None:
+            yield Cell()
+        else:
+            value = float(n) if isinstance(n, int | float) else None
+            title = sources([outcome.first])
+            yield Cell(text=plain_value(n, 24), value=value, title=title)
 
 
-def _count(outcome: Outcome, name: str) -> Cell:
-    n = outcome.first.counts.get(name)
-    if n is None:
-        return Cell()
-    return Cell(
-        text=plain_value(n, 24), value=_number(n), title=sources([outcome.first])
-    )
-
-
-def _number(value: object) -> float | None:
-    return float(value) if isinstance(value, int | float) else None
-
-
-def errors(evidence: Evidence) -> Section:
+@section(56, "errors", "Errors")
+def errors(a: Analysis) -> Iterator[Part]:
     """List the four residuals and, where there is one, the certified bound."""
-    bounded = any(o.largest("energy_bound") is not None for o in evidence.flat)
-    bound = (
-        " Energy bound: a certified bound of the relative error in the energy norm, "
-        "where the case has one."
-    )
-    measures = (*RESIDUALS, "energy_bound") if bounded else RESIDUALS
-    heads = tuple(name.replace("_", " ") for name in measures)
-    answers = [o for o in evidence.flat if o.worst is not None]
-    if not answers:
-        none = "No solver handed over a point, so there are no residuals."
-        return Section(name="errors", title="Errors", prose=(none,))
-    rows = tuple(_residuals(o, measures) for o in answers)
-    table = Table(
-        caption="Residuals of every answer.",
-        notes=legend(rows),
-        columns=("case", "solver", "tol", "verdict", *heads),
-        rows=rows,
-        text_columns=2,
-    )
-    return Section(
-        name="errors",
-        title="Errors",
-        prose=(
-            "The four scale-free residuals, each the worst over the repeats; coloured "
-            "and bold where it exceeds what verification allows."
-            f"{bound if bounded else ''}",
-        ),
-        tables=(table,),
-    )
+    answers = [o for o in a.evidence.flat if o.worst is not None]
+    bounded = any(o.largest("energy_bound") is not None for o in a.evidence.flat)
+    yield from TEXT.parts("errors", answers, bounded)
 
+    def residual(name: str, o: Outcome) -> Cell:
+        value = o.largest(name)
+        over = value is not None and value > o.allowed and name in RESIDUALS
+        return Cell.power(value, kind="over" if over else "", title=source(o))
 
-def _residuals(outcome: Outcome, measures: tuple[str, ...]) -> tuple[Cell, ...]:
-    """Make one row of the table of errors."""
-    cells = []
-    for name in measures:
-        value = outcome.largest(name)
-        over = value is not None and value > outcome.allowed and name in RESIDUALS
-        cells.append(
-            Cell(
-                text=power(value),
-                value=value,
-                kind="over" if over else "",
-                title=source(outcome),
-            )
+    if answers:
+        columns: tuple[Column, ...] = (
+            *answer_columns(),
+            ("verdict", verdict_cell),
+            *(
+                (name.replace("_", " "), partial(residual, name))
+                for name in (*RESIDUALS, *("energy_bound",) * bounded)
+            ),
         )
-    case, tol = case_cells(outcome)
-    solver = Cell(text=clean(outcome.solver, 40))
-    return (case, solver, tol, verdict_cell(outcome), *cells)
+        caption = "Residuals of every answer."
+        yield explained(Table.of(caption, answers, columns, text_columns=2))

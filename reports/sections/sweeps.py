@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.crossval.discretisation import (
     Discretisation,
     read_discretisation,
 )
-from mortarbench.reports.data.cells import source
+from mortarbench.reports.data.cells import solver_columns, source
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.time_at_accuracy import (
     TimeAtAccuracy,
@@ -17,19 +19,21 @@ from mortarbench.reports.data.time_at_accuracy import (
     time_at_accuracy,
 )
 from mortarbench.reports.document.formatting import (
-    ABSENT,
     TIMED,
     clean,
     power,
     seconds,
     tolerance,
 )
-from mortarbench.reports.document.layout import Cell, Picture, Section, Table, name_cell
+from mortarbench.reports.document.grouping import Name, grouped
+from mortarbench.reports.document.layout import Cell, Part, Picture, Table
+from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.sweeps import certified_figure, sweep_figure
-from mortarbench.reports.statistics.intervals import COVERAGE
+from mortarbench.reports.sections import Analysis, section
+from mortarbench.reports.statistics.intervals import Interval
 
+TEXT = Sentences(__name__)
 _PANELS = 4  #: cases that are drawn; all are tabulated
-
 ERRORS = (1e-2, 1e-4, 1e-6)  #: certified, at which times are compared
 LEAST = 3  #: tolerances that make a sweep
 
@@ -37,155 +41,133 @@ Sweeps = Mapping[str, Mapping[str, Sequence[Outcome]]]  #: case → solver → b
 Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
 
 
-def accuracy(evidence: Evidence) -> Section | None:
-    """Tabulate and draw every sweep; None where there is none.
-
-    Certified errors where there are any; the largest residual elsewhere.
-    """
-    swept, certified = _sweeps(evidence), certified_sweeps(evidence)
-    if not swept and not certified:
-        return None
-    tables, pictures, prose = [], [], []
-    if certified:
-        meshes = read_discretisation(evidence.directory)
-        prose.append(
-            "Solvers test their tolerance in norms of their own, so that equal "
-            "tolerances are unequal demands. Here the tolerance asked for is swept, "
-            "the error of every answer is certified, and solvers are compared by the "
-            "time at equal error. No claim is believed: it only tells that a solver's "
-            "own test ended the solve."
-        )
-        tables.append(time_at_accuracy_table(certified, evidence.solvers))
-        pictures.append(certified_picture(certified, evidence.solvers, meshes))
+@section(
+    46, "accuracy", "Time to accuracy",
+    "Time to accuracy: it takes the key accuracy in the suite, or answers with a "
+    "certified error at three tolerances or more (see suites/accuracy.toml).",
+)  # fmt: skip
+def accuracy(a: Analysis) -> Iterator[Part]:
+    """Tabulate and draw every sweep: certified errors, or else the largest residual."""
+    solvers = a.evidence.solvers
+    if certified := certified_sweeps(a.evidence):
+        yield from TEXT.parts("certified")
+        yield time_at_accuracy_table(certified, solvers)
+        meshes = read_discretisation(a.evidence.directory)
+        yield certified_picture(certified, solvers, meshes)
+    judged = [o for o in a.evidence.flat if o.first.accuracy is not None]
+    swept = by_solver(judged, lambda o: (o.case, o.first.judged_at))
+    swept = dict(sorted(swept.items()))
     if swept:
-        prose.append(
-            "Every answer of the sweep is judged at the same accuracy, too, whatever "
-            "tolerance was asked for; what counts there is the cheapest answer that is "
-            "verified at it."
-        )
-        tables.append(_table(swept, evidence.solvers))
-    if rest := {key: row for key, row in swept.items() if key[0] not in certified}:
-        pictures.append(_picture(rest, evidence.solvers))
-    return Section(
-        name="accuracy", title="Time to accuracy", prose=tuple(prose),
-        tables=tuple(tables), pictures=tuple(pictures),
-    )  # fmt: skip
-
-
-def _picture(
-    swept: Mapping[Key, Mapping[str, list[Outcome]]], solvers: Sequence[str]
-) -> Picture:
-    drawn = dict([*swept.items()][:_PANELS])
-    rest = f" The first {len(drawn)} of {len(swept)} cases." * (len(swept) > len(drawn))
-    return Picture(
-        name="sweep",
-        caption="Certified accuracy (the largest of the four residuals) against the "
-        "median total time, a line per solver through the tolerances asked for. Below "
-        f"the horizontal line an answer is verified (filled).{rest}",
-        figure=sweep_figure([(case, row) for (case, _), row in drawn.items()], solvers),
-    )
-
-
-def _sweeps(evidence: Evidence) -> dict[Key, dict[str, list[Outcome]]]:
-    """Group the outcomes of sweeps by solver, loosest tolerance first."""
-    found: dict[Key, dict[str, list[Outcome]]] = {}
-    for o in sorted(evidence.flat, key=lambda o: -o.tol):
-        if o.first.accuracy is not None:
-            row = found.setdefault((o.case, o.first.accuracy), {})
-            row.setdefault(o.solver, []).append(o)
-    return dict(sorted(found.items()))
+        yield from TEXT.parts("swept")
+        yield _table(swept, solvers)
+    rest = [(case, row) for (case, _), row in swept.items() if case not in certified]
+    if rest:
+        caption = TEXT("sweep_caption", len(rest), _PANELS)
+        figure = sweep_figure(rest[:_PANELS], solvers)
+        yield Picture(name="sweep", caption=caption, figure=figure)
 
 
 def _table(
     swept: Mapping[Key, Mapping[str, list[Outcome]]], solvers: Sequence[str]
 ) -> Table:
-    present = [s for s in solvers if any(s in row for row in swept.values())]
-    rows = []
-    for (case, at), row in swept.items():
-        cheapest = {s: _cheapest(outcomes) for s, outcomes in row.items()}
-        times = [t.value for o in cheapest.values() if o and (t := o.seconds("total"))]
-        best = min(times, default=None)
-        cells = [_cell(cheapest.get(s), row.get(s, ()), best) for s in present]
-        rows.append((name_cell(case), Cell(text=tolerance(at), value=at), *cells))
-    return Table(
-        caption="Median total time of the cheapest verified answer, and the tolerance "
-        "that was asked for to get it.",
+    cheapest = {key: _cheapest_of(row) for key, row in swept.items()}
+    best = {
+        key: min((time.value for time, _ in of.values()), default=0.0)
+        for key, of in cheapest.items()
+    }
+
+    def cell(solver: str, key: Key) -> Cell:
+        if solver not in cheapest[key]:
+            return _not_reached(swept[key].get(solver, ()))
+        time, outcome = cheapest[key][solver]
+        return Cell.time(
+            time, title=source(outcome), after=f"tol {tolerance(outcome.tol)}",
+            kind="best" if time.value == best[key] else "",
+        )  # fmt: skip
+
+    return Table.of(
+        TEXT("swept_caption"),
+        swept,
+        (
+            ("case", lambda key: Cell.name(key[0])),
+            ("accuracy", lambda key: Cell.tolerance(key[1])),
+            *solver_columns(_present(swept, solvers), cell),
+        ),
         notes=(TIMED,),
-        columns=("case", "accuracy", *(clean(s, 40) for s in present)),
-        rows=tuple(rows),
     )
 
 
-def _cheapest(outcomes: Sequence[Outcome]) -> Outcome | None:
-    timed = {t.value: o for o in outcomes if o.verified and (t := o.seconds("total"))}
-    return timed[min(timed)] if timed else None
+def _present(
+    rows: Mapping[Any, Mapping[str, object]], solvers: Sequence[str]
+) -> list[str]:
+    return [s for s in solvers if any(s in row for row in rows.values())]
 
 
-def _cell(
-    outcome: Outcome | None, tried: Sequence[Outcome], best: float | None
-) -> Cell:
-    if outcome is None:
-        declined = all(o.verdict is Verdict.DECLINED for o in tried)
-        text = "declined" if declined else "not reached"
-        return Cell(text=text if tried else ABSENT, kind="quiet")
-    interval = outcome.seconds("total")
-    assert interval is not None
-    return Cell(
-        text=seconds(interval),
-        after=f"tol {tolerance(outcome.tol)}",
-        kind="best" if interval.value == best else "",
-        value=interval.value,
-        title=source(outcome),
-    )
+def _cheapest_of(
+    row: Mapping[str, Sequence[Outcome]],
+) -> dict[str, tuple[Interval, Outcome]]:
+    """Choose the verified answer of each solver that took least."""
+    timed = {
+        s: [(t, o) for o in of if o.verified and (t := o.seconds("total"))]
+        for s, of in row.items()
+    }
+    return {s: min(of, key=lambda each: each[0].value) for s, of in timed.items() if of}
+
+
+def _not_reached(tried: Sequence[Outcome], after: str = "") -> Cell:
+    if not tried:
+        return Cell(kind="quiet")
+    if all(o.verdict is Verdict.DECLINED for o in tried):
+        return Cell(text="declined", kind="quiet")
+    return Cell(text="not reached", after=after, kind="quiet")
 
 
 def certified_sweeps(evidence: Evidence) -> dict[str, dict[str, list[Outcome]]]:
     """Collect the cases with certified errors at three tolerances or more."""
-    found: dict[str, dict[str, list[Outcome]]] = {}
-    for o in sorted(evidence.flat, key=lambda o: -o.tol):
-        found.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-    return {case: row for case, row in sorted(found.items()) if _swept(row)}
+    bounded = (o for o in evidence.flat if o.largest("energy_bound") is not None)
+    tols = Counter(case for case, _ in {(o.case, o.tol) for o in bounded})
+    swept = (o for o in evidence.flat if tols[o.case] >= LEAST)
+    return dict(sorted(by_solver(swept, lambda o: o.case).items()))
 
 
-def _swept(row: Mapping[str, Sequence[Outcome]]) -> bool:
-    bounded = {
-        o.tol for outcomes in row.values() for o in outcomes
-        if o.largest("energy_bound") is not None
-    }  # fmt: skip
-    return len(bounded) >= LEAST
+def by_solver(
+    outcomes: Iterable[Outcome], name: Callable[[Outcome], Name]
+) -> dict[Name, dict[str, list[Outcome]]]:
+    """Group by a name and by solver, loosest tolerance first."""
+    ordered = sorted(outcomes, key=lambda o: -o.tol)
+    groups = grouped(ordered, name).items()
+    return {key: grouped(of, lambda o: o.solver) for key, of in groups}
 
 
 def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
     """Tabulate the times at matched certified errors."""
-    present = [s for s in solvers if any(s in row for row in swept.values())]
-    rows = []
-    for case, row in swept.items():
-        for error in ERRORS:
-            found = {
-                s: time_at_accuracy(outcomes, error) for s, outcomes in row.items()
-            }
-            kinds = places({s: m for s, m in found.items() if not row[s][0].first.role})
-            cells = [
-                _matched(found.get(s), row.get(s, ()), kinds.get(s, ""))
-                for s in present
-            ]
-            rows.append(
-                (name_cell(case), Cell(text=tolerance(error), value=error), *cells)
-            )
-    return Table(
-        caption="Total time at matched certified error: relative, in the energy norm.",
-        notes=(
-            "Interpolated between the tolerances of the sweep, monotone and linear in "
-            f"logarithms, never beyond them; in brackets the {COVERAGE:.0%} interval "
-            "of a bootstrap over the repeats. ≤: the answer at the loosest tolerance "
-            "is better than that already, and took so long; at this error it may take "
-            "less than any other. Bold: the fastest of its row, where no other has a "
-            "≤; ≈: the interval overlaps that of the fastest time without a ≤, so that "
-            "this run does not tell them apart.",
-            TIMED,
+    times = {
+        (case, error): {s: time_at_accuracy(of, error) for s, of in row.items()}
+        for case, row in swept.items()
+        for error in ERRORS
+    }
+    kinds = {
+        (case, error): places(
+            {s: t for s, t in of.items() if not swept[case][s][0].first.role}
+        )
+        for (case, error), of in times.items()
+    }
+
+    def cell(solver: str, key: Key) -> Cell:
+        if solver not in times[key]:
+            return Cell()
+        kind = kinds[key].get(solver, "")
+        return _matched(times[key][solver], swept[key[0]][solver], kind)
+
+    return Table.of(
+        "Total time at matched certified error: relative, in the energy norm.",
+        times,
+        (
+            ("case", lambda key: Cell.name(key[0])),
+            ("error", lambda key: Cell.tolerance(key[1])),
+            *solver_columns(_present(swept, solvers), cell),
         ),
-        columns=("case", "error", *(clean(s, 40) for s in present)),
-        rows=tuple(rows),
+        notes=(TEXT("matched_note"), TIMED),
     )
 
 
@@ -207,16 +189,11 @@ def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
     }  # fmt: skip
 
 
-def _matched(found: TimeAtAccuracy | None, tried: Sequence[Outcome], kind: str) -> Cell:
-    if found is None:
-        return Cell(text=ABSENT)
+def _matched(found: TimeAtAccuracy, tried: Sequence[Outcome], kind: str) -> Cell:
     reached = [o for o in tried if counts(o)]
     if found.time is None:
-        if all(o.verdict is Verdict.DECLINED for o in tried):
-            return Cell(text="declined", kind="quiet")
         closest = min((o.largest("energy_bound") or 0.0 for o in reached), default=None)
-        after = "" if closest is None else f"at best {power(closest)}"
-        return Cell(text="not reached", after=after, kind="quiet")
+        return _not_reached(tried, f"at best {power(closest)}" if reached else "")
     runs = " ".join(i for o in reached for i in o.run_ids)
     looser = found.kind == "looser"
     return Cell(
@@ -233,26 +210,15 @@ def certified_picture(
     swept: Sweeps, solvers: Sequence[str], meshes: Mapping[str, Discretisation]
 ) -> Picture:
     """Draw certified error against time for the first few cases."""
-    drawn = dict([*swept.items()][:_PANELS])
-    rest = f" The first {len(drawn)} of {len(swept)} cases." * (len(swept) > len(drawn))
+    drawn = [*swept.items()][:_PANELS]
     errors = {
         physical: mesh.error
         for physical, mesh in meshes.items()
         if mesh.kind in ("limit", "change") and mesh.error
     }
-    lines = (
-        " Below a tenth of the discretisation error, more digits say no more about the "
-        "bodies; where refinement has no limit, it is the change to the next mesh."
-    ) * any(_physical(row) in errors for row in drawn.values())
+    lines = any(next(iter(row.values()))[0].physical in errors for _, row in drawn)
     return Picture(
         name="certified",
-        caption="Certified relative error in the energy norm against the median total "
-        "time, a line per solver through the tolerances asked for. Bars: interval of "
-        "the median. Filled: the solver's own test ended the solve; hollow: a limit "
-        f"did, or it gave up.{lines}{rest}",
-        figure=certified_figure([*drawn.items()], solvers, errors),
+        caption=TEXT("certified_caption", len(swept), _PANELS, lines),
+        figure=certified_figure(drawn, solvers, errors),
     )
-
-
-def _physical(row: Mapping[str, Sequence[Outcome]]) -> str:
-    return next(iter(row.values()))[0].physical

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from mortarbench.harness import Verdict
 from mortarbench.harness.crossval.discretisation import Discretisation
@@ -11,68 +12,28 @@ from mortarbench.reports.document.formatting import (
     ABSENT,
     VERDICTS,
     clean,
+    listing,
     plural,
-    tolerance,
+    power,
 )
 from mortarbench.reports.document.layout import (
     Cell,
+    Column,
     Page,
+    Part,
     Picture,
     Section,
     Table,
-    name_cell,
 )
 from mortarbench.reports.document.mesh_errors import mesh_table
+from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.render.html_page import html
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.render.writing import write_figures, write_text
-from mortarbench.reports.validation.compared import (
-    Data,
-    count_cell,
-    left_out,
-    listed,
-    number_cell,
-    problems,
-    remarks,
-    run,
-    tol_cell,
-)
 from mortarbench.reports.validation.error_figure import error_figure
 
-_FOOTER = (
-    "All answers and all pairs are in validation.json beside the journal, at full "
-    "precision. Click a column's head to sort by it."
-)
-
-_RULES = (
-    "Every case was built again, and residuals, errors and distances computed from the "
-    "stored points; nothing that the run concluded was taken over.",
-    r"The truth \(u^*\) of a problem comes from a reference solve that is none of the "
-    r"solvers. Its own error is bounded by the identity of Prager and Synge: with "
-    r"\(\hat u\) admissible and \(u_\lambda\) the equilibrium under contact forces "
-    r"\(\hat\lambda \ge 0\), both are within \(\sqrt{2(J(\hat u) - D(\hat\lambda))}\) "
-    r"of \(u^*\) in the energy norm. No majority decides.",
-    r"Error: the larger of \(\|u - u^*\|\) and \(\|u_\lambda - u^*\|\) over "
-    r"\(\|u^*\|\) in the energy norm, plus the bound of the reference. The second is "
-    r"the distance \(\|B^{\mathsf T}(\lambda - \lambda^*)\|\) of the contact forces in "
-    r"the dual norm; \(\lambda\) itself need not be unique.",
-    r"A claim of success at tolerance \(t\) is refuted if a KKT residual exceeds "
-    r"\(10t\); or if one of the two distances, less the bound of the reference, is "
-    r"above \(\sqrt{20t}\,\|u^*\|\), which is what a gap of \(10t\) allows; or if a "
-    r"multiplier pulls. A claim that there "
-    "is no solution is refuted by the certified one.",
-    "Two answers at one tolerance disagree without a culprit if they are farther apart "
-    "than both claims allow, and neither is refuted.",
-    "Rows: contact rows where truth and answer contradict each other. A row is closed "
-    r"where \(\lambda_i D_i > \mathrm{gap}_i\) with its compliance \(D_i\); rows that "
-    r"are nearly neither are left out (force or gap below "
-    r"\(\sqrt{20t D_i}\,\|u^*\|\)).",
-    r"Penetration: largest \(\max(Bu - c, 0)\) over the mesh size of the contact side. "
-    "Balance: largest force or moment left on a body by load, supports and contact, "
-    "relative to what acts on it.",
-    "What stands out is no disagreement: the error is within the claim, but more than "
-    "a hundred times the median of the other solvers on the same case, and above t.",
-)
+Data = Mapping[str, Any]
+TEXT = Sentences(__name__)
 
 
 def write_validation(
@@ -93,13 +54,16 @@ def write_validation(
 def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
     """Put the page together, verdict first."""
     sections = (
-        _verdict(data),
-        _disagreements(data),
-        problems(data),
-        remarks(data),
-        _discretisation(meshes),
-        left_out(data),
-        Section(name="rules", title="How it is decided", points=_RULES),
+        Section.of(*each)
+        for each in (
+            ("verdict", "Verdict", _verdict(data)),
+            ("disagreements", "Disagreements", _disagreements(data)),
+            ("problems", "Problems", _problems(data)),
+            ("remarks", "What stands out", _remarks(data)),
+            ("discretisation", "Errors of the meshes", _discretisation(meshes)),
+            ("left-out", "Not compared", _left_out(data)),
+            ("rules", "How it is decided", TEXT.parts("rules")),
+        )
     )
     answers, solvers, cases, asked, pairs = (
         plural(data["counts"][f"{noun}s"], noun)
@@ -109,143 +73,209 @@ def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
         title=f"Cross-validation of {clean(data['folder'])}",
         dateline=f"{answers} of {solvers} to {cases} of {asked}; {pairs} compared",
         sections=tuple(s for s in sections if s is not None),
-        footer=_FOOTER,
+        footer=TEXT("footer"),
     )
 
 
-def _verdict(data: Data) -> Section:
+def _verdict(data: Data) -> Iterator[Part]:
     rows = data["solvers"]
     tols = {row["tol"] for row in rows}
     ours = any(row["from_ours"] is not None for row in rows)
-    columns = (
-        "solver", *(("tol",) if len(tols) > 1 else ()), "answers", "refuted",
-        "unanswered", "error, median", "worst", "worst on", "penetration / h",
-        "balance", "rows", "primal against dual", *(("against smalbe",) * ours),
-    )  # fmt: skip
-    at = f", tol {tolerance(next(iter(tols)))}" if len(tols) == 1 else ""
-    table = Table(
-        caption=f"Every solver{at}: certified errors, relative, in the energy norm.",
-        columns=columns,
-        rows=tuple(_solver(row, several=len(tols) > 1, ours=ours) for row in rows),
-        notes=(
-            f"{'The last two' if ours else 'The last'}: largest distance between its "
-            f"answers to primal and dual forms{', and from those of smalbe' * ours}.",
+    yield clean(data["headline"], 600)
+    yield Table.of(
+        TEXT("solvers", tols),
+        rows,
+        (
+            _SOLVER,
+            *[_TOL] * (len(tols) > 1),
+            _column("answers"),
+            (
+                "refuted",
+                lambda d: Cell.number(d["refuted"], kind="over" * bool(d["refuted"])),
+            ),
+            _column("unanswered"),
+            _column("error, median", "error_median", power),
+            _column("worst", "error_worst", power),
+            ("worst on", _worst_case),
+            _column("penetration / h", "penetration", power),
+            _column("balance", "balance", power),
+            _column("rows", "contradicted_rows"),
+            _column("primal against dual", "primal_dual", power),
+            *[_column("against smalbe", "from_ours", power)] * ours,
         ),
+        notes=(TEXT("last", ours),),
     )
-    return Section(
-        name="verdict",
-        title="Verdict",
-        prose=(clean(data["headline"], 600),),
-        tables=(table,),
-        pictures=_errors(data),
-    )
-
-
-def _errors(data: Data) -> tuple[Picture, ...]:
-    """Draw the errors of all answers at the tightest tolerance."""
+    # the errors of all answers at the tightest tolerance
     answers = [a for p in data["problems"] for a in p["answers"]]
     tol = min((a["tol"] for a in answers), default=0.0)
     figure = error_figure(answers, tol)
-    if figure is None:  # as where all that was judged are claims without a point
-        return ()
-    caption = (
-        f"Certified error of every answer, over ‖u*‖, at tol {tolerance(tol)}. It is "
-        "never below what is known of the reference. Beyond √(20t) no verified answer "
-        "may lie."
-    )
-    return (Picture(name="validation-errors", caption=caption, figure=figure),)
+    if figure is not None:  # else all that was judged are claims without a point
+        caption = TEXT("errors", tol)
+        yield Picture(name="validation-errors", caption=caption, figure=figure)
 
 
-def _solver(row: Data, *, several: bool, ours: bool) -> tuple[Cell, ...]:
-    tol = (Cell(text=tolerance(row["tol"]), value=row["tol"]),) if several else ()
-    refuted = row["refuted"]
-    return (
-        Cell(text=clean(row["solver"], 40)),
-        *tol,
-        count_cell(row["answers"]),
-        Cell(text=str(refuted), value=refuted, kind="over" if refuted else ""),
-        count_cell(row["unanswered"]),
-        number_cell(row["error_median"]),
-        number_cell(row["error_worst"]),
-        Cell(
-            text=clean(row["worst_case"], 60) or ABSENT,
-            kind="words",
-            title=clean(row["worst_case"], 2000),
-        ),
-        number_cell(row["penetration"]),
-        number_cell(row["balance"]),
-        count_cell(row["contradicted_rows"]),
-        number_cell(row["primal_dual"]),
-        *((number_cell(row["from_ours"]),) * ours),
-    )
+def _column(head: str, name: str = "", show: Callable[[Any], str] = str) -> Column:
+    """Show a number of an entry."""
+    return head, lambda d: Cell.number(d[name or head], show)
 
 
-def _discretisation(meshes: Sequence[Discretisation]) -> Section | None:
-    """List the errors of the meshes themselves, which certified errors add to."""
-    if not meshes:
-        return None
-    return Section(
-        name="discretisation",
-        title="Errors of the meshes",
-        prose=(
-            "u* is the solution on a mesh; this is how far it is from that of the "
-            "continuum. The report says what accuracy beyond it costs.",
-        ),
-        tables=(mesh_table(meshes),),
-    )
+_SOLVER: Column = ("solver", lambda d: Cell.label(d["solver"]))
+_TOL: Column = ("tol", lambda d: Cell.tolerance(d["tol"]))
+_CASE: tuple[Column, ...] = (
+    (
+        "solver",
+        lambda d: Cell.label(d["solver"], title=f"run {clean(d['run_id'], 40)}"),
+    ),
+    ("case", lambda d: Cell.name(d["case"])),
+    _TOL,
+)
 
 
-def _disagreements(data: Data) -> Section | None:
+def _worst_case(d: Data) -> Cell:
+    case = d["worst_case"]
+    return Cell.words(clean(case, 60) or ABSENT, title=clean(case, 2000))
+
+
+def _disagreements(data: Data) -> Iterator[Part]:
     """List every refuted claim, and pairs apart without a culprit."""
-    tables = []
     if wrong := data["disagreements"]:
-        tables.append(
-            Table(
-                caption="Refuted claims: what the solver said, and what is true.",
-                columns=("solver", "case", "tol", "claimed", "verdict", "error", "why"),
-                rows=tuple(map(_wrong, wrong)),
-                text_columns=2,
-            )
+        yield Table.of(
+            "Refuted claims: what the solver said, and what is true.",
+            wrong,
+            (
+                *_CASE,
+                ("claimed", lambda d: Cell.words(clean(d["claimed"], 20))),
+                ("verdict", _judged),
+                _column("error", show=power),
+                ("why", lambda d: Cell.words(clean(TEXT("why", d), 400))),
+            ),
+            text_columns=2,
         )
     if apart := data["unresolved"]:
-        tables.append(
-            Table(
-                caption="Answers that contradict each other, neither refuted.",
-                columns=("problem", "between", "tol", "distance", "allowed"),
-                rows=tuple(map(_apart, apart)),
-                text_columns=2,
-            )
+        yield Table.of(
+            "Answers that contradict each other, neither refuted.",
+            apart,
+            (
+                ("problem", lambda d: Cell.name(d["problem"])),
+                ("between", lambda d: Cell.label(" and ".join(d["between"]), 120)),
+                _TOL,
+                _column("distance", show=power),
+                _column("allowed", show=power),
+            ),
+            text_columns=2,
         )
     if broken := data["contradictions"]:
-        tables.append(
-            listed("Certificates that the reference contradicts: our fault.", broken)
+        yield Table.of(
+            "Certificates that the reference contradicts: our fault.",
+            broken,
+            (*_CASE, ("what", lambda d: Cell.words(clean(d["text"], 240)))),
+            text_columns=2,
         )
-    if not tables:
-        return None
-    return Section(name="disagreements", title="Disagreements", tables=tuple(tables))
 
 
-def _wrong(d: Data) -> tuple[Cell, ...]:
-    symbol, words = VERDICTS[Verdict(d["verdict"])]
-    why = "; ".join(d["reasons"])
-    if d["rows"]:
-        why += f"; contradicts contact at {plural(len(d['rows']), 'row')}"
-    return (
-        Cell(text=clean(d["solver"], 40), title=run(d)),
-        name_cell(d["case"]),
-        tol_cell(d),
-        Cell(text=clean(d["claimed"], 20), kind="words"),
-        Cell(text=words, symbol=symbol, kind=d["verdict"]),
-        number_cell(d["error"]),
-        Cell(text=clean(why, 400), kind="words"),
+def _judged(d: Data) -> Cell:
+    symbol, text = VERDICTS[Verdict(d["verdict"])]
+    return Cell(text=text, symbol=symbol, kind=d["verdict"])
+
+
+def _problems(data: Data) -> Iterator[Part]:
+    """List every problem with how far its answers lie apart."""
+
+    def largest(name: str) -> Callable[[Data], Cell]:
+        def cell(p: Data) -> Cell:
+            known = [pair[name] for pair in p["pairs"] if pair[name] is not None]
+            return Cell.power(max(known, default=None))
+
+        return cell
+
+    def distance(pair: Data) -> float:
+        found = [pair[k] for k in ("distance", "equilibrium") if pair[k] is not None]
+        return max(found, default=float("inf"))
+
+    def between(p: Data) -> Cell:
+        farthest = max(p["pairs"], key=distance, default=None)
+        if farthest is None:
+            return Cell.words(ABSENT)
+        two = (p["answers"][farthest[k]] for k in ("a", "b"))
+        text = " and ".join(f"{a['solver']} on {a['form']}" for a in two)
+        return Cell.words(clean(text, 80))
+
+    def doubt(p: Data) -> Cell:
+        truth = "" if p["truth"] == "reference" else clean(p["truth"] or "none", 40)
+        return Cell.power(p["doubt"], after=truth)
+
+    yield Table.of(
+        "Every problem: all pairs of answers, of each solver and form.",
+        data["problems"],
+        (
+            ("problem", lambda p: Cell.name(p["name"])),
+            ("answers", lambda p: Cell.number(len(p["answers"]))),
+            ("pairs", lambda p: Cell.number(len(p["pairs"]))),
+            _column("closed rows", "closed"),
+            ("error of the reference", doubt),
+            ("largest distance", largest("distance")),
+            ("of forces", largest("equilibrium")),
+            ("of energies", largest("energy")),
+            ("between", between),
+        ),
+        notes=(TEXT("distances"),),
     )
 
 
-def _apart(d: Data) -> tuple[Cell, ...]:
-    return (
-        name_cell(d["problem"]),
-        Cell(text=clean(" and ".join(d["between"]), 120)),
-        tol_cell(d),
-        number_cell(d["distance"]),
-        number_cell(d["allowed"]),
-    )
+def _remarks(data: Data) -> Iterator[Part]:
+    """Say per solver how often it stands out, and where most."""
+    grouped: dict[str, list[Data]] = {}
+    for d in data["remarks"]:
+        grouped.setdefault(d["solver"], []).append(d)
+    if grouped:
+        worst = {
+            s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
+        }
+        yield Table.of(
+            "Answers within what they claim that stand out from the others.",
+            grouped,
+            (
+                ("solver", Cell.label),
+                (
+                    "answers",
+                    lambda s: Cell.number(len({d["run_id"] for d in grouped[s]})),
+                ),
+                ("largest error", lambda s: Cell.power(worst[s]["error"])),
+                ("on", lambda s: Cell.words(clean(worst[s]["case"]))),
+                ("what", lambda s: Cell.words(clean(worst[s]["text"], 200))),
+            ),
+        )
+
+
+def _discretisation(meshes: Sequence[Discretisation]) -> Iterator[Part]:
+    """List the errors of the meshes themselves, which certified errors add to."""
+    if meshes:
+        yield TEXT("discretisation")
+        yield mesh_table(meshes)
+
+
+def _left_out(data: Data) -> Iterator[Part]:
+    """List what was asked and not answered, and what could not be judged."""
+    for name, caption in (
+        ("unanswered", "Measurements that ended without a claim."),
+        ("not_validated", "Stored answers that could not be judged."),
+    ):
+        grouped: dict[tuple[str, str], list[str]] = {}
+        for d in sorted(data[name], key=lambda d: (d["solver"], d["text"], d["case"])):
+            grouped.setdefault((d["solver"], d["text"]), []).append(d["case"])
+        if grouped:
+            yield Table.of(
+                caption,
+                grouped.items(),
+                (
+                    ("solver", lambda each: Cell.label(each[0][0])),
+                    ("times", lambda each: Cell.number(len(each[1]))),
+                    ("what", lambda each: Cell.words(clean(each[0][1], 240))),
+                    ("on", lambda each: _cases(list(dict.fromkeys(each[1])))),
+                ),
+            )
+    yield from TEXT.parts("without_reference", data["without_reference"])
+
+
+def _cases(names: Sequence[str]) -> Cell:
+    return Cell.words(listing(names, 2), title=clean(", ".join(names), 2000))

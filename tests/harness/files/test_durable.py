@@ -37,6 +37,7 @@ from mortarbench.harness.results.faults import (
 from mortarbench.harness.results.folder import Held, refuse_foreign
 from mortarbench.registries import Registries
 from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.summary import summary
 from tests.support import TOY_PROBLEM
 
@@ -321,7 +322,9 @@ forms = ["dual"]
 
 def first_page(folder, _formats, *, factor=10.0, pool_forms=False):
     """Write what the summary of a report says."""
-    (folder / "said").write_text("\n".join(summary(read_evidence(folder)).prose))
+    (folder / "said").write_text(
+        "\n".join(summary(Analysis(read_evidence(folder))).prose)
+    )
     return []
 
 

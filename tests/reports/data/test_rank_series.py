@@ -16,6 +16,7 @@ from mortarbench.reports.data.rank_series import (
 from mortarbench.reports.data.size_series import size_series
 from mortarbench.reports.document.figure import Area, Series
 from mortarbench.reports.folder import compose
+from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.ranks import predicted, ranks
 from mortarbench.reports.statistics.cost_model import CostModel
 from tests.support.manufactured_ranks import (
@@ -132,7 +133,7 @@ def test_records_with_other_entries_have_no_model_either(change):
     records = [r.but(**change) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
     assert series.model is None
-    assert ranks(evidence(records)).name == "ranks"
+    assert ranks(Analysis(evidence(records))).name == "ranks"
 
 
 def test_a_network_may_be_told_of_more_than_the_model_takes():
@@ -198,7 +199,7 @@ def test_copies_are_no_solver_of_a_series_of_sizes(manufactured):
 def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
     manufactured,
 ):
-    section = ranks(manufactured)
+    section = ranks(Analysis(manufactured))
     (model,) = (p for p in section.pictures if p.name == "ranks-model")
     assert model.caption.startswith("Model, not measured")
     for panel in model.figure.panels:

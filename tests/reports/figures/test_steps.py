@@ -9,6 +9,7 @@ from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.size_series import size_series, sweeps
 from mortarbench.reports.document.figure import Series
 from mortarbench.reports.figures.steps import steps_figure, torn_figure
+from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.scaling import steps
 
 SIZES = (1_000, 16_000, 81_000, 256_000)  # fourth powers are whole numbers
@@ -81,10 +82,11 @@ def test_counts_against_cells_of_a_subdomain_have_their_values_as_ticks():
         )
         for r, h in zip(records(), (4, 8, 16, 32), strict=True)
     ]  # fmt: skip
-    (sweep,) = sweeps(evidence(torn), "feti")
-    found = torn_figure(sweep)
-    assert [name for _, name in found.panels[0].x.ticks] == ["4", "8", "16", "32"]
-    section = steps([], [sweep])
+    found = evidence(torn)
+    (sweep,) = sweeps(found, "feti")
+    figure = torn_figure(sweep)
+    assert [name for _, name in figure.panels[0].x.ticks] == ["4", "8", "16", "32"]
+    section = steps(Analysis(found))
     assert [p.name for p in section.pictures] == ["steps-1"]
 
 

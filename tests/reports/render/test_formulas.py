@@ -1,6 +1,7 @@
 """Formulas of prose arrive whole in every format."""
 
 import re
+from types import SimpleNamespace
 
 import pytest
 
@@ -8,17 +9,19 @@ from mortarbench.reports.document.layout import Page, Section
 from mortarbench.reports.render.formulas import mathml, split
 from mortarbench.reports.render.html_page import html
 from mortarbench.reports.render.markdown import markdown
+from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.settings import definitions
-from mortarbench.reports.validation.report import _RULES
+from mortarbench.reports.validation.report import TEXT
 
-RULES = Section(name="rules", title="Rules", points=_RULES)
+DEFINITIONS = definitions(Analysis(SimpleNamespace(factor=10.0)))
+RULES = Section(name="rules", title="Rules", points=tuple(TEXT.parts("rules")))
 
 
 def page(section):
     return Page(title="t", dateline="d", sections=(section,))
 
 
-@pytest.mark.parametrize("section", [definitions(10.0), RULES])
+@pytest.mark.parametrize("section", [DEFINITIONS, RULES])
 def test_every_formula_of_a_section_is_typeset(section):
     formulas = [
         tex for text in (*section.prose, *section.points) for tex in split(text)[1::2]

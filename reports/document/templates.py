@@ -1,0 +1,67 @@
+"""Sentences of pages, from the Jinja template beside the module that needs them.
+
+A template NAME.j2 belongs to the module NAME.py. It holds macros: each writes a
+sentence, a caption or several paragraphs, and takes numbers and names as they are: the
+formats of `reports.document.formatting` are filters. Text is plain; renderers escape
+it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from mortarbench.reports.document import formatting
+from mortarbench.reports.document.layout import Point
+from mortarbench.reports.statistics.intervals import COVERAGE
+
+_FORMATS = (
+    "clean", "estimate", "listing", "plural", "power", "seconds", "significant",
+    "tolerance",
+)  # fmt: skip
+_SPACE = re.compile(r"[ \n]+")
+
+
+@cache
+def environment() -> Environment:
+    """Return the settings of all templates, with formats as filters."""
+    made = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    made.filters |= {name: getattr(formatting, name) for name in _FORMATS}
+    made.filters["format"] = format
+    made.globals |= {"COVERAGE": f"{COVERAGE:.0%}", "TIMED": formatting.TIMED}
+    return made
+
+
+class Sentences:
+    """The macros of a template.
+
+    module : full name of the module that the template lies beside
+    names : what all macros know besides their arguments
+    """
+
+    def __init__(self, module: str, **names: Any) -> None:
+        self._module = module
+        self._names = names
+
+    @cached_property
+    def _macros(self) -> Any:
+        package, _, name = self._module.rpartition(".")
+        text = files(package).joinpath(f"{name}.j2").read_text("utf-8")
+        return environment().from_string(text, self._names).module
+
+    def __call__(self, macro: str, *args: Any, **values: Any) -> str:
+        """Return what a macro writes, in one line."""
+        write: Callable[..., str] = getattr(self._macros, macro)
+        return _SPACE.sub(" ", write(*args, **values)).strip()
+
+    def parts(self, macro: str, *args: Any, **values: Any) -> list[str]:
+        """Return the paragraphs of a macro; those that begin with a dash are points."""
+        write: Callable[..., str] = getattr(self._macros, macro)
+        texts = re.split(r"\n\s*\n", write(*args, **values).strip())
+        lines = [_SPACE.sub(" ", text).strip() for text in texts if text]
+        return [Point(line[2:]) if line.startswith("- ") else line for line in lines]
