@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 from mortarbench.reports.data.evidence import Evidence, Outcome, shared
 from mortarbench.reports.document.figure import (
@@ -21,10 +21,10 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.figures.style import (
     LEGEND_LINE,
     TITLE,
+    curve,
     legible,
     log,
     look,
-    run_ids,
 )
 
 CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
@@ -36,17 +36,18 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
     shown = [o for o in evidence.flat if o.worst is not None and o.seconds("total")]
     if not shown:
         return None
-    names = list(dict.fromkeys(o.solver for o in shown))
+    points: dict[tuple[str, bool], list[tuple[Any, float, Outcome]]] = {}
+    for o in shown:
+        time, excess = o.seconds("total"), (o.worst or 0.0) / o.first.asked_tol
+        point = time and time.value, max(excess, _LEAST), o
+        points.setdefault((o.solver, o.verified), []).append(point)
     looks = {s: replace(look(i), dash=None) for i, s in enumerate(evidence.solvers)}
-    crowded = len(shown) > CROWDED
-    marks = []
-    for solver in (s for s in evidence.solvers if s in names):
-        mine = [o for o in shown if o.solver == solver]
-        size, opacity = (2.6, 0.5) if crowded else (4.5, 0.85)
-        filled = replace(looks[solver], size=size, opacity=opacity)
-        for verified, style in ((True, filled), (False, replace(filled, fill="none"))):
-            if chosen := [o for o in mine if o.verified is verified]:
-                marks.append(_points(chosen, style))
+    size, opacity = (2.6, 0.5) if len(shown) > CROWDED else (4.5, 0.85)
+    marks = list[Series]()
+    for solver, style in looks.items():
+        for verified, fill in ((True, ""), (False, "none")):
+            drawn = replace(style, size=size, opacity=opacity, fill=fill)
+            marks += curve(points.get((solver, verified), ()), drawn, solver)
     panel = Panel(
         x=log("median total time in s"),
         y=log("worst residual / tolerance"),
@@ -59,6 +60,7 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
             ),
         ),
     )  # fmt: skip
+    names = dict.fromkeys(o.solver for o in shown)
     keys = tuple(Key(label=legible(s), look=looks[s], solver=s) for s in names)
     return Figure(
         rows=(Row(panels=(panel,)),),
@@ -66,14 +68,3 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
         title=legible(shared(shown), 96),
         legend=Legend(keys=keys, place="right"),
     )
-
-
-def _points(outcomes: Sequence[Outcome], style: Look) -> Series:
-    """Median time, and worst residual over tolerance, of a solver's answers."""
-    points = [
-        (t.value, max((o.worst or 0.0) / o.first.asked_tol, _LEAST), run_ids(o.records))
-        for o in outcomes
-        if (t := o.seconds("total")) is not None
-    ]
-    x, y, runs = zip(*points, strict=True)
-    return Series(x=x, y=y, runs=runs, look=style, solver=outcomes[0].solver)

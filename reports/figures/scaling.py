@@ -10,7 +10,6 @@ from mortarbench.reports.data.size_series import SizeSeries
 from mortarbench.reports.document.figure import (
     Axis,
     Figure,
-    Intervals,
     Key,
     Limits,
     Look,
@@ -26,10 +25,11 @@ from mortarbench.reports.figures.style import (
     LEGEND_LINE,
     TITLE,
     below,
+    curve,
     legible,
     log,
     look,
-    run_ids,
+    with_legend,
 )
 
 MOST_SERIES = 6  #: that are drawn; all are tabulated
@@ -40,16 +40,17 @@ _FOOT = 0.04  #: part of the axis below the guides, and above them at least
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
     """Draw total time and iterations against n on logarithmic axes."""
-    times, counts, keys = [], [], []
+    times, counts, keys = list[Series](), list[Series](), []
     for solver in series.solvers:
-        style = look(solvers.index(solver))
-        if timed := _times(series, solver, style):
+        style, answers = look(solvers.index(solver)), series.curve(solver)
+        if timed := curve(
+            [(n, o.seconds("total"), o) for n, o in answers], style, solver
+        ):
             law = series.time_law(solver)
             label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
             keys.append(Key(label=label, look=style, solver=solver))
-            times.append(timed)
-        if counted := _counts(series, solver, style):
-            counts.append(counted)
+            times += timed
+        counts += _counts(series, solver, style)
     left = with_slopes(
         Panel(x=log(_SIZE), y=log("total time in s"), marks=tuple(times))
     )
@@ -65,57 +66,29 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
 
 def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None:
     """Draw the iterations of one solver in every series; None without any."""
-    curves: list[Series] = []
-    keys: list[Key] = []
+    curves = list[Series]()
+    keys = list[Key]()
     for series in found[:MOST_SERIES]:
         style = look(len(keys))
         if counted := _counts(series, solver, style):
             keys.append(Key(label=legible(series.title, 64), look=style))
-            curves.append(counted)
+            curves += counted
     if not curves:
         return None
-    most = max(max(curve.y) for curve in curves)
+    most = max(max(drawn.y) for drawn in curves)
     panel = Panel(
         x=log(_SIZE),
         y=Axis(label="iterations", low=0.0, high=1.15 * most, most=6, integers=True),
         marks=tuple(curves),
         title=legible(f"{solver}, verified answers", 64),
     )
-    return Figure(
-        rows=(Row(panels=(panel,)),),
-        height=2.6 + LEGEND_LINE * len(keys),
-        legend=below(keys, 1),
-    )
+    return with_legend((Row(panels=(panel,)),), keys, 1, 2.6)
 
 
-def _counts(series: SizeSeries, solver: str, style: Look) -> Series | None:
-    """Return the iterations over the size, the middle of both ends; None without."""
-    counted = [
-        (float(n), sum(o.iterations) / 2, run_ids(o.records))
-        for n, o in series.curve(solver)
-        if o.iterations is not None
-    ]
-    if not counted:
-        return None
-    n, its, runs = zip(*counted, strict=True)
-    return Series(x=n, y=its, look=style, solver=solver, runs=runs)
-
-
-def _times(series: SizeSeries, solver: str, style: Look) -> Series | None:
-    """Medians with their intervals."""
-    timed = [
-        (float(n), t, run_ids(o.records))
-        for n, o in series.curve(solver)
-        if (t := o.seconds("total")) is not None
-    ]
-    if not timed:
-        return None
-    sizes, times, runs = zip(*timed, strict=True)
-    low, high = tuple(t.low for t in times), tuple(t.high for t in times)
-    return Series(
-        x=sizes, y=tuple(t.value for t in times), look=style, solver=solver, runs=runs,
-        intervals=Intervals(low=low, high=high),
-    )  # fmt: skip
+def _counts(series: SizeSeries, solver: str, style: Look) -> list[Series]:
+    """Draw the iterations over the size, the middle of both ends."""
+    answers = ((n, o.iterations, o) for n, o in series.curve(solver))
+    return curve([(n, i and sum(i) / 2, o) for n, i, o in answers], style, solver)
 
 
 def with_slopes(panel: Panel) -> Panel:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -25,13 +26,11 @@ from mortarbench.reports.document.formatting import exponent
 from mortarbench.reports.figures.style import (
     COLOURS,
     DASHED,
-    LEGEND_LINE,
     MARKERS,
-    TITLE,
-    below,
+    curve,
     legible,
     log,
-    run_ids,
+    with_legend,
 )
 from mortarbench.reports.statistics.intervals import PowerLaw
 
@@ -42,17 +41,6 @@ PANELS = (
 )
 KAPPA = "kappa"  #: condition numbers among the quantities begin so
 _FITTED = 24  #: points of a curve of a fit
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Curve:
-    """One count, or κ, against size."""
-
-    label: str
-    x: tuple[float, ...]
-    y: tuple[float, ...]
-    answers: tuple[Outcome, ...]
-    law: PowerLaw | None = None
 
 
 def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
@@ -79,73 +67,45 @@ def _figure(
     solver: str,
     title: str,
 ) -> Figure | None:
-    panels: list[Panel] = []
-    keys: list[Key] = []
-    groups = [
-        *((title, [*_counts(points, names, laws)]) for title, names in PANELS),
-        ("condition number", _condition_curves(points)),
-    ]
-    for name, curves in groups:
+    groups: dict[str, dict[str, tuple[Sequence[Any], PowerLaw | None]]] = {
+        panel: {
+            legible(name.replace("_", " ")): (counted, laws.get(name))
+            for name in names
+            if None not in (counted := [o.counted(name) for _, o in points])
+        }
+        for panel, names in PANELS
+    }
+    groups["condition number"] = {
+        " ".join([r"$\kappa$", *legible(name).split()[1:]]): (values, None)
+        for name, values in condition_numbers(points).items()
+    }
+    panels, keys = list[Panel](), list[Key]()
+    for name, curves in groups.items():
         if not curves:
             continue
-        marks: list[Mark] = []
-        for curve in curves:
+        marks = list[Mark]()
+        for label, (values, law) in curves.items():
             i = len(keys)
             colour = COLOURS[i % len(COLOURS)]
-            style = Look(colour=colour, marker=MARKERS[i % len(MARKERS)], dash=None)
-            joined = Look(colour=colour, marker=MARKERS[i % len(MARKERS)])
-            label = curve.label
-            if curve.law is not None:
-                marks.append(_fit(curve, colour))
-                label += f",  p = {exponent(curve.law)}"
-            chosen = joined if curve.law is None else style
-            marks.append(
-                Series(
-                    x=curve.x, y=curve.y, look=chosen, solver=solver,
-                    runs=tuple(run_ids(o.records) for o in curve.answers),
-                )
-            )  # fmt: skip
-            keys.append(Key(label=label, look=chosen))
-        most = max(max(curve.y) for curve in curves)
-        panels.append(
-            Panel(
-                x=x, y=Axis(low=0.0, high=1.12 * most or 1.0, integers=True, most=6),
-                title=name, marks=tuple(marks),
-            )
-        )  # fmt: skip
+            style = Look(colour=colour, marker=MARKERS[i % len(MARKERS)])
+            if law is not None:
+                n = np.geomspace(points[0][0], points[-1][0], _FITTED)
+                fit = Look(colour=colour, dash=DASHED, width=0.9)
+                marks.append(Series(x=numbers(n), y=numbers(law.at(n)), look=fit))
+                style = replace(style, dash=None)
+                label += f",  p = {exponent(law)}"
+            answers = ((x, v, o) for (x, o), v in zip(points, values, strict=True))
+            marks += curve(answers, style, solver)
+            keys.append(Key(label=label, look=style))
+        most = max(float(v) for values, _ in curves.values() for v in values)
+        y = Axis(low=0.0, high=1.12 * most or 1.0, integers=True, most=6)
+        panels.append(Panel(x=x, y=y, title=name, marks=tuple(marks)))
     if not panels:
         return None
     rows = in_rows(panels, 2)
     if len(panels) == 3:  # κ below, as wide as both
         rows = (rows[0], Row(panels=(replace(panels[2], span=2),)))
-    return Figure(
-        rows=rows,
-        height=0.2 + TITLE + 2.3 * len(rows) + LEGEND_LINE * -(-len(keys) // 2),
-        legend=below(keys, 2),
-        title=legible(title, 96),
-    )
-
-
-def _counts(
-    points: Sequence[tuple[float, Outcome]],
-    names: Sequence[str],
-    laws: dict[str, PowerLaw | None],
-) -> list[_Curve]:
-    found = []
-    for name in names:
-        counted = [(x, c, o) for x, o in points if (c := o.counted(name)) is not None]
-        if len(counted) == len(points):
-            x, y, answers = zip(*counted, strict=True)
-            found.append(
-                _Curve(
-                    label=legible(name.replace("_", " ")),
-                    x=x,
-                    y=y,
-                    answers=answers,
-                    law=laws.get(name),
-                )
-            )
-    return found
+    return with_legend(rows, keys, 2, 0.2 + 2.3 * len(rows), title)
 
 
 def condition_numbers(
@@ -165,24 +125,3 @@ def condition_numbers(
         if len(known) == len(points):
             found[" ".join(["κ", *name.removeprefix(KAPPA).split("_")[1:]])] = known
     return found
-
-
-def _condition_curves(points: Sequence[tuple[float, Outcome]]) -> list[_Curve]:
-    return [
-        _Curve(
-            label=" ".join([r"$\kappa$", *legible(name).split()[1:]]),
-            x=tuple(x for x, _ in points),
-            y=values,
-            answers=tuple(o for _, o in points),
-        )
-        for name, values in condition_numbers(points).items()
-    ]
-
-
-def _fit(curve: _Curve, colour: str) -> Series:
-    assert curve.law is not None
-    n = np.geomspace(min(curve.x), max(curve.x), _FITTED)
-    return Series(
-        x=numbers(n), y=numbers(curve.law.at(n)),
-        look=Look(colour=colour, dash=DASHED, width=0.9),
-    )  # fmt: skip
