@@ -7,7 +7,6 @@ from math import lcm, nan
 from typing import Any
 
 from mortarbench.harness import Record
-from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.document.figure import (
     INK,
     Axis,
@@ -93,7 +92,7 @@ def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
 
 
 def curve(
-    points: Iterable[tuple[Any, Any, Outcome | tuple[str, ...] | None]],
+    points: Iterable[Sequence[Any]],
     style: Look,
     solver: str = "",
     bars: Mapping[str, float] | None = None,
@@ -101,26 +100,24 @@ def curve(
 ) -> list[Series]:
     """Draw points as one series; return an empty list where no point is complete.
 
-    points : (x, y, answer or its run_ids); an estimate with an interval (`Interval`,
-        `Ratio`) gets an error bar, and a point without x or y is left out
+    points : (x, y), or (x, y, answer or its run_ids); an estimate with an interval
+        (`Interval`, `Ratio`) gets an error bar, and a point without x or y is left out
     bars : cap, width and opacity of the error bars
     how : further attributes of the series
     """
     known = [p for p in points if p[0] is not None and p[1] is not None]
     if not known:
         return []
-    *places, answers = zip(*known, strict=True)
-    for along, values in zip("xy", places, strict=True):
+    x, y, *answers = zip(*known, strict=True)
+    for along, values in (("x", x), ("y", y)):
         if any(isinstance(v, tuple) for v in values):
             low, high = (
                 numbers([getattr(v, end, nan) for v in values])
                 for end in ("low", "high")
             )
             how["intervals"] = Intervals(low=low, high=high, along=along, **bars or {})  # type: ignore[arg-type]
-    x, y = (numbers([getattr(v, "value", v) for v in values]) for values in places)
-    runs = tuple(
-        a if isinstance(a, tuple) else a.run_ids for a in answers if a is not None
-    )
+    x, y = (numbers([getattr(v, "value", v) for v in values]) for values in (x, y))
+    runs = tuple(a if isinstance(a, tuple) else a.run_ids for of in answers for a in of)
     return [Series(x=x, y=y, look=style, solver=solver, runs=runs, **how)]
 
 
