@@ -44,6 +44,17 @@ SEVERITY = (
 )
 
 
+def _seconds(r: Record, phase: str) -> float | None:
+    seconds: float | None = getattr(r, f"{phase}_seconds")
+    return seconds
+
+
+def _median(seconds: Iterable[float | None]) -> Interval | None:
+    """Take the median of the times that are known; None without any."""
+    times = [t for t in seconds if t is not None]
+    return median_interval(times) if times else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
     """All repeats of one solver on one case at one tolerance."""
@@ -133,20 +144,19 @@ class Outcome:
     @property
     def by_block(self) -> dict[Block, float]:
         """Total seconds of each repeat that has them; see `harness.running.pairs`."""
-        return {
-            (r.session, r.repeat): r.total_seconds
-            for r in self.records
-            if r.total_seconds
-        }
+        return self.seconds_by_block("total")
+
+    def seconds_by_block(self, phase: str) -> dict[Block, float]:
+        """Return the seconds of one phase in each repeat that has them."""
+        times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
+        return {block: t for block, t in times.items() if t}
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
-        found: dict[str, Interval | None] = {}
-        for phase in ("prepare", "solve", "total"):
-            values = [getattr(r, f"{phase}_seconds") for r in self.records]
-            times = [float(v) for v in values if v is not None]
-            found[phase] = median_interval(times) if times else None
-        return found
+        return {
+            phase: _median(_seconds(r, phase) for r in self.records)
+            for phase in ("prepare", "solve", "total")
+        }
 
     @cached_property
     def dualising(self) -> Interval | None:
@@ -154,18 +164,16 @@ class Outcome:
 
         All measurements of one build have the same.
         """
-        values = {r.dualise_seconds for r in self.records if r.dualise_seconds}
-        return median_interval(sorted(values)) if values else None
+        return _median({r.dualise_seconds for r in self.records if r.dualise_seconds})
 
     @cached_property
     def with_dualising(self) -> Interval | None:
         """Median total time, that of dualising included; None for primal forms."""
-        times = [
+        return _median(
             r.total_seconds + r.dualise_seconds
             for r in self.records
             if r.total_seconds is not None and r.dualise_seconds
-        ]
-        return median_interval(times) if times else None
+        )
 
     @cached_property
     def iterations(self) -> tuple[int, int] | None:
