@@ -10,10 +10,14 @@ from mortarbench.harness.errors import unknown
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.reports.data.aggregation import ranking_of
 from mortarbench.reports.data.cells import BY_OPTIMUM
-from mortarbench.reports.data.comparison_groups import ComparisonGroup, all_groups
+from mortarbench.reports.data.comparison_groups import (
+    ComparisonGroup,
+    all_groups,
+    answers_of,
+)
 from mortarbench.reports.data.environment import dateline
 from mortarbench.reports.data.evidence import Evidence, read_evidence
-from mortarbench.reports.data.fastest import answers_of, fastest_solvers
+from mortarbench.reports.data.fastest import fastest_solvers
 from mortarbench.reports.data.size_series import SizeSeries, size_series, sweeps
 from mortarbench.reports.data.ways import compare_ways
 from mortarbench.reports.document.fields import FieldFigure

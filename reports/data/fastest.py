@@ -30,16 +30,14 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
 from mortarbench.reports.data.comparison_groups import (
     CASES,
-    POOLED,
+    Answers,
     ComparisonGroup,
     Kind,
-    kind_of,
+    Row,
+    time_of,
 )
-from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.statistics.resampling import symmetric_interval
-
-Row = Mapping[str, Outcome]  #: by solver
-Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
 
 
 class Finding(Enum):
@@ -140,24 +138,6 @@ def fastest_solvers(
     )
 
 
-def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
-    """Choose the answer of every solver to every case; null arms take no part."""
-    found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
-    for o in evidence.flat:
-        if not o.first.role:
-            kind = kind_of(o.first)
-            kind = kind._replace(form=POOLED) if pool_forms else kind
-            cases = found.setdefault(kind, {})
-            cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-    return {
-        kind: {
-            case: {solver: representative(given) for solver, given in row.items()}
-            for case, row in cases.items()
-        }
-        for kind, cases in found.items()
-    }
-
-
 def unverified(rows: Iterable[Row]) -> list[Unverified]:
     """Count what was not verified, by solver and verdict; most failures first."""
     given: dict[str, list[Outcome]] = {}
@@ -175,23 +155,6 @@ def unverified(rows: Iterable[Row]) -> list[Unverified]:
             for verdict, those in by_verdict.items()
         ]
     return sorted(found, key=lambda one: -len(one.answers))
-
-
-def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Choose the answer of a solver on a case: of a sweep, the cheapest verified one.
-
-    Where none is verified, that at the tightest tolerance.
-    """
-    timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
-    if timed:
-        return min(timed, key=lambda each: each[:2])[-1]
-    return min(outcomes, key=lambda o: o.tol)
-
-
-def time_of(outcome: Outcome) -> float | None:
-    """Median total time of a verified answer, s."""
-    time = outcome.seconds("total") if outcome.verified else None
-    return time.value if time is not None and time.value > 0 else None
 
 
 def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:

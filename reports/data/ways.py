@@ -12,13 +12,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from mortarbench.harness import Record
-from mortarbench.reports.data.comparison_groups import all_groups
+from mortarbench.reports.data.comparison_groups import all_groups, answers_of
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.fastest import (
     Competitor,
     FastestSolver,
     Finding,
-    answers_of,
     fastest_solvers,
 )
 

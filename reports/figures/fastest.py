@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 
 from mortarbench.harness.running.pairs import Ratio
+from mortarbench.reports.data.comparison_groups import time_of
 from mortarbench.reports.data.evidence import case_set
-from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding, time_of
+from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding
 from mortarbench.reports.document.figure import (
     INK,
     Axis,

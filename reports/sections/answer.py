@@ -8,16 +8,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from mortarbench.harness import Verdict
-from mortarbench.reports.data.comparison_groups import CASES
+from mortarbench.reports.data.comparison_groups import CASES, Answers, time_of
 from mortarbench.reports.data.environment import busy_with
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.data.fastest import (
-    Answers,
     Competitor,
     FastestSolver,
     Finding,
     Unverified,
-    time_of,
     unverified,
 )
 from mortarbench.reports.data.time_at_accuracy import time_at_accuracy
