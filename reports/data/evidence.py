@@ -132,10 +132,8 @@ class Outcome:
     @cached_property
     def worst(self) -> float | None:
         """The largest of the four residuals; None if there is no finite one."""
-        values = [self.largest(name) for name in RESIDUALS]
-        return max((v for v in values if v is not None), default=None) if all(
-            v is not None for v in values
-        ) else None  # fmt: skip
+        known = [v for name in RESIDUALS if (v := self.largest(name)) is not None]
+        return max(known) if len(known) == len(RESIDUALS) else None
 
     def seconds(self, phase: str) -> Interval | None:
         """Median of prepare, solve or total time over the repeats that have one."""
@@ -183,10 +181,9 @@ class Outcome:
 
     def counted(self, name: str) -> float | None:
         """Mean of one of the solver's counts over the repeats; None if one lacks it."""
-        values = [r.counts.get(name) for r in self.records]
-        if not values or None in values:
-            return None
-        return float(sum(v for v in values if v is not None) / len(values))
+        values = [v for r in self.records if (v := r.counts.get(name)) is not None]
+        whole = len(values) == len(self.records)
+        return float(sum(values) / len(values)) if whole else None
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
@@ -286,7 +283,7 @@ def read_evidence(
     return Evidence(
         directory=directory,
         journal=journal,
-        records=arrange(_apart(_judged(r, factor), marks) for r in records),
+        records=arrange(_apart(r, factor, marks) for r in records),
         environment=environment,
         marks=marks,
         suite=read_stored(suite) if os.path.lexists(suite) else {},
@@ -331,20 +328,20 @@ def _tell_contradicted(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
     """Warn of records that say verified beside residuals that are too large for it."""
-    wrong = [r.run_id for r in records if _is_contradicted(r)]
+    wrong = []
+    for r in records:
+        names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
+        values = [v for name in names if (v := getattr(r, name)) is not None]
+        if r.verdict is Verdict.VERIFIED and max(values, default=0) > allowed(
+            r.judged_at
+        ):
+            wrong.append(r.run_id)
     if wrong:
         warn(
             f"{directory}: verified, by their journal, with residuals above "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
             "that, and `validate` judges the points anew"
         )
-
-
-def _is_contradicted(r: Record) -> bool:
-    names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
-    values = (getattr(r, name) for name in names)
-    is_above = any(v is not None and v > allowed(r.judged_at) for v in values)
-    return r.verdict is Verdict.VERIFIED and is_above
 
 
 def _environment(path: Path) -> dict[str, Any]:
@@ -357,23 +354,19 @@ def _environment(path: Path) -> dict[str, Any]:
     return table
 
 
-def _judged(record: Record, factor: float) -> Record:
-    if factor == VERIFIED_FACTOR:
-        return record
-    return record.but(verdict=rejudged(record, factor))
-
-
-def _apart(record: Record, marks: Mapping[str, str]) -> Record:
-    """Call a solver by another name where its measurements are others.
+def _apart(record: Record, factor: float, marks: Mapping[str, str]) -> Record:
+    """Judge at `factor`, and rename a solver whose measurements are others.
 
     That is where it drove a sequence instead of beginning cold, and in a further
     environment of a folder that holds the same measurements of several.
     """
-    name = (
-        record.solver if record.mode == "cold" else f"{record.solver} ({record.mode})"
-    )
-    mark = marks.get(record.environment, "")
-    return record if name + mark == record.solver else record.but(solver=name + mark)
+    changes: dict[str, Any] = {}
+    if factor != VERIFIED_FACTOR:
+        changes["verdict"] = rejudged(record, factor)
+    mode = "" if record.mode == "cold" else f" ({record.mode})"
+    if after := mode + marks.get(record.environment, ""):
+        changes["solver"] = record.solver + after
+    return record.but(**changes) if changes else record
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
