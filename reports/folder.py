@@ -26,8 +26,8 @@ from mortarbench.reports.document.formatting import TIMED, clean
 from mortarbench.reports.document.layout import Page, Picture, Section
 from mortarbench.reports.export.csv_tables import csv_tables, frame_csv
 from mortarbench.reports.export.parquet import write_records
-from mortarbench.reports.figures.accuracy import accuracy_figure
 from mortarbench.reports.figures.scaling import MOST_SERIES, scaling_figure
+from mortarbench.reports.figures.sweeps import accuracy_figure
 from mortarbench.reports.render.writing import RENDERED, write_page, write_text
 from mortarbench.reports.sections.answer import opening
 from mortarbench.reports.sections.convergence import convergence
