@@ -26,9 +26,9 @@ from mortarbench.reports.document.formatting import (
     tolerance,
 )
 from mortarbench.reports.document.layout import Cell, Picture, Section, Statement, Table
-from mortarbench.reports.figures.scaling import iterations_figure
-from mortarbench.reports.figures.steps import (
+from mortarbench.reports.figures.scaling import (
     condition_numbers,
+    iterations_figure,
     steps_figure,
     torn_figure,
 )
