@@ -95,30 +95,28 @@ class ComparisonGroup:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say what takes no part."""
-        refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
-        counted = [
+        """Name what takes no part."""
+        counted = ", ".join(
             f"{clean(form, 24)} {plural(n, 'case')}" for form, n in self.forms.items()
-        ]
-        pooled = (
-            f"Forms together: {', '.join(counted)}. A form that a solver declines is "
-            "unsolved by it.",
         )
-        said = pooled * bool(self.forms) + refused * bool(self.refused)
+        pooled = (
+            f"Forms together: {counted}. A form that a solver declines is "
+            "unsolved by it."
+        )
+        refused = f"Declined all of them: {listing(self.refused, 6)}."
+        said = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
         return said + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
-        """Say what takes no part because it was not measured."""
-        rare = (f"Measured on fewer than half of them: {listing(self.rare, 6)}.",)
-        cases = plural(self.incomplete, "case")
-        return rare * bool(self.rare) + (
-            f"Not measured by all, left out: {cases}.",
-        ) * bool(self.incomplete)
+        """Name what takes no part because it was not measured."""
+        rare = f"Measured on fewer than half of them: {listing(self.rare, 6)}."
+        left = f"Not measured by all, left out: {plural(self.incomplete, 'case')}."
+        return (rare,) * bool(self.rare) + (left,) * bool(self.incomplete)
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """Say who was measured in other sessions than whom."""
+        """Name solvers that were measured in different sessions."""
         left = self.apart.copy()
         pairs = []
         while left.any():

@@ -19,6 +19,7 @@ References
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -116,7 +117,14 @@ class FastestSolver:
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
         """Return per case the fastest and those whose interval does not exclude it."""
-        return {case: _front(self.competitors, case) for case in self.cases}
+        fronts = {}
+        for case in self.cases:
+            given = [(c, c.outcomes[case]) for c in self.competitors]
+            first, its = min(given, key=lambda each: time_of(each[1]) or np.inf)
+            ratios = [(c, ratio_of(o.by_block, its.by_block)) for c, o in given]
+            tied = (c for c, r in ratios if r is None or r.low <= 1)
+            fronts[case] = (first, *(c for c in tied if c is not first))
+        return fronts
 
 
 class Unverified(NamedTuple):
@@ -140,21 +148,21 @@ def fastest_solvers(
 
 def unverified(rows: Iterable[Row]) -> list[Unverified]:
     """Count what was not verified, by solver and verdict; most failures first."""
-    given: dict[str, list[Outcome]] = {}
+    given = Counter[str]()
+    failed: dict[tuple[str, Verdict], list[Outcome]] = {}
     for row in rows:
-        for solver, outcome in row.items():
-            given.setdefault(solver, []).append(outcome)
-    found: list[Unverified] = []
-    for solver, outcomes in given.items():
-        by_verdict: dict[Verdict, list[Outcome]] = {}
-        for o in outcomes:
+        for solver, o in row.items():
+            given[solver] += 1
             if not o.verified:
-                by_verdict.setdefault(o.verdict, []).append(o)
-        found += [
-            Unverified(solver, verdict, tuple(those), len(outcomes))
-            for verdict, those in by_verdict.items()
-        ]
-    return sorted(found, key=lambda one: -len(one.answers))
+                failed.setdefault((solver, o.verdict), []).append(o)
+    solvers = list(given)
+    return sorted(
+        (
+            Unverified(*key, tuple(those), given[key[0]])
+            for key, those in failed.items()
+        ),
+        key=lambda one: (-len(one.answers), solvers.index(one.solver)),
+    )
 
 
 def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
@@ -197,56 +205,43 @@ def _geometric_mean(c: Competitor) -> float:
 def _compared(
     c: Competitor, first: Competitor, group: ComparisonGroup, over_cases: bool
 ) -> Competitor:
-    """Compare with the first on the cases that both solved, in one environment."""
+    """Compare with the first on the cases that both solved, in one environment.
+
+    That is by the blocks of each case that both were measured in. Over cases it is by
+    Student's interval, widened to that of flipped signs: Student's presumes logarithms
+    that scatter normally, the other one that they scatter alike to both sides. Neither
+    presumption is safe for six cases, so both must hold 1 out before two solvers count
+    as different.
+    """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
         return c
-    within = _within_blocks(c, first, both)
+    paired = {
+        case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
+        for case in both
+    }
+    by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
+    within = replace(c, compared=tuple(both), by_case=by_case)
     if not over_cases:
-        return within
-    ratio = _over_cases(c, first, both) if len(both) >= CASES else None
-    slower = ratio is not None and ratio.low > 1
-    apart = False
+        every = len(by_case) == len(c.outcomes)
+        slower = every and all(ratio.low > 1 for ratio in by_case.values())
+        only = by_case.get(both[0]) if len(both) == len(c.outcomes) == 1 else None
+        return replace(within, ratio=only, slower=slower)
+    mine, its = (
+        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(both)}
+        for one in (c, first)
+    )
+    ratio = paired_ratio(mine, its) if len(both) >= CASES else None
+    if ratio is not None:
+        logs = np.log([mine[i] / its[i] for i in mine])
+        low, high = map(float, np.exp(symmetric_interval(logs, both)))
+        ratio = ratio._replace(low=min(ratio.low, low), high=max(ratio.high, high))
+    slower, apart = ratio is not None and ratio.low > 1, False
     if group.apart.any():  # of different sessions: no pairs
         one, other = (group.solvers.index(s.solver) for s in (first, c))
         apart = bool(group.apart[one, other])
         slower = slower and (not apart or bool(group.told[one, other]))
     return replace(within, ratio=ratio, slower=slower, apart=apart)
-
-
-def _over_cases(c: Competitor, first: Competitor, cases: Sequence[str]) -> Ratio | None:
-    """Compare over cases: Student's interval, widened to that of flipped signs.
-
-    Student's presumes logarithms that scatter normally, the other one that they scatter
-    alike to both sides. Neither presumption is safe for six cases, so both must hold 1
-    out before two solvers count as different.
-    """
-    mine, its = (
-        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(cases)}
-        for one in (c, first)
-    )
-    ratio = paired_ratio(mine, its)
-    if ratio is None:
-        return None
-    logs = np.log([mine[i] / its[i] for i in mine])
-    low, high = np.exp(symmetric_interval(logs, cases))
-    return ratio._replace(
-        low=min(ratio.low, float(low)), high=max(ratio.high, float(high))
-    )
-
-
-def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
-    """Compare on each case by the blocks that both were measured in, if there are."""
-    paired = {
-        case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
-        for case in cases
-    }
-    by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
-    slower = len(by_case) == len(c.outcomes) and all(
-        ratio.low > 1 for ratio in by_case.values()
-    )
-    only = by_case.get(cases[0]) if len(cases) == len(c.outcomes) == 1 else None
-    return replace(c, compared=tuple(cases), by_case=by_case, ratio=only, slower=slower)
 
 
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
@@ -285,15 +280,3 @@ def _finding(
         return Finding.ONE_BLOCK
     faster = any(r.high < 1 for c in full[1:] for r in c.by_case.values())
     return Finding.DIVIDED if faster else Finding.TIE
-
-
-def _front(competitors: Sequence[Competitor], case: str) -> tuple[Competitor, ...]:
-    first = min(competitors, key=lambda c: time_of(c.outcomes[case]) or np.inf)
-    its = first.outcomes[case].by_block
-
-    def is_slower(c: Competitor) -> bool:
-        ratio = ratio_of(c.outcomes[case].by_block, its)
-        return ratio is not None and ratio.low > 1
-
-    tied = (c for c in competitors if c is not first and not is_slower(c))
-    return (first, *tied)
