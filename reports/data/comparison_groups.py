@@ -1,4 +1,4 @@
-"""Who solved which case in what time: what means, ranks and profiles are made from."""
+"""Times of all solvers on all cases of a group, for means, ranks and profiles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def _no_pairs() -> Pairs:
 
 
 class Kind(NamedTuple):
-    """What the cases of one group share."""
+    """Attributes that the cases of one group share."""
 
     sweep: bool  #: of the tolerance asked for
     mode: str
@@ -86,7 +86,7 @@ class ComparisonGroup:
     apart: Pairs = field(default_factory=_no_pairs)
     """(solvers, solvers) whether two share no block on some case; none: all share."""
     told: Pairs = field(default_factory=_no_pairs)
-    """Of those, whether row is faster than column on every case, by its interval."""
+    """(solvers, solvers) of those, True if row is faster than column on every case."""
 
     @property
     def title(self) -> str:
@@ -134,12 +134,12 @@ class ComparisonGroup:
 
     @property
     def comparable(self) -> bool:
-        """Whether cases, solvers and answers are enough for a statement over cases."""
+        """True if cases, solvers and answers suffice for a statement over cases."""
         return not self.lack
 
     @property
     def lack(self) -> str:
-        """Say what is missing for a statement over cases; empty if nothing is."""
+        """The lack that prevents a statement over cases; empty without one."""
         if len(self.solvers) < 2:
             return plural(len(self.solvers), "solver")
         if len(self.cases) < CASES:
@@ -288,7 +288,7 @@ def kind_of(r: Record, *, pool_forms: bool = False) -> Kind:
 
 
 def _numbered(names: Iterable[Name]) -> dict[Name, int]:
-    """Give a number to each, in the order of occurrence: pandas takes not any name."""
+    """Map names to numbers in their order: pandas does not accept every name."""
     return {name: number for number, name in enumerate(dict.fromkeys(names))}
 
 

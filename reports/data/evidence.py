@@ -1,4 +1,4 @@
-"""What a result folder holds, grouped the way the report asks for it."""
+"""The contents of a result folder, grouped as the report needs them."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Outcome:
 
     @property
     def verified(self) -> bool:
-        """Whether every repeat was verified."""
+        """True if every repeat was verified."""
         return self.verdict.is_verified
 
     @cached_property
@@ -116,7 +116,7 @@ class Outcome:
 
     @cached_property
     def claims(self) -> tuple[str, ...]:
-        """What the solver said of itself, without repetition."""
+        """The solver's own verdicts, each once."""
         return tuple(dict.fromkeys(r.claimed for r in self.records if r.claimed))
 
     @property
@@ -293,7 +293,7 @@ def read_evidence(
 
 
 def _in_like_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Give environments whose times compare one digest: that of the first of them."""
+    """Unite environments with comparable times under the digest of the first."""
     known: dict[str, Mapping[str, Any]] = {}
     of: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
@@ -312,7 +312,7 @@ def _in_like_environments(directory: Path, records: list[Record]) -> list[Record
 
 
 def _one_name_each(records: list[Record]) -> list[Record]:
-    """Give a QP that lies in several files the name and path of the first of them."""
+    """Rename a QP that lies in several files after the first of them."""
     first: dict[str, Record] = {}
     for r in records:
         if r.family == FROM_FILE and r.qp is not None:

@@ -1,4 +1,4 @@
-"""Who was fastest at equal verified accuracy, per form and accuracy, and how surely.
+"""The fastest solver at equal verified accuracy, per form, and how sure that is.
 
 A solver competes if all of its answers are verified: on every case of the group that
 anybody solved. The first has the smallest geometric mean of times. It is called the
@@ -42,7 +42,7 @@ from mortarbench.reports.statistics.resampling import symmetric_interval
 
 
 class Finding(Enum):
-    """What can be said of the fastest solver of a group, or why nothing can."""
+    """Conclusions on the fastest solver of a group, or reasons why there are none."""
 
     FASTEST = "one solver is faster than all others"
     TIE = "the first is not told apart from all others"
@@ -245,7 +245,7 @@ def _compared(
 
 
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
-    """Whether what is compared of two solvers comes from different environments."""
+    """Return whether compared times of two solvers come from different environments."""
     mine, its = (
         {(r.session, r.repeat): r.environment for r in one.outcomes[case].records}
         for one in (a, b)

@@ -1,4 +1,4 @@
-"""Which histories a report shows, and what they say in numbers."""
+"""The histories that a report shows, and numbers derived from them."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ RULE = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SolverRun:
-    """How one solver went through one case, by its own account; rows from its start."""
+    """The path of one solver through one case, by its own account, row by row."""
 
     outcome: Outcome
     record: Record  #: the repeat that this is the history of
@@ -74,7 +74,7 @@ class SolverRun:
         return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:
-        """(rows,) whether a step was of that kind."""
+        """Mark the steps of that kind, (rows,)."""
         kinds = self.history.get("step", np.full(self.rows, ""))
         return np.asarray(kinds.astype(str) == kind, dtype=bool)
 
@@ -96,7 +96,7 @@ class CaseHistories:
 
     @property
     def counted(self) -> bool:
-        """Whether all runs can be drawn over products; over iterations if not."""
+        """True if all runs can be drawn over products; else over iterations."""
         return all(c.products is not None for c in self.runs)
 
     def work(self, run: SolverRun) -> Vector:
@@ -105,7 +105,7 @@ class CaseHistories:
         return np.arange(1.0, run.rows + 1) if products is None else products
 
     def taken(self, kind: str) -> bool:
-        """Whether any run has a step of that kind."""
+        """Return whether any run has a step of that kind."""
         return any(c.steps(kind).any() for c in self.runs)
 
 

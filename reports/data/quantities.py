@@ -42,7 +42,7 @@ Leaves = dict[tuple[str, ...], Leaf]  #: by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Whether quantities are in SI units: those of elastic bodies are."""
+    """Return whether quantities are in SI units, as those of elastic bodies are."""
     return _STRESS in outcome.quantities
 
 
@@ -136,7 +136,7 @@ def _rounded(leaf: Leaf, digits: int) -> str:
 
 
 class Spread(NamedTuple):
-    """How far the energies of verified answers to one physical case lie apart."""
+    """Energies of the verified answers to one physical case, and their differences."""
 
     answers: tuple[Outcome, ...]  #: of every solver and form; at least one
     relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
@@ -149,7 +149,7 @@ class Spread(NamedTuple):
 
     @property
     def digits(self) -> int:
-        """As many as the energies agree on and one more; alone, as tol promises."""
+        """Number of common digits of the energies, plus one; of one answer, by tol."""
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 

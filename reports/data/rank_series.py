@@ -49,7 +49,7 @@ class _Scaling:
     cpus: int | None  #: that the machine has, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Whether ranks had to share CPUs: their times say nothing about others."""
+        """Return whether ranks shared CPUs: such times do not extend to others."""
         return self.cpus is not None and ranks > self.cpus
 
 

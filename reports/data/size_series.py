@@ -66,7 +66,7 @@ def _law(points: Iterable[tuple[int, float | None]]) -> PowerLaw | None:
 
 
 class Alike(NamedTuple):
-    """What cases that differ in size only have in common."""
+    """Attributes that cases of different size have in common."""
 
     family: str
     held: tuple[tuple[str, Any], ...]  #: parameters

@@ -80,7 +80,7 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _measurements(records: Sequence[Record]) -> pd.DataFrame:
-    """Give every field of every record a column; what is nested is JSON text."""
+    """Tabulate the fields of records, a column each; nested ones are JSON text."""
     columns = {
         name: [getattr(r, f.name) for r in records] for name, f in JOURNAL.items()
     }

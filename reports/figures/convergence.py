@@ -1,4 +1,4 @@
-"""How solvers converge and find the active set, from their histories."""
+"""Convergence of solvers and of their active sets, from their histories."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Say where the colours end and the largest stress, Pa; None without stress."""
+    """Return the end of the colours and the largest stress, Pa; None without stress."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None

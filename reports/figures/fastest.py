@@ -125,7 +125,7 @@ def _short(name: str) -> str:
 
 
 def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
-    """Give all ratios one scale that holds 0.8 and 2."""
+    """Scale all ratios alike, on an axis that contains 0.8 and 2."""
     ratios = [p for p in panels if p.x.log]
     if not ratios:
         return list(panels)
@@ -175,7 +175,7 @@ def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
 
 
 def _failure(c: Competitor) -> str:
-    """Say which verdict most of the answers ended in that were not verified."""
+    """Name the most frequent verdict of the answers that were not verified."""
     count = Counter(o.verdict for o in c.outcomes.values() if time_of(o) is None)
     if not count:
         return ""

@@ -79,7 +79,7 @@ def rivals(ranking: Ranking) -> list[int]:
 
 
 def banded(ranking: Ranking) -> bool:
-    """Whether `profile_figure` has bands; `pairwise_figure` always has."""
+    """Return whether `profile_figure` has bands; `pairwise_figure` always has."""
     group = ranking.group
     return len(group.solvers) <= 2 or len(group.cases) >= BANDED
 

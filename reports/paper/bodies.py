@@ -228,7 +228,7 @@ def _outlined(fields: Fields, points: Points, width: float) -> list[Path]:
 
 
 class Extent(NamedTuple):
-    """Where colours end and what the largest value is, both in size, Pa."""
+    """The end of the colours and the largest value, both in size, Pa."""
 
     clipped: float
     largest: float

@@ -59,12 +59,12 @@ class Place(NamedTuple):
 
     @property
     def tried(self) -> bool:
-        """Whether the solver takes such problems at all."""
+        """True unless the solver declined."""
         return self.outcome.verdict is not Verdict.DECLINED
 
     @property
     def failed(self) -> bool:
-        """Whether it was tried and not verified: no time of it means anything."""
+        """True if it was tried and not verified: its time means nothing."""
         return self.tried and not self.outcome.verified
 
 

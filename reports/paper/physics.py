@@ -1,4 +1,4 @@
-"""What the paper has no figures of: pressures, both contact methods, load steps."""
+"""Figures that the paper lacks: pressures, both contact methods, load steps."""
 
 from __future__ import annotations
 

@@ -226,7 +226,7 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
 
 
 def _line(look: Look) -> dict[str, Any]:
-    """Say how a line looks."""
+    """Translate the look of a line for matplotlib."""
     style: Any = "none" if look.dash is None else (0, look.dash) if look.dash else "-"
     return {
         "color": look.colour, "linestyle": style, "linewidth": look.width,
@@ -235,7 +235,7 @@ def _line(look: Look) -> dict[str, Any]:
 
 
 def look_of(look: Look) -> dict[str, Any]:
-    """Say how a line and its marks look."""
+    """Translate the look of a line and of its marks."""
     return {
         **_line(look), "marker": look.marker or "none", "markersize": look.size,
         "markerfacecolor": look.fill or look.colour, "markeredgewidth": look.edge,

@@ -203,7 +203,7 @@ def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
 
 
 def look_of(look: Look) -> Data:
-    """Tell how a line and its marks look, lengths in px or points."""
+    """Translate the look of a line and of its marks, lengths in px or points."""
     dash = look.dash
     return {
         "colour": colour(look.colour),

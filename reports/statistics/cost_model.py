@@ -1,4 +1,4 @@
-"""What a solve on N ranks takes, as a model: work, what every rank repeats, messages.
+"""A model of the time of a solve on N ranks: shared and repeated work, messages.
 
     t(N) = s(N)·(W/N + C) + R·α_R(N) + M(N)·α + b·β
 
@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """What a rank sends in one solve on `ranks` ranks, and how fast that was there."""
+    """Messages of a rank in one solve on `ranks` ranks, and their speed."""
 
     ranks: int  #: at least two
     reductions: float  #: over all ranks
@@ -63,7 +63,7 @@ class Communication:
 
     @property
     def seconds(self) -> Array:
-        """Give what reductions, messages and bytes take on these ranks, (3,)."""
+        """Seconds of reductions, messages and bytes on these ranks, (3,)."""
         return np.array(
             [
                 self.reductions * self.reduction_seconds,
@@ -74,7 +74,7 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Say how many times as long each of the three takes on other ranks, (…, 3)."""
+    """Return the factors by which the three grow on other ranks, (…, 3)."""
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)
