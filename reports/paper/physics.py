@@ -25,9 +25,9 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import exponent, significant
 from mortarbench.reports.document.layout import Cell, Table
 from mortarbench.reports.figures.scaling import along
-from mortarbench.reports.figures.style import GUIDE, below, curve, log, look
+from mortarbench.reports.figures.style import GUIDE, below, log, look
 from mortarbench.reports.paper.bodies import ACTIVE
-from mortarbench.reports.paper.timings import keys, select, titled
+from mortarbench.reports.paper.timings import labelled, select, titled
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
 CONTACTS = {  #: of the tables → as the figures call them
@@ -80,35 +80,37 @@ def pressure_figure(rows: Sequence[Row]) -> Figure:
     angle = Axis(label="arc angle in degrees", low=low, high=high)
     last = max(int(r["step"]) for r in rows)
 
-    def profile(contact: str, step: int, style: Look) -> list[Series]:
+    def profile(contact: str, step: int) -> list[tuple[float, float]]:
         mine = select(rows, contact=contact, step=step)
         places = ((float(r["angle"]), float(r["pressure"]) / 1e9) for r in mine)
-        return curve(sorted(p for p in places if low <= p[0] <= high), style)
+        return sorted(p for p in places if low <= p[0] <= high)
 
     known = np.array([list(bytes.fromhex(name)) for name in _RAMP])
     at = np.linspace(0, len(_RAMP) - 1, last)
     mixed = [np.interp(at, np.arange(len(_RAMP)), channel) for channel in known.T]
     parts = np.round(np.transpose(mixed)).astype(np.uint8)
     colours = tuple(f"#{bytes(colour).hex()}" for colour in parts)
-    steps = [
-        mark
+    through, _ = labelled(
+        ("", profile("nts", step), Look(colour=colour, width=1.0))
         for step, colour in enumerate(colours, 1)
-        for mark in profile("nts", step, Look(colour=colour, width=1.0))
-    ]
-    nts, mortar = _LOOKS.values()
-    ends = {"nts": replace(nts, size=4), "mortar": replace(mortar, size=3)}
-    nodes = {"nts": replace(nts, size=3.4, edge=0.7, dash=None),
-             "mortar": replace(mortar, size=6.2, edge=0.7, dash=None)}  # fmt: skip
-    methods = tuple(keys({CONTACTS[c]: style for c, style in ends.items()}))
+    )
+    methods, named = labelled(
+        (CONTACTS[contact], profile(contact, last), replace(style, size=size))
+        for (contact, style), size in zip(_LOOKS.items(), (4, 3), strict=True)
+    )
+    nodes, keys = labelled(
+        (CONTACTS[contact], touched[contact],
+         replace(style, size=size, edge=0.7, dash=None))
+        for (contact, style), size in zip(_LOOKS.items(), (3.4, 6.2), strict=True)
+    )  # fmt: skip
     at_end = Panel(
-        x=angle, y=Axis(label=_PRESSURE),
-        marks=tuple(s for c, style in ends.items() for s in profile(c, last, style)),
-        legend=Legend(keys=methods, place="upper left", size=8.5),
+        x=angle, y=Axis(label=_PRESSURE), marks=methods,
+        legend=Legend(keys=named, place="upper left", size=8.5),
     )  # fmt: skip
     _, top = limits([at_end], "y")
     panels = titled(
         ("node-to-segment, all load steps", Panel(
-            x=angle, y=Axis(label=_PRESSURE, low=0), marks=tuple(steps),
+            x=angle, y=Axis(label=_PRESSURE, low=0), marks=through,
             bar=ColourBar(label="load step", colours=colours),
         )),
         (f"both methods, load step {last}",
@@ -116,16 +118,14 @@ def pressure_figure(rows: Sequence[Row]) -> Figure:
         ("active set: the nodes in contact", Panel(
             x=angle, y=Axis(label="load step", low=0.3, high=last + 0.7,
                             most=min(last, 10), integers=True),
-            marks=tuple(s for c, how in nodes.items() for s in curve(touched[c], how)),
-            span=2,
+            marks=nodes, span=2,
         )),
     )  # fmt: skip
     rows_of = (
         figure.Row(panels=panels[:2]),
         figure.Row(panels=panels[2:], height=0.85),
     )
-    named = keys({CONTACTS[c]: style for c, style in nodes.items()})
-    return Figure(rows=rows_of, height=5.6, legend=below(named, 2))
+    return Figure(rows=rows_of, height=5.6, legend=below(keys, 2))
 
 
 def verification_figure(rows: Sequence[Row]) -> Figure:
@@ -135,26 +135,24 @@ def verification_figure(rows: Sequence[Row]) -> Figure:
         "hertz": ("Hertz contact", "elements per half width", "$L^2$ pressure error"),
     }
     styles = (look(0), look(1), replace(look(2), size=7, fill="none"))
-    looks = dict(zip(CONTACTS, styles, strict=True))
     panels = []
     for problem, (title, size, error) in titles.items():
-        marks = [
-            mark
-            for contact, style in looks.items()
-            for mark in curve(
+        marks, keys = labelled(
+            (
+                label,
                 sorted(
                     (float(r["n"]), max(float(r["error"]), EXACT))
                     for r in select(rows, problem=problem, contact=contact)
                 ),
                 style,
             )
-        ]
+            for (contact, label), style in zip(CONTACTS.items(), styles, strict=True)
+        )
         axis = log(f"{error}, relative")
         if problem == "patch":
             axis = replace(axis, low=EXACT / 10, high=10)
-        panels.append((title, Panel(x=log(size), y=axis, marks=tuple(marks))))
-    named = keys({CONTACTS[contact]: style for contact, style in looks.items()})
-    return Figure(rows=in_rows(titled(*panels), 2), height=3.2, legend=below(named, 3))
+        panels.append((title, Panel(x=log(size), y=axis, marks=marks)))
+    return Figure(rows=in_rows(titled(*panels), 2), height=3.2, legend=below(keys, 3))
 
 
 def errors(rows: Sequence[Row], relin: int, quantity: str) -> list[tuple[int, float]]:
@@ -186,15 +184,13 @@ def stepping_figure(rows: Sequence[Row]) -> Figure:
 
     A guide of slope −1 lies above the curves.
     """
-    looks = {relin: look(i) for i, relin in enumerate(linearisations(rows))}
     panels = []
     for quantity in QUANTITIES:
-        marks = [
-            mark
-            for relin, style in looks.items()
-            for mark in curve((p for p in errors(rows, relin, quantity) if p[1]), style)
-        ]
-        panel = Panel(x=log("load steps"), y=log("relative error"), marks=tuple(marks))
+        marks, keys = labelled(
+            (f"{relin}", [p for p in errors(rows, relin, quantity) if p[1]], look(i))
+            for i, relin in enumerate(linearisations(rows))
+        )
+        panel = Panel(x=log("load steps"), y=log("relative error"), marks=marks)
         (x0, x1), (y0, y1) = limits([panel], "x"), limits([panel], "y")
         start, stop = along((x0, x1), 0.55), along((x0, x1), 0.85)
         top = along((y0, y1), 0.93)
@@ -211,11 +207,10 @@ def stepping_figure(rows: Sequence[Row]) -> Figure:
             texts=(name,),
         )
         panels.append((quantity, panel))
-    named = keys({f"{relin}": style for relin, style in looks.items()})
     return Figure(
         rows=in_rows(titled(*panels), 2),
         height=3.1,
-        legend=below(named, len(named), "linearisations per step"),
+        legend=below(keys, len(keys), "linearisations per step"),
     )
 
 

@@ -138,32 +138,32 @@ def titled(*panels: tuple[str, Panel]) -> tuple[Panel, ...]:
     )
 
 
-def keys(looks: Mapping[str, Look]) -> list[Key]:
-    """List the keys of a legend by their labels."""
-    return [Key(label=label, look=style) for label, style in looks.items()]
+def labelled(curves: Iterable[Labelled]) -> tuple[tuple[Mark, ...], tuple[Key, ...]]:
+    """Draw curves, and list their keys."""
+    marks, keys = list[Mark](), []
+    for label, points, style in curves:
+        marks += curve(points, style)
+        keys.append(Key(label=label, look=style))
+    return tuple(marks), tuple(keys)
 
 
 def assembly_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 3: linear and logarithmic."""
-    methods = ("triplets", "compiled", "compiled-reused")
-    marks = [
-        *(s for i, m in enumerate(methods)
-          for s in curve(times(rows, "n", method=m), look(i))),
-        *curve([(published.DOFS, published.SECONDS["assembly"])], _PUBLISHED),
-    ]  # fmt: skip
+    curves: list[Labelled] = [
+        (METHODS[method], times(rows, "n", method=method), look(i))
+        for i, method in enumerate(("triplets", "compiled", "compiled-reused"))
+    ]
     words = f"published, both bodies ({published.MACHINE})"
-    looks = {METHODS[m]: look(i) for i, m in enumerate(methods)}
+    place = published.DOFS, published.SECONDS["assembly"]
+    marks, keys = labelled([*curves, (words, [place], _PUBLISHED)])
     time = "assembly time in s"
     left = Panel(
-        x=Axis(label=DOFS, low=0, most=4), y=Axis(label=time, low=0),
-        marks=tuple(marks), grid="none",
+        x=Axis(label=DOFS, low=0, most=4), y=Axis(label=time, low=0), marks=marks,
+        grid="none",
     )  # fmt: skip
-    right = Panel(x=log(DOFS), y=log(time), marks=tuple(marks))
-    return Figure(
-        rows=in_rows(titled(("linear scale", left), ("logarithmic scale", right)), 2),
-        height=3.4,
-        legend=below(keys(looks | {words: _PUBLISHED}), 2),
-    )
+    right = Panel(x=log(DOFS), y=log(time), marks=marks)
+    panels = titled(("linear scale", left), ("logarithmic scale", right))
+    return Figure(rows=in_rows(panels, 2), height=3.4, legend=below(keys, 2))
 
 
 def contact_figure(rows: Sequence[Row]) -> Figure:
@@ -172,61 +172,56 @@ def contact_figure(rows: Sequence[Row]) -> Figure:
     place = published.SEGMENTS["slave"], published.SECONDS["contact"] / published.STEPS
     name = f"published\n({published.SEGMENTS['master']} master segments)"
     panels = []
-    for method in ("nts", "mortar"):
+    for method, title in (
+        ("nts", "node-to-segment, as in the paper"), ("mortar", "mortar, dual basis"),
+    ):  # fmt: skip
         first = method == "nts"
-        marks = [
-            mark
+        marks, keys = labelled(
+            (f"{master}", times(rows, "slave", method=method, master=master), look(i))
             for i, master in enumerate(masters)
-            for mark in curve(
-                times(rows, "slave", method=method, master=master), look(i)
-            )
-        ]
-        panels.append(
-            Panel(
-                x=log("slave segments"),
-                y=Axis(
-                    label="time of one linearisation in s" * first, log=True, high=0.7,
-                    shared="time", numbered=first,
-                ),
-                marks=(*marks, *curve([place] * first, _PUBLISHED)),
-                texts=(Text(text=name, place=place, offset=(9, 0)),) * first,
-            )
+        )
+        panel = Panel(
+            x=log("slave segments"),
+            y=Axis(
+                label="time of one linearisation in s" * first, log=True, high=0.7,
+                shared="time", numbered=first,
+            ),
+            marks=(*marks, *curve([place] * first, _PUBLISHED)),
+            texts=(Text(text=name, place=place, offset=(9, 0)),) * first,
         )  # fmt: skip
-    named = zip(("node-to-segment, as in the paper", "mortar, dual basis"), panels,
-                strict=True)  # fmt: skip
-    looks = {f"{master}": look(i) for i, master in enumerate(masters)}
+        panels.append((title, panel))
     return Figure(
-        rows=in_rows(titled(*named), 2),
+        rows=in_rows(titled(*panels), 2),
         height=3.6,
-        legend=below(keys(looks), len(masters), "master segments"),
+        legend=below(keys, len(masters), "master segments"),
     )
 
 
 def inverse_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 5: building K⁺ and multiplying with it."""
-    looks = {"pinv": look(2), "geometric": look(0), "spectral": look(1)}
     until = float(max(r["n"] for r in rows))
     panels = []
-    for part in ("build", "multiply"):
-        marks = list[Mark]()
-        for method, style in looks.items():
-            marks += curve(times(rows, "n", method=method, part=part), style)
+    for part, title in (
+        ("build", "building"), ("multiply", "multiplication with a random vector"),
+    ):  # fmt: skip
+        marks, keys = labelled(
+            (METHODS[method], times(rows, "n", method=method, part=part), look(i))
+            for method, i in (("pinv", 2), ("geometric", 0), ("spectral", 1))
+        )
         law = pinv_fit(rows, part)  # goes on where nothing was measured
         x = np.geomspace(law.until, until, 40)
         at, low, middle, high = (
             numbers(v)
             for v in (x, *(c * x**law.power for c in (law.low, law.c, law.high)))
         )
-        marks.append(Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2))
-        marks.append(Series(x=at, y=middle, look=_FITTED))
-        panels.append(Panel(x=log(DOFS), y=log("time in s"), marks=tuple(marks)))
+        band = Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2)
+        marks = (*marks, band, Series(x=at, y=middle, look=_FITTED))
+        panels.append((title, Panel(x=log(DOFS), y=log("time in s"), marks=marks)))
     words = "dense pinv, not measured: fitted $c\\,n^3$ (a), $c\\,n^2$ (b)"
-    titles = ("building", "multiplication with a random vector")
-    named = {METHODS[m]: style for m, style in looks.items()} | {words: _FITTED}
     return Figure(
-        rows=in_rows(titled(*zip(titles, panels, strict=True)), 2),
+        rows=in_rows(titled(*panels), 2),
         height=3.6,
-        legend=below(keys(named), 2),
+        legend=below((*keys, Key(label=words, look=_FITTED)), 2),
     )
 
 
@@ -273,25 +268,22 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
 
 
 def _against_Nr(Nr: Vector, y: Axis, curves: Mapping[str, Vector]) -> Panel:
-    looks = {name: look(i) for i, name in enumerate(curves)}
-    return Panel(
-        x=Axis(label="$N_r$"), y=y,
-        marks=tuple(
-            Series(x=numbers(Nr), y=numbers(values), look=looks[name])
-            for name, values in curves.items()
-        ),
-        legend=Legend(keys=tuple(keys(looks)), place="upper left"),
-    )  # fmt: skip
+    marks, keys = labelled(
+        (name, list(zip(Nr, values, strict=True)), look(i))
+        for i, (name, values) in enumerate(curves.items())
+    )
+    legend = Legend(keys=keys, place="upper left")
+    return Panel(x=Axis(label="$N_r$"), y=y, marks=marks, legend=legend)
 
 
 def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Panel:
     """Make a panel of labelled curves with room for its legend above them."""
-    named = keys({label: style for label, _, style in curves})
+    marks, keys = labelled(curves)
     panel = Panel(
         x=Axis(label=size, most=4),
         y=log("time in s"),
-        marks=tuple(s for _, points, style in curves for s in curve(points, style)),
-        legend=Legend(keys=tuple(named), place="upper left", size=8),
+        marks=marks,
+        legend=Legend(keys=keys, place="upper left", size=8),
     )
     low, high = limits([panel], "y")
     head = high * 10 ** (0.35 * decades)
