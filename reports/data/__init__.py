@@ -1,1 +1,1 @@
-"""What was measured, read and grouped the way that reports ask for it."""
+"""Measurements, read and grouped as reports need them."""

@@ -22,7 +22,7 @@ GATES = ("verified", "claimed")
 
 @dataclass(frozen=True, kw_only=True)
 class Convention:
-    """What has to be agreed before times over cases become one number."""
+    """Choices by which times over cases become one number."""
 
     shift: float = 1.0  #: times that of the group
     penalty: float = 3.0  #: an unsolved case is charged this many limits
@@ -92,7 +92,7 @@ def _logs(group: ComparisonGroup, convention: Convention) -> tuple[Array, float]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Ranking:
-    """What one group of cases says under the usual convention, and how surely."""
+    """Ranks of one group under the usual convention, with their uncertainty."""
 
     group: ComparisonGroup
     draws: Array  #: (draws, solvers) means over resampled cases, s
@@ -180,7 +180,7 @@ def ranking_of(group: ComparisonGroup) -> Ranking:
 
 
 class Changed(NamedTuple):
-    """What becomes of the ranks under another convention."""
+    """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
     turned: NDArray[np.bool_]  #: (solvers, solvers) whether it turns their order

@@ -1,4 +1,4 @@
-"""Who solved which case in what time: what means, ranks and profiles are made from."""
+"""Times of all solvers on all cases of a group, for means, ranks and profiles."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from mortarbench.harness import Record, Verdict
-from mortarbench.harness.running.pairs import Block, ratio_of
-from mortarbench.reports.data.evidence import Evidence
+from mortarbench.harness.running.pairs import ratio_of
+from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
 #: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
@@ -27,7 +27,7 @@ _CELL = ["kind", "case", "solver"]
 
 Times = NDArray[np.float64]
 Pairs = NDArray[np.bool_]
-Seconds = Mapping[Block, float]
+Row = Mapping[str, Outcome]  #: by solver
 Name = TypeVar("Name")
 
 
@@ -36,7 +36,7 @@ def _no_pairs() -> Pairs:
 
 
 class Kind(NamedTuple):
-    """What the cases of one group share."""
+    """Attributes that the cases of one group share."""
 
     sweep: bool  #: of the tolerance asked for
     mode: str
@@ -58,6 +58,9 @@ class Kind(NamedTuple):
     def title(self) -> str:
         """Name all of it."""
         return ", ".join(filter(None, (self.subject, self.accuracy)))
+
+
+Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,7 +86,7 @@ class ComparisonGroup:
     apart: Pairs = field(default_factory=_no_pairs)
     """(solvers, solvers) whether two share no block on some case; none: all share."""
     told: Pairs = field(default_factory=_no_pairs)
-    """Of those, whether row is faster than column on every case, by its interval."""
+    """(solvers, solvers) of those, True if row is faster than column on every case."""
 
     @property
     def title(self) -> str:
@@ -92,30 +95,28 @@ class ComparisonGroup:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Say what takes no part."""
-        refused = (f"Declined all of them: {listing(self.refused, 6)}.",)
-        counted = [
+        """Name what takes no part."""
+        counted = ", ".join(
             f"{clean(form, 24)} {plural(n, 'case')}" for form, n in self.forms.items()
-        ]
-        pooled = (
-            f"Forms together: {', '.join(counted)}. A form that a solver declines is "
-            "unsolved by it.",
         )
-        said = pooled * bool(self.forms) + refused * bool(self.refused)
+        pooled = (
+            f"Forms together: {counted}. A form that a solver declines is "
+            "unsolved by it."
+        )
+        refused = f"Declined all of them: {listing(self.refused, 6)}."
+        said = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
         return said + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
-        """Say what takes no part because it was not measured."""
-        rare = (f"Measured on fewer than half of them: {listing(self.rare, 6)}.",)
-        cases = plural(self.incomplete, "case")
-        return rare * bool(self.rare) + (
-            f"Not measured by all, left out: {cases}.",
-        ) * bool(self.incomplete)
+        """Name what takes no part because it was not measured."""
+        rare = f"Measured on fewer than half of them: {listing(self.rare, 6)}."
+        left = f"Not measured by all, left out: {plural(self.incomplete, 'case')}."
+        return (rare,) * bool(self.rare) + (left,) * bool(self.incomplete)
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """Say who was measured in other sessions than whom."""
+        """Name solvers that were measured in different sessions."""
         left = self.apart.copy()
         pairs = []
         while left.any():
@@ -133,12 +134,12 @@ class ComparisonGroup:
 
     @property
     def comparable(self) -> bool:
-        """Whether cases, solvers and answers are enough for a statement over cases."""
+        """True if cases, solvers and answers suffice for a statement over cases."""
         return not self.lack
 
     @property
     def lack(self) -> str:
-        """Say what is missing for a statement over cases; empty if nothing is."""
+        """The lack that prevents a statement over cases; empty without one."""
         if len(self.solvers) < 2:
             return plural(len(self.solvers), "solver")
         if len(self.cases) < CASES:
@@ -187,26 +188,35 @@ def all_groups(
     records = [r for r in evidence.records if not r.role]
     if not records:
         return ()
-    of = [kind_of(r) for r in records]
-    if pool_forms:
-        of = [kind._replace(form=POOLED) for kind in of]
+    of = [kind_of(r, pool_forms=pool_forms) for r in records]
     kinds = _numbered(of)
     cases = _numbered(r.case for r in records)
     solvers = _numbered(evidence.solvers)
-    rows = [
-        {"kind": kinds[kind], "case": cases[r.case], "solver": solvers[r.solver]}
-        | _row(r)
-        for kind, r in zip(of, records, strict=True)
-    ]
-    outcomes = _outcomes(pd.DataFrame(rows))
+    verified = np.array([r.verdict.is_verified for r in records])
+    outcomes = _outcomes(
+        pd.DataFrame(
+            {
+                "kind": [kinds[kind] for kind in of],
+                "case": [cases[r.case] for r in records],
+                "solver": [solvers[r.solver] for r in records],
+                "tol": [r.tol for r in records],
+                "seconds": np.array([r.total_seconds for r in records], dtype=float),
+                "verified": verified,
+                "claimed": [r.claims_answer for r in records],
+                # one repeat in time is no answer yet
+                "late": [r.verdict is Verdict.TIME_LIMIT for r in records] | verified,
+                "declined": [r.verdict is Verdict.DECLINED for r in records],
+            }
+        )
+    )
     limit = _limit(evidence, outcomes)
     found = tuple(
         _group(kind, group, [*cases], evidence.solvers, limit)
         for kind, (_, group) in zip(kinds, outcomes.groupby("kind"), strict=True)
     )
     if len({r.session for r in records}) > 1:
-        blocks = _blocks(of, records)
-        found = tuple(_with_sessions(group, blocks) for group in found)
+        answers = answers_of(evidence, pool_forms=pool_forms)
+        found = tuple(_with_sessions(group, answers[group.kind]) for group in found)
     if not pool_forms:
         return found
     form = {r.case: r.form for r in records}
@@ -216,39 +226,47 @@ def all_groups(
     )
 
 
-def _blocks(
-    of: Sequence[Kind], records: Sequence[Record]
-) -> dict[tuple[Kind, str, str], Seconds]:
-    """Seconds by block of each solver on each case; of a sweep, of its best answer."""
-    cells: dict[tuple[Kind, str, str], dict[float, list[Record]]] = {}
-    for kind, r in zip(of, records, strict=True):
-        by_tol = cells.setdefault((kind, r.case, r.solver), {})
-        by_tol.setdefault(r.tol, []).append(r)
-
-    def rank(answer: list[Record]) -> tuple[bool, float]:
-        failed = not all(r.verdict.is_verified for r in answer)
-        return failed, float(np.median([r.total_seconds or np.inf for r in answer]))
-
+def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
+    """Choose the answer of every solver to every case; null arms take no part."""
+    found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
+    for o in evidence.flat:
+        if not o.first.role:
+            cases = found.setdefault(kind_of(o.first, pool_forms=pool_forms), {})
+            cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
     return {
-        cell: {
-            (r.session, r.repeat): r.total_seconds
-            for r in min(by_tol.values(), key=rank)
-            if r.total_seconds
+        kind: {
+            case: {solver: representative(given) for solver, given in row.items()}
+            for case, row in cases.items()
         }
-        for cell, by_tol in cells.items()
+        for kind, cases in found.items()
     }
 
 
-def _with_sessions(
-    group: ComparisonGroup, blocks: Mapping[tuple[Kind, str, str], Seconds]
-) -> ComparisonGroup:
+def representative(outcomes: Sequence[Outcome]) -> Outcome:
+    """Choose the answer of a solver on a case: of a sweep, the cheapest verified one.
+
+    Where none is verified, that at the tightest tolerance.
+    """
+    timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
+    if timed:
+        return min(timed, key=lambda each: each[:2])[-1]
+    return min(outcomes, key=lambda o: o.tol)
+
+
+def time_of(outcome: Outcome) -> float | None:
+    """Median total time of a verified answer, s."""
+    time = outcome.seconds("total") if outcome.verified else None
+    return time.value if time is not None and time.value > 0 else None
+
+
+def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
     """Mark the solvers that were not measured together on every case."""
     n = len(group.solvers)
     apart, told = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):
         pairs = [
             tuple(
-                blocks[group.kind, case, group.solvers[s]] if group.solved[k, s] else {}
+                rows[case][group.solvers[s]].by_block if group.solved[k, s] else {}
                 for s in (i, j)
             )
             for k, case in enumerate(group.cases)
@@ -262,32 +280,20 @@ def _with_sessions(
     return replace(group, apart=apart, told=told)
 
 
-def kind_of(r: Record) -> Kind:
-    """Say what a record has in common with those that it is compared with."""
+def kind_of(r: Record, *, pool_forms: bool = False) -> Kind:
+    """Return what a record has in common with those that it is compared with."""
+    form = POOLED if pool_forms else r.form
     swept = r.accuracy is not None
-    return Kind(swept, r.mode, r.form, r.tol if r.accuracy is None else r.accuracy)
+    return Kind(swept, r.mode, form, r.tol if r.accuracy is None else r.accuracy)
 
 
 def _numbered(names: Iterable[Name]) -> dict[Name, int]:
-    """Give a number to each, in the order of occurrence: pandas takes not any name."""
+    """Map names to numbers in their order: pandas does not accept every name."""
     return {name: number for number, name in enumerate(dict.fromkeys(names))}
-
-
-def _row(r: Record) -> dict[str, float]:
-    """Take of a record what a group asks for."""
-    return {
-        "tol": r.tol,
-        "seconds": np.nan if r.total_seconds is None else r.total_seconds,
-        "verified": r.verdict.is_verified,
-        "claimed": r.claims_answer,
-        "late": r.verdict is Verdict.TIME_LIMIT,
-        "declined": r.verdict is Verdict.DECLINED,
-    }
 
 
 def _outcomes(records: pd.DataFrame) -> pd.DataFrame:
     """Put repeats together, then the tolerances of a sweep: one row per cell."""
-    records["late"] |= records["verified"]  # one repeat in time is no answer yet
     repeats = records.groupby([*_CELL, "tol"], sort=False).agg(
         seconds=("seconds", "median"),
         verified=("verified", "all"),

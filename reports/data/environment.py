@@ -1,4 +1,4 @@
-"""What is recorded of the machine and the time that measurements were made at."""
+"""Records of the machine and of the time of measurements."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def busy_with(evidence: Evidence) -> float | None:
 
 
 def dateline(evidence: Evidence) -> str:
-    """Say when and on which machine, in one line."""
+    """State time and machine of the measurements in one line."""
     days = sorted({r.started[:10] for r in evidence.records if r.started})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
     return f"{clean(when)} · {machine(evidence.environment)}"

@@ -1,4 +1,4 @@
-"""What a result folder holds, grouped the way the report asks for it."""
+"""The contents of a result folder, grouped as the report needs them."""
 
 from __future__ import annotations
 
@@ -42,6 +42,17 @@ SEVERITY = (
     Verdict.VERIFIED_INFEASIBLE,
     Verdict.VERIFIED,
 )
+
+
+def _seconds(r: Record, phase: str) -> float | None:
+    seconds: float | None = getattr(r, f"{phase}_seconds")
+    return seconds
+
+
+def _median(seconds: Iterable[float | None]) -> Interval | None:
+    """Take the median of the times that are known; None without any."""
+    times = [t for t in seconds if t is not None]
+    return median_interval(times) if times else None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +99,7 @@ class Outcome:
 
     @property
     def verified(self) -> bool:
-        """Whether every repeat was verified."""
+        """True if every repeat was verified."""
         return self.verdict.is_verified
 
     @cached_property
@@ -105,7 +116,7 @@ class Outcome:
 
     @cached_property
     def claims(self) -> tuple[str, ...]:
-        """What the solver said of itself, without repetition."""
+        """The solver's own verdicts, each once."""
         return tuple(dict.fromkeys(r.claimed for r in self.records if r.claimed))
 
     @property
@@ -121,10 +132,8 @@ class Outcome:
     @cached_property
     def worst(self) -> float | None:
         """The largest of the four residuals; None if there is no finite one."""
-        values = [self.largest(name) for name in RESIDUALS]
-        return max((v for v in values if v is not None), default=None) if all(
-            v is not None for v in values
-        ) else None  # fmt: skip
+        known = [v for name in RESIDUALS if (v := self.largest(name)) is not None]
+        return max(known) if len(known) == len(RESIDUALS) else None
 
     def seconds(self, phase: str) -> Interval | None:
         """Median of prepare, solve or total time over the repeats that have one."""
@@ -133,20 +142,19 @@ class Outcome:
     @property
     def by_block(self) -> dict[Block, float]:
         """Total seconds of each repeat that has them; see `harness.running.pairs`."""
-        return {
-            (r.session, r.repeat): r.total_seconds
-            for r in self.records
-            if r.total_seconds
-        }
+        return self.seconds_by_block("total")
+
+    def seconds_by_block(self, phase: str) -> dict[Block, float]:
+        """Return the seconds of one phase in each repeat that has them."""
+        times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
+        return {block: t for block, t in times.items() if t}
 
     @cached_property
     def _intervals(self) -> dict[str, Interval | None]:
-        found: dict[str, Interval | None] = {}
-        for phase in ("prepare", "solve", "total"):
-            values = [getattr(r, f"{phase}_seconds") for r in self.records]
-            times = [float(v) for v in values if v is not None]
-            found[phase] = median_interval(times) if times else None
-        return found
+        return {
+            phase: _median(_seconds(r, phase) for r in self.records)
+            for phase in ("prepare", "solve", "total")
+        }
 
     @cached_property
     def dualising(self) -> Interval | None:
@@ -154,18 +162,16 @@ class Outcome:
 
         All measurements of one build have the same.
         """
-        values = {r.dualise_seconds for r in self.records if r.dualise_seconds}
-        return median_interval(sorted(values)) if values else None
+        return _median({r.dualise_seconds for r in self.records if r.dualise_seconds})
 
     @cached_property
     def with_dualising(self) -> Interval | None:
         """Median total time, that of dualising included; None for primal forms."""
-        times = [
+        return _median(
             r.total_seconds + r.dualise_seconds
             for r in self.records
             if r.total_seconds is not None and r.dualise_seconds
-        ]
-        return median_interval(times) if times else None
+        )
 
     @cached_property
     def iterations(self) -> tuple[int, int] | None:
@@ -175,10 +181,9 @@ class Outcome:
 
     def counted(self, name: str) -> float | None:
         """Mean of one of the solver's counts over the repeats; None if one lacks it."""
-        values = [r.counts.get(name) for r in self.records]
-        if not values or None in values:
-            return None
-        return float(sum(v for v in values if v is not None) / len(values))
+        values = [v for r in self.records if (v := r.counts.get(name)) is not None]
+        whole = len(values) == len(self.records)
+        return float(sum(values) / len(values)) if whole else None
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
@@ -278,7 +283,7 @@ def read_evidence(
     return Evidence(
         directory=directory,
         journal=journal,
-        records=arrange(_apart(_judged(r, factor), marks) for r in records),
+        records=arrange(_apart(r, factor, marks) for r in records),
         environment=environment,
         marks=marks,
         suite=read_stored(suite) if os.path.lexists(suite) else {},
@@ -288,7 +293,7 @@ def read_evidence(
 
 
 def _in_like_environments(directory: Path, records: list[Record]) -> list[Record]:
-    """Give environments whose times compare one digest: that of the first of them."""
+    """Unite environments with comparable times under the digest of the first."""
     known: dict[str, Mapping[str, Any]] = {}
     of: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
@@ -307,7 +312,7 @@ def _in_like_environments(directory: Path, records: list[Record]) -> list[Record
 
 
 def _one_name_each(records: list[Record]) -> list[Record]:
-    """Give a QP that lies in several files the name and path of the first of them."""
+    """Rename a QP that lies in several files after the first of them."""
     first: dict[str, Record] = {}
     for r in records:
         if r.family == FROM_FILE and r.qp is not None:
@@ -323,20 +328,20 @@ def _tell_contradicted(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
     """Warn of records that say verified beside residuals that are too large for it."""
-    wrong = [r.run_id for r in records if _is_contradicted(r)]
+    wrong = []
+    for r in records:
+        names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
+        values = [v for name in names if (v := getattr(r, name)) is not None]
+        if r.verdict is Verdict.VERIFIED and max(values, default=0) > allowed(
+            r.judged_at
+        ):
+            wrong.append(r.run_id)
     if wrong:
         warn(
             f"{directory}: verified, by their journal, with residuals above "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
             "that, and `validate` judges the points anew"
         )
-
-
-def _is_contradicted(r: Record) -> bool:
-    names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
-    values = (getattr(r, name) for name in names)
-    is_above = any(v is not None and v > allowed(r.judged_at) for v in values)
-    return r.verdict is Verdict.VERIFIED and is_above
 
 
 def _environment(path: Path) -> dict[str, Any]:
@@ -349,23 +354,19 @@ def _environment(path: Path) -> dict[str, Any]:
     return table
 
 
-def _judged(record: Record, factor: float) -> Record:
-    if factor == VERIFIED_FACTOR:
-        return record
-    return record.but(verdict=rejudged(record, factor))
-
-
-def _apart(record: Record, marks: Mapping[str, str]) -> Record:
-    """Call a solver by another name where its measurements are others.
+def _apart(record: Record, factor: float, marks: Mapping[str, str]) -> Record:
+    """Judge at `factor`, and rename a solver whose measurements are others.
 
     That is where it drove a sequence instead of beginning cold, and in a further
     environment of a folder that holds the same measurements of several.
     """
-    name = (
-        record.solver if record.mode == "cold" else f"{record.solver} ({record.mode})"
-    )
-    mark = marks.get(record.environment, "")
-    return record if name + mark == record.solver else record.but(solver=name + mark)
+    changes: dict[str, Any] = {}
+    if factor != VERIFIED_FACTOR:
+        changes["verdict"] = rejudged(record, factor)
+    mode = "" if record.mode == "cold" else f" ({record.mode})"
+    if after := mode + marks.get(record.environment, ""):
+        changes["solver"] = record.solver + after
+    return record.but(**changes) if changes else record
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:

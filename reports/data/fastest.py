@@ -1,4 +1,4 @@
-"""Who was fastest at equal verified accuracy, per form and accuracy, and how surely.
+"""The fastest solver at equal verified accuracy, per form, and how sure that is.
 
 A solver competes if all of its answers are verified: on every case of the group that
 anybody solved. The first has the smallest geometric mean of times. It is called the
@@ -19,6 +19,7 @@ References
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
@@ -30,20 +31,18 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
 from mortarbench.reports.data.comparison_groups import (
     CASES,
-    POOLED,
+    Answers,
     ComparisonGroup,
     Kind,
-    kind_of,
+    Row,
+    time_of,
 )
-from mortarbench.reports.data.evidence import Evidence, Outcome
+from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.statistics.resampling import symmetric_interval
-
-Row = Mapping[str, Outcome]  #: by solver
-Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
 
 
 class Finding(Enum):
-    """What can be said of the fastest solver of a group, or why nothing can."""
+    """Conclusions on the fastest solver of a group, or reasons why there are none."""
 
     FASTEST = "one solver is faster than all others"
     TIE = "the first is not told apart from all others"
@@ -118,7 +117,14 @@ class FastestSolver:
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
         """Return per case the fastest and those whose interval does not exclude it."""
-        return {case: _front(self.competitors, case) for case in self.cases}
+        fronts = {}
+        for case in self.cases:
+            given = [(c, c.outcomes[case]) for c in self.competitors]
+            first, its = min(given, key=lambda each: time_of(each[1]) or np.inf)
+            ratios = [(c, ratio_of(o.by_block, its.by_block)) for c, o in given]
+            tied = (c for c, r in ratios if r is None or r.low <= 1)
+            fronts[case] = (first, *(c for c in tied if c is not first))
+        return fronts
 
 
 class Unverified(NamedTuple):
@@ -140,58 +146,23 @@ def fastest_solvers(
     )
 
 
-def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
-    """Choose the answer of every solver to every case; null arms take no part."""
-    found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
-    for o in evidence.flat:
-        if not o.first.role:
-            kind = kind_of(o.first)
-            kind = kind._replace(form=POOLED) if pool_forms else kind
-            cases = found.setdefault(kind, {})
-            cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-    return {
-        kind: {
-            case: {solver: representative(given) for solver, given in row.items()}
-            for case, row in cases.items()
-        }
-        for kind, cases in found.items()
-    }
-
-
 def unverified(rows: Iterable[Row]) -> list[Unverified]:
     """Count what was not verified, by solver and verdict; most failures first."""
-    given: dict[str, list[Outcome]] = {}
+    given = Counter[str]()
+    failed: dict[tuple[str, Verdict], list[Outcome]] = {}
     for row in rows:
-        for solver, outcome in row.items():
-            given.setdefault(solver, []).append(outcome)
-    found: list[Unverified] = []
-    for solver, outcomes in given.items():
-        by_verdict: dict[Verdict, list[Outcome]] = {}
-        for o in outcomes:
+        for solver, o in row.items():
+            given[solver] += 1
             if not o.verified:
-                by_verdict.setdefault(o.verdict, []).append(o)
-        found += [
-            Unverified(solver, verdict, tuple(those), len(outcomes))
-            for verdict, those in by_verdict.items()
-        ]
-    return sorted(found, key=lambda one: -len(one.answers))
-
-
-def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Choose the answer of a solver on a case: of a sweep, the cheapest verified one.
-
-    Where none is verified, that at the tightest tolerance.
-    """
-    timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
-    if timed:
-        return min(timed, key=lambda each: each[:2])[-1]
-    return min(outcomes, key=lambda o: o.tol)
-
-
-def time_of(outcome: Outcome) -> float | None:
-    """Median total time of a verified answer, s."""
-    time = outcome.seconds("total") if outcome.verified else None
-    return time.value if time is not None and time.value > 0 else None
+                failed.setdefault((solver, o.verdict), []).append(o)
+    solvers = list(given)
+    return sorted(
+        (
+            Unverified(*key, tuple(those), given[key[0]])
+            for key, those in failed.items()
+        ),
+        key=lambda one: (-len(one.answers), solvers.index(one.solver)),
+    )
 
 
 def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
@@ -234,16 +205,38 @@ def _geometric_mean(c: Competitor) -> float:
 def _compared(
     c: Competitor, first: Competitor, group: ComparisonGroup, over_cases: bool
 ) -> Competitor:
-    """Compare with the first on the cases that both solved, in one environment."""
+    """Compare with the first on the cases that both solved, in one environment.
+
+    That is by the blocks of each case that both were measured in. Over cases it is by
+    Student's interval, widened to that of flipped signs: Student's presumes logarithms
+    that scatter normally, the other one that they scatter alike to both sides. Neither
+    presumption is safe for six cases, so both must hold 1 out before two solvers count
+    as different.
+    """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
         return c
-    within = _within_blocks(c, first, both)
+    paired = {
+        case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
+        for case in both
+    }
+    by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
+    within = replace(c, compared=tuple(both), by_case=by_case)
     if not over_cases:
-        return within
-    ratio = _over_cases(c, first, both) if len(both) >= CASES else None
-    slower = ratio is not None and ratio.low > 1
-    apart = False
+        every = len(by_case) == len(c.outcomes)
+        slower = every and all(ratio.low > 1 for ratio in by_case.values())
+        only = by_case.get(both[0]) if len(both) == len(c.outcomes) == 1 else None
+        return replace(within, ratio=only, slower=slower)
+    mine, its = (
+        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(both)}
+        for one in (c, first)
+    )
+    ratio = paired_ratio(mine, its) if len(both) >= CASES else None
+    if ratio is not None:
+        logs = np.log([mine[i] / its[i] for i in mine])
+        low, high = map(float, np.exp(symmetric_interval(logs, both)))
+        ratio = ratio._replace(low=min(ratio.low, low), high=max(ratio.high, high))
+    slower, apart = ratio is not None and ratio.low > 1, False
     if group.apart.any():  # of different sessions: no pairs
         one, other = (group.solvers.index(s.solver) for s in (first, c))
         apart = bool(group.apart[one, other])
@@ -251,43 +244,8 @@ def _compared(
     return replace(within, ratio=ratio, slower=slower, apart=apart)
 
 
-def _over_cases(c: Competitor, first: Competitor, cases: Sequence[str]) -> Ratio | None:
-    """Compare over cases: Student's interval, widened to that of flipped signs.
-
-    Student's presumes logarithms that scatter normally, the other one that they scatter
-    alike to both sides. Neither presumption is safe for six cases, so both must hold 1
-    out before two solvers count as different.
-    """
-    mine, its = (
-        {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(cases)}
-        for one in (c, first)
-    )
-    ratio = paired_ratio(mine, its)
-    if ratio is None:
-        return None
-    logs = np.log([mine[i] / its[i] for i in mine])
-    low, high = np.exp(symmetric_interval(logs, cases))
-    return ratio._replace(
-        low=min(ratio.low, float(low)), high=max(ratio.high, float(high))
-    )
-
-
-def _within_blocks(c: Competitor, first: Competitor, cases: list[str]) -> Competitor:
-    """Compare on each case by the blocks that both were measured in, if there are."""
-    paired = {
-        case: ratio_of(c.outcomes[case].by_block, first.outcomes[case].by_block)
-        for case in cases
-    }
-    by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
-    slower = len(by_case) == len(c.outcomes) and all(
-        ratio.low > 1 for ratio in by_case.values()
-    )
-    only = by_case.get(cases[0]) if len(cases) == len(c.outcomes) == 1 else None
-    return replace(c, compared=tuple(cases), by_case=by_case, ratio=only, slower=slower)
-
-
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
-    """Whether what is compared of two solvers comes from different environments."""
+    """Return whether compared times of two solvers come from different environments."""
     mine, its = (
         {(r.session, r.repeat): r.environment for r in one.outcomes[case].records}
         for one in (a, b)
@@ -322,15 +280,3 @@ def _finding(
         return Finding.ONE_BLOCK
     faster = any(r.high < 1 for c in full[1:] for r in c.by_case.values())
     return Finding.DIVIDED if faster else Finding.TIE
-
-
-def _front(competitors: Sequence[Competitor], case: str) -> tuple[Competitor, ...]:
-    first = min(competitors, key=lambda c: time_of(c.outcomes[case]) or np.inf)
-    its = first.outcomes[case].by_block
-
-    def is_slower(c: Competitor) -> bool:
-        ratio = ratio_of(c.outcomes[case].by_block, its)
-        return ratio is not None and ratio.low > 1
-
-    tied = (c for c in competitors if c is not first and not is_slower(c))
-    return (first, *tied)

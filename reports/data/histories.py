@@ -1,9 +1,10 @@
-"""Which histories a report shows, and what they say in numbers."""
+"""The histories that a report shows, and numbers derived from them."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,7 +28,7 @@ RULE = (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SolverRun:
-    """How one solver went through one case, by its own account; rows from its start."""
+    """The path of one solver through one case, by its own account, row by row."""
 
     outcome: Outcome
     record: Record  #: the repeat that this is the history of
@@ -38,21 +39,23 @@ class SolverRun:
         """Number of rows."""
         return int(next(iter(self.history.values())).size)
 
+    def numbers(self, name: str) -> Vector | None:
+        """(rows,) of one column, NaN where not finite; None if no number is."""
+        values = self.history.get(name, np.zeros(0))
+        if values.dtype.kind not in "if" or not np.isfinite(values).any():
+            return None
+        return np.where(np.isfinite(values), values, np.nan)
+
     @cached_property
     def products(self) -> Vector | None:
         """(rows,) products with P so far; None unless all are known."""
-        values = self._numbers("products")
+        values = self.numbers("products")
         return values if values is not None and np.isfinite(values).all() else None
-
-    @property
-    def iterations(self) -> Vector:
-        """(rows,) counted from one."""
-        return np.arange(1.0, self.rows + 1)
 
     @cached_property
     def gradient(self) -> Vector | None:
         """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
-        phi, beta = self._numbers("free_gradient"), self._numbers("chopped_gradient")
+        phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:
             return None
         norm = np.hypot(phi, beta)
@@ -62,38 +65,26 @@ class SolverRun:
     @cached_property
     def infeasibility(self) -> Vector | None:
         """(rows,) relative norm of Ax − b; None if it is never positive."""
-        values = self._numbers("infeasibility")
+        values = self.numbers("infeasibility")
         return values if values is not None and (values > 0).any() else None
 
-    @cached_property
-    def active(self) -> Vector | None:
-        """(rows,) number of active bounds."""
-        return self._numbers("active")
-
-    @cached_property
+    @property
     def two_sided(self) -> Vector | None:
         """(rows,) number of active bounds of components between two: rows that slip."""
-        return self._numbers("two_sided")
+        return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:
-        """(rows,) whether a step was of that kind."""
+        """Mark the steps of that kind, (rows,)."""
         kinds = self.history.get("step", np.full(self.rows, ""))
         return np.asarray(kinds.astype(str) == kind, dtype=bool)
 
     @cached_property
     def outer_ends(self) -> NDArray[np.bool_]:
         """(rows,) whether an outer iteration ends there; nowhere if there is one."""
-        outer = self._numbers("outer")
+        outer = self.numbers("outer")
         if outer is None or np.all(outer == outer[0]):
             return np.zeros(self.rows, dtype=bool)
         return np.append(outer[1:] != outer[:-1], True)
-
-    def _numbers(self, name: str) -> Vector | None:
-        """(rows,) with NaN for what is not finite; None if no number is."""
-        values = self.history.get(name, np.zeros(0))
-        if values.dtype.kind not in "if" or not np.isfinite(values).any():
-            return None
-        return np.where(np.isfinite(values), values, np.nan)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,16 +96,16 @@ class CaseHistories:
 
     @property
     def counted(self) -> bool:
-        """Whether all runs can be drawn over products; over iterations if not."""
+        """True if all runs can be drawn over products; else over iterations."""
         return all(c.products is not None for c in self.runs)
 
     def work(self, run: SolverRun) -> Vector:
-        """(rows,) products or iterations."""
+        """(rows,) products or iterations, counted from one."""
         products = run.products if self.counted else None
-        return run.iterations if products is None else products
+        return np.arange(1.0, run.rows + 1) if products is None else products
 
     def taken(self, kind: str) -> bool:
-        """Whether any run has a step of that kind."""
+        """Return whether any run has a step of that kind."""
         return any(c.steps(kind).any() for c in self.runs)
 
 
@@ -146,21 +137,16 @@ def unread(evidence: Evidence) -> list[str]:
 
 
 def _runs(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[SolverRun]:
+    """Yield the first stored history of each solver, as far as it can be read."""
     for outcome in row.values():
         for record in outcome.records:
-            history = _history(evidence, record)
+            history: History = {}
+            if record.vectors is not None:
+                with suppress(InputError):  # the journal alone must do
+                    history = load_history(evidence.directory, record.vectors)
             if history and next(iter(history.values())).size:
                 yield SolverRun(outcome=outcome, record=record, history=history)
                 break
-
-
-def _history(evidence: Evidence, record: Record) -> History:
-    if record.vectors is None:
-        return {}
-    try:
-        return load_history(evidence.directory, record.vectors)
-    except InputError:  # the journal alone must do
-        return {}
 
 
 def _importance(row: Mapping[str, Outcome]) -> tuple[float, float, float, str]:

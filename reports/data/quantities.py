@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import combinations
+from operator import itemgetter
 from typing import Any, NamedTuple
 
 from mortarbench.reports.data.cells import source
@@ -41,7 +42,7 @@ Leaves = dict[tuple[str, ...], Leaf]  #: by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Whether quantities are in SI units: those of elastic bodies are."""
+    """Return whether quantities are in SI units, as those of elastic bodies are."""
     return _STRESS in outcome.quantities
 
 
@@ -62,16 +63,16 @@ def known_digits(doubt: float, most: int) -> int:
 
 def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
     """List every scalar by its path, vectors by component, in their order."""
-    found: dict[tuple[str, ...], Leaf] = {}
+    found: Leaves = {}
     for name, value in outcome.quantities.items():
         if (name in SIZES) is sizes:
             found |= _flat((str(name),), value)
-    return {path: leaf for path, leaf in found.items() if path[-1] in _shown(path)}
-
-
-def _shown(path: tuple[str, ...]) -> tuple[str, ...]:
-    """Keep of each contact pair the one scalar that a table has room for."""
-    return (_PRESSURE,) if path[0] == _CONTACTS and len(path) > 1 else path
+    # of each contact pair a table has room for one scalar
+    return {
+        path: leaf
+        for path, leaf in found.items()
+        if path[0] != _CONTACTS or len(path) == 1 or path[-1] == _PRESSURE
+    }
 
 
 def _flat(path: tuple[str, ...], value: object) -> dict[tuple[str, ...], Leaf]:
@@ -111,11 +112,11 @@ def quantity(
         return Cell()
     if not isinstance(leaf.value, int | float):
         return Cell(text=clean(str(leaf.value), 40), kind="words")
-    others = [found.get(path) for found in peers]
     values = [
         o.value
-        for o in others
-        if o is not None and isinstance(o.value, int | float) and o.value == o.value
+        for found in peers
+        if (o := found.get(path)) and isinstance(o.value, int | float)
+        if o.value == o.value
     ] or [leaf.value]
     if isinstance(leaf.value, int):
         text = span((int(min(values)), int(max(values))))
@@ -135,7 +136,7 @@ def _rounded(leaf: Leaf, digits: int) -> str:
 
 
 class Spread(NamedTuple):
-    """How far the energies of verified answers to one physical case lie apart."""
+    """Energies of the verified answers to one physical case, and their differences."""
 
     answers: tuple[Outcome, ...]  #: of every solver and form; at least one
     relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
@@ -148,7 +149,7 @@ class Spread(NamedTuple):
 
     @property
     def digits(self) -> int:
-        """As many as the energies agree on and one more; alone, as tol promises."""
+        """Number of common digits of the energies, plus one; of one answer, by tol."""
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 
@@ -163,16 +164,12 @@ def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
     for o in outcomes:
         if o.verified and o.energy is not None:
             groups.setdefault((o.physical, o.tol), []).append(o)
-    return [_spread(tuple(group)) for group in groups.values()]
-
-
-def _spread(answers: tuple[Outcome, ...]) -> Spread:
-    pairs = list(combinations(answers, 2))
-    if not pairs:
-        return Spread(answers, None, None)
-    differences = [_difference(a, b) for a, b in pairs]
-    worst = max(range(len(pairs)), key=differences.__getitem__)
-    return Spread(answers, differences[worst], pairs[worst])
+    found = []
+    for group in groups.values():
+        apart = ((_difference(*pair), pair) for pair in combinations(group, 2))
+        widest = max(apart, key=itemgetter(0), default=(None, None))
+        found.append(Spread(tuple(group), *widest))
+    return found
 
 
 def _difference(a: Outcome, b: Outcome) -> float:
@@ -182,8 +179,7 @@ def _difference(a: Outcome, b: Outcome) -> float:
 
 def best_of(answers: Sequence[Outcome]) -> Outcome:
     """Take the answer with the smallest worst residual; names break ties."""
-    return min(answers, key=lambda o: (_residual(o), o.case, o.solver))
-
-
-def _residual(outcome: Outcome) -> float:
-    return float("inf") if outcome.worst is None else outcome.worst
+    return min(
+        answers,
+        key=lambda o: (math.inf if o.worst is None else o.worst, o.case, o.solver),
+    )

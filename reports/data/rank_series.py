@@ -1,9 +1,9 @@
 """One solve on several numbers of ranks: strong and weak scaling, as measured.
 
 Strong scaling is one case on more ranks. Weak scaling is a case that grows with the
-ranks, so that each has as much. Both are told of preparing and solving apart, and held
-against copies: what so many independent solves reach that run at the same time on the
-same machine, whose memory they share as ranks do.
+ranks, so that each has as much. Both are reported for preparing and solving apart, and
+compared with copies: what so many independent solves reach that run at the same time on
+the same machine, whose memory they share as ranks do.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from mortarbench.harness import Record
 from mortarbench.harness.registry import COPIES
-from mortarbench.harness.running.pairs import Block, Ratio, paired_ratio, unpaired_ratio
+from mortarbench.harness.running.pairs import paired_ratio, unpaired_ratio
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.data.size_series import held_keys
+from mortarbench.reports.data.size_series import alike, sized
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.cost_model import (
     Communication,
@@ -33,22 +34,32 @@ ALIKE = 0.05  #: dofs of a rank may differ by that much, relatively, in weak sca
 
 
 class Part(NamedTuple):
-    """What ranks spent, sent or held: medians over the repeats."""
+    """Seconds, counts or memory of ranks: medians over the repeats."""
 
     mean: float  #: of the ranks
     largest: float
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StrongSeries:
+class _Scaling:
+    """Verified answers of one solver on several numbers of ranks."""
+
+    solver: str  #: its label on one rank
+    copies: Mapping[int, Outcome]  #: by number, of so many independent solves at once
+    cpus: int | None  #: that the machine has, if known
+
+    def crowded(self, ranks: int) -> bool:
+        """Return whether ranks shared CPUs: such times do not extend to others."""
+        return self.cpus is not None and ranks > self.cpus
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StrongSeries(_Scaling):
     """Verified answers of one solver to one case on one rank and on several."""
 
     case: str
     tol: float
-    solver: str  #: its label on one rank
     answers: Mapping[int, Outcome]  #: by ranks, ascending; the first is one
-    copies: Mapping[int, Outcome]  #: of so many independent solves at once
-    cpus: int | None  #: that the machine has, if known
 
     @property
     def title(self) -> str:
@@ -61,29 +72,21 @@ class StrongSeries:
         """The numbers of ranks above one."""
         return tuple(self.answers)[1:]
 
-    def crowded(self, ranks: int) -> bool:
-        """Whether ranks had to share CPUs: their times say nothing about others."""
-        return self.cpus is not None and ranks > self.cpus
-
     def speed_up(self, ranks: int, phase: str) -> Interval | None:
         """Compare one rank with several: t(1)/t(N)."""
         return _ratio(self.answers[1], self.answers[ranks], phase)
 
     def efficiency(self, ranks: int, phase: str) -> Interval | None:
-        """Give the part of N-fold speed that is reached: t(1)/(N·t(N))."""
-        return _times(self.speed_up(ranks, phase), 1 / ranks)
+        """Return the part of N-fold speed that is reached: t(1)/(N·t(N))."""
+        return _ratio(self.answers[1], self.answers[ranks], phase, 1 / ranks)
 
     def reach(self, ranks: int, phase: str) -> Interval | None:
-        """Give what copies reach together, in solves of one rank: N·t(1)/t(copies)."""
-        if ranks not in self.copies:
-            return None
-        return _times(_ratio(self.answers[1], self.copies[ranks], phase), ranks)
+        """Return what copies reach together, in solves of one: N·t(1)/t(copies)."""
+        return _ratio(self.answers[1], self.copies.get(ranks), phase, ranks)
 
     def against_copies(self, ranks: int, phase: str) -> Interval | None:
-        """Give the part of the reach of copies: t(copies)/(N·t(N))."""
-        if ranks not in self.copies:
-            return None
-        return _times(_ratio(self.copies[ranks], self.answers[ranks], phase), 1 / ranks)
+        """Return the part of the reach of copies: t(copies)/(N·t(N))."""
+        return _ratio(self.copies.get(ranks), self.answers[ranks], phase, 1 / ranks)
 
     @cached_property
     def model(self) -> CostModel | None:
@@ -91,24 +94,20 @@ class StrongSeries:
 
         Ranks that shared CPUs are left out.
         """
-        seconds = {
-            n: [*blocks(o, "solve").values()]
-            for n, o in self.answers.items()
-            if not self.crowded(n)
-        }
-        free = [n for n, of in seconds.items() if of]
-        if len(free) < 2 or free[0] != 1:
+        seconds, copies = (
+            {
+                n: [*times.values()]
+                for n, o in of.items()
+                if not self.crowded(n) and (times := o.seconds_by_block("solve"))
+            }
+            for of in (self.answers, self.copies)
+        )
+        if len(seconds) < 2 or 1 not in seconds:
             return None
-        sent = [_communication(r) for r in self.answers[free[-1]].records]
+        sent = map(_communication, self.answers[max(seconds)].records)
         known = [c for c in sent if c is not None]
-        if not known:
-            return None
-        copies = {
-            n: of
-            for n in free
-            if n in self.copies and (of := [*blocks(self.copies[n], "solve").values()])
-        }
-        return cost_model({n: seconds[n] for n in free}, copies, known)
+        copies = {n: of for n, of in copies.items() if n in seconds}
+        return cost_model(seconds, copies, known) if known else None
 
     @property
     def most(self) -> int | None:
@@ -123,20 +122,20 @@ class Member(NamedTuple):
     dofs: int
     answer: Outcome
 
+    def growth(self, first: Member) -> float:
+        """Relate the dofs of a rank to those of the first case on one rank."""
+        return self.dofs / (self.ranks * first.dofs)
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class WeakSeries:
-    """Verified answers of one solver, each on ranks that have equally many dofs."""
+class WeakSeries(_Scaling):
+    """Verified answers of one solver, each on ranks that have equally many dofs.
+
+    Copies are those of the first case.
+    """
 
     title: str  #: family, parameters held, solver, tolerance
-    solver: str  #: its label on one rank
     members: tuple[Member, ...]  #: by ranks; the first is on one
-    copies: Mapping[int, Outcome]  #: of the first case, so many at once
-    cpus: int | None  #: that the machine has, if known
-
-    def crowded(self, ranks: int) -> bool:
-        """Whether ranks had to share CPUs."""
-        return self.cpus is not None and ranks > self.cpus
 
     def efficiency(self, member: Member, phase: str) -> Interval | None:
         """Compare with the first case on one rank: t(1)/t(N), 1 at best."""
@@ -144,138 +143,103 @@ class WeakSeries:
 
     def against_copies(self, member: Member, phase: str) -> Interval | None:
         """Compare with as many copies of the first case at once: t(copies)/t(N)."""
-        if member.ranks not in self.copies:
-            return None
-        return _ratio(self.copies[member.ranks], member.answer, phase, paired=False)
+        return _ratio(self.copies.get(member.ranks), member.answer, phase, paired=False)
 
 
 def strong_series(evidence: Evidence) -> list[StrongSeries]:
     """Find the cases that a solver was verified on with one rank and with several."""
     found = []
     for (case, tol), row in evidence.outcomes.items():
-        alone, copies = _by_ranks(row.values())
+        by_role: dict[str, dict[str, dict[int, Outcome]]] = {"": {}, COPIES: {}}
+        for o in row.values():
+            if o.verified and o.first.role in by_role:
+                of = by_role[o.first.role].setdefault(base_label(o), {})
+                of[o.first.ranks] = o
         found += [
             StrongSeries(
-                case=case, tol=tol, solver=solver, cpus=_cpus(evidence),
-                answers=dict(sorted(answers.items())), copies=copies.get(solver, {}),
+                case=case,
+                tol=tol,
+                solver=solver,
+                cpus=_cpus(evidence),
+                answers=dict(sorted(answers.items())),
+                copies=by_role[COPIES].get(solver, {}),
             )
-            for solver, answers in alone.items()
+            for solver, answers in by_role[""].items()
             if 1 in answers and len(answers) > 1
-        ]  # fmt: skip
+        ]
     return found
 
 
 def weak_series(evidence: Evidence) -> list[WeakSeries]:
     """Find cases that grow with the ranks: equally many dofs for each, within 5 %.
 
-    What else cases differ in is held, as in series of sizes (`size_series`).
+    Other parameters are held, as in series of sizes (`size_series`).
     """
-    groups: dict[tuple[Any, ...], list[Outcome]] = {}
-    sized = [(o, n) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
-    held = held_keys(sized)
-    for o, _ in sized:
-        kept = tuple((k, o.first.params.get(k)) for k in held[o.first.family])
-        key = (o.first.family, kept, o.first.form, base_label(o), o.tol)
-        groups.setdefault(key, []).append(o)
     found = []
-    for (family, kept, form, solver, tol), of in groups.items():
-        keys = [f"{k}={v}" for k, v in kept]
-        name = clean("/".join([family, *keys, *([form] * bool(form))]))
-        title = f"{name}, {clean(solver, 40)}, tol {tolerance(tol)}"
-        answers = [Member(o.first.ranks, n, o) for o, n in _sized(of, copies=False)]
-        copied = [o for o, _ in _sized(of, copies=True)]
-        alone = [m for m in answers if m.ranks == 1]
+    for key, of in alike(sized(evidence), base_label).items():
+        members = [Member(o.first.ranks, n, o) for n, o in of if not o.first.role]
+        alone = [m for m in members if m.ranks == 1]
         for first in sorted(alone, key=lambda m: m.dofs):
-            members = tuple(_grown(first, answers))
-            if len(members) > 1:
+            by_ranks = {1: [first]}
+            for m in sorted(members, key=lambda m: m.ranks):
+                if m.ranks > 1 and abs(m.growth(first) - 1) <= ALIKE:
+                    by_ranks.setdefault(m.ranks, []).append(m)
+            if len(by_ranks) > 1:
                 found.append(
                     WeakSeries(
-                        title=title, solver=solver, members=members,
+                        title=key.title,
+                        solver=key.solver,
+                        members=tuple(
+                            min(ms, key=lambda m: abs(m.growth(first) - 1))
+                            for ms in by_ranks.values()
+                        ),
                         cpus=_cpus(evidence),
                         copies={
                             o.first.ranks: o
-                            for o in copied
-                            if o.case == first.answer.case
+                            for _, o in of
+                            if o.first.role == COPIES and o.case == first.answer.case
                         },
                     )
-                )  # fmt: skip
+                )
     return found
 
 
-def _sized(of: Iterable[Outcome], *, copies: bool) -> list[tuple[Outcome, int]]:
-    chosen = (o for o in of if (o.first.role == COPIES) is copies)
-    return [
-        (o, n) for o in chosen if o.first.role in ("", COPIES) and (n := o.size("dofs"))
-    ]
-
-
-def _grown(first: Member, of: Iterable[Member]) -> Iterable[Member]:
-    """Choose, for every number of ranks, the case that is nearest to so many times."""
-    by_ranks: dict[int, list[Member]] = {1: [first]}
-    for m in of:
-        if m.ranks > 1 and abs(_growth(first, m) - 1) <= ALIKE:
-            by_ranks.setdefault(m.ranks, []).append(m)
-    for _, members in sorted(by_ranks.items()):
-        yield min(members, key=lambda m: abs(_growth(first, m) - 1))
-
-
-def _growth(first: Member, m: Member) -> float:
-    return m.dofs / (m.ranks * first.dofs)
-
-
 def base_label(o: Outcome) -> str:
-    """Give the label that a solver has on one rank."""
+    """Return the label that a solver has on one rank."""
     r = o.first
     word = "copies" if r.role == COPIES else "ranks"
     return o.solver.replace(f" {word}={r.ranks}", "", 1) if r.ranks > 1 else o.solver
 
 
-def _by_ranks(
-    row: Iterable[Outcome],
-) -> tuple[dict[str, dict[int, Outcome]], dict[str, dict[int, Outcome]]]:
-    """Group verified answers by solver and ranks: those on ranks, and copies."""
-    alone: dict[str, dict[int, Outcome]] = {}
-    copies: dict[str, dict[int, Outcome]] = {}
-    for o in row:
-        if o.verified and o.first.role in ("", COPIES):
-            of = copies if o.first.role == COPIES else alone
-            of.setdefault(base_label(o), {})[o.first.ranks] = o
-    return alone, copies
-
-
-def blocks(o: Outcome, phase: str) -> dict[Block, float]:
-    """Give the seconds of preparing or solving of each repeat that has them."""
-    found = {(r.session, r.repeat): getattr(r, f"{phase}_seconds") for r in o.records}
-    return {block: float(t) for block, t in found.items() if t}
-
-
 def _ratio(
-    a: Outcome, b: Outcome, phase: str, *, paired: bool = True
+    a: Outcome | None,
+    b: Outcome | None,
+    phase: str,
+    factor: float = 1.0,
+    *,
+    paired: bool = True,
 ) -> Interval | None:
     """Compare times of a with those of b; from one run each, without an interval.
 
+    factor : multiplies the ratio
     paired : whether blocks of the same name ran next to each other
     """
-    of_a, of_b = blocks(a, phase), blocks(b, phase)
+    if a is None or b is None:
+        return None
+    of_a, of_b = a.seconds_by_block(phase), b.seconds_by_block(phase)
     if not of_a or not of_b:
         return None
-    found: Ratio | None = paired_ratio(of_a, of_b) if paired else None
-    found = found or unpaired_ratio(of_a.values(), of_b.values())
-    if found is None:
-        value = median(of_a.values()) / median(of_b.values())
+    ratio = paired_ratio(of_a, of_b) if paired else None
+    ratio = ratio or unpaired_ratio(of_a.values(), of_b.values())
+    if ratio is None:
+        value = factor * median(of_a.values()) / median(of_b.values())
         return Interval(value, value, value, 0.0, 1)
-    return Interval(found.value, found.low, found.high, COVERAGE, found.pairs)
-
-
-def _times(interval: Interval | None, factor: float) -> Interval | None:
-    if interval is None:
-        return None
-    value, low, high = (factor * v for v in interval[:3])
-    return interval._replace(value=value, low=low, high=high)
+    value, low, high = (factor * v for v in ratio[:3])
+    return Interval(value, low, high, COVERAGE, ratio.pairs)
 
 
 def rank_parts(o: Outcome) -> dict[str, Part]:
-    """Give the seconds of the solve that ranks spent on each of its parts, by name."""
+    """Return the seconds that ranks spent on each part of the solve, by name."""
     return _parts(r.rank_seconds for r in o.records)
 
 
@@ -285,7 +249,7 @@ def rank_counts(o: Outcome) -> dict[str, Part]:
 
 
 def rank_memory(o: Outcome) -> Part | None:
-    """Give the peak memory of a rank, MiB."""
+    """Return the peak memory of a rank, MiB."""
     ends = ("mean", "largest")
     told = [[r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records]
     known = [of for of in told if all(isinstance(v, int | float) for v in of)]
@@ -304,7 +268,7 @@ def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
     }
 
 
-def _communication(r: Any) -> Communication | None:
+def _communication(r: Record) -> Communication | None:
     counts, network = r.rank_counts, r.rank_network
     counted = ("reductions", "messages", "bytes")
     timed = ("reduction_seconds", "message_seconds", "seconds_per_byte")
@@ -312,9 +276,12 @@ def _communication(r: Any) -> Communication | None:
         return None
     reductions, messages, sent = (float(counts[name][1]) for name in counted)
     return Communication(
-        ranks=r.ranks, reductions=reductions, messages=messages, sent=sent,
+        ranks=r.ranks,
+        reductions=reductions,
+        messages=messages,
+        sent=sent,
         **{name: float(network[name][0]) for name in timed},
-    )  # fmt: skip
+    )
 
 
 def _cpus(evidence: Evidence) -> int | None:

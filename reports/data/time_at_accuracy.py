@@ -44,7 +44,7 @@ class TimeAtAccuracy(NamedTuple):
 
 
 def counts(outcome: Outcome) -> bool:
-    """Whether an outcome is a point of its solver's curve."""
+    """Return whether an outcome is a point of its solver's curve."""
     limited = outcome.verdict in (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT)
     return (
         outcome.claims == ("solved",)

@@ -7,18 +7,17 @@ forms need, plus those of preparing and solving; assembling is the same for all.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from mortarbench.harness import Record
-from mortarbench.reports.data.comparison_groups import all_groups
+from mortarbench.reports.data.comparison_groups import all_groups, answers_of
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.fastest import (
     Competitor,
     FastestSolver,
     Finding,
-    answers_of,
     fastest_solvers,
 )
 
@@ -55,7 +54,7 @@ def compare_ways(evidence: Evidence) -> Ways:
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
         if not r.role:
-            problems.setdefault(problem_of(r), []).append(r)
+            problems.setdefault(r.case.removesuffix(f"/{r.form}"), []).append(r)
     differing = {
         name: records
         for name, records in problems.items()
@@ -71,21 +70,39 @@ def compare_ways(evidence: Evidence) -> Ways:
         for records in known.values()
         for r in records
     }
-    charged = _charged(evidence, known, ways)
+    charged = replace(
+        evidence,
+        records=arrange(
+            r.but(
+                case=name,
+                solver=Way(r.solver, r.form).label,
+                total_seconds=None
+                if r.total_seconds is None
+                else r.total_seconds + (r.dualise_seconds or 0.0),
+            )
+            for name, records in known.items()
+            for r in records
+        ),
+        suite={
+            **evidence.suite,
+            "solvers": sorted(
+                ways, key=lambda label: evidence.solvers.index(ways[label].solver)
+            ),
+        },
+    )
     groups = all_groups(charged, pool_forms=True)
     answers = answers_of(charged, pool_forms=True)
+
+    def named(competitors: Iterable[Competitor]) -> tuple[Competitor, ...]:
+        return tuple(replace(c, **ways[c.solver]._asdict()) for c in competitors)
+
     found = [
-        _named(one, ways)
-        for one in fastest_solvers(answers, groups)
-        if one.finding is not Finding.ALONE
+        replace(f, competitors=named(f.competitors), others=named(f.others))
+        for f in fastest_solvers(answers, groups)
+        if f.finding is not Finding.ALONE
     ]
     found.sort(key=lambda f: (f.kind.mode != "cold", f.kind.mode, f.kind.at))
     return Ways(found=tuple(found), uncharged=len(differing) - len(known))
-
-
-def problem_of(r: Record) -> str:
-    """Return the case name without its form."""
-    return r.case.removesuffix(f"/{r.form}")
 
 
 def _is_charged(r: Record) -> bool:
@@ -94,40 +111,3 @@ def _is_charged(r: Record) -> bool:
     Journals of older versions and cases emitted by ranks lack those of dualising.
     """
     return r.form == PRIMAL or r.total_seconds is None or r.dualise_seconds is not None
-
-
-def _charged(
-    evidence: Evidence,
-    problems: Mapping[str, list[Record]],
-    ways: Mapping[str, Way],
-) -> Evidence:
-    """Replace cases by problems, solvers by ways, and charge dualising."""
-    records = arrange(
-        r.but(
-            case=name,
-            solver=Way(r.solver, r.form).label,
-            total_seconds=None
-            if r.total_seconds is None
-            else r.total_seconds + (r.dualise_seconds or 0.0),
-        )
-        for name, of in problems.items()
-        for r in of
-    )
-    ordered = sorted(ways, key=lambda label: evidence.solvers.index(ways[label].solver))
-    return replace(
-        evidence, records=records, suite={**evidence.suite, "solvers": ordered}
-    )
-
-
-def _named(found: FastestSolver, ways: Mapping[str, Way]) -> FastestSolver:
-    """Replace the labels of ways by solver and form."""
-
-    def split(c: Competitor) -> Competitor:
-        way = ways[c.solver]
-        return replace(c, solver=way.solver, form=way.form)
-
-    return replace(
-        found,
-        competitors=tuple(map(split, found.competitors)),
-        others=tuple(map(split, found.others)),
-    )

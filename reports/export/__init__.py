@@ -1,1 +1,1 @@
-"""What was measured as files for other programs: CSV, Parquet and VTK."""
+"""Measurements as files for other programs: CSV, Parquet and VTK."""

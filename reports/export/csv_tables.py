@@ -28,7 +28,6 @@ from mortarbench.reports.data.evidence import RESIDUALS, Evidence, Outcome
 from mortarbench.reports.data.quantities import spreads
 from mortarbench.reports.data.size_series import SizeSeries, size_series
 from mortarbench.reports.export.parquet import texts
-from mortarbench.reports.statistics.intervals import PowerLaw
 from mortarbench.reports.statistics.profiles import performance_ratios
 
 _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
@@ -81,7 +80,7 @@ def _counted(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _measurements(records: Sequence[Record]) -> pd.DataFrame:
-    """Give every field of every record a column; what is nested is JSON text."""
+    """Tabulate the fields of records, a column each; nested ones are JSON text."""
     columns = {
         name: [getattr(r, f.name) for r in records] for name, f in JOURNAL.items()
     }
@@ -92,7 +91,8 @@ def _measurements(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def _outcome(o: Outcome) -> dict[str, Any]:
-    row: dict[str, Any] = {
+    least, most = o.iterations or (None, None)
+    return {
         "case": o.case,
         "form": o.first.form,
         "tol": o.tol,
@@ -100,40 +100,40 @@ def _outcome(o: Outcome) -> dict[str, Any]:
         "verdict": o.verdict.value,
         "claimed": "; ".join(o.claims),
         "repeats": len(o.records),
+        **{
+            f"{phase}_seconds_{name}": getattr(o.seconds(phase), part, None)
+            for phase in ("prepare", "solve", "total")
+            for name, part in (("median", "value"), ("low", "low"), ("high", "high"))
+        },
+        "interval_coverage": getattr(o.seconds("total"), "coverage", None),
+        "iterations_min": least,
+        "iterations_max": most,
+        **{name: o.largest(name) for name in (*RESIDUALS, "energy_bound")},
+        "energy": o.energy,
+        "n": o.size("dofs"),
+        "m": o.size("equality_rows", "contact_rows"),
+        "run_ids": " ".join(o.run_ids),
     }
-    for phase in ("prepare", "solve", "total"):
-        interval = o.seconds(phase)
-        for part in ("value", "low", "high"):
-            name = "median" if part == "value" else part
-            value = getattr(interval, part) if interval else None
-            row[f"{phase}_seconds_{name}"] = value
-    interval = o.seconds("total")
-    row["interval_coverage"] = interval.coverage if interval else None
-    row["iterations_min"], row["iterations_max"] = o.iterations or (None, None)
-    row |= {name: o.largest(name) for name in (*RESIDUALS, "energy_bound")}
-    row["energy"] = o.energy
-    row["n"] = o.size("dofs")
-    row["m"] = o.size("equality_rows", "contact_rows")
-    row["run_ids"] = " ".join(o.run_ids)
-    return row
 
 
 def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
-    row: dict[str, Any] = {
+    laws = {
+        f"{what}{'_against_m' * (size == 'm')}": law(solver, size)
+        for what, law in (
+            ("time", series.time_law), ("iterations", series.iteration_law)
+        )
+        for size in ("n", "m")
+    }  # fmt: skip
+    return {
         "ladder": series.title,
         "solver": solver,
         "sizes": len(series.curve(solver)),
+        **{
+            f"{what}_{part}": getattr(law, part, None)
+            for what, law in laws.items()
+            for part in ("exponent", "low", "high", "factor")
+        },
     }
-    laws: dict[str, PowerLaw | None] = {
-        "time": series.time_law(solver),
-        "time_against_m": series.time_law(solver, "m"),
-        "iterations": series.iteration_law(solver),
-        "iterations_against_m": series.iteration_law(solver, "m"),
-    }
-    for what, law in laws.items():
-        for part in ("exponent", "low", "high", "factor"):
-            row[f"{what}_{part}"] = getattr(law, part) if law else None
-    return row
 
 
 def comparison_tables(
@@ -173,25 +173,21 @@ def _cells(group: ComparisonGroup) -> pd.DataFrame:
 def _means(ranking: Ranking) -> list[dict[str, Any]]:
     """One row per convention and solver."""
     group = ranking.group
-    usual: dict[str, Any] = {
-        "low": ranking.intervals[0],
-        "high": ranking.intervals[1],
-    }
+    usual: dict[str, Any] = dict(zip(("low", "high"), ranking.intervals, strict=True))
     names = ("ratio", "ratio_low", "ratio_high")
     usual |= dict(zip(names, ranking.ratios, strict=True))
     usual |= {"p_best": ranking.first, "tier": ranking.tiers}
     rows = []
     for convention in (*EVERY, Convention(common=True)):
-        found = means_by(group, convention)
-        ranked = ranks(found)
-        more = usual if convention == USUAL else {}
-        for i, solver in enumerate(_spelt(group.solvers)):
-            rows.append(
-                {"contest": group.title, "solver": solver}
-                | vars(convention)
-                | {"mean": found[i], "rank": ranked[i]}
-                | {name: values[i] for name, values in more.items()}
-            )
+        means = means_by(group, convention)
+        columns = {"mean": means, "rank": ranks(means)}
+        columns |= usual if convention == USUAL else {}
+        rows += [
+            {"contest": group.title, "solver": solver}
+            | vars(convention)
+            | {name: values[i] for name, values in columns.items()}
+            for i, solver in enumerate(_spelt(group.solvers))
+        ]
     return rows
 
 

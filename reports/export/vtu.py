@@ -6,7 +6,8 @@ Beside every .vtu there is a CSV along each contact of the state.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -44,10 +45,15 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
         When the file cannot be written.
 
     """
+    nodes = len(fields.points)
     forces = np.zeros_like(fields.displacement, dtype=float)
     if fields.contact_nodes is not None and fields.contact_forces is not None:
         forces[fields.contact_nodes] = fields.contact_forces
-    touching = _in_contact(fields, forces)
+    sizes = np.linalg.norm(forces, axis=1)
+    least = IN_CONTACT * float(sizes.max(initial=0.0))
+    touching = np.zeros(nodes, dtype=bool) if fields.contacts else sizes > least
+    for side in fields.contacts:
+        touching[side.nodes] |= side.pressed(least)
     of_cells = {"body": fields.bodies}
     if fields.subdomains is not None:
         of_cells["subdomain"] = fields.subdomains
@@ -59,7 +65,7 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
             "displacement": _in_space(fields.displacement),
             "contact_force": _in_space(forces),
             "in_contact": touching.astype(np.int32),
-            **_along_sides(fields),
+            **_along_sides(fields.contacts, nodes),
             **fields.nodal,
         },
         cell_data={
@@ -67,53 +73,49 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
             for name, v in of_cells.items()
         },
     )
-    try:
+    with _named(path):
         mesh.write(path, file_format="vtu")
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
     return [path, *(_write_side(fields, side, path) for side in fields.contacts)]
 
 
-def _in_contact(fields: Fields, forces: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Mark the nodes (N,) that are pressed; forces: on the nodes, (N, dim)."""
-    sizes = np.linalg.norm(forces, axis=1)
-    least = IN_CONTACT * float(sizes.max(initial=0.0))
-    if not fields.contacts:
-        return np.asarray(sizes > least)
-    touching = np.zeros(len(sizes), dtype=np.bool_)
-    for side in fields.contacts:
-        touching[side.nodes] |= side.pressed(least)
-    return touching
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the file in the message of a write that fails."""
+    try:
+        yield
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
 
 
-def _along_sides(fields: Fields) -> dict[str, Vector]:
+def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
     """Put pressures and gaps at the nodes (N,); of several, the tightest.
 
     With friction the shear, too, and the place of a node's state in `STATES`.
     """
-    if not fields.contacts:
+    if not sides:
         return {}
-    pressure, gap = np.zeros(len(fields.points)), np.full(len(fields.points), np.nan)
-    for side in fields.contacts:
+    pressure, gap, shear = np.zeros(nodes), np.full(nodes, np.nan), np.zeros(nodes)
+    weight = np.zeros(nodes, dtype=np.int64)
+    for side in sides:
         np.maximum.at(pressure, side.nodes, side.pressure)
         np.fmin.at(gap, side.nodes, side.gap)
-    rough = [side for side in fields.contacts if side.friction is not None]
-    if not rough:
-        return {"pressure": pressure, "gap": gap}
-    shear = np.zeros(len(fields.points))
-    weight = np.zeros(len(fields.points), dtype=np.int64)
-    for side in rough:
-        assert side.shear is not None
-        shear[side.nodes] += side.shear
-        weights = [_BY_WEIGHT.index(str(told)) for told in np.asarray(side.friction)]
-        np.maximum.at(weight, side.nodes, weights)
-    state = np.array([float(STATES.index(told)) for told in _BY_WEIGHT])[weight]
-    return {"pressure": pressure, "gap": gap, "shear": shear, "friction": state}
+        if side.friction is not None:
+            assert side.shear is not None
+            shear[side.nodes] += side.shear
+            states = map(str, np.asarray(side.friction))
+            np.maximum.at(weight, side.nodes, [_BY_WEIGHT.index(s) for s in states])
+    found = {"pressure": pressure, "gap": gap}
+    if any(side.friction is not None for side in sides):
+        state = np.array([float(STATES.index(name)) for name in _BY_WEIGHT])[weight]
+        found |= {"shear": shear, "friction": state}
+    return found
 
 
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
     """Write one contact as a table, a row per node along the slave side."""
-    path = vtu.with_name(f"{vtu.stem}-{_spelt(side.name)}.csv")
+    # fit for a file: letters, digits and dashes
+    name = "-".join(re.findall(r"\w+", side.name)) or "contact"
+    path = vtu.with_name(f"{vtu.stem}-{name}.csv")
     points = fields.points[side.nodes]
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     u, axes = fields.displacement[side.nodes], "xyz"[: fields.dim]
@@ -126,26 +128,19 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
         **{f"force_{axis}_{unit}": side.force[:, k] for k, axis in enumerate(axes)},
         "pressure_Pa": side.pressure,
         "gap_m": side.gap,
-        **({} if side.shear is None else {"shear_Pa": side.shear}),
-        **({} if side.friction is None else {"friction": side.friction}),
+        "shear_Pa": side.shear,
+        "friction": side.friction,
     }
-    rows = zip(*(map(_known, v.tolist()) for v in columns.values()), strict=True)
-    try:
-        with replacing(path) as file:
-            file.write(csv_text([*columns], rows).encode())
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    known = {head: v.tolist() for head, v in columns.items() if v is not None}
+    rows = zip(*(map(_known, values) for values in known.values()), strict=True)
+    with _named(path), replacing(path) as file:
+        file.write(csv_text([*known], rows).encode())
     return path
 
 
 def _known(value: float | str) -> float | str | None:
     """Replace a NaN, where there is no such number, by None."""
     return None if value != value else value
-
-
-def _spelt(name: str) -> str:
-    """Make a name fit for a file: letters, digits and dashes."""
-    return "-".join(re.findall(r"\w+", name)) or "contact"
 
 
 def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Path]:
@@ -168,11 +163,8 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
         '<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">',
         "  <Collection>", *lines, "  </Collection>", "</VTKFile>", "",
     ])  # fmt: skip
-    try:
-        with replacing(path) as file:
-            file.write(text.encode())
-    except OSError as e:
-        raise InputError(f"{path}: cannot be written: {e.strerror}") from None
+    with _named(path), replacing(path) as file:
+        file.write(text.encode())
     return [path, *written]
 
 

@@ -1,13 +1,13 @@
-"""How solvers converge and find the active set, from their histories."""
+"""Convergence of solvers and of their active sets, from their histories."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from math import ceil, hypot, log10
+from math import ceil, hypot
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.reports.data.histories import CaseHistories, SolverRun
@@ -17,8 +17,6 @@ from mortarbench.reports.document.figure import (
     Axis,
     Figure,
     Key,
-    Legend,
-    Limits,
     Look,
     Panel,
     Row,
@@ -48,13 +46,17 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
     """Draw projected gradient and infeasibility over the work; None without either."""
     gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
     errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
-    tol = c.runs[0].outcome.tol
     rows = []
     if gradients:
         panel = _curves(c, gradients, r"$\|g^P\|\,/\,\|g^P_0\|$")
         rows.append(Row(panels=(panel,), height=2.6))
     if errors:
-        panel = _curves(c, errors, r"$\|Ax-b\|$, relative", tol)
+        tol = c.runs[0].outcome.tol
+        name = Text(text="tol", place=(1, tol), inside=(True, False), offset=(3, 0))
+        panel = _curves(
+            c, errors, r"$\|Ax-b\|$, relative", texts=(name,),
+            rules=(Rule(axis="y", at=tol, look=_TOLERANCE),),
+        )  # fmt: skip
         rows.append(Row(panels=(panel,), height=1.9))
     if not rows:
         return None
@@ -79,28 +81,22 @@ def active_set_figure(c: CaseHistories) -> Figure | None:
 
     Below them those of components between two bounds, where there are some.
     """
-    counts = [(one, n) for one in c.runs if (n := one.active) is not None]
-    if not counts:
+    if all(run.numbers("active") is None for run in c.runs):
         return None
-    slipping = [(one, n) for one in c.runs if (n := one.two_sided) is not None]
-    rows = [Row(panels=(_counts(c, counts, "active bounds"),), height=2.2)]
-    if slipping:
-        panel = _counts(c, slipping, "of two bounds")
-        rows.append(Row(panels=(panel,), height=1.6))
-    return _figure(c, rows, [run for run, _ in counts])
-
-
-def _counts(c: CaseHistories, counts: Curves, label: str) -> Panel:
-    """Draw numbers of components over the work, as steps."""
-    most = max(*(float(np.nanmax(n)) for _, n in counts), 1.0)
-    return Panel(
-        x=_work(c),
-        y=Axis(label=label, low=0, high=1.06 * most, most=6, integers=True),
-        marks=tuple(
-            replace(_line(c, run, c.work(run), active), step=True)
-            for run, active in counts
-        ),
-    )
+    rows = []
+    for name, label, height in (
+        ("active", "active bounds", 2.2),
+        ("two_sided", "of two bounds", 1.6),
+    ):
+        counts = [(run, n) for run in c.runs if (n := run.numbers(name)) is not None]
+        if counts:
+            most = max(*(float(np.nanmax(n)) for _, n in counts), 1.0)
+            axis = Axis(label=label, low=0, high=1.06 * most, most=6, integers=True)
+            lines = (replace(_line(c, run, c.work(run), n), step=True)
+                     for run, n in counts)  # fmt: skip
+            panel = Panel(x=_work(c), y=axis, marks=tuple(lines))
+            rows.append(Row(panels=(panel,), height=height))
+    return _figure(c, rows, [r for r in c.runs if r.numbers("active") is not None])
 
 
 def marked(c: CaseHistories) -> list[str]:
@@ -125,9 +121,18 @@ def _figure(
         stack[i] = replace(row, panels=(replace(panel, x=axis),))
     lines = ceil((len(c.runs) + len(marked(c))) / COLUMNS)
     height = sum(row.height for row in stack) + 0.5 + 0.2 * lines + TITLE
+    keys = []
+    for run in runs:
+        outcome, style = run.outcome, _style(c, run)
+        verdict = "" if outcome.verified else f" ({VERDICTS[outcome.verdict][1]})"
+        label = legible(outcome.solver) + verdict
+        keys.append(Key(label=label, look=style, solver=outcome.solver))
+    for letter, name, marker in kinds:
+        if c.taken(letter):
+            keys.append(Key(label=name, look=_mark(marker, INK)))
     one = c.runs[0].outcome
     return Figure(
-        rows=tuple(stack), height=height, legend=_legend(c, runs, kinds),
+        rows=tuple(stack), height=height, legend=below(keys, COLUMNS),
         title=legible(f"{one.case}, tol {tolerance(one.tol)}", 96),
     )  # fmt: skip
 
@@ -161,24 +166,14 @@ def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
     return Panel(x=_work(c), y=axis, marks=marks, grid="none")
 
 
-def _curves(
-    c: CaseHistories, drawn: Curves, label: str, tol: float | None = None
-) -> Panel:
-    """Make curves of positive values on a logarithmic axis; a rule where tol is."""
+def _curves(c: CaseHistories, drawn: Curves, label: str, **more: Any) -> Panel:
+    """Draw curves of positive values on a logarithmic axis, and what else is shown."""
     marks = []
     for run, values in drawn:
-        seen = _positive(values)
+        seen = values > 0  # NaN is not
         marks.append(_line(c, run, c.work(run)[seen], values[seen]))
-    rules, texts = [], []
-    if tol is not None:
-        rules.append(Rule(axis="y", at=tol, look=_TOLERANCE))
-        texts.append(
-            Text(text="tol", place=(1, tol), inside=(True, False), offset=(3, 0))
-        )
     axis = Axis(label=label, log=True, most=8)
-    panel = Panel(
-        x=_work(c), y=axis, marks=tuple(marks), rules=tuple(rules), texts=tuple(texts)
-    )
+    panel = Panel(x=_work(c), y=axis, marks=tuple(marks), **more)
     low, high = limits([panel], "y")
     floor = min(FLOOR * drawn[0][0].outcome.tol, high / 10)
     return replace(panel, y=replace(axis, low=max(low, floor), high=high))
@@ -195,48 +190,31 @@ def _steps(
     c: CaseHistories, run: SolverRun, values: Vector, panel: Panel, height: float
 ) -> list[Series]:
     """Mark the kinds of steps on a curve, except where marks would overlap."""
-    size = 72 * (WIDTH - _BESIDE), 72 * height  # points
-    ends = limits([panel], "x"), limits([panel], "y")
-    logs = panel.x.log, panel.y.log
     made = []
+    ends = limits([panel], "x"), limits([panel], "y")
+    sizes = 72 * (WIDTH - _BESIDE), 72 * height  # points
     for letter, _, marker in KINDS:
-        at = np.flatnonzero(run.steps(letter) & _positive(values))
+        at = np.flatnonzero(run.steps(letter) & (values > 0))
         xy = np.column_stack([c.work(run)[at], values[at]])
         if panel.x.log:
             xy = xy[xy[:, 0] > 0]
-        places = [tuple(map(_place, point, ends, logs, size)) for point in xy.tolist()]
-        kept = xy[_apart(places)]
-        if kept.size:
+        places = []
+        for column, axis, along, size in zip(
+            xy.T, (panel.x, panel.y), ends, sizes, strict=True
+        ):
+            scale = np.log10 if axis.log else np.asarray
+            low, high = scale(along)
+            places.append(size * (scale(column) - low) / (high - low))
+        kept = list[int]()
+        for i, (x, y) in enumerate(zip(*places, strict=True)):
+            if not kept or hypot(
+                x - places[0][kept[-1]], y - places[1][kept[-1]]
+            ) >= CLOSEST:  # fmt: skip
+                kept.append(i)
+        if kept:
             style = _mark(marker, _style(c, run).colour)
-            made.append(replace(_line(c, run, *kept.T), look=style))
+            made.append(replace(_line(c, run, *xy[kept].T), look=style))
     return made
-
-
-def _place(value: float, ends: Limits, log: bool, size: float) -> float:
-    """Find how far along an axis of that size a value lies."""
-    low, high, at = (log10(v) for v in (*ends, value)) if log else (*ends, value)
-    return size * (at - low) / (high - low)
-
-
-def _apart(places: Sequence[tuple[float, ...]]) -> list[int]:
-    """Choose points, the first one first, none closer than CLOSEST to the one before.
-
-    places : of (x, y) in points of typography
-    """
-    kept: list[int] = []
-    for i, (x, y) in enumerate(places):
-        if not kept:
-            kept.append(i)
-            continue
-        before = places[kept[-1]]
-        if hypot(x - before[0], y - before[1]) >= CLOSEST:
-            kept.append(i)
-    return kept
-
-
-def _positive(values: Vector) -> NDArray[np.bool_]:
-    """Tell what has a logarithm."""
-    return values > 0  # NaN is not
 
 
 def _style(c: CaseHistories, run: SolverRun) -> Look:
@@ -249,25 +227,3 @@ def _mark(marker: str, colour: str) -> Look:
         colour=colour, marker=marker, dash=None, size=3.2, edge=0.7,
         fill="none" if marker == "^" else "",
     )  # fmt: skip
-
-
-def _legend(
-    c: CaseHistories,
-    runs: Sequence[SolverRun],
-    kinds: Sequence[tuple[str, str, str]],
-) -> Legend:
-    """Name the solvers, with the verdict where it is not good, and the marks."""
-    keys = [
-        Key(label=_name(run), look=_style(c, run), solver=run.outcome.solver)
-        for run in runs
-    ]
-    for letter, name, marker in kinds:
-        if c.taken(letter):
-            keys.append(Key(label=name, look=_mark(marker, INK)))
-    return below(keys, COLUMNS)
-
-
-def _name(run: SolverRun) -> str:
-    outcome = run.outcome
-    verdict = "" if outcome.verified else f" ({VERDICTS[outcome.verdict][1]})"
-    return legible(outcome.solver) + verdict

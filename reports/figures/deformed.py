@@ -56,7 +56,7 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Say where the colours end and the largest stress, Pa; None without stress."""
+    """Return the end of the colours and the largest stress, Pa; None without stress."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -115,7 +115,8 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     scale = automatic_scale(fields) if scale is None else scale
     points = moved(fields, scale)
     loaded = _loaded(fields)
-    low, high = _box(fields, points)
+    both = np.vstack([fields.points, points])
+    low, high = both.min(axis=0), both.max(axis=0)
     width, height = high - low
     pad = 0.02 * width
     drawn = min(_WIDTH * (height + 2 * pad) / (width + 2 * pad), _TALLEST)
@@ -129,13 +130,23 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     corners = low - pad, high + pad
     span = float((high - low).max())
     letters = [f"({chr(ord('b') + i)})" for i in range(len(loaded))]
-    frames = [
-        mark
-        for letter, contact in zip(letters, loaded, strict=True)
-        for mark in _frame(
-            letter, _window(points[contact.nodes[contact.closed]], span), corners
+    frames = list[
+        FieldMark
+    ]()  # outlines of the enlargements, as far as they lie within
+    for letter, contact in zip(letters, loaded, strict=True):
+        window = _window(points[contact.nodes[contact.closed]], span)
+        (x0, y0), (x1, y1) = (
+            within(one, other)
+            for within, one, other in zip(
+                (np.maximum, np.minimum), window, corners, strict=True
+            )
         )
-    ]
+        at = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+        frames += [
+            Polygons(corners=(at,), edge=_ARROW, width=0.8, cased=True),
+            Label(text=letter, place=_pair(at[2]), offset=(3, 0), align=("left", "top"),
+                  colour=_ARROW, cased=True),
+        ]  # fmt: skip
     bands = [mark for contact in loaded for mark in _bands(contact, points)]
     there = moved(fields)  # enlarged by more, bodies in contact would overlap
     near = (
@@ -150,12 +161,12 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
         "dashed: undeformed",
         **_axes(span),
     )  # fmt: skip
-    windows = [
-        _enlarged((*near, *_bands(contact, there)),
-                  f"{letter} {_listed(contact.name, truly)}", contact,
-                  there[contact.nodes], span)
-        for letter, contact in zip(letters, loaded, strict=True)
-    ]  # fmt: skip
+    windows = []
+    for letter, contact in zip(letters, loaded, strict=True):
+        words = ", ".join(filter(None, (contact.name, truly)))
+        title = f"{letter} {words}: " if words else f"{letter} "
+        marks, tips = (*near, *_bands(contact, there)), there[contact.nodes]
+        windows.append(_enlarged(marks, title, contact, tips, span))
     return FieldFigure(
         panels=(overview, *windows),
         height=drawn + 0.55 + len(windows) * (enlarged + 0.69),
@@ -194,12 +205,6 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
 
 def _pair(point: Vector) -> tuple[float, float]:
     return float(point[0]), float(point[1])
-
-
-def _box(fields: Fields, points: Points) -> tuple[Vector, Vector]:
-    """Lower left and upper right corner of the bodies, before and after."""
-    both = np.vstack([fields.points, points])
-    return both.min(axis=0), both.max(axis=0)
 
 
 def _scale(fields: Fields) -> ColourScale | None:
@@ -297,12 +302,6 @@ def _axes(span: float) -> dict[str, Any]:
     return {"xlabel": f"$x$ in {name}", "ylabel": f"$y$ in {name}", "unit": unit}
 
 
-def _listed(*words: str) -> str:
-    """Join what a title begins with; empty where that is nothing."""
-    given = ", ".join(filter(None, words))
-    return f"{given}: " if given else ""
-
-
 def _loaded(fields: Fields) -> list[_Loaded]:
     """List the contacts that carry load; all as one where they are not told apart."""
     told = [
@@ -315,21 +314,15 @@ def _loaded(fields: Fields) -> list[_Loaded]:
     for name, nodes, forces, friction in told:
         states = np.full(len(nodes), "") if friction is None else friction
         size, apart = np.hypot(*forces.T), states == SLIDING
-        if (active := size > _ACTIVE * size.max(initial=0.0)).any():
+        active = size > _ACTIVE * size.max(initial=0.0)
+        if active.any():
             active |= apart
+            pairs = np.column_stack([nodes[:-1], nodes[1:]])
+            sliding = np.vstack([pairs[apart[:-1]], pairs[apart[1:]][:, ::-1]])
             found.append(
-                _Loaded(name, nodes[active], forces[active], states[active],
-                        _neighbours(np.asarray(nodes), apart))
-            )  # fmt: skip
+                _Loaded(name, nodes[active], forces[active], states[active], sliding)
+            )
     return found
-
-
-def _neighbours(
-    nodes: NDArray[np.int64], chosen: NDArray[np.bool_]
-) -> NDArray[np.int64]:
-    """Pair chosen nodes of a side with the one before and the one after (j, 2)."""
-    pairs = np.column_stack([nodes[:-1], nodes[1:]])
-    return np.vstack([pairs[chosen[:-1]], pairs[chosen[1:]][:, ::-1]])
 
 
 def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
@@ -383,20 +376,4 @@ def _enlarged(
         title=f"{title}contact forces on the slave nodes; the largest is "
         f"{largest / factor:.3g} {prefix}N/m{key}",
         **_axes(span),
-    )  # fmt: skip
-
-
-def _frame(
-    letter: str, window: tuple[Vector, Vector], panel: tuple[Vector, Vector]
-) -> tuple[FieldMark, ...]:
-    """Outline an enlargement in the overview, as far as it lies within."""
-    (low, high), (least, most) = window, panel
-    (x0, y0), (x1, y1) = np.maximum(low, least), np.minimum(high, most)
-    corners = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-    return (
-        Polygons(corners=(corners,), edge=_ARROW, width=0.8, cased=True),
-        Label(
-            text=letter, place=_pair(corners[2]), offset=(3, 0), align=("left", "top"),
-            colour=_ARROW, cased=True,
-        ),
     )  # fmt: skip

@@ -9,26 +9,24 @@ from dataclasses import replace
 import numpy as np
 
 from mortarbench.harness.running.pairs import Ratio
+from mortarbench.reports.data.comparison_groups import time_of
 from mortarbench.reports.data.evidence import case_set
-from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding, time_of
+from mortarbench.reports.data.fastest import Competitor, FastestSolver, Finding
 from mortarbench.reports.document.figure import (
     INK,
     Axis,
     Figure,
-    Intervals,
     Look,
     Mark,
     Panel,
     Row,
     Rule,
-    Series,
     Text,
     categories,
     limits,
-    numbers,
 )
 from mortarbench.reports.document.formatting import VERDICTS, clean
-from mortarbench.reports.figures.style import legible, look, run_ids
+from mortarbench.reports.figures.style import curve, legible, look
 
 PANELS = 4  #: forms that are drawn
 SOLVERS = 12  #: of a panel
@@ -37,6 +35,7 @@ _ROW = 0.3  #: height of a solver, inches
 _BESIDE = 0.24  #: from a mean to the cases that it is of, rows
 _TALL = 0.38  #: where ratios and a verdict share one, inches
 _RAISED, _BELOW = 0.16, 0.32  #: of ratios above a verdict, and it below them, rows
+_BARS = {"cap": 0.0, "width": 1.1}
 _ALIKE = Look(colour=INK, width=0.8)  #: the line where times are equal
 
 
@@ -126,7 +125,7 @@ def _short(name: str) -> str:
 
 
 def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
-    """Give all ratios one scale that holds 0.8 and 2."""
+    """Scale all ratios alike, on an axis that contains 0.8 and 2."""
     ratios = [p for p in panels if p.x.log]
     if not ratios:
         return list(panels)
@@ -144,60 +143,39 @@ def _has_reference(f: FastestSolver) -> bool:
 def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]:
     """Mark the ratios of one solver to the first, case by case and over the cases."""
     if c is f.first:
-        return [_points([1.0], [y], [_behind(c, f.cases)], c, style)]
+        return [*curve([(1.0, y, _behind(c, f.cases))], style, c.solver, clipped=False)]
     count = len(c.compared)
     middle = c.ratio if f.over_cases else None
     spread = np.linspace(0.25, -0.25, count) if count > 1 else np.zeros(count)
     places = np.full(count, y + (_BESIDE if middle else 0.0))
     places += 0 if f.over_cases else spread
     small = replace(style, size=2.8, opacity=0.6) if f.over_cases else style
-    marks: list[Mark] = []
-    if count:
-        ratios = [_ratio(c, f, case) for case in c.compared]
-        runs = [_behind(c, [case]) for case in c.compared]
-        known = [None if f.over_cases else c.by_case.get(case) for case in c.compared]
-        marks.append(_points(ratios, places, runs, c, small, known))
-    if middle:
-        runs = [_behind(c, c.compared)]
-        marks.append(_points([middle.value], [y], runs, c, style, [middle]))
-    return marks
+    cases = [
+        (_ratio(c, f, case), place, _behind(c, [case]))
+        for case, place in zip(c.compared, places, strict=True)
+    ]
+    over = (middle, y, _behind(c, c.compared))
+    return [
+        *curve(cases, small, c.solver, _BARS, clipped=False),
+        *curve([over], style, c.solver, _BARS, clipped=False),
+    ]
 
 
 def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
     """Name the measurements of a solver on some cases."""
-    return run_ids(r for case in cases for r in c.outcomes[case].records)
+    return tuple(name for case in cases for name in c.outcomes[case].run_ids)
 
 
-def _ratio(c: Competitor, f: FastestSolver, case: str) -> float:
+def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
     """Ratio of a case: of medians where cases are averaged, else within blocks."""
     if case in c.by_case and not f.over_cases:
-        return c.by_case[case].value
+        return c.by_case[case]
     mine, its = time_of(c.outcomes[case]), time_of(f.first.outcomes[case])
     return mine / its if mine and its else np.nan
 
 
-def _points(
-    x: Sequence[float],
-    y: Iterable[float],
-    runs: Sequence[tuple[str, ...]],
-    c: Competitor,
-    style: Look,
-    known: Sequence[Ratio | None] = (),
-) -> Series:
-    """Make a series of ratios with their intervals, where they have one."""
-    bars = None
-    if any(known):
-        low = numbers([i.low if i else np.nan for i in known])
-        high = numbers([i.high if i else np.nan for i in known])
-        bars = Intervals(low=low, high=high, along="x", cap=0.0, width=1.1)
-    return Series(
-        x=numbers(x), y=numbers(list(y)), runs=tuple(runs), look=style, intervals=bars,
-        solver=c.solver, clipped=False,
-    )  # fmt: skip
-
-
 def _failure(c: Competitor) -> str:
-    """Say which verdict most of the answers ended in that were not verified."""
+    """Name the most frequent verdict of the answers that were not verified."""
     count = Counter(o.verdict for o in c.outcomes.values() if time_of(o) is None)
     if not count:
         return ""

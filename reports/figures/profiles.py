@@ -14,7 +14,6 @@ from mortarbench.reports.document.figure import (
     Area,
     Axis,
     Figure,
-    Key,
     Look,
     Mark,
     Panel,
@@ -24,7 +23,15 @@ from mortarbench.reports.document.figure import (
     numbers,
 )
 from mortarbench.reports.document.formatting import plural
-from mortarbench.reports.figures.style import LEGEND_LINE, TITLE, below, legible, look
+from mortarbench.reports.figures.style import (
+    LEGEND_LINE,
+    TITLE,
+    below,
+    legible,
+    look,
+    solver_keys,
+    with_legend,
+)
 from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
 ROW = 4  #: solvers that are told apart in one panel, with their bands
@@ -72,7 +79,7 @@ def rivals(ranking: Ranking) -> list[int]:
 
 
 def banded(ranking: Ranking) -> bool:
-    """Whether `profile_figure` has bands; `pairwise_figure` always has."""
+    """Return whether `profile_figure` has bands; `pairwise_figure` always has."""
     group = ranking.group
     return len(group.solvers) <= 2 or len(group.cases) >= BANDED
 
@@ -89,30 +96,25 @@ def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
     for mine in found:
         last = mine is found[-1]
         names = [group.solvers[i] for i in mine]
-        left: list[Mark] = []
-        right: list[Mark] = []
-        for values, ends, marks in (
-            (ratios, factors, left),
-            (group.times, times, right),
-        ):
-            others = sorted(set(range(len(group.solvers))) - set(mine))
+        others = sorted(set(range(len(group.solvers))) - set(mine))
+        left, right = list[Mark](), list[Mark]()
+        for values, ends, marks in (ratios, factors, left), (group.times, times, right):
             marks += [_grey(values[:, i], ends, group.solvers[i]) for i in others]
             for i, name in zip(mine, names, strict=True):
-                style = look(solvers.index(name))
-                band = banded(ranking)
+                style, band = look(solvers.index(name)), banded(ranking)
                 marks += _profile(values[:, i], ends, style, name, band=band)
         panels = (
             _panel(_factors("time / best time of the case" * last, factors), left),
             _panel(_log("time in s" * last, times), right, first=False),
         )
-        keys = [_key(name, look(solvers.index(name))) for name in names]
+        keys = solver_keys(names, solvers)
         # the last row has the labels of the axes, too
         height = 1.9 + LEGEND_LINE * (2 if last else 1)
         rows.append(Row(panels=panels, height=height, legend=below(keys, ROW)))
     return Figure(
         rows=tuple(rows),
         height=TITLE + sum(row.height for row in rows),
-        title=_title(ranking),
+        title=legible(_title(ranking), 96),
     )
 
 
@@ -134,11 +136,10 @@ def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
         marks += _profile(ratios[:, 0], ends, styles[0], names[0])
         panels.append(_panel(axis, marks, first=n % columns == 0))
     rows = in_rows(panels, columns)
-    height = 1.75 * len(rows) + LEGEND_LINE * (1 + -(-len(names) // ROW))
-    keys = [_key(name, style) for name, style in zip(names, styles, strict=True)]
-    return Figure(
-        rows=rows, height=TITLE + height, legend=below(keys, ROW), title=_title(ranking)
-    )
+    first, *others = solver_keys(names, solvers)
+    keys = [replace(first, look=styles[0]), *others]
+    height = 1.75 * len(rows) + LEGEND_LINE
+    return with_legend(rows, keys, ROW, height, _title(ranking))
 
 
 def _title(ranking: Ranking) -> str:
@@ -146,11 +147,7 @@ def _title(ranking: Ranking) -> str:
     group = ranking.group
     families = Counter(case.partition("/")[0] for case in group.cases)
     of = f" of {next(iter(families))}" if len(families) == 1 else ""
-    return legible(f"{group.title}, {plural(len(group.cases), 'case')}{of}", 96)
-
-
-def _key(name: str, style: Look) -> Key:
-    return Key(label=legible(name), look=style, solver=name)
+    return f"{group.title}, {plural(len(group.cases), 'case')}{of}"
 
 
 def _end(ratios: Array) -> float:

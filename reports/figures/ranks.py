@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.rank_series import (
     PHASES,
     StrongSeries,
@@ -17,7 +16,6 @@ from mortarbench.reports.document.figure import (
     Area,
     Axis,
     Figure,
-    Intervals,
     Key,
     Look,
     Mark,
@@ -28,6 +26,7 @@ from mortarbench.reports.document.figure import (
     Series,
     Text,
     categories,
+    in_rows,
 )
 from mortarbench.reports.figures.style import (
     COLOURS,
@@ -35,11 +34,11 @@ from mortarbench.reports.figures.style import (
     DOTTED,
     GUIDE,
     LEGEND_LINE,
-    below,
+    curve,
     legible,
     log,
     look,
-    run_ids,
+    with_legend,
 )
 from mortarbench.reports.statistics.intervals import Interval
 
@@ -49,6 +48,8 @@ _LONG = 72  #: letters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
 _BEYOND = 1.5  #: times the values that an axis goes on for intervals
 _REST = "#9aa2ad"  #: time that is in none of the parts
+_ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up of one rank
+_MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
 _EDGE = Look(colour=INK, width=0.8, dash=DOTTED)  #: between measured and model
 
 
@@ -75,42 +76,23 @@ def strong_figure(found: Sequence[StrongSeries]) -> Figure:
         crowded = replace(look(0), dash=None, fill="none")
         keys.append(Key(label="more ranks than CPUs: they took turns", look=crowded))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
-    return _figure(panels, keys, columns=1)
+    return _figure(panels, keys, 1)
 
 
 def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
-    first = Interval(1.0, 1.0, 1.0, 1.0, 1)
-    measured = [(1, first, s.answers[1])] + [
-        (n, ratio, s.answers[n])
+    first = (1, _ONE, s.answers[1])
+    measured = [first, *((n, s.speed_up(n, phase), s.answers[n]) for n in s.several)]
+    copied = [
+        (n, reach, s.copies[n])
         for n in s.several
-        if (ratio := s.speed_up(n, phase)) is not None
+        if (reach := s.reach(n, phase)) is not None
     ]
-    copied = [(1, first, s.answers[1])] + [
-        (n, ratio, s.copies[n])
-        for n in s.several
-        if (ratio := s.reach(n, phase)) is not None
+    hollow = replace(style, dash=None, fill="none")
+    return [
+        *curve([first, *copied] * bool(copied), _copies_look(style.colour), s.solver),
+        *curve((p for p in measured if not s.crowded(p[0])), _line(style), s.solver),
+        *curve((p for p in measured if s.crowded(p[0])), hollow, s.solver),
     ]
-    free = [point for point in measured if not s.crowded(point[0])]
-    crowded = [point for point in measured if s.crowded(point[0])]
-    curves = [_curve(free, _line(style), s.solver)]
-    if crowded:
-        hollow = replace(style, dash=None, fill="none")
-        curves.append(_curve(crowded, hollow, s.solver))
-    if len(copied) > 1:
-        curves.insert(0, _curve(copied, _copies_look(style.colour), s.solver))
-    return curves
-
-
-def _curve(
-    points: Sequence[tuple[int, Interval, Outcome]], style: Look, solver: str
-) -> Series:
-    ranks, values, outcomes = zip(*points, strict=True)
-    low, high = tuple(v.low for v in values), tuple(v.high for v in values)
-    return Series(
-        x=tuple(map(float, ranks)), y=tuple(v.value for v in values), look=style,
-        solver=solver, intervals=Intervals(low=low, high=high),
-        runs=tuple(run_ids(o.records) for o in outcomes),
-    )  # fmt: skip
 
 
 def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
@@ -122,20 +104,19 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
     for i, (s, asked) in enumerate(found):
         assert s.model is not None
         last = s.model.measured[-1]
-        beyond = [(n, s.model.speed_up(n)) for n in (last, *asked)]
-        ranks = tuple(float(n) for n, _ in beyond)
+        beyond = {float(n): s.model.speed_up(n) for n in (last, *asked)}
+        ranks, said = tuple(beyond), beyond.values()
         colour = look(i).colour
-        measured = [(n, v, s.answers[n]) for n in s.model.measured[1:]
-                    if (v := s.speed_up(n, "solve")) is not None]  # fmt: skip
-        first = (1, Interval(1.0, 1.0, 1.0, 1.0, 1), s.answers[1])
+        measured = [(n, s.speed_up(n, "solve"), s.answers[n])
+                    for n in s.model.measured[1:]]  # fmt: skip
         marks: list[Mark] = [
             _ideal([1, *asked]),
-            Area(x=ranks, low=tuple(v.low for _, v in beyond),
-                 high=tuple(v.high for _, v in beyond), colour=colour, opacity=_BAND,
+            Area(x=ranks, low=tuple(v.low for v in said),
+                 high=tuple(v.high for v in said), colour=colour, opacity=_BAND,
                  solver=s.solver),
-            Series(x=ranks, y=tuple(v.value for _, v in beyond), solver=s.solver,
-                   look=Look(colour=colour, dash=DASHED, width=1.4)),
-            _curve([first, *measured], _line(look(i)), s.solver),
+            Series(x=ranks, y=tuple(v.value for v in said), solver=s.solver,
+                   look=replace(_MODEL, colour=colour)),
+            *curve([(1, _ONE, s.answers[1]), *measured], _line(look(i)), s.solver),
         ]  # fmt: skip
         panels.append(
             Panel(
@@ -151,13 +132,11 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
         )  # fmt: skip
     keys = (
         Key(label="measured", look=_line(look(0))),
-        Key(label="model, not measured",
-            look=Look(colour=COLOURS[0], dash=DASHED, width=1.4)),
-        Key(label="band of the fit",
-            look=Look(colour=_PALE, width=6.0)),
+        Key(label="model, not measured", look=_MODEL),
+        Key(label="band of the fit", look=_bar(_PALE)),
         Key(label="as many times as ranks", look=GUIDE),
-    )  # fmt: skip
-    return _figure(panels, keys, columns=4)
+    )
+    return _figure(panels, keys, 4)
 
 
 def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
@@ -176,7 +155,7 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
                     Segments(
                         ends=((start, -float(i), start + taken, -float(i)),),
                         colour=colours.get(name, _REST), width=_BAR, solver=s.solver,
-                        runs=(run_ids(o.records),),
+                        runs=(o.run_ids,),
                     )
                 )  # fmt: skip
                 start += taken
@@ -187,9 +166,8 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
         x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
         marks=tuple(marks), grid="x",
     )  # fmt: skip
-    return replace(
-        _figure([panel], keys, columns=6), height=0.9 + LEGEND_LINE + 0.26 * len(found)
-    )
+    figure = with_legend((Row(panels=(panel,)),), keys, 6, 0.0)
+    return replace(figure, height=0.9 + LEGEND_LINE + 0.26 * len(found))
 
 
 def weak_figure(found: Sequence[WeakSeries]) -> Figure:
@@ -199,14 +177,15 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
     for phase in PHASES:
         marks: list[Mark] = []
         for i, s in enumerate(found):
-            first = s.members[0].answer
-            beside = {m.ranks for m in s.members}
-            copied = [(1, first)]
-            copied += [(n, o) for n, o in sorted(s.copies.items()) if n in beside]
-            if len(copied) > 1:
-                marks += _times(copied, phase, _copies_look(look(i).colour), s.solver)
-            answers = [(m.ranks, m.answer) for m in s.members]
-            marks += _times(answers, phase, _line(look(i)), s.solver)
+            answers = {m.ranks: m.answer for m in s.members}
+            copied = {1: answers[1]} | {
+                n: s.copies[n] for n in answers if n in s.copies
+            }
+            drawn = {_copies_look(look(i).colour): copied, _line(look(i)): answers}
+            for style, of in drawn.items():
+                if len(of) > 1:
+                    timed = ((n, o.seconds(phase), o) for n, o in of.items())
+                    marks += curve(timed, style, s.solver)
         panels.append(
             Panel(
                 x=_ranks_axis(shown), y=log("time in s"), title=phase,
@@ -220,14 +199,7 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
     ]  # fmt: skip
     if any(s.copies for s in found):
         keys.append(Key(label="copies of the first at once", look=_copies_look(INK)))
-    return _figure(panels, keys, columns=1)
-
-
-def _times(
-    of: Sequence[tuple[int, Outcome]], phase: str, style: Look, solver: str
-) -> list[Series]:
-    timed = [(n, t, o) for n, o in of if (t := o.seconds(phase)) is not None]
-    return [_curve(timed, style, solver)] if timed else []
+    return _figure(panels, keys, 1)
 
 
 def _ideal(ranks: Sequence[int]) -> Series:
@@ -276,10 +248,6 @@ def _bar(colour: str) -> Look:
     return Look(colour=colour, width=6.0)
 
 
-def _figure(panels: Sequence[Panel], keys: Sequence[Key], *, columns: int) -> Figure:
-    rows = [Row(panels=tuple(panels[i : i + 2])) for i in range(0, len(panels), 2)]
-    lines = -(-len(keys) // columns)
-    return Figure(
-        rows=tuple(rows), height=0.4 + 2.5 * len(rows) + LEGEND_LINE * lines,
-        legend=below(keys, columns),
-    )  # fmt: skip
+def _figure(panels: Sequence[Panel], keys: Sequence[Key], columns: int) -> Figure:
+    rows = in_rows(panels, 2)
+    return with_legend(rows, keys, columns, 0.4 + 2.5 * len(rows))

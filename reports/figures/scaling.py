@@ -1,55 +1,74 @@
-"""Total time and iterations against size."""
+"""Time, iterations and counts of each kind against size and H/h; and κ."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from math import sqrt
+from typing import Any
 
-from mortarbench.reports.data.size_series import SizeSeries
+import numpy as np
+
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.data.size_series import SizeSeries, Sweep
 from mortarbench.reports.document.figure import (
     Axis,
     Figure,
-    Intervals,
     Key,
     Limits,
     Look,
+    Mark,
     Panel,
     Row,
     Series,
     Text,
+    in_rows,
     limits,
+    numbers,
 )
 from mortarbench.reports.document.formatting import exponent
 from mortarbench.reports.figures.style import (
+    COLOURS,
+    DASHED,
     GUIDE,
     LEGEND_LINE,
+    MARKERS,
     TITLE,
     below,
+    curve,
     legible,
     log,
     look,
-    run_ids,
+    with_legend,
 )
+from mortarbench.reports.statistics.intervals import PowerLaw
 
 MOST_SERIES = 6  #: that are drawn; all are tabulated
 _SIZE = "degrees of freedom $n$"
 SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: of guides, the steepest last
+#: panels of counts, whose names are those of SMALBE; others are in the tables
+PANELS = (
+    ("products", ("P_products", "preconditioner_applies")),
+    ("steps", ("cg", "expansion", "proportioning")),
+)
+KAPPA = "kappa"  #: condition numbers among the quantities begin so
+_FITTED = 24  #: points of a curve of a fit
 _FOOT = 0.04  #: part of the axis below the guides, and above them at least
 
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
     """Draw total time and iterations against n on logarithmic axes."""
-    times, counts, keys = [], [], []
+    times, counts, keys = list[Series](), list[Series](), []
     for solver in series.solvers:
-        style = look(solvers.index(solver))
-        if timed := _times(series, solver, style):
+        style, answers = look(solvers.index(solver)), series.curve(solver)
+        if timed := curve(
+            [(n, o.seconds("total"), o) for n, o in answers], style, solver
+        ):
             law = series.time_law(solver)
             label = legible(solver) + (f",  p = {exponent(law)}" if law else "")
             keys.append(Key(label=label, look=style, solver=solver))
-            times.append(timed)
-        if counted := _counts(series, solver, style):
-            counts.append(counted)
+            times += timed
+        counts += _counts(series, solver, style)
     left = with_slopes(
         Panel(x=log(_SIZE), y=log("total time in s"), marks=tuple(times))
     )
@@ -65,57 +84,29 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
 
 def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None:
     """Draw the iterations of one solver in every series; None without any."""
-    curves: list[Series] = []
-    keys: list[Key] = []
+    curves = list[Series]()
+    keys = list[Key]()
     for series in found[:MOST_SERIES]:
         style = look(len(keys))
         if counted := _counts(series, solver, style):
             keys.append(Key(label=legible(series.title, 64), look=style))
-            curves.append(counted)
+            curves += counted
     if not curves:
         return None
-    most = max(max(curve.y) for curve in curves)
+    most = max(max(drawn.y) for drawn in curves)
     panel = Panel(
         x=log(_SIZE),
         y=Axis(label="iterations", low=0.0, high=1.15 * most, most=6, integers=True),
         marks=tuple(curves),
         title=legible(f"{solver}, verified answers", 64),
     )
-    return Figure(
-        rows=(Row(panels=(panel,)),),
-        height=2.6 + LEGEND_LINE * len(keys),
-        legend=below(keys, 1),
-    )
+    return with_legend((Row(panels=(panel,)),), keys, 1, 2.6)
 
 
-def _counts(series: SizeSeries, solver: str, style: Look) -> Series | None:
-    """Return the iterations over the size, the middle of both ends; None without."""
-    counted = [
-        (float(n), sum(o.iterations) / 2, run_ids(o.records))
-        for n, o in series.curve(solver)
-        if o.iterations is not None
-    ]
-    if not counted:
-        return None
-    n, its, runs = zip(*counted, strict=True)
-    return Series(x=n, y=its, look=style, solver=solver, runs=runs)
-
-
-def _times(series: SizeSeries, solver: str, style: Look) -> Series | None:
-    """Medians with their intervals."""
-    timed = [
-        (float(n), t, run_ids(o.records))
-        for n, o in series.curve(solver)
-        if (t := o.seconds("total")) is not None
-    ]
-    if not timed:
-        return None
-    sizes, times, runs = zip(*timed, strict=True)
-    low, high = tuple(t.low for t in times), tuple(t.high for t in times)
-    return Series(
-        x=sizes, y=tuple(t.value for t in times), look=style, solver=solver, runs=runs,
-        intervals=Intervals(low=low, high=high),
-    )  # fmt: skip
+def _counts(series: SizeSeries, solver: str, style: Look) -> list[Series]:
+    """Draw the iterations over the size, the middle of both ends."""
+    answers = ((n, o.iterations, o) for n, o in series.curve(solver))
+    return curve([(n, i and sum(i) / 2, o) for n, i, o in answers], style, solver)
 
 
 def with_slopes(panel: Panel) -> Panel:
@@ -145,3 +136,87 @@ def along(ends: Limits, part: float) -> float:
     """Find the value at a part of a logarithmic axis."""
     low, high = ends
     return float(low * (high / low) ** part)
+
+
+def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
+    """Draw the counts of one solver against dofs with fits c·nᵖ; None without any."""
+    points = [(float(n), o) for n, o in series.curve(solver)]
+    laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
+    title = f"{solver}, {series.title}"
+    return _counted(points, log("degrees of freedom $n$"), laws, solver, title)
+
+
+def torn_figure(sweep: Sweep) -> Figure | None:
+    """Draw the counts of one solver against H/h; None where none is known."""
+    points = [(float(value), o) for value, o in sweep.answers]
+    shown = tuple((x, f"{x:g}") for x, _ in points)
+    low, high = points[0][0] / 1.15, points[-1][0] * 1.15
+    axis = Axis(label="cells $H/h$", log=True, low=low, high=high, ticks=shown)
+    return _counted(points, axis, {}, sweep.solver, f"{sweep.solver}, {sweep.title}")
+
+
+def _counted(
+    points: Sequence[tuple[float, Outcome]],
+    x: Axis,
+    laws: dict[str, PowerLaw | None],
+    solver: str,
+    title: str,
+) -> Figure | None:
+    groups: dict[str, dict[str, tuple[Sequence[Any], PowerLaw | None]]] = {
+        panel: {
+            legible(name.replace("_", " ")): (counted, laws.get(name))
+            for name in names
+            if None not in (counted := [o.counted(name) for _, o in points])
+        }
+        for panel, names in PANELS
+    }
+    groups["condition number"] = {
+        " ".join([r"$\kappa$", *legible(name).split()[1:]]): (values, None)
+        for name, values in condition_numbers(points).items()
+    }
+    panels, keys = list[Panel](), list[Key]()
+    for name, curves in groups.items():
+        if not curves:
+            continue
+        marks = list[Mark]()
+        for label, (values, law) in curves.items():
+            i = len(keys)
+            colour = COLOURS[i % len(COLOURS)]
+            style = Look(colour=colour, marker=MARKERS[i % len(MARKERS)])
+            if law is not None:
+                n = np.geomspace(points[0][0], points[-1][0], _FITTED)
+                fit = Look(colour=colour, dash=DASHED, width=0.9)
+                marks.append(Series(x=numbers(n), y=numbers(law.at(n)), look=fit))
+                style = replace(style, dash=None)
+                label += f",  p = {exponent(law)}"
+            answers = ((x, v, o) for (x, o), v in zip(points, values, strict=True))
+            marks += curve(answers, style, solver)
+            keys.append(Key(label=label, look=style))
+        most = max(float(v) for values, _ in curves.values() for v in values)
+        y = Axis(low=0.0, high=1.12 * most or 1.0, integers=True, most=6)
+        panels.append(Panel(x=x, y=y, title=name, marks=tuple(marks)))
+    if not panels:
+        return None
+    rows = in_rows(panels, 2)
+    if len(panels) == 3:  # κ below, as wide as both
+        rows = (rows[0], Row(panels=(replace(panels[2], span=2),)))
+    return with_legend(rows, keys, 2, 0.2 + 2.3 * len(rows), title)
+
+
+def condition_numbers(
+    points: Sequence[tuple[float, Outcome]],
+) -> dict[str, tuple[float, ...]]:
+    """Return each κ that every answer has, without error bounds, by its name."""
+    names = [
+        name
+        for name in (points[0][1].quantities if points else ())
+        if (name == KAPPA or name.startswith(f"{KAPPA}_"))
+        and not name.endswith("_error")
+    ]
+    found: dict[str, tuple[float, ...]] = {}
+    for name in names:
+        values = [o.quantities.get(name) for _, o in points]
+        known = tuple(float(v) for v in values if isinstance(v, int | float))
+        if len(known) == len(points):
+            found[" ".join(["κ", *name.removeprefix(KAPPA).split("_")[1:]])] = known
+    return found

@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from math import lcm
+from collections.abc import Iterable, Mapping, Sequence
+from math import lcm, nan
+from typing import Any
 
 from mortarbench.harness import Record
-from mortarbench.reports.document.figure import INK, Axis, Key, Legend, Look
+from mortarbench.reports.document.figure import (
+    INK,
+    Axis,
+    Figure,
+    Intervals,
+    Key,
+    Legend,
+    Look,
+    Row,
+    Series,
+    numbers,
+)
 from mortarbench.reports.document.formatting import clean
 
 #: One hue for each solver, at least 28° apart up to the eighth and 6° up to the last.
@@ -77,3 +89,52 @@ def below(keys: Sequence[Key], columns: int, title: str = "") -> Legend:
 def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
     """Name the measurements behind a point."""
     return tuple(r.run_id for r in records)
+
+
+def curve(
+    points: Iterable[Sequence[Any]],
+    style: Look,
+    solver: str = "",
+    bars: Mapping[str, float] | None = None,
+    **how: Any,
+) -> list[Series]:
+    """Draw points as one series; return an empty list where no point is complete.
+
+    points : (x, y), or (x, y, answer or its run_ids); an estimate with an interval
+        (`Interval`, `Ratio`) gets an error bar, and a point without x or y is left out
+    bars : cap, width and opacity of the error bars
+    how : further attributes of the series
+    """
+    known = [p for p in points if p[0] is not None and p[1] is not None]
+    if not known:
+        return []
+    x, y, *answers = zip(*known, strict=True)
+    for along, values in (("x", x), ("y", y)):
+        if any(isinstance(v, tuple) for v in values):
+            low, high = (
+                numbers([getattr(v, end, nan) for v in values])
+                for end in ("low", "high")
+            )
+            how["intervals"] = Intervals(low=low, high=high, along=along, **bars or {})  # type: ignore[arg-type]
+    x, y = (numbers([getattr(v, "value", v) for v in values]) for values in (x, y))
+    runs = tuple(a if isinstance(a, tuple) else a.run_ids for of in answers for a in of)
+    return [Series(x=x, y=y, look=style, solver=solver, runs=runs, **how)]
+
+
+def with_legend(
+    rows: Sequence[Row],
+    keys: Sequence[Key],
+    columns: int,
+    height: float,
+    title: str = "",
+) -> Figure:
+    """Put a legend below rows of panels and a title above them.
+
+    height : of the rows, inches
+    """
+    return Figure(
+        rows=tuple(rows),
+        height=height + TITLE * bool(title) + LEGEND_LINE * -(-len(keys) // columns),
+        legend=below(keys, columns),
+        title=legible(title, 96),
+    )

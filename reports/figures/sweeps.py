@@ -1,43 +1,89 @@
-"""Sweeps of tolerances: the error that was reached against the time that it took."""
+"""Errors that were reached against the time that it took, and sweeps of tolerances."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import isfinite
+from typing import Any
 
-from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.data.evidence import Evidence, Outcome, shared
 from mortarbench.reports.data.time_at_accuracy import SMALLEST, counts
 from mortarbench.reports.document.figure import (
     INK,
     Figure,
-    Intervals,
     Key,
+    Legend,
     Look,
     Panel,
+    Row,
     Rule,
     Series,
+    Text,
     in_rows,
 )
 from mortarbench.reports.figures.style import (
     DASHED,
     DOTTED,
     LEGEND_LINE,
-    below,
+    TITLE,
+    curve,
     legible,
     log,
     look,
-    run_ids,
     solver_keys,
+    with_legend,
 )
 
 SHARE = 0.1  #: of the discretisation error that a solver may add
+CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
 _COLUMNS = 4  #: of the legend
 _LEAST = 1e-17  #: residuals below, zero among them, are drawn there
+_LEAST_RATIO = 1e-10  #: the same of residuals over the tolerance
 _MESH = Look(colour=INK, width=0.8, dash=DASHED)
 _TENTH = Look(colour=INK, width=0.8, dash=DOTTED)
+_BARS = {"cap": 1.5, "width": 0.6, "opacity": 0.55}
 
 Sweep = Mapping[str, Sequence[Outcome]]  #: solver → its answers, by tolerance
+
+
+def accuracy_figure(evidence: Evidence) -> Figure | None:
+    """Draw the accuracy reached against the time spent, verified answers filled."""
+    shown = [o for o in evidence.flat if o.worst is not None and o.seconds("total")]
+    if not shown:
+        return None
+    points: dict[tuple[str, bool], list[tuple[Any, float, Outcome]]] = {}
+    for o in shown:
+        time, excess = o.seconds("total"), (o.worst or 0.0) / o.first.asked_tol
+        point = time and time.value, max(excess, _LEAST_RATIO), o
+        points.setdefault((o.solver, o.verified), []).append(point)
+    looks = {s: replace(look(i), dash=None) for i, s in enumerate(evidence.solvers)}
+    size, opacity = (2.6, 0.5) if len(shown) > CROWDED else (4.5, 0.85)
+    marks = list[Series]()
+    for solver, style in looks.items():
+        for verified, fill in ((True, ""), (False, "none")):
+            drawn = replace(style, size=size, opacity=opacity, fill=fill)
+            marks += curve(points.get((solver, verified), ()), drawn, solver)
+    panel = Panel(
+        x=log("median total time in s"),
+        y=log("worst residual / tolerance"),
+        marks=tuple(marks),
+        rules=(Rule(axis="y", at=evidence.factor, look=Look(colour=INK, width=0.8)),),
+        texts=(
+            Text(
+                text="verified below", place=(0.995, evidence.factor),
+                inside=(True, False), offset=(0, -3), align=("right", "top"),
+            ),
+        ),
+    )  # fmt: skip
+    names = dict.fromkeys(o.solver for o in shown)
+    keys = tuple(Key(label=legible(s), look=looks[s], solver=s) for s in names)
+    return Figure(
+        rows=(Row(panels=(panel,)),),
+        height=TITLE + max(3.2, 0.5 + LEGEND_LINE * len(names)),
+        title=legible(shared(shown), 96),
+        legend=Legend(keys=keys, place="right"),
+    )
 
 
 def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> Figure:
@@ -64,25 +110,22 @@ def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> 
         )
         for case, row in swept
     ]  # fmt: skip
-    return _figure(panels, solver_keys(_present(swept, solvers), solvers))
+    return _figure(panels, swept, solvers)
 
 
 def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
     """Join the answers of one solver; hollow where they are not verified."""
     points = [
-        (t.value, max(o.worst, _LEAST), run_ids(o.records), o.verified)
+        (t.value, max(o.worst, _LEAST), o)
         for o in outcomes
         if o.worst is not None and (t := o.seconds("total")) is not None
     ]
-    made = []
-    hollow, filled = replace(style, fill="none"), replace(style, dash=None)
-    for chosen, how in ((points, hollow), ([p for p in points if p[-1]], filled)):
-        if chosen:
-            x, y, runs, _ = zip(*chosen, strict=True)
-            made.append(
-                Series(x=x, y=y, runs=runs, look=how, solver=outcomes[0].solver)
-            )
-    return made
+    verified = [point for point in points if point[-1].verified]
+    solver = outcomes[0].solver
+    return [
+        *curve(points, replace(style, fill="none"), solver),
+        *curve(verified, replace(style, dash=None), solver),
+    ]
 
 
 def certified_figure(
@@ -114,46 +157,33 @@ def certified_figure(
                 ),
             )
         )  # fmt: skip
-    keys = solver_keys(_present(swept, solvers), solvers)
-    return _figure(panels, (*keys, *(Key(label=s, look=how) for s, how in lines)))
+    return _figure(panels, swept, solvers, lines)
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
     """Join the points that count; mark the others hollow, on their own."""
-    made = []
-    for counted in (True, False):
-        points = [
-            (t, max(e, SMALLEST), run_ids(o.records))
-            for o in outcomes
-            if (e := o.largest("energy_bound")) is not None and isfinite(e)
-            and (t := o.seconds("total")) is not None and counts(o) is counted
-        ]  # fmt: skip
-        if not points:
-            continue
-        times, errors, runs = zip(*points, strict=True)
-        low, high = tuple(t.low for t in times), tuple(t.high for t in times)
-        made.append(
-            Series(
-                x=tuple(t.value for t in times), y=errors, runs=runs,
-                look=style if counted else replace(style, fill="none", dash=None),
-                solver=outcomes[0].solver,
-                intervals=Intervals(
-                    low=low, high=high, along="x", cap=1.5, width=0.6, opacity=0.55
-                ),
-            )
-        )  # fmt: skip
-    return made
+    points = [
+        (o.seconds("total"), max(e, SMALLEST), o)
+        for o in outcomes
+        if (e := o.largest("energy_bound")) is not None and isfinite(e)
+    ]
+    apart, bars = replace(style, fill="none", dash=None), _BARS
+    return [
+        *curve((p for p in points if counts(p[-1])), style, outcomes[0].solver, bars),
+        *curve(
+            (p for p in points if not counts(p[-1])), apart, outcomes[0].solver, bars
+        ),
+    ]
 
 
-def _present(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> list[str]:
-    return [s for s in solvers if any(s in row for _, row in swept)]
-
-
-def _figure(panels: Sequence[Panel], keys: Sequence[Key]) -> Figure:
+def _figure(
+    panels: Sequence[Panel],
+    swept: Sequence[tuple[str, Sweep]],
+    solvers: Sequence[str],
+    lines: Sequence[tuple[str, Look]] = (),
+) -> Figure:
+    """Put the panels side by side above a legend of solvers and further lines."""
+    present = [s for s in solvers if any(s in row for _, row in swept)]
+    keys = [*solver_keys(present, solvers), *(Key(label=s, look=l) for s, l in lines)]
     rows = in_rows(panels, min(len(panels), 2))
-    legend = LEGEND_LINE * -(-len(keys) // _COLUMNS)
-    return Figure(
-        rows=rows,
-        height=0.3 + legend + 2.6 * len(rows),
-        legend=below(keys, _COLUMNS),
-    )
+    return with_legend(rows, keys, _COLUMNS, 0.3 + 2.6 * len(rows))

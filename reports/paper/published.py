@@ -1,4 +1,4 @@
-"""What the paper says, in numbers; its figures carry no tables."""
+"""Numbers printed in the paper, whose figures have no tables."""
 
 from __future__ import annotations
 

@@ -1,18 +1,78 @@
-"""The paper's figures and tables from measured data: no measuring happens here."""
+"""The page: figures and tables of the paper, and further ones, from measured data."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
-from mortarbench.harness.files.experiment import load_experiment
-from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.harness.files.experiment import Experiment, Row, load_experiment
+from mortarbench.reports.data.evidence import Evidence, read_evidence
+from mortarbench.reports.document.fields import FieldFigure
+from mortarbench.reports.document.figure import Figure
+from mortarbench.reports.document.formatting import (
+    TIMED,
+    clean,
+    plural,
+    seconds,
+    significant,
+)
+from mortarbench.reports.document.layout import Page, Picture, Section
 from mortarbench.reports.export.csv_tables import csv_tables as report_tables
 from mortarbench.reports.export.csv_tables import frame_csv
-from mortarbench.reports.paper.csv_tables import csv_tables
-from mortarbench.reports.paper.page import BEYOND, compose
+from mortarbench.reports.figures.deformed import PERCENTILE, SCALE
+from mortarbench.reports.paper import published
+from mortarbench.reports.paper.bodies import (
+    STRESSES,
+    extent,
+    geometry_figure,
+    mesh_figure,
+    stress_figure,
+    zoom_figure,
+)
+from mortarbench.reports.paper.fleet import (
+    DUALS,
+    certified_figure,
+    certified_table,
+    fleet_figure,
+    fleet_table,
+    primal_dual_figure,
+    totals_table,
+)
+from mortarbench.reports.paper.physics import (
+    SINCE,
+    active,
+    orders,
+    pressure_figure,
+    stepping_figure,
+    verification_figure,
+)
+from mortarbench.reports.paper.timings import (
+    assembly_figure,
+    contact_figure,
+    csv_tables,
+    here,
+    inverse_figure,
+    largest,
+    of_table_1,
+    pinv_fit,
+    scaling_figure,
+    select,
+    table_1,
+    times,
+    timings,
+)
 from mortarbench.reports.render.html_page import html
 from mortarbench.reports.render.latex import latex
 from mortarbench.reports.render.writing import write_figures, write_text
+
+REPEATED = (
+    "Medians of interleaved, randomised repeats in worker processes of their own, with "
+    "the distribution-free 95 % interval of the median (below six repeats: smallest "
+    "and largest). Every answer is judged on the QP as given, by its "
+    "residuals or for small QPs by a proven optimum; only verified answers have times."
+)
 
 
 def write_paper(folder: Path) -> list[Path]:
@@ -51,3 +111,307 @@ def write_paper(folder: Path) -> list[Path]:
         for name, frame in frames.items()
     ]
     return written
+
+
+def compose(
+    experiment: Experiment, suites: Mapping[str, Evidence] = MappingProxyType({})
+) -> Page:
+    """Put the page together: the paper in its order, then what it does not have.
+
+    suites : measured ones by name; those of `BEYOND` make sections
+    """
+    environment = experiment.setting["environment"]
+    now = environment.get("now", {}).get("time", "")
+    return Page(
+        title="The paper's figures and tables",
+        dateline=clean(
+            f"{published.PAPER}. Measured {now} on "
+            f"{here(environment.get('machine', {}))}; published times: "
+            f"{published.MACHINE}.",
+            400,
+        ),
+        sections=(
+            _summary(largest(experiment)),
+            *_bodies(experiment),
+            *_times(experiment),
+            _final(experiment),
+            *_physics(experiment),
+            *(
+                section
+                for name, of in BEYOND.items()
+                if name in suites
+                for section in of(suites[name])
+            ),
+            Section(
+                name="errata", title="Errata of the paper", points=published.ERRATA
+            ),
+        ),
+        footer="Every sample is in data/, the medians in tables/*.csv; the figures are "
+        "drawn from these files alone.",
+    )  # fmt: skip
+
+
+def _section(
+    name: str, title: str, figure: Figure | FieldFigure, caption: str, **more: Any
+) -> Section:
+    """Make a section of one picture of the same name, and of what else it has."""
+    picture = Picture(name=name, caption=caption, figure=figure)
+    return Section(name=name, title=title, pictures=(picture,), **more)
+
+
+def _summary(rows: Sequence[Row]) -> Section:
+    Nr, Nh, n = (rows[0][k] for k in ("Nr", "Nh", "n"))
+    ours, theirs = (
+        times(rows, "n", method=m)[0].time for m in ("condensed", "per-row")
+    )
+    prose = (
+        f"The whole analysis at Nr = {Nr}, Nh = {Nh} (n = {n}) takes {seconds(ours)} "
+        "here with the dual condensed onto the interface and our SMALBE, "
+        f"{seconds(theirs)} the paper's way: one solve per constraint row and load "
+        "step, the textbook's SMALBE; both in one interleaved run."
+    )
+    if of_table_1(rows):
+        ratio = significant(published.TOTAL / ours.value)
+        prose += (
+            f" Published: {published.TOTAL:.2f} s ({published.MACHINE}), {ratio} times "
+            "as long. Of this ratio the machine and the language are a part that "
+            "cannot be told from here; compare methods within one machine."
+        )
+    return Section(
+        name="summary",
+        title="Summary",
+        prose=(
+            prose,
+            "Times are medians of interleaved repeats in one process, with the "
+            "distribution-free 95 % interval of the median in brackets and as bars "
+            "(below six repeats: smallest and largest, which cover less). Garbage "
+            "collection is off. Methods are ours throughout, also those marked “the "
+            "paper's way”: its own code is not public.",
+        ),
+    )
+
+
+def _bodies(experiment: Experiment) -> tuple[Section, ...]:
+    """Show geometry and mesh: Figures 1 and 2."""
+    setting, states = experiment.setting, experiment.states
+    E = {k: m["E"] / 1e9 for k, m in setting["materials"].items()}
+    Nr, Nh = setting["plan"]["example"]
+    one, two = (len(states[name].points) for name in ("example-Nh", "example-2Nh"))
+    meshes = {
+        f"$N_h$ layers: {one} nodes": states["example-Nh"],
+        f"$2N_h$ layers: {two} nodes": states["example-2Nh"],
+    }
+    return (
+        _section(
+            "figure1", "Geometry",
+            geometry_figure(states["example-2Nh"], setting["load"]),
+            "Geometry, supports and load, drawn from the mesh. Hatched: clamped. "
+            f"E = {E['beam']:g} GPa (A) and {E['ring']:g} GPa (B), "
+            f"ν = {setting['materials']['beam']['nu']:g} in both.",
+        ),
+        _section(
+            "figure2", "Mesh and solution", mesh_figure(meshes),
+            f"Mesh with Nr = {Nr}, Nh = {Nh} and its deformation (displacement × "
+            f"{SCALE:g}) with two numbers of radial layers. (a), (b): the picture in "
+            f"the paper, Nh layers, {one} nodes (the paper: "
+            f"{published.FIGURE_2_NODES}). (c), (d): the rule of its text and Table 1, "
+            f"2·Nh layers, {two} nodes.",
+        ),
+    )  # fmt: skip
+
+
+def _times(experiment: Experiment) -> tuple[Section, ...]:
+    """Show the times of the parts against size: Figures 3 to 6."""
+    three, four, five, six = (experiment.tables[f"figure{i}"] for i in (3, 4, 5, 6))
+    law = pinv_fit(five, "build")
+    return (
+        _section(
+            "figure3", "Assembly", assembly_figure(three),
+            "Assembly of the rectangle's stiffness matrix against its size, "
+            f"{_repeats(three)} repeats (the paper: averages of 100 runs of the "
+            "vectorised library [6]). Star: its one printed number, 0.087 s, which is "
+            f"for both bodies ({published.DOFS} dofs).",
+        ),
+        _section(
+            "figure4", "Contact rows", contact_figure(four),
+            "One linearisation of the contact at u = 0 against the slave segments "
+            "(ring), a line for each number of master segments (beam), "
+            f"{_repeats(four)} repeats (the paper: averages of 10 runs). Star: a tenth "
+            "of its 2.064 s for ten steps with 240 master and 180 slave segments "
+            f"({published.MACHINE}).",
+        ),
+        _section(
+            "figure5", "Generalised inverse", inverse_figure(five),
+            "Generalised inverse of the rectangle's stiffness: building it (a), "
+            f"multiplying it with a random vector (b), {_repeats(five)} repeats (the "
+            "paper: averages of 10 runs). The dense pseudoinverse is measured up to "
+            f"n = {law.until:g}; the dotted continuation is not: it is c·n³ (a) and "
+            f"c·n² (b), fitted to the sizes from {law.since:g} on, its band the spread "
+            "of c over them. The two inverses are different matrices (see the errata).",
+        ),
+        _section(
+            "figure6", "Scaling", scaling_figure(six),
+            f"Growth with Nr at Nh = {six[0]['Nh']}, "
+            f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
+            "repeats. (c): the condensed curve contains the factorisation, in which "
+            "its work lies; the other does not. (d): everything from the mesh to u. "
+            f"Star and cross: published for Nr = 30 ({published.MACHINE}).",
+        ),
+    )  # fmt: skip
+
+
+def _repeats(rows: Sequence[Row]) -> str:
+    """State how many repeats the medians are of: a number, or the range."""
+    most: dict[tuple[Any, ...], int] = {}
+    for row in rows:
+        key = tuple(row.get(k) for k in ("Nr", "Nh", "method"))
+        most[key] = max(most.get(key, 0), 1 + int(row["repeat"]))
+    return " to ".join(dict.fromkeys(str(f(most.values())) for f in (min, max)))
+
+
+def _final(experiment: Experiment) -> Section:
+    fields, rows = experiment.states["largest"], largest(experiment)
+    names = {"sxx": "σx", "syy": "σy", "sxy": "τxy", "von_mises": "von Mises"}
+    ends = ", ".join(
+        f"{names[name]} {end.clipped / 1e9:.3g} ({end.largest / 1e9:.3g})"
+        for name in STRESSES
+        for end in [extent(fields, name)]
+    )
+    caption = (
+        f"Patch-recovered stresses at Nr = {rows[0]['Nr']}, Nh = {rows[0]['Nh']}, "
+        "plane strain, on the deformed bodies (displacement × "
+        f"{SCALE:g}); never averaged across bodies. Colours end at the "
+        f"{PERCENTILE:g} % quantile of the nodal values' size, since stresses are "
+        f"singular at corners; in GPa, the largest in brackets: {ends}."
+    )
+    picture = Picture(name="figure7", caption=caption, figure=stress_figure(fields))
+    return Section(
+        name="results",
+        title="Final results",
+        tables=(table_1(experiment), timings(experiment)),
+        pictures=(picture,),
+    )
+
+
+def _physics(experiment: Experiment) -> tuple[Section, ...]:
+    """Show the contact closely, both methods, and the accuracy of the stepping."""
+    tables, plan = experiment.tables, experiment.setting["plan"]
+    followed = active(tables["pressures"], "nts")
+    last = max(followed)
+    zoom = (
+        f"The contact at load step {last}, node-to-segment, to scale (displacement × 1)"
+        ". Orange: contact pressures on the ring's nodes (dots), each drawn along the "
+        "normal of its contact row; the arrow in the corner is their scale. Pressure: "
+        "nodal force over the undeformed arc that belongs to the node."
+    )
+    pressures = (
+        "Contact pressure against the angle around the ring's centre, from its right "
+        f"foot on: (a) through the {last} load steps, (b) both methods at the last. "
+        f"(c): the active set, which grows from {plural(len(followed[1]), 'node')} to "
+        f"{len(followed[last])} (node-to-segment; a node is active if its force "
+        "exceeds 1e-6 of the largest)."
+    )
+    patch = select(tables["verification"], problem="patch")
+    (left,) = select(patch, contact="nts", n=max(int(r["n"]) for r in patch))
+    mortar = max(float(r["error"]) for r in select(patch, contact="mortar"))
+    Nr, Nh = plan["stepped"]
+    settled = tables["stepping"][-1]
+    return (
+        Section(
+            name="contact",
+            title="Beyond the paper: the contact",
+            pictures=(
+                Picture(
+                    name="zoom", caption=zoom,
+                    figure=zoom_figure(experiment.states["largest"]),
+                ),
+                Picture(
+                    name="pressure", caption=pressures,
+                    figure=pressure_figure(tables["pressures"]),
+                ),
+            ),
+        ),
+        Section(
+            name="methods",
+            title="Beyond the paper: node-to-segment against mortar",
+            prose=(
+                "What the paper calls mortar is node-to-segment collocation. On its "
+                "benchmark both give nearly the same pressures (the figure above); on "
+                "problems with exact solutions they do not.",
+            ),
+            pictures=(
+                Picture(
+                    name="verification",
+                    figure=verification_figure(tables["verification"]),
+                    caption="Contact rows against exact solutions. (a): largest error "
+                    "of σy at any Gauss point of the patch test, 3 elements meeting 2 "
+                    "(errors below 1e-12 are rounding and drawn there): "
+                    f"node-to-segment keeps {100 * float(left['error']):.2g} % on the "
+                    f"finest mesh, mortar has {mortar:.0e} at most. (b): pressure "
+                    "between two cylinders against Hertz's, in L²; it cannot fall "
+                    "below the order a²/R² of the finite bodies.",
+                ),
+            ),
+        ),
+        _section(
+            "stepping", "Beyond the paper: accuracy of the load steps",
+            stepping_figure(tables["stepping"]),
+            f"Error of the load steps at Nr = {Nr}, Nh = {Nh} (node-to-segment) "
+            f"against their number; what they approach is {settled['relin']} "
+            f"linearisations in each of {settled['steps']} steps, where contact holds "
+            "as linearised at the solution itself. The errors are those of the "
+            "stepping alone, every QP being solved to rounding.",
+            prose=(
+                "The paper linearises the contact once per step, at the solution of "
+                "the step before, and gives no error. It is of first order in 1/steps; "
+                f"orders are fitted from {SINCE} steps on, with Student's interval.",
+            ),
+            tables=(orders(tables["stepping"]),),
+        ),
+    )  # fmt: skip
+
+
+def _fleet(evidence: Evidence) -> tuple[Section, ...]:
+    """Show how SMALBE and the others grow with m, and primal against dual."""
+    return (
+        _section(
+            "fleet", "Beyond the paper: SMALBE against the fleet",
+            fleet_figure(evidence),
+            "Time against the size m of the dual at the last load step, tolerance "
+            "1e-6, verified answers only; crosses: tried and not verified. Bars: "
+            f"interval of the median. {TIMED}",
+            prose=(REPEATED,),
+            tables=tuple(fleet_table(evidence, form) for form in DUALS),
+        ),
+        _section(
+            "totals", "Beyond the paper: primal against dual",
+            primal_dual_figure(evidence),
+            "Primal totals beside dual totals, the latter with the dualisation of one "
+            "load step, its factorisation included (over ten steps, the factorisation "
+            "is shared); verified answers only, crosses: tried and not verified. "
+            "SMALBE takes bounds and equalities, so no primal form.",
+            tables=(totals_table(evidence),),
+        ),
+    )  # fmt: skip
+
+
+def _certified(evidence: Evidence) -> tuple[Section, ...]:
+    """Show the time to certified accuracy."""
+    n = max((o.size("dofs") or 0) for o in evidence.flat)
+    caption = (
+        "Certified relative error of the displacement in the energy norm against the "
+        f"median time at n = {n}, a line for each solver through the tolerances asked "
+        "for. The certificate is an upper bound computed from the answer alone; it "
+        "holds whatever the solver claims."
+    )
+    return (
+        _section(
+            "certified", "Beyond the paper: time to certified accuracy",
+            certified_figure(evidence), caption,
+            prose=(REPEATED,), tables=(certified_table(evidence),),
+        ),
+    )  # fmt: skip
+
+
+#: suite → sections on it
+BEYOND = {"paper-fleet": _fleet, "paper-accuracy": _certified}

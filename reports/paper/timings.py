@@ -1,33 +1,37 @@
-"""Figures 3 to 6: times against sizes, with the intervals of their medians."""
+"""Figures 3 to 6, Table 1 and the times of Section 5, beside what the paper says."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from mortarbench.harness import Vector
-from mortarbench.harness.files.experiment import Row
-from mortarbench.reports.document import figure
+from mortarbench.harness.files.experiment import Experiment, Row
 from mortarbench.reports.document.figure import (
     INK,
     Area,
     Axis,
     Figure,
-    Intervals,
     Key,
     Legend,
     Look,
+    Mark,
     Panel,
     Series,
     Text,
+    in_rows,
     limits,
     numbers,
 )
-from mortarbench.reports.figures.style import COLOURS, below, log, look
+from mortarbench.reports.document.formatting import bracketed, clean, seconds
+from mortarbench.reports.document.layout import Cell, Table
+from mortarbench.reports.figures.style import COLOURS, below, curve, log, look
 from mortarbench.reports.paper import published
-from mortarbench.reports.paper.samples import Fit, Point, curve, fit
+from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 DOFS = "degrees of freedom $n$"
 METHODS = {  #: of the tables → as the figures and tables of the report call them
@@ -40,56 +44,126 @@ METHODS = {  #: of the tables → as the figures and tables of the report call t
     "per-row": "one solve per row (the paper's way)",
     "condensed": "condensed",
 }
+LINES = {  #: of the table of times → the parts of an analysis
+    "mesh and assembly": ("assembly",),
+    "Cholesky": ("factor",),
+    "contact rows (the paper: mortar), all steps": ("contact",),
+    "dualisation, all steps": ("dualisation",),
+    "Cholesky and dualisation together": ("factor", "dualisation"),
+    "dual QPs, all steps": ("qp",),
+    "recovery of u, all steps": ("recovery",),
+}
+PARTS = tuple({part: None for parts in LINES.values() for part in parts})
+KEYS = {  #: of CSV tables: the columns that a median is for
+    "figure3": ("Nr", "n", "method"),
+    "figure4": ("Nr", "Nh", "master", "slave", "method"),
+    "figure5": ("Nr", "n", "method", "part"),
+    "figure6": ("Nr", "Nh", "n", "m_E", "m_I", "method", "part"),
+}
 _PUBLISHED = Look(colour=INK, marker="*", size=10, edge=0.9, dash=None, fill="white")
 _FITTED = Look(colour=COLOURS[2], dash=(1, 1.5))
 
-
-def _times(points: Sequence[Point], style: Look) -> Series:
-    """Make medians and their intervals."""
-    times = [p.time for p in points]
-    low, high = tuple(t.low for t in times), tuple(t.high for t in times)
-    return Series(
-        x=tuple(p.x for p in points), y=tuple(t.value for t in times), look=style,
-        intervals=Intervals(low=low, high=high),
-    )  # fmt: skip
+Labelled = tuple[str, Sequence[Any], Look]  #: label, points and look of a curve
 
 
-def _star(x: float, y: float, style: Look = _PUBLISHED) -> Series:
-    """Make the mark of a published number."""
-    return Series(x=(float(x),), y=(float(y),), look=style)
+class Point(NamedTuple):
+    """One point of a curve: a size and a time in seconds with its interval."""
+
+    x: float
+    time: Interval
 
 
-def _row(panels: Sequence[Panel]) -> figure.Row:
-    return figure.Row(panels=tuple(panels))
+class Fit(NamedTuple):
+    """t = c·xᵖ with p given; c between the extremes over the points it rests on."""
+
+    power: int
+    c: float
+    low: float
+    high: float
+    since: float  #: the smallest size it rests on
+    until: float  #: the largest
 
 
-def _titled(panels: Sequence[Panel], titles: Sequence[str]) -> tuple[Panel, ...]:
+def select(rows: Iterable[Row], **where: Any) -> list[Row]:
+    """Return the rows with the values in `where`; a tuple allows any of its values."""
+    return [
+        row
+        for row in rows
+        if all(
+            row[k] in (v if isinstance(v, tuple) else (v,)) for k, v in where.items()
+        )
+    ]
+
+
+def medians(
+    rows: Iterable[Row], keys: Sequence[str]
+) -> dict[tuple[Any, ...], Interval]:
+    """Group rows by the values of `keys` and take the median of their seconds.
+
+    Parts that are not among the keys are summed within each repeat.
+    """
+    sums: dict[tuple[Any, ...], dict[Any, float]] = {}
+    for row in rows:
+        repeats = sums.setdefault(tuple(row[k] for k in keys), {})
+        repeat = row["repeat"]
+        repeats[repeat] = repeats.get(repeat, 0.0) + float(row["seconds"])
+    return {key: median_interval(list(s.values())) for key, s in sums.items()}
+
+
+def times(rows: Iterable[Row], x: str, **where: Any) -> list[Point]:
+    """Medians against the column `x` of `select`ed rows, whose parts are summed."""
+    found = medians(select(rows, **where), [x])
+    return [Point(float(key), time) for (key,), time in sorted(found.items())]
+
+
+def fit(points: Sequence[Point], power: int) -> Fit:
+    """Fit c by least squares on logarithms to the upper half of the sizes."""
+    upper = points[len(points) // 2 :]
+    ratios = [p.time.value / p.x**power for p in upper]
+    c = float(np.exp(np.mean(np.log(ratios))))
+    return Fit(power, c, min(ratios), max(ratios), upper[0].x, upper[-1].x)
+
+
+def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
+    """Fit c·n³ to building the dense pseudoinverse, c·n² to multiplying with it."""
+    points = times(rows, "n", method="pinv", part=part)
+    return fit(points, 3 if part == "build" else 2)
+
+
+def titled(*panels: tuple[str, Panel]) -> tuple[Panel, ...]:
+    """Letter the panels of a figure, and name them."""
     return tuple(
         replace(panel, title=f"({letter}) {title}")
-        for letter, panel, title in zip("abcdef", panels, titles, strict=False)
+        for letter, (title, panel) in zip("abcdef", panels, strict=False)
     )
+
+
+def labelled(curves: Iterable[Labelled]) -> tuple[tuple[Mark, ...], tuple[Key, ...]]:
+    """Draw curves, and list their keys."""
+    marks, keys = list[Mark](), []
+    for label, points, style in curves:
+        marks += curve(points, style)
+        keys.append(Key(label=label, look=style))
+    return tuple(marks), tuple(keys)
 
 
 def assembly_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 3: linear and logarithmic."""
-    methods = ("triplets", "compiled", "compiled-reused")
-    curves = [
-        _times(curve(rows, "n", method=m), look(i)) for i, m in enumerate(methods)
+    curves: list[Labelled] = [
+        (METHODS[method], times(rows, "n", method=method), look(i))
+        for i, method in enumerate(("triplets", "compiled", "compiled-reused"))
     ]
-    marks = (*curves, _star(published.DOFS, published.SECONDS["assembly"]))
-    keys = [Key(label=METHODS[m], look=look(i)) for i, m in enumerate(methods)]
     words = f"published, both bodies ({published.MACHINE})"
+    place = published.DOFS, published.SECONDS["assembly"]
+    marks, keys = labelled([*curves, (words, [place], _PUBLISHED)])
     time = "assembly time in s"
     left = Panel(
         x=Axis(label=DOFS, low=0, most=4), y=Axis(label=time, low=0), marks=marks,
         grid="none",
     )  # fmt: skip
     right = Panel(x=log(DOFS), y=log(time), marks=marks)
-    return Figure(
-        rows=(_row(_titled((left, right), ("linear scale", "logarithmic scale"))),),
-        height=3.4,
-        legend=below((*keys, Key(label=words, look=_PUBLISHED)), 2),
-    )
+    panels = titled(("linear scale", left), ("logarithmic scale", right))
+    return Figure(rows=in_rows(panels, 2), height=3.4, legend=below(keys, 2))
 
 
 def contact_figure(rows: Sequence[Row]) -> Figure:
@@ -98,27 +172,26 @@ def contact_figure(rows: Sequence[Row]) -> Figure:
     place = published.SEGMENTS["slave"], published.SECONDS["contact"] / published.STEPS
     name = f"published\n({published.SEGMENTS['master']} master segments)"
     panels = []
-    for method in ("nts", "mortar"):
+    for method, title in (
+        ("nts", "node-to-segment, as in the paper"), ("mortar", "mortar, dual basis"),
+    ):  # fmt: skip
         first = method == "nts"
-        curves = [
-            _times(curve(rows, "slave", method=method, master=master), look(i))
+        marks, keys = labelled(
+            (f"{master}", times(rows, "slave", method=method, master=master), look(i))
             for i, master in enumerate(masters)
-        ]
-        panels.append(
-            Panel(
-                x=log("slave segments"),
-                y=Axis(
-                    label="time of one linearisation in s" * first, log=True, high=0.7,
-                    shared="time", numbered=first,
-                ),
-                marks=(*curves, _star(*place)) if first else tuple(curves),
-                texts=(Text(text=name, place=place, offset=(9, 0)),) if first else (),
-            )
+        )
+        panel = Panel(
+            x=log("slave segments"),
+            y=Axis(
+                label="time of one linearisation in s" * first, log=True, high=0.7,
+                shared="time", numbered=first,
+            ),
+            marks=(*marks, *curve([place] * first, _PUBLISHED)),
+            texts=(Text(text=name, place=place, offset=(9, 0)),) * first,
         )  # fmt: skip
-    titles = ("node-to-segment, as in the paper", "mortar, dual basis")
-    keys = [Key(label=f"{master}", look=look(i)) for i, master in enumerate(masters)]
+        panels.append((title, panel))
     return Figure(
-        rows=(_row(_titled(panels, titles)),),
+        rows=in_rows(titled(*panels), 2),
         height=3.6,
         legend=below(keys, len(masters), "master segments"),
     )
@@ -126,122 +199,203 @@ def contact_figure(rows: Sequence[Row]) -> Figure:
 
 def inverse_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 5: building K⁺ and multiplying with it."""
-    looks = {"pinv": look(2), "geometric": look(0), "spectral": look(1)}
     until = float(max(r["n"] for r in rows))
     panels = []
-    for part in ("build", "multiply"):
-        curves = [
-            _times(curve(rows, "n", method=method, part=part), style)
-            for method, style in looks.items()
-        ]
-        band, law = _extrapolation(pinv_fit(rows, part), until)
-        panels.append(
-            Panel(x=log(DOFS), y=log("time in s"), marks=(*curves, band, law))
+    for part, title in (
+        ("build", "building"), ("multiply", "multiplication with a random vector"),
+    ):  # fmt: skip
+        marks, keys = labelled(
+            (METHODS[method], times(rows, "n", method=method, part=part), look(i))
+            for method, i in (("pinv", 2), ("geometric", 0), ("spectral", 1))
         )
+        law = pinv_fit(rows, part)  # goes on where nothing was measured
+        x = np.geomspace(law.until, until, 40)
+        at, low, middle, high = (
+            numbers(v)
+            for v in (x, *(c * x**law.power for c in (law.low, law.c, law.high)))
+        )
+        band = Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2)
+        marks = (*marks, band, Series(x=at, y=middle, look=_FITTED))
+        panels.append((title, Panel(x=log(DOFS), y=log("time in s"), marks=marks)))
     words = "dense pinv, not measured: fitted $c\\,n^3$ (a), $c\\,n^2$ (b)"
-    keys = [Key(label=METHODS[m], look=style) for m, style in looks.items()]
-    titles = ("building", "multiplication with a random vector")
     return Figure(
-        rows=(_row(_titled(panels, titles)),),
+        rows=in_rows(titled(*panels), 2),
         height=3.6,
         legend=below((*keys, Key(label=words, look=_FITTED)), 2),
     )
 
 
-def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
-    """Fit c·n³ to building the dense pseudoinverse, c·n² to multiplying with it."""
-    points = curve(rows, "n", method="pinv", part=part)
-    return fit(points, 3 if part == "build" else 2)
-
-
-def _extrapolation(law: Fit, until: float) -> tuple[Area, Series]:
-    """Continue the fit where nothing was measured, with its band."""
-    x = np.geomspace(law.until, until, 40)
-    at, low, middle, high = (
-        numbers(v) for v in (x, *(c * x**law.power for c in (law.low, law.c, law.high)))
-    )
-    band = Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2)
-    return band, Series(x=at, y=middle, look=_FITTED)
-
-
 def scaling_figure(rows: Sequence[Row]) -> Figure:
     """Draw Figure 6: sizes, constraints, dualisation and QPs, the whole."""
-    panels = _titled(
-        (*_sizes(rows), _dual(rows), _total(rows)),
-        ("size of the problems", "constraints", "dualisation and QPs, all steps",
-         "the whole analysis"),
-    )  # fmt: skip
-    return Figure(rows=figure.in_rows(panels, 2), height=6.3)
-
-
-def _sizes(rows: Sequence[Row]) -> tuple[Panel, Panel]:
-    points = sorted({(r["Nr"], r["n"], r["m_E"], r["m_I"]) for r in rows})
-    Nr, n, m_E, m_I = np.array(points, dtype=float).T
-
-    def panel(y: Axis, curves: Mapping[str, Vector]) -> Panel:
-        looks = {name: look(i) for i, name in enumerate(curves)}
-        marks = tuple(
-            Series(x=numbers(Nr), y=numbers(values), look=looks[name])
-            for name, values in curves.items()
-        )
-        keys = tuple(Key(label=name, look=style) for name, style in looks.items())
-        legend = Legend(keys=keys, place="upper left")
-        return Panel(x=Axis(label="$N_r$"), y=y, marks=marks, legend=legend)
-
+    sizes = sorted({(r["Nr"], r["n"], r["m_E"], r["m_I"]) for r in rows})
+    Nr, n, m_E, m_I = np.array(sizes, dtype=float).T
     most = float(max(m_E.max(), m_I.max()))
-    return (
-        panel(
-            Axis(label="unknowns", log=True, low=100, high=1e5),
-            {"primal, $n$": n, "dual, $m = m_E + m_I$": m_E + m_I},
-        ),
-        panel(
-            Axis(label="rows", low=0, high=1.35 * most),
-            {"Dirichlet equalities $m_E$": m_E, "contact inequalities $m_I$": m_I},
-        ),
-    )
-
-
-def _dual(rows: Sequence[Row]) -> Panel:
-    rows = [{**row, "m": int(row["m_E"]) + int(row["m_I"])} for row in rows]
-    marks, keys = [], []
-    for i, (method, parts, label) in enumerate((
-        ("per-row", ("dualisation",), "dualisation, one solve per row"),
-        ("condensed", ("factor", "dualisation"), "the same, condensed, with factor"),
-        ("per-row", ("qp",), "dual QPs, the textbook's SMALBE"),
-        ("condensed", ("qp",), "dual QPs, our SMALBE"),
+    unknowns = _against_Nr(
+        Nr, Axis(label="unknowns", log=True, low=100, high=1e5),
+        {"primal, $n$": n, "dual, $m = m_E + m_I$": m_E + m_I},
+    )  # fmt: skip
+    constraints = _against_Nr(
+        Nr, Axis(label="rows", low=0, high=1.35 * most),
+        {"Dirichlet equalities $m_E$": m_E, "contact inequalities $m_I$": m_I},
+    )  # fmt: skip
+    summed = [{**row, "m": int(row["m_E"]) + int(row["m_I"])} for row in rows]
+    dual, whole = list[Labelled](), list[Labelled]()
+    for i, (label, method, parts) in enumerate((
+        ("dualisation, one solve per row", "per-row", ("dualisation",)),
+        ("the same, condensed, with factor", "condensed", ("factor", "dualisation")),
+        ("dual QPs, the textbook's SMALBE", "per-row", ("qp",)),
+        ("dual QPs, our SMALBE", "condensed", ("qp",)),
     )):  # fmt: skip
-        points = curve(rows, "m", method=method, part=parts)
-        marks.append(_times(points, look(i)))
-        keys.append(Key(label=label, look=look(i)))
-    stars = (("dualisation", "*", 9.0, "dualisation"), ("qp", "P", 7.0, "QPs"))
-    for part, marker, size, name in stars:
+        points = times(summed, "m", method=method, part=parts)
+        dual.append((label, points, look(i)))
+    for label, part, marker, size in (
+        ("published: dualisation", "dualisation", "*", 9.0),
+        ("published: QPs", "qp", "P", 7.0),
+    ):
         style = replace(_PUBLISHED, marker=marker, size=size)
-        marks.append(_star(published.ROWS, published.SECONDS[part], style))
-        keys.append(Key(label=f"published: {name}", look=style))
-    return _with_head_room("size of the dual $m$", marks, keys, 3.8)
-
-
-def _total(rows: Sequence[Row]) -> Panel:
-    marks, keys = [], []
+        dual.append((label, [(published.ROWS, published.SECONDS[part])], style))
     for i, method in enumerate(("per-row", "condensed")):
-        marks.append(_times(curve(rows, "n", method=method), look(i)))
-        keys.append(Key(label=METHODS[method], look=look(i)))
-    marks.append(_star(published.DOFS, published.TOTAL))
-    keys.append(Key(label="published", look=_PUBLISHED))
-    return _with_head_room("size of the primal $n$", marks, keys, 2.2)
+        whole.append((METHODS[method], times(rows, "n", method=method), look(i)))
+    whole.append(("published", [(published.DOFS, published.TOTAL)], _PUBLISHED))
+    panels = titled(
+        ("size of the problems", unknowns),
+        ("constraints", constraints),
+        ("dualisation and QPs, all steps",
+         _with_head_room("size of the dual $m$", dual, 3.8)),
+        ("the whole analysis", _with_head_room("size of the primal $n$", whole, 2.2)),
+    )  # fmt: skip
+    return Figure(rows=in_rows(panels, 2), height=6.3)
 
 
-def _with_head_room(
-    size: str, marks: Sequence[Series], keys: Sequence[Key], decades: float
-) -> Panel:
-    """Make a panel with room for its legend above the curves."""
-    legend = Legend(keys=tuple(keys), place="upper left", size=8)
+def _against_Nr(Nr: Vector, y: Axis, curves: Mapping[str, Vector]) -> Panel:
+    marks, keys = labelled(
+        (name, list(zip(Nr, values, strict=True)), look(i))
+        for i, (name, values) in enumerate(curves.items())
+    )
+    legend = Legend(keys=keys, place="upper left")
+    return Panel(x=Axis(label="$N_r$"), y=y, marks=marks, legend=legend)
+
+
+def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Panel:
+    """Make a panel of labelled curves with room for its legend above them."""
+    marks, keys = labelled(curves)
     panel = Panel(
         x=Axis(label=size, most=4),
         y=log("time in s"),
-        marks=tuple(marks),
-        legend=legend,
+        marks=marks,
+        legend=Legend(keys=keys, place="upper left", size=8),
     )
     low, high = limits([panel], "y")
     head = high * 10 ** (0.35 * decades)
     return replace(panel, y=replace(panel.y, low=low, high=head))
+
+
+def here(machine: dict[str, Any]) -> str:
+    """Name the machine of the measurements."""
+    cpu = machine.get("cpu") or "an unknown processor"
+    return f"{cpu}, {machine.get('system', 'unknown system')}, one thread, Python"
+
+
+def largest(experiment: Experiment) -> list[Row]:
+    """Keep the measurements of the analysis at its largest size."""
+    rows = experiment.tables["figure6"]
+    return select(rows, Nr=max(int(row["Nr"]) for row in rows))
+
+
+def of_table_1(rows: Sequence[Row]) -> bool:
+    """Return whether this is the size that the published times are of."""
+    return (rows[0]["Nr"], rows[0]["Nh"]) == (30, 15)
+
+
+def table_1(experiment: Experiment) -> Table:
+    """Make Table 1, beside the paper's counts."""
+    heads = ("nodes", "elements", "dofs")
+    counted = experiment.tables["table1"]
+    lines: list[tuple[Cell, tuple[Any, ...], tuple[Any, ...]]] = [
+        (Cell(text=str(r["body"])), tuple(int(r[k]) for k in ("N", *heads, "segments")),
+         published.TABLE_1[str(r["body"])])
+        for r in counted
+    ]  # fmt: skip
+    sums = tuple(sum(int(r[k]) for r in counted) for k in heads)
+    total = ("", *published.TOTALS, "")
+    lines.append((Cell(text="total", kind="total"), ("", *sums, ""), total))
+    return Table(
+        caption="Parameters of the largest problem (the paper's Table 1).",
+        columns=("", "N", *heads, "segments", "the paper"),
+        rows=tuple(
+            (name, *(Cell(text=str(v), value=v or None) for v in ours),
+             Cell(text="the same" if ours == theirs else "another size"))
+            for name, ours, theirs in lines
+        ),
+    )  # fmt: skip
+
+
+def timings(experiment: Experiment) -> Table:
+    """Put Section 5's times beside ours."""
+    rows = largest(experiment)
+    steps = experiment.setting["plan"]["steps"]
+    machine = here(experiment.setting["environment"].get("machine", {}))
+    lines = []
+    for name, parts in (LINES | {"total": PARTS}).items():
+        said = sum(published.SECONDS.get(part, 0.0) for part in parts)
+        way, ours = (
+            times(rows, "n", method=m, part=parts)[0].time
+            for m in ("per-row", "condensed")
+        )
+        ratio = Cell()
+        if said and of_table_1(rows):
+            text = bracketed(*(said / t for t in (ours.value, ours.high, ours.low)))
+            ratio = Cell(text=text, value=said / ours.value)
+        lines.append((
+            Cell(text=name, kind="total" if parts == PARTS else ""),
+            Cell(text=f"{said:.4g} s", value=said) if said else Cell(),
+            Cell(text=seconds(way), value=way.value),
+            Cell(text=seconds(ours), value=ours.value),
+            ratio,
+        ))  # fmt: skip
+    return Table(
+        caption=f"Section 5: times at Nr = {rows[0]['Nr']}, Nh = {rows[0]['Nh']}, "
+        f"{steps} steps. Published: {published.MACHINE}; ours: {clean(machine)}. "
+        "Condensed: the factor contains the condensation onto the interface, so "
+        "compare it together with the dualisation. Ratio: published over ours "
+        "condensed, two machines apart.",
+        columns=("", "published", "ours, the paper's way", "ours, condensed", "ratio"),
+        rows=tuple(lines),
+    )
+
+
+def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
+    """Make one table per figure, in seconds, Table 1 and the published times.
+
+    kind: measured, or fitted where nothing was measured.
+    """
+    made = {"table1": pd.DataFrame(list(experiment.tables["table1"]))}
+    for name, columns in KEYS.items():
+        rows = [
+            dict(zip(columns, key, strict=True))
+            | {"kind": "measured", "median": t.value, "low": t.low, "high": t.high,
+               "coverage": t.coverage, "samples": t.samples}
+            for key, t in medians(experiment.tables[name], columns).items()
+        ]  # fmt: skip
+        if name == "figure5":
+            rows += _fitted(experiment.tables[name])
+        made[name] = pd.DataFrame(rows)
+    made["published"] = pd.DataFrame(
+        {"part": part, "seconds": s, "machine": published.MACHINE}
+        for part, s in (published.SECONDS | {"total": published.TOTAL}).items()
+    )
+    return made
+
+
+def _fitted(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Tabulate the fits at the sizes that the dense pseudoinverse was not measured."""
+    sizes = sorted({(int(r["Nr"]), int(r["n"])) for r in rows})
+    return [
+        {"Nr": Nr, "n": n, "method": "pinv", "part": part, "kind": "fitted"}
+        | {name: c * float(n) ** law.power
+           for name, c in (("median", law.c), ("low", law.low), ("high", law.high))}
+        for part in ("build", "multiply")
+        for law in [pinv_fit(rows, part)]
+        for Nr, n in sizes
+        if n > law.until
+    ]  # fmt: skip

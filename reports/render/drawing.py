@@ -1,17 +1,18 @@
-"""Figures of curves, drawn with matplotlib."""
+"""Figures of curves and of bodies, drawn with matplotlib."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import ceil, log10
 from typing import Any
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import colormaps, patheffects, rc_context
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickedAxis
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import LineCollection
-from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure as Canvas
 from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
@@ -23,7 +24,21 @@ from matplotlib.ticker import (
     NullFormatter,
     NullLocator,
 )
+from matplotlib.tri import Triangulation
 
+from mortarbench.reports.document.fields import (
+    Arrow,
+    ColourField,
+    ColourScale,
+    FieldFigure,
+    FieldMark,
+    FieldPanel,
+    Label,
+    Path,
+    Polygons,
+    Strokes,
+    Vectors,
+)
 from mortarbench.reports.document.figure import (
     INK,
     Area,
@@ -79,6 +94,9 @@ _PLACES: dict[str, Any] = {
     "right": "outside right upper",
     "upper left": "upper left",
 }
+
+_CASING = 1.6  #: width of the white around arrows and frames, points
+_LETTER_CASING = 3.2  #: the strokes of a letter do not show white between them
 
 
 def draw_curves(figure: Figure) -> Canvas:
@@ -208,7 +226,7 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
 
 
 def _line(look: Look) -> dict[str, Any]:
-    """Say how a line looks."""
+    """Translate the look of a line for matplotlib."""
     style: Any = "none" if look.dash is None else (0, look.dash) if look.dash else "-"
     return {
         "color": look.colour, "linestyle": style, "linewidth": look.width,
@@ -217,7 +235,7 @@ def _line(look: Look) -> dict[str, Any]:
 
 
 def look_of(look: Look) -> dict[str, Any]:
-    """Say how a line and its marks look."""
+    """Translate the look of a line and of its marks."""
     return {
         **_line(look), "marker": look.marker or "none", "markersize": look.size,
         "markerfacecolor": look.fill or look.colour, "markeredgewidth": look.edge,
@@ -287,3 +305,107 @@ def _bar(axes: Axes, bar: ColourBar) -> None:
     drawn.set_ticks(list(range(1, count + 1, max(count // 5, 1))))
     drawn.ax.tick_params(which="minor", size=0)
     drawn.outline.set_linewidth(0.5)
+
+
+def draw_fields(figure: FieldFigure) -> Canvas:
+    """Draw a figure of bodies; it is laid out when it is printed."""
+    with rc_context(STYLE):
+        canvas = Canvas(figsize=(figure.width, figure.height))
+        grid = canvas.add_gridspec(
+            len(figure.heights), figure.columns, height_ratios=figure.heights
+        )
+        made = []
+        for i, panel in enumerate(figure.panels):
+            axes = canvas.add_subplot(grid[divmod(i, figure.columns)])
+            _field_panel(axes, panel)
+            made.append(axes)
+            if panel.scale:
+                _field_bar(canvas, panel.scale, axes, orientation="horizontal",
+                           aspect=30, fraction=0.06, pad=0.02)  # fmt: skip
+        if figure.scale:
+            _field_bar(canvas, figure.scale, made, aspect=32, fraction=0.04, pad=0.015)
+    return canvas
+
+
+def _field_panel(axes: Axes, panel: FieldPanel) -> None:
+    axes.set(
+        aspect="equal", title=panel.title, xlabel=panel.xlabel, ylabel=panel.ylabel
+    )
+    for i, mark in enumerate(panel.marks):
+        _field_mark(axes, mark, 1.0 + i / (1 + len(panel.marks)))
+    axes.set(xlim=(panel.low[0], panel.high[0]), ylim=(panel.low[1], panel.high[1]))
+    if panel.unit != 1.0:
+        for axis in (axes.xaxis, axes.yaxis):
+            axis.set_major_formatter(_in_units(panel.unit))
+    axes.tick_params(labelbottom=panel.numbered[0], labelleft=panel.numbered[1])
+    if panel.axes == "none":
+        axes.axis("off")
+    axes.spines[["top", "right"]].set_visible(panel.axes == "frame")
+
+
+def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
+    match mark:
+        case ColourField():
+            x, y = mark.points.T
+            mesh = Triangulation(x, y, mark.triangles)
+            axes.tripcolor(
+                mesh, mark.values, cmap=mark.scale.colours, shading="gouraud",
+                norm=Normalize(mark.scale.low, mark.scale.high), rasterized=True,
+                zorder=height,
+            )  # fmt: skip
+        case Polygons():
+            fill = to_rgba(mark.fill, mark.opacity) if mark.fill != "none" else "none"
+            polygons = PolyCollection(
+                list(mark.corners), facecolor=fill, edgecolor=mark.edge,
+                linewidth=mark.width, hatch=mark.hatch or None, zorder=height,
+            )  # fmt: skip
+            polygons.set_path_effects(_cased(_CASING, mark.cased))
+            axes.add_collection(polygons)
+        case Strokes():
+            axes.add_collection(
+                LineCollection(
+                    list(mark.ends), color=mark.colour, linewidth=mark.width,
+                    alpha=mark.opacity, rasterized=mark.rasterised, zorder=height,
+                )
+            )  # fmt: skip
+        case Path():
+            axes.plot(*mark.points.T, zorder=height, **look_of(mark.look))
+        case Vectors():
+            axes.quiver(
+                *mark.feet.T, *mark.vectors.T, angles="xy", scale_units="xy", scale=1,
+                width=mark.width, color=mark.colour, zorder=height,
+                path_effects=_cased(_CASING, mark.cased),
+            )  # fmt: skip
+        case Arrow():
+            arrow = {
+                "arrowstyle": mark.head, "color": mark.colour, "lw": mark.width,
+                "mutation_scale": mark.size, "shrinkA": mark.gap, "shrinkB": 0,
+            }  # fmt: skip
+            axes.annotate("", mark.end, mark.start, arrowprops=arrow, zorder=height)
+        case Label():
+            axes.annotate(
+                mark.text, mark.place, xytext=mark.offset, color=mark.colour,
+                textcoords="offset points", ha=mark.align[0], va=mark.align[1],
+                path_effects=_cased(_LETTER_CASING, mark.cased), zorder=height,
+                fontsize=mark.size,
+            )  # fmt: skip
+
+
+def _cased(width: float, cased: bool) -> list[patheffects.AbstractPathEffect]:
+    return [patheffects.withStroke(linewidth=width, foreground="white")] * cased
+
+
+def _in_units(unit: float) -> Callable[[float, float], str]:
+    """Write numbers of an axis in multiples of `unit`."""
+    return lambda v, _: f"{v / unit:.4g}".replace("-", "−")
+
+
+def _field_bar(
+    canvas: Canvas, scale: ColourScale, beside: Axes | list[Axes], **how: Any
+) -> None:
+    norm = Normalize(scale.low, scale.high)
+    colours = ScalarMappable(norm=norm, cmap=colormaps[scale.colours])
+    bar = canvas.colorbar(colours, ax=beside, extend=scale.beyond, **how)
+    bar.long_axis.set_major_formatter(_in_units(scale.unit))
+    bar.set_label(scale.label)
+    bar.outline.set_linewidth(0.5)

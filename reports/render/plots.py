@@ -1,7 +1,11 @@
-"""Figures of curves as the page's script draws them: plain data for JSON."""
+"""Figures of curves as the page's script draws them: plain data for JSON.
+
+Labels hold formulas as matplotlib reads them; the page shows them as plain text.
+"""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from math import isfinite
@@ -20,18 +24,22 @@ from mortarbench.reports.document.figure import (
     Mark,
     Numbers,
     Panel,
-    Rule,
     Runs,
     Segments,
     Series,
-    Text,
     fitted,
 )
-from mortarbench.reports.render.mathtext import plain
 
 Data = dict[str, Any]
 
 MOST = 4000  #: points of a line; of more, each stretch shows its least and largest
+_NAMED = {
+    "lambda": "λ", "sigma": "σ", "tau": "τ", "rho": "ρ", "mu": "µ", "nu": "ν",
+    "alpha": "α", "kappa": "κ", "Gamma": "Γ", "times": "×", "cdot": "·",
+    "leq": "≤", "geq": "≥", "infty": "∞", "pm": "±", "approx": "≈", "%": "%",
+}  # fmt: skip
+_RAISED = str.maketrans("0123456789-+/nkpP.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁺ᐟⁿᵏᵖᴾ·")
+_LOWERED = str.maketrans("0123456789kij", "₀₁₂₃₄₅₆₇₈₉ₖᵢⱼ")
 
 
 def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
@@ -60,14 +68,30 @@ def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
 
 
 def _panel(panel: Panel, solvers: Mapping[str, int]) -> Data:
+    own = [panel.legend] if panel.legend else []
+    if panel.bar is not None:
+        looks = (Look(colour=name) for name in panel.bar.colours)
+        keys = (Key(label=str(k), look=look) for k, look in enumerate(looks, 1))
+        own.append(Legend(keys=tuple(keys), title=panel.bar.label))
     return {
         "title": plain(panel.title),
         "x": _axis(panel.x),
         "y": _axis(panel.y),
         "traces": [t for mark in panel.marks for t in _traces(mark, solvers)],
-        "rules": [_rule(rule) for rule in panel.rules],
-        "texts": [_text(text) for text in panel.texts],
-        "own": _legend([*filter(None, [panel.legend]), *_steps(panel)], solvers),
+        "rules": [
+            look_of(rule.look) | {"axis": rule.axis, "at": rule.at}
+            for rule in panel.rules
+        ],
+        "texts": [
+            {
+                "text": plain(text.text),
+                "place": list(text.place),
+                "inside": list(text.inside),
+                "align": list(text.align),
+            }
+            for text in panel.texts
+        ],
+        "own": _legend(own, solvers),
     }
 
 
@@ -156,62 +180,30 @@ def _segments(ends: Sequence[Numbers], name: str, width: float, runs: Runs) -> D
 
 def _outline(area: Area) -> Iterator[float]:
     """Go around an area: along its upper end, and back along the lower."""
-    upper, lower = (
-        list(zip(area.x, end, strict=True)) for end in (area.high, area.low)
-    )
-    if area.step:
-        upper, lower = _stepped(upper), _stepped(lower)
-    for x, y in (*upper, *reversed(lower)):
-        yield from (x, y)
-
-
-def _stepped(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Hold each value until the next point."""
-    made = list(points[:1])
-    for (_, before), (x, y) in pairwise(points):
-        made += [(x, before), (x, y)]
-    return made
-
-
-def _rule(rule: Rule) -> Data:
-    return look_of(rule.look) | {"axis": rule.axis, "at": rule.at}
-
-
-def _text(text: Text) -> Data:
-    return {
-        "text": plain(text.text),
-        "place": list(text.place),
-        "inside": list(text.inside),
-        "align": list(text.align),
-    }
+    for values, direction in ((area.high, 1), (area.low, -1)):
+        points = list(zip(area.x, values, strict=True))
+        if area.step:  # each value holds until the next point
+            held = [((x, y0), (x, y)) for (_, y0), (x, y) in pairwise(points)]
+            points[1:] = [point for two in held for point in two]
+        for point in points[::direction]:
+            yield from point
 
 
 def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
     titles = dict.fromkeys(plain(one.title) for one in legends)
     return {
         "title": ", ".join(filter(None, titles)),
-        "keys": [_key(key, solvers) for one in legends for key in one.keys],
+        "keys": [
+            look_of(key.look)
+            | {"label": plain(key.label), "s": solvers.get(key.solver, -1)}
+            for one in legends
+            for key in one.keys
+        ],
     }
 
 
-def _key(key: Key, solvers: Mapping[str, int]) -> Data:
-    label = {"label": plain(key.label), "s": solvers.get(key.solver, -1)}
-    return look_of(key.look) | label
-
-
-def _steps(panel: Panel) -> list[Legend]:
-    """Make keys of the colours of a bar."""
-    if panel.bar is None:
-        return []
-    keys = tuple(
-        Key(label=str(k), look=Look(colour=name))
-        for k, name in enumerate(panel.bar.colours, 1)
-    )
-    return [Legend(keys=keys, title=panel.bar.label)]
-
-
 def look_of(look: Look) -> Data:
-    """Tell how a line and its marks look, lengths in px or points."""
+    """Translate the look of a line and of its marks, lengths in px or points."""
     dash = look.dash
     return {
         "colour": colour(look.colour),
@@ -234,3 +226,22 @@ def colour(name: str) -> str:
 def rounded(values: Any, digits: int = 6) -> list[float | None]:
     """Round for the page; what is not finite has no place in JSON."""
     return [float(f"{v:.{digits}g}") if isfinite(v) else None for v in values]
+
+
+def plain(text: str) -> str:
+    r"""Read mathtext as text: "degrees of freedom $n$" loses its dollars.
+
+    An escaped dollar is one, as `reports.figures.style.legible` writes it.
+    """
+    parts = re.split(r"(?<!\\)\$", text)
+    shown = [_formula(p) if i % 2 else p for i, p in enumerate(parts)]
+    return "".join(shown).replace(r"\$", "$").strip()
+
+
+def _formula(tex: str) -> str:
+    tex = tex.replace(r"\|", "‖").replace(r"\,", " ")
+    tex = re.sub(r"\\(?:mathrm|mathbf|mathit|text|rm)\b\s*", "", tex)
+    tex = re.sub(r"\\([A-Za-z]+|%)", lambda m: _NAMED.get(m[1], m[1]), tex)
+    tex = re.sub(r"\^(\{[^}]*\}|.)", lambda m: m[1].strip("{}").translate(_RAISED), tex)
+    tex = re.sub(r"_(\{[^}]*\}|.)", lambda m: m[1].strip("{}").translate(_LOWERED), tex)
+    return re.sub(r"[{}]", "", tex).replace("  ", " ")

@@ -15,8 +15,7 @@ from matplotlib.transforms import Bbox
 from mortarbench.harness import InputError
 from mortarbench.reports.document.fields import FieldFigure
 from mortarbench.reports.document.figure import Figure
-from mortarbench.reports.render.drawing import STYLE, draw_curves
-from mortarbench.reports.render.field_drawing import draw_fields
+from mortarbench.reports.render.drawing import STYLE, draw_curves, draw_fields
 from mortarbench.reports.render.svg import PAPER, Svg
 
 ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures

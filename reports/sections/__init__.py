@@ -13,14 +13,14 @@ from pkgutil import iter_modules
 from typing import NamedTuple
 
 from mortarbench.reports.data.aggregation import Ranking, ranking_of
-from mortarbench.reports.data.comparison_groups import ComparisonGroup, all_groups
-from mortarbench.reports.data.evidence import Evidence
-from mortarbench.reports.data.fastest import (
+from mortarbench.reports.data.comparison_groups import (
     Answers,
-    FastestSolver,
+    ComparisonGroup,
+    all_groups,
     answers_of,
-    fastest_solvers,
 )
+from mortarbench.reports.data.evidence import Evidence
+from mortarbench.reports.data.fastest import FastestSolver, fastest_solvers
 from mortarbench.reports.data.size_series import SizeSeries, size_series
 from mortarbench.reports.data.ways import Ways, compare_ways
 from mortarbench.reports.document.layout import Part, Section

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from mortarbench.harness import Verdict
-from mortarbench.reports.data.comparison_groups import CASES
+from mortarbench.reports.data.comparison_groups import CASES, time_of
 from mortarbench.reports.data.environment import busy_with
 from mortarbench.reports.data.evidence import Evidence
 from mortarbench.reports.data.fastest import (
@@ -20,7 +20,6 @@ from mortarbench.reports.data.fastest import (
     FastestSolver,
     Finding,
     Unverified,
-    time_of,
     unverified,
 )
 from mortarbench.reports.data.rank_series import strong_series
@@ -38,8 +37,7 @@ from mortarbench.reports.document.formatting import (
 from mortarbench.reports.document.layout import Part, Picture, Statement
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.fastest import PANELS, SOLVERS, fastest_figure
-from mortarbench.reports.figures.scaling import iterations_figure
-from mortarbench.reports.figures.steps import condition_numbers
+from mortarbench.reports.figures.scaling import condition_numbers, iterations_figure
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.sections.scaling import iteration_growth, per_decade
 from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps, places

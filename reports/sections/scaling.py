@@ -13,8 +13,12 @@ from mortarbench.reports.data.size_series import SizeSeries, Sweep, sweeps
 from mortarbench.reports.document.formatting import TIMED, clean, exponent
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
-from mortarbench.reports.figures.scaling import MOST_SERIES, scaling_figure
-from mortarbench.reports.figures.steps import steps_figure, torn_figure
+from mortarbench.reports.figures.scaling import (
+    MOST_SERIES,
+    scaling_figure,
+    steps_figure,
+    torn_figure,
+)
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.growth import (
     PRACTICAL,

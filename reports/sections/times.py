@@ -27,7 +27,7 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import TIMED, VERDICTS, estimate, seconds
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
-from mortarbench.reports.figures.accuracy import accuracy_figure
+from mortarbench.reports.figures.sweeps import accuracy_figure
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
 

@@ -1,4 +1,4 @@
-"""What a solve on N ranks takes, as a model: work, what every rank repeats, messages.
+"""A model of the time of a solve on N ranks: shared and repeated work, messages.
 
     t(N) = s(N)·(W/N + C) + R·α_R(N) + M(N)·α + b·β
 
@@ -51,7 +51,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """What a rank sends in one solve on `ranks` ranks, and how fast that was there."""
+    """Messages of a rank in one solve on `ranks` ranks, and their speed."""
 
     ranks: int  #: at least two
     reductions: float  #: over all ranks
@@ -63,7 +63,7 @@ class Communication:
 
     @property
     def seconds(self) -> Array:
-        """Give what reductions, messages and bytes take on these ranks, (3,)."""
+        """Seconds of reductions, messages and bytes on these ranks, (3,)."""
         return np.array(
             [
                 self.reductions * self.reduction_seconds,
@@ -74,7 +74,7 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Say how many times as long each of the three takes on other ranks, (…, 3)."""
+    """Return the factors by which the three grow on other ranks, (…, 3)."""
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)
@@ -157,6 +157,8 @@ def cost_model(
         raise ValueError("a model of ranks needs times on one rank and on several")
     if not communication or {c.ranks for c in communication} != {ranks[-1]}:
         raise ValueError(f"a model needs what {ranks[-1]} ranks have sent")
+    from scipy.optimize import nnls  # late: other reports begin without it
+
     N = np.array(ranks, dtype=float)
     samples = min(len(of) for of in (*seconds.values(), *copies.values()))
     rng = np.random.default_rng(crc32(repr(sorted(seconds.items())).encode()))
@@ -171,7 +173,10 @@ def cost_model(
     sent = parts @ growth(N, ranks[-1]).T
     with_none_alike = N * np.maximum(t - sent, 0.0) / t[:, :1]
     slow = np.where(slow > with_none_alike, np.maximum(with_none_alike, 1.0), slow)
-    work, alike = _fitted(N, np.maximum(t - sent, 0.0) / slow, t / slow)
+    y, scale = np.maximum(t - sent, 0.0) / slow, t / slow
+    terms = np.column_stack([1 / N, np.ones_like(N)])
+    fits = [nnls(terms / s[:, None], v / s)[0] for v, s in zip(y, scale, strict=True)]
+    work, alike = np.transpose(fits)
     found = slow * (work[:, None] / N + alike[:, None]) + sent
     return CostModel(
         work=float(work[0]),
@@ -191,17 +196,3 @@ def _geometric(values: ArrayLike, rng: np.random.Generator, count: int) -> Array
         logs = np.log(np.asarray(values, dtype=float))
     drawn = rng.integers(logs.size, size=(count, logs.size))
     return np.asarray(np.exp(np.r_[logs.mean(), logs[drawn].mean(axis=1)]))
-
-
-def _fitted(N: Array, y: Array, scale: Array) -> tuple[Array, Array]:
-    """Fit y = W/N + C, W and C ≥ 0, in every row of (rows, k), errors over `scale`."""
-    a, one, target = 1 / (N * scale), 1 / scale, y / scale
-    aa, a1, ll = (a * a).sum(1), (a * one).sum(1), (one * one).sum(1)
-    ay, ly = (a * target).sum(1), (one * target).sum(1)
-    determinant = aa * ll - a1 * a1
-    W, C = (ll * ay - a1 * ly) / determinant, (aa * ly - a1 * ay) / determinant
-    all_shared, none_shared = ay / aa, ly / ll
-    return (
-        np.where(C < 0, all_shared, np.where(W < 0, 0.0, W)),
-        np.where(C < 0, 0.0, np.where(W < 0, none_shared, C)),
-    )

@@ -1,4 +1,4 @@
-"""How sure we are of a median and of an exponent."""
+"""Confidence intervals of a median and of an exponent."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class PowerLaw(NamedTuple):
 
     @property
     def factor(self) -> float:
-        """What is multiplied with nᵖ; infinite where it is beyond all doubles."""
+        """The factor c of c·nᵖ; infinite where it exceeds all doubles."""
         with np.errstate(over="ignore"):
             return float(np.exp(self.log_factor))
 

@@ -57,7 +57,7 @@ def limits(draws: Array, cases: int) -> tuple[Array, Array]:
 
 
 def told_apart(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
-    """Tell which solvers are faster than which, all statements at 95 % together.
+    """Determine which solvers are faster than which, jointly at 95 %.
 
     If two solvers are alike, their times on a case might as well be exchanged: the sign
     of the difference of logarithms is a coin. The signs of whole cases are flipped, and

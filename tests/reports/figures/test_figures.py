@@ -22,10 +22,13 @@ from mortarbench.reports.document.figure import (
     Text,
     fitted,
 )
-from mortarbench.reports.figures.accuracy import accuracy_figure
 from mortarbench.reports.figures.scaling import scaling_figure
 from mortarbench.reports.figures.style import GUIDE
-from mortarbench.reports.figures.sweeps import certified_figure, sweep_figure
+from mortarbench.reports.figures.sweeps import (
+    accuracy_figure,
+    certified_figure,
+    sweep_figure,
+)
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.saving import draw, draw_svg
 from mortarbench.reports.validation.error_figure import error_figure

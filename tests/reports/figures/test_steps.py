@@ -8,7 +8,7 @@ from mortarbench.harness import Record, Verdict
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.size_series import size_series, sweeps
 from mortarbench.reports.document.figure import Series
-from mortarbench.reports.figures.steps import steps_figure, torn_figure
+from mortarbench.reports.figures.scaling import steps_figure, torn_figure
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.scaling import steps
 

@@ -29,20 +29,16 @@ from mortarbench.problems.fem.mesh import half_ring
 from mortarbench.problems.fem.triplets import stiffness_by_triplets
 from mortarbench.problems.models.beam_ring import BEAM
 from mortarbench.reports.data.evidence import Evidence, arrange, read_evidence
-from mortarbench.reports.paper.contact import active
+from mortarbench.reports.paper.bodies import dimensions, extent
 from mortarbench.reports.paper.fleet import (
     certified_table,
     fleet_figure,
     fleet_table,
     totals_table,
 )
-from mortarbench.reports.paper.geometry import dimensions
-from mortarbench.reports.paper.page import compose
-from mortarbench.reports.paper.report import write_paper
-from mortarbench.reports.paper.samples import curve, fit, medians
-from mortarbench.reports.paper.stepping import errors, order
-from mortarbench.reports.paper.stress import extent
-from mortarbench.reports.paper.tables import PARTS
+from mortarbench.reports.paper.physics import active, errors, order
+from mortarbench.reports.paper.report import compose, write_paper
+from mortarbench.reports.paper.timings import PARTS, fit, medians, times
 from mortarbench.reports.render.saving import save_all
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import PAPER, SMALBE
@@ -333,14 +329,14 @@ def cubes(*sizes, factor=lambda n: 2e-9):
 
 
 def test_a_fit_of_cubes_returns_their_factor():
-    law = fit(curve(cubes(10, 20, 40, 80), "n"), 3)
+    law = fit(times(cubes(10, 20, 40, 80), "n"), 3)
 
     assert (law.c, law.low, law.high) == pytest.approx((2.2e-9,) * 3)
     assert (law.since, law.until) == (40, 80)
 
 
 def test_the_band_of_a_fit_holds_the_factors_of_the_sizes_it_rests_on():
-    law = fit(curve(cubes(10, 20, 40, 80, factor=lambda n: n * 1e-9), "n"), 3)
+    law = fit(times(cubes(10, 20, 40, 80, factor=lambda n: n * 1e-9), "n"), 3)
 
     assert (law.low, law.high) == pytest.approx((44e-9, 88e-9))
     assert law.c == pytest.approx(np.sqrt(44 * 88) * 1e-9)  # geometric mean
@@ -355,7 +351,7 @@ def test_parts_are_summed_within_each_repeat_before_the_median_is_taken():
     ]  # fmt: skip
 
     assert medians(rows, ["n"])[(5,)][:3] == (6, 4, 10)
-    (point,) = curve(rows, "n", part=("a",))
+    (point,) = times(rows, "n", part=("a",))
     assert (point.x, point.time.value) == (5, 2)
 
 
@@ -375,7 +371,7 @@ def test_published_times_are_compared_at_the_published_size_only(experiment):
     compared = ratios(replace(experiment, tables=tables))
     ours = [r for r in grown if r["Nr"] == 30]
     total, set_up = (
-        curve(ours, "n", method="condensed", part=parts)[0].time.value
+        times(ours, "n", method="condensed", part=parts)[0].time.value
         for parts in (PARTS, ("factor", "dualisation"))
     )
     assert float(compared[-1].split()[0]) == pytest.approx(29.99 / total, rel=0.01)
@@ -443,9 +439,9 @@ def evidence(name):
 def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
     """`lazy` took 1 ns to be wrong: below every axis, and a cross instead."""
     figure = fleet_figure(evidence("paper-fleet"))
-    times, strips = (row.panels for row in figure.rows)
+    upper, strips = (row.panels for row in figure.rows)
 
-    for panel in times:
+    for panel in upper:
         assert min(y for series in panel.marks for y in series.y) >= 2.5e-3
     for panel in strips:
         assert [series.x for series in panel.marks] == [(200,)]

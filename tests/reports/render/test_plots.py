@@ -29,8 +29,7 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.layout import Cell, Table, named
 from mortarbench.reports.figures.style import COLOURS, legible, look
 from mortarbench.reports.render.embedded import cell, rows_of, script, spans, table
-from mortarbench.reports.render.mathtext import plain
-from mortarbench.reports.render.plots import MOST, panels
+from mortarbench.reports.render.plots import MOST, panels, plain
 from mortarbench.reports.render.saving import draw
 
 SOLVERS = {"a $b": 0, "b": 1, "b2": 2}

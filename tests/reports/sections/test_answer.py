@@ -9,9 +9,9 @@ import pytest
 from mortarbench.harness import InputError, Verdict
 from mortarbench.harness.results.journal import Journal
 from mortarbench.reports import answer, write_report
-from mortarbench.reports.data.comparison_groups import all_groups
+from mortarbench.reports.data.comparison_groups import all_groups, answers_of
 from mortarbench.reports.data.evidence import Evidence, arrange
-from mortarbench.reports.data.fastest import Finding, answers_of, fastest_solvers
+from mortarbench.reports.data.fastest import Finding, fastest_solvers
 from mortarbench.reports.figures.fastest import fastest_figure
 from mortarbench.reports.folder import compose
 from mortarbench.reports.render.html_page import html
