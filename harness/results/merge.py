@@ -94,7 +94,9 @@ def merge(
     _refuse_run(out)
     before = [out] if _journal(out).exists() else []
     folders = [*before, *read]
-    suite = _united_suite(folders)
+    paths = {str(folder): folder / "suite.toml" for folder in folders}
+    suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
+    suite = as_toml(united(suites))
     for folder in folders:
         check_copies(folder)
     with full_disk_told(out), locked(out):
@@ -165,16 +167,6 @@ def _refuse_run(out: Path) -> None:
             f"{out} holds measurements of a run (journal/{min(others)}); expected a "
             "new folder, or one that was merged before; choose another --out"
         )
-
-
-def _united_suite(folders: Sequence[Path]) -> str:
-    """Unite the suites of all folders that have one."""
-    tables: dict[str, dict[str, Any]] = {}
-    for folder in folders:
-        path = folder / "suite.toml"
-        if path.exists():
-            tables[str(folder)] = read_stored(path)
-    return as_toml(united(tables))
 
 
 def _copy_solutions(
