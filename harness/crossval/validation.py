@@ -12,13 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from mortarbench.harness.crossval.comparison import Problem, brief, compared
+import numpy as np
+
+from mortarbench.harness.crossval.comparison import Answer, Problem, brief, compared
 from mortarbench.harness.crossval.ground_truth import Given
-from mortarbench.harness.crossval.misattribution import (
-    recognised,
-    suspects,
-    true_forces,
-)
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -31,12 +28,14 @@ from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.results.rebuild import rebuild
+from mortarbench.harness.results.stored_run import rebuild
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
+ALIKE = 1e-3  #: relative difference of contact forces up to which they are the same
 PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none
 
 
@@ -92,7 +91,7 @@ class _Part(NamedTuple):
     problems: list[Problem]
     lost: list[Listed]  #: answers that could not be judged
     false: list[Listed]  #: claims without a point that are not so
-    suspects: dict[str, Vector]  #: see `harness.crossval.misattribution`
+    suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
     truths: dict[str, Vector]
     proven: int  #: claims of infeasibility
 
@@ -132,7 +131,9 @@ def validated(
     false_claims = [claim for part in parts for claim in part.false]
     refuted = {k: z for part in parts for k, z in part.suspects.items()}
     truths = {k: z for part in parts for k, z in part.truths.items()}
-    problems = recognised((p for part in parts for p in part.problems), refuted, truths)
+    problems = _recognised(
+        (p for part in parts for p in part.problems), refuted, truths
+    )
     return Validation(
         problems=tuple(problems),
         solvers=tuple(sorted({r.solver for r in records})),
@@ -191,8 +192,8 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         called = name if len(by_numbers) == 1 else f"{name} ({forms})"
         p = compared(called, same, solve, kept)
         problems.append(p)
-        forces |= suspects(p, same)
-        if (known := true_forces(p, same, solve, kept)) is not None:
+        forces |= _suspects(p, same)
+        if (known := _true_forces(p, same, solve, kept)) is not None:
             truths[p.name] = known
     proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
     solvable = {a.case: p for p in proven for a in p.answers}
@@ -291,3 +292,62 @@ def _apart(r: Record) -> Record:
 
 def _listed(r: Record, text: str) -> Listed:
     return Listed(run_id=r.run_id, solver=r.solver, case=r.case, tol=r.tol, text=text)
+
+
+def _true_forces(
+    problem: Problem, given: Sequence[Given], solve: Reference, references: Path
+) -> Vector | None:
+    """Return the multipliers (m,) of the reference; None where there is none."""
+    mechanics = given[0].case.mechanics
+    if mechanics is None or problem.truth != "reference":
+        return None
+    point = reference_point(mechanics, solve, references)  # which keeps it
+    return np.asarray(point.multipliers, dtype=float)
+
+
+def _suspects(problem: Problem, given: Sequence[Given]) -> dict[str, Vector]:
+    """Return the multipliers of refuted answers by run_id."""
+    refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
+    return {
+        g.record.run_id: g.case.mechanics.multipliers(g.case.mechanics.back(g.solution))
+        for g in given
+        if g.record.run_id in refuted and g.case.mechanics is not None
+    }
+
+
+def _recognised(
+    problems: Iterable[Problem],
+    found: Mapping[str, Vector],
+    truths: Mapping[str, Vector],
+) -> list[Problem]:
+    """Remark on each refuted answer that is the solution of another problem.
+
+    found : multipliers of refuted answers by run_id
+    truths : multipliers of solutions by the name of the problem
+    """
+
+    def remarked(a: Answer, own: str) -> Answer:
+        name = _whose(found[a.run_id], truths, own) if a.run_id in found else ""
+        if not name:
+            return a
+        text = f"its contact forces are those of {name}"
+        return replace(a, remarks=(*a.remarks, text))
+
+    return [
+        replace(p, answers=tuple(remarked(a, p.name) for a in p.answers))
+        for p in problems
+    ]
+
+
+def _whose(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
+    """Name the problem whose contact forces are nearest.
+
+    Empty if none are alike, or its own are: then something else is wrong.
+    """
+    differences = {
+        name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))
+        for name, lam in truths.items()
+        if lam.shape == z.shape and lam.any()
+    }
+    alike = {name: d for name, d in differences.items() if d <= ALIKE}
+    return "" if own in alike else min(alike, key=lambda n: alike[n], default="")

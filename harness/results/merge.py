@@ -111,7 +111,10 @@ def merge(
             _copy_solutions(source, out, records, tell)
         merge_copies(list(read), out, tell)
         _copy_environments(folders, out, union.records.values(), tell)
-        _merge_faults(folders, out)
+        faults = [f.to_json() for folder in folders for f in read_faults(folder)]
+        if faults:
+            text = "".join(f"{line}\n" for line in dict.fromkeys(faults))
+            replace_file(out / FAULTS, text.encode())
         replace_file(out / "suite.toml", suite.encode())
         lines = "".join(f"{r.to_json()}\n" for r in union.records.values())
         replace_file(_journal(out), lines.encode())
@@ -203,12 +206,3 @@ def _environment(folders: Sequence[Path], digest: str) -> Mapping[str, Any] | No
         with suppress(InputError):
             return environment_of(folder, digest)
     return None
-
-
-def _merge_faults(folders: Sequence[Path], out: Path) -> None:
-    """Keep every fault once, as a line."""
-    lines = dict.fromkeys(
-        f.to_json() for folder in folders for f in read_faults(folder)
-    )
-    if lines:
-        replace_file(out / FAULTS, "".join(f"{line}\n" for line in lines).encode())
