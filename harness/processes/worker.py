@@ -169,11 +169,9 @@ class _Bench:
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
-            "rank_seconds": spent.seconds,
-            "rank_counts": spent.counts,
-            "rank_network": spent.network,
             "first_seconds": timed.first_seconds,
-            "canary_seconds": canary,
+            # fields of the record that the parent takes as they are
+            "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
