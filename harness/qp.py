@@ -108,7 +108,8 @@ class QP:
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
         _check_sets(self.sets, n)
-        for array in (*arrays.values(), *_arrays_of(self.sets).values()):
+        of_sets = [array for one in self.sets for array in one.arrays().values()]
+        for array in (*arrays.values(), *of_sets):
             _freeze(array)
 
     @property
@@ -254,11 +255,6 @@ def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
                 "expected blocks without common variables"
             )
         taken[one.block] = True
-
-
-def _arrays_of(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of all sets by their names in files."""
-    return {name: array for one in sets for name, array in one.arrays().items()}
 
 
 def no_rows(n: int) -> Matrix:

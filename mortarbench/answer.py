@@ -79,12 +79,8 @@ class Answer:
     @property
     def residuals(self) -> Residuals | None:
         """Relative KKT residuals, evaluated by us; None where there is no point."""
-        r = self.record
-        if r.primal is None or r.dual is None:
-            return None
-        if r.complementarity is None or r.gap is None:
-            return None
-        return Residuals(r.primal, r.dual, r.complementarity, r.gap)
+        found: list[Any] = [getattr(self.record, name) for name in Residuals._fields]
+        return None if None in found else Residuals(*found)
 
     @property
     def energy_bound(self) -> float | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -193,16 +192,15 @@ def _exported(M: Matrix) -> Matrix:
     return M
 
 
-@dataclass(frozen=True)
 class GivenQP(plugin.Family):
     """A QP from a script, as a family of one problem."""
 
-    qp: QP
-    name: str = "qp"
-    defaults: Mapping[str, plugin.Value] = field(
-        default_factory=lambda: MappingProxyType({}), hash=False
-    )
-    forms: tuple[str, ...] = ("qp",)
+    name = "qp"
+    defaults: Mapping[str, plugin.Value] = MappingProxyType({})
+    forms = ("qp",)
+
+    def __init__(self, qp: QP) -> None:
+        self.qp = qp
 
     def build(
         self,

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import cache
 from html import escape
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness.names import completed
 from mortarbench.harness.plugin import About, Solver
@@ -26,49 +26,31 @@ if TYPE_CHECKING:
 CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
-class Listing(Sequence[Mapping[str, Any]]):
+class Listing(tuple[Mapping[str, Any], ...]):
     """Rows of plain data; a table where it is shown."""
 
-    def __init__(self, rows: Iterable[Mapping[str, Any]]) -> None:
-        self._rows = tuple(rows)
-
-    @overload
-    def __getitem__(self, index: int) -> Mapping[str, Any]: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> Listing: ...
-
-    def __getitem__(self, index: int | slice) -> Mapping[str, Any] | Listing:
-        if isinstance(index, slice):
-            return Listing(self._rows[index])
-        return self._rows[index]
-
-    def __len__(self) -> int:
-        return len(self._rows)
-
-    def __iter__(self) -> Iterator[Mapping[str, Any]]:
-        return iter(self._rows)
+    __slots__ = ()
 
     @property
     def names(self) -> tuple[str, ...]:
         """The name of each row."""
-        return tuple(row["name"] for row in self._rows)
+        return tuple(row["name"] for row in self)
 
     @property
     def df(self) -> DataFrame:
         """The same as a table of pandas."""
         from pandas import DataFrame
 
-        return DataFrame(list(self._rows))
+        return DataFrame(list(self))
 
     def __repr__(self) -> str:
-        return listing(self._rows) if self._rows else "none"
+        return listing(self) if self else "none"
 
     def _repr_html_(self) -> str:
         rows = "".join(
             f"<tr><td><code>{escape(row['name'])}</code></td>"
             f"<td style='text-align:left'>{escape(row['description'])}</td></tr>"
-            for row in self._rows
+            for row in self
         )
         return f"<table><tr><th>name</th><th>what it is</th></tr>{rows}</table>"
 

@@ -142,9 +142,9 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
             f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
             for d in data["unresolved"]
         ],
-        "Certificates contradicted (a fault of ours)": list(
-            map(_listed, data["contradictions"])
-        ),
+        "Certificates contradicted (a fault of ours)": [
+            f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
+        ],
         "Not validated": _together(data["not_validated"]),
         "Without a reference": [
             f"{d['problem']}: {d['text']}" for d in data["without_reference"]
@@ -211,23 +211,16 @@ def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _wrong(d: Mapping[str, Any]) -> str:
     error = f"; error {_e(d['error'])}" if d["error"] is not None else ""
-    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {_reasons(d)}{error}"
+    return f"{_measured(d)}: {'; '.join(d['reasons'])}{error}"
 
 
-def _reasons(d: Mapping[str, Any]) -> str:
-    return "; ".join(d["reasons"])
-
-
-def _listed(d: Mapping[str, Any]) -> str:
-    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}: {d['text']}"
+def _measured(d: Mapping[str, Any]) -> str:
+    return f"{d['solver']} on {d['case']}, tol {d['tol']:g}"
 
 
 def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
     """Say once what concerns all answers to a case."""
-    counted: dict[tuple[str, str], int] = {}
-    for d in listed:
-        key = (d["case"], d["text"])
-        counted[key] = counted.get(key, 0) + 1
+    counted = Counter((d["case"], d["text"]) for d in listed)
     return [
         f"{case} ({n} answer{'s' * (n != 1)}): {text}"
         for (case, text), n in counted.items()

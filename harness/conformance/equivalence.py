@@ -131,39 +131,14 @@ def _order(count: int) -> Order:
     return np.random.default_rng(141421).permutation(count)
 
 
-def _permuted(qp: QP, form: str) -> Equivalent:
-    return permute_unknowns(qp, _order(qp.q.size))
-
-
-def _rows_permuted(qp: QP, form: str) -> Equivalent:
-    return permute_rows(qp, _order(qp.b.size)[::-1], _order(qp.h.size))
-
-
 def _rows_scaled(qp: QP, form: str) -> Equivalent:
     """By factors from a thousandth to a thousand."""
     exponents = np.random.default_rng(173205).integers(-10, 11, qp.b.size + qp.h.size)
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-def _equalities_twice(qp: QP, form: str) -> Equivalent:
-    return duplicate_rows(qp, np.arange(qp.b.size), np.arange(0))
-
-
-def _inequalities_twice(qp: QP, form: str) -> Equivalent:
-    return duplicate_rows(qp, np.arange(0), np.arange(qp.h.size))
-
-
-def _shifted(qp: QP, form: str) -> Equivalent:
-    """By half of what the largest contact force, or deflection, is about."""
-    return shift_unknowns(
-        qp, np.full(qp.q.size, 2.0**-5 if form == "primal" else 2.0**-7)
-    )
-
-
-def _mirrored(qp: QP, form: str) -> Equivalent:
-    """Turn all round: what was pushed down is pushed up, and λ ≥ 0 becomes λ ≤ 0."""
-    return mirror(qp, np.arange(qp.q.size))
-
+#: of a shift: half of what the largest contact force, or deflection, is about
+_SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
 Change = Callable[[QP, str], Equivalent]  #: of the strings in a form
 
@@ -172,13 +147,22 @@ AS_IT_IS = "as it is"
 CHANGES: Mapping[str, Change] = {
     AS_IT_IS: lambda qp, form: Equivalent(qp, lambda s: s),
     **{f"units {name}": partial(_units, name) for name in UNITS},
-    "unknowns permuted": _permuted,
-    "rows permuted": _rows_permuted,
+    "unknowns permuted": lambda qp, _: permute_unknowns(qp, _order(qp.q.size)),
+    "rows permuted": lambda qp, _: permute_rows(
+        qp, _order(qp.b.size)[::-1], _order(qp.h.size)
+    ),
     "rows scaled": _rows_scaled,
-    "equality rows twice": _equalities_twice,
-    "inequality rows twice": _inequalities_twice,
-    "unknowns shifted": _shifted,
-    "mirrored": _mirrored,
+    "equality rows twice": lambda qp, _: duplicate_rows(
+        qp, np.arange(qp.b.size), np.arange(0)
+    ),
+    "inequality rows twice": lambda qp, _: duplicate_rows(
+        qp, np.arange(0), np.arange(qp.h.size)
+    ),
+    "unknowns shifted": lambda qp, form: shift_unknowns(
+        qp, np.full(qp.q.size, _SHIFTS[form])
+    ),
+    # what was pushed down is pushed up, and λ ≥ 0 becomes λ ≤ 0
+    "mirrored": lambda qp, _: mirror(qp, np.arange(qp.q.size)),
 }
 
 _ROWS = {

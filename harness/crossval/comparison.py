@@ -75,7 +75,8 @@ class Answer:
         """Certified: neither displacement nor contact forces are farther off."""
         if self.assessment is None or self.doubt is None:
             return None
-        return _farther(self.assessment) + self.doubt
+        found = self.assessment
+        return max(found.error, found.equilibrium_error or 0.0) + self.doubt
 
 
 class Pair(NamedTuple):
@@ -135,7 +136,10 @@ def compared(
         p
         for p in pairs
         if max(p.distance, p.equilibrium or 0.0) > p.allowed
-        and all(_upheld(answers[i]) for i in (p.a, p.b))
+        and all(
+            answers[i].claimed == Status.SOLVED and not answers[i].refuted
+            for i in (p.a, p.b)
+        )
     ]
     return Problem(
         name=name, truth=truth.name, doubt=truth.doubt, closed=truth.closed,
@@ -259,14 +263,6 @@ def _pairs(
             )
         )
     return found
-
-
-def _upheld(a: Answer) -> bool:
-    return a.claimed == Status.SOLVED and not a.refuted
-
-
-def _farther(a: Assessment) -> float:
-    return max(a.error, a.equilibrium_error or 0.0)
 
 
 def brief(value: float) -> str:

@@ -191,11 +191,7 @@ def _many(count: int, noun: str) -> str:
 def _disagreement(a: Answer) -> dict[str, Any]:
     """Say what was claimed, what is true, and where."""
     found = a.assessment
-    return {
-        "run_id": a.run_id,
-        "solver": a.solver,
-        "case": a.case,
-        "tol": a.tol,
+    return _about(a) | {
         "claimed": a.claimed,
         "stored": a.stored.value,
         "verdict": a.verdict.value,
@@ -210,17 +206,18 @@ def _disagreement(a: Answer) -> dict[str, Any]:
 
 def _without_point(x: Listed) -> dict[str, Any]:
     infeasible = "no solution" in x.text
-    return {
-        "run_id": x.run_id,
-        "solver": x.solver,
-        "case": x.case,
-        "tol": x.tol,
+    return _about(x) | {
         "claimed": "infeasible" if infeasible else "solved",
         "stored": None,
         "verdict": "infeasible_claim" if infeasible else "wrong",
         "reasons": [x.text],
         "residual": None, "error": None, "energy": None, "rows": [], "pulls": [],
     }  # fmt: skip
+
+
+def _about(x: Answer | Listed) -> dict[str, Any]:
+    """Name a measurement."""
+    return {"run_id": x.run_id, "solver": x.solver, "case": x.case, "tol": x.tol}
 
 
 def _apart(p: Problem, pair: Pair) -> dict[str, Any]:
@@ -236,9 +233,7 @@ def _apart(p: Problem, pair: Pair) -> dict[str, Any]:
 
 
 def _remark(a: Answer, text: str) -> dict[str, Any]:
-    return asdict(
-        Listed(run_id=a.run_id, solver=a.solver, case=a.case, tol=a.tol, text=text)
-    ) | {"error": a.error}
+    return _about(a) | {"text": text, "error": a.error}
 
 
 def _problem(p: Problem) -> dict[str, Any]:

@@ -12,13 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from mortarbench.harness.crossval.comparison import Problem, brief, compared
+import numpy as np
+
+from mortarbench.harness.crossval.comparison import Answer, Problem, brief, compared
 from mortarbench.harness.crossval.ground_truth import Given
-from mortarbench.harness.crossval.misattribution import (
-    recognised,
-    suspects,
-    true_forces,
-)
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -28,15 +25,17 @@ from mortarbench.harness.files.store import (
     point_arrays,
 )
 from mortarbench.harness.plugin import Case, Family, Reference
-from mortarbench.harness.qp import QP, Vector
+from mortarbench.harness.qp import Vector
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.results.rebuild import rebuild
+from mortarbench.harness.results.stored_run import rebuild
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
+from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
+ALIKE = 1e-3  #: relative difference of contact forces up to which they are the same
 PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none
 
 
@@ -92,7 +91,7 @@ class _Part(NamedTuple):
     problems: list[Problem]
     lost: list[Listed]  #: answers that could not be judged
     false: list[Listed]  #: claims without a point that are not so
-    suspects: dict[str, Vector]  #: see `harness.crossval.misattribution`
+    suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
     truths: dict[str, Vector]
     proven: int  #: claims of infeasibility
 
@@ -132,18 +131,18 @@ def validated(
     false_claims = [claim for part in parts for claim in part.false]
     refuted = {k: z for part in parts for k, z in part.suspects.items()}
     truths = {k: z for part in parts for k, z in part.truths.items()}
-    problems = recognised((p for part in parts for p in part.problems), refuted, truths)
+    problems = _recognised(
+        (p for part in parts for p in part.problems), refuted, truths
+    )
     return Validation(
         problems=tuple(problems),
         solvers=tuple(sorted({r.solver for r in records})),
         false_claims=tuple(false_claims),
         unanswered=tuple(
-            _listed(r, _ending(r))
+            _listed(r, ": ".join(filter(None, (r.verdict.words, r.message))))
             for r in records
-            if (
-                r.claimed != Status.SOLVED
-                and not (r.verdict.is_verified or r.verdict is Verdict.DECLINED)
-            )
+            if r.claimed != Status.SOLVED
+            and not (r.verdict.is_verified or r.verdict is Verdict.DECLINED)
             and r.run_id not in {x.run_id for x in false_claims}
         ),
         not_validated=tuple(x for part in parts for x in part.lost),
@@ -166,25 +165,35 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
     cases, lost = _built(folder, records)
     given, damaged = _given(folder, [r for r in records if r.case in cases], cases)
     lost += damaged
-    called = [r for r in records if _is_proven(r) and r.case in cases]
-    contradictory = {r.run_id for r in called if _is_infeasible(cases[r.case].qp)}
+    claims = [r for r in records if _is_proven(r) and r.case in cases]
+    contradictory = set()
+    for r in claims:  # the solver's certificate is not stored: another one is sought
+        qp = cases[r.case].qp
+        claim = Solution.without_point(qp, Status.INFEASIBLE)
+        if infeasibility_margin(qp, claim) is not None:
+            contradictory.add(r.run_id)
     lost += [
         _listed(r, "no certificate of infeasibility was found again")
-        for r in called
+        for r in claims
         if r.run_id not in contradictory
     ]
+    # answers to equal numbers are to one problem, whatever the form
     by_numbers: dict[str, list[Given]] = {}
     for g in given:
-        by_numbers.setdefault(_numbers(g), []).append(g)
+        of = g.case.mechanics
+        key = g.record.case if of is None else qp_digest(of.program)
+        by_numbers.setdefault(key, []).append(g)
     solve, kept = folder.reference, folder.references
     problems: list[Problem] = []
     forces: dict[str, Vector] = {}
     truths: dict[str, Vector] = {}
     for same in by_numbers.values():
-        p = compared(_called(name, same, len(by_numbers)), same, solve, kept)
+        forms = ", ".join(dict.fromkeys(g.record.form for g in same))
+        called = name if len(by_numbers) == 1 else f"{name} ({forms})"
+        p = compared(called, same, solve, kept)
         problems.append(p)
-        forces |= suspects(p, same)
-        if (known := true_forces(p, same, solve, kept)) is not None:
+        forces |= _suspects(p, same)
+        if (known := _true_forces(p, same, solve, kept)) is not None:
             truths[p.name] = known
     proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
     solvable = {a.case: p for p in proven for a in p.answers}
@@ -243,33 +252,22 @@ def _given(
         try:
             s = load_solution(folder.path, r.vectors, Status(r.claimed or "failed"))
             if (wrong := s.mismatch(case.qp)) or not has_point(s):
-                raise InputError(f"{_file(folder.path, r)}: {wrong or 'NaN or inf'}")
+                file = folder.path / "vectors" / f"{r.vectors}.npz"
+                raise InputError(f"{file}: {wrong or 'NaN or inf'}")
         except InputError as e:
             lost.append(_listed(r, str(e)))
             continue
         found[key] = Given(
             record=r, label=r.solver, repeats=1, case=case, solution=s,
             remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
-            twin=_twin(folder, r),
+            twin=min(folder.twins[r.solver, r.vectors] - {r.case}, default=""),
         )  # fmt: skip
     return list(found.values()), lost
-
-
-def _twin(folder: _Folder, r: Record) -> str:
-    """Name another case to which the solver gave the same point; empty if none."""
-    others = folder.twins.get((r.solver, r.vectors or ""), set()) - {r.case}
-    return min(others, default="")
 
 
 def _is_proven(r: Record) -> bool:
     """Return whether a claim of infeasibility was proven when it was measured."""
     return r.verdict is Verdict.VERIFIED_INFEASIBLE
-
-
-def _is_infeasible(qp: QP) -> bool:
-    """Return whether a certificate is found; that of the solver is not stored."""
-    claim = Solution.without_point(qp, Status.INFEASIBLE)
-    return infeasibility_margin(qp, claim) is not None
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
@@ -287,32 +285,69 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
     return ""
 
 
-def _ending(r: Record) -> str:
-    return f"{r.verdict.words}: {r.message}" if r.message else r.verdict.words
-
-
-def _numbers(g: Given) -> str:
-    """Name the problem that an answer is to: equal numbers, whatever the form."""
-    if g.case.mechanics is None:
-        return g.record.case
-    return qp_digest(g.case.mechanics.program)
-
-
-def _called(name: str, given: Sequence[Given], problems: int) -> str:
-    """Name a problem; with its forms, where not all forms of the case are of it."""
-    if problems == 1:
-        return name
-    return f"{name} ({', '.join(dict.fromkeys(g.record.form for g in given))})"
-
-
 def _apart(r: Record) -> Record:
     """Call a solver that drove a sequence by another name than one that began cold."""
     return r if r.mode == "cold" else r.but(solver=f"{r.solver} ({r.mode})")
 
 
-def _file(path: Path, r: Record) -> Path:
-    return path / "vectors" / f"{r.vectors}.npz"
-
-
 def _listed(r: Record, text: str) -> Listed:
     return Listed(run_id=r.run_id, solver=r.solver, case=r.case, tol=r.tol, text=text)
+
+
+def _true_forces(
+    problem: Problem, given: Sequence[Given], solve: Reference, references: Path
+) -> Vector | None:
+    """Return the multipliers (m,) of the reference; None where there is none."""
+    mechanics = given[0].case.mechanics
+    if mechanics is None or problem.truth != "reference":
+        return None
+    point = reference_point(mechanics, solve, references)  # which keeps it
+    return np.asarray(point.multipliers, dtype=float)
+
+
+def _suspects(problem: Problem, given: Sequence[Given]) -> dict[str, Vector]:
+    """Return the multipliers of refuted answers by run_id."""
+    refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
+    return {
+        g.record.run_id: g.case.mechanics.multipliers(g.case.mechanics.back(g.solution))
+        for g in given
+        if g.record.run_id in refuted and g.case.mechanics is not None
+    }
+
+
+def _recognised(
+    problems: Iterable[Problem],
+    found: Mapping[str, Vector],
+    truths: Mapping[str, Vector],
+) -> list[Problem]:
+    """Remark on each refuted answer that is the solution of another problem.
+
+    found : multipliers of refuted answers by run_id
+    truths : multipliers of solutions by the name of the problem
+    """
+
+    def remarked(a: Answer, own: str) -> Answer:
+        name = _whose(found[a.run_id], truths, own) if a.run_id in found else ""
+        if not name:
+            return a
+        text = f"its contact forces are those of {name}"
+        return replace(a, remarks=(*a.remarks, text))
+
+    return [
+        replace(p, answers=tuple(remarked(a, p.name) for a in p.answers))
+        for p in problems
+    ]
+
+
+def _whose(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
+    """Name the problem whose contact forces are nearest.
+
+    Empty if none are alike, or its own are: then something else is wrong.
+    """
+    differences = {
+        name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))
+        for name, lam in truths.items()
+        if lam.shape == z.shape and lam.any()
+    }
+    alike = {name: d for name, d in differences.items() if d <= ALIKE}
+    return "" if own in alike else min(alike, key=lambda n: alike[n], default="")

@@ -73,12 +73,15 @@ def capture(
         key=lambda p: (p["library"], p["owner"]),
     )
     mapped = mapped_libraries()
+    cores = set(zip(_cpuinfo("physical id"), _cpuinfo("core id"), strict=False))
+    governors = {_read(f) for f in _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")}
+    governors.discard("")
     return {
         "machine": {
             "cpu": next(iter(_cpuinfo("model name")), None),
-            "physical_cores": _physical_cores(),
+            "physical_cores": len(cores) or None,
             "logical_cores": os.cpu_count(),
-            "usable_cores": _usable_cores(),
+            "usable_cores": len(os.sched_getaffinity(0)),
             "cpu_limit": _cpu_limit(),
             "memory_mib": _meminfo("MemTotal"),
             "architecture": platform.machine(),
@@ -86,7 +89,7 @@ def capture(
             "kernel": platform.release(),
             "libc": " ".join(platform.libc_ver()).strip() or None,
             "virtual": "hypervisor" in " ".join(_cpuinfo("flags")).split(),
-            "governor": _governor(),
+            "governor": ", ".join(sorted(governors)) or None,  # that of each CPU
             "turbo": _turbo(),
             "smt": {"1": True, "0": False}.get(_read(_CPU / "smt/active")),
         },
@@ -252,17 +255,6 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
     return {name: hex_digest(content) for name, content in contents.items()}
 
 
-def _physical_cores() -> int | None:
-    cores = set(zip(_cpuinfo("physical id"), _cpuinfo("core id"), strict=False))
-    return len(cores) or None
-
-
-def _usable_cores() -> int | None:
-    """Count the cores that this process may run on."""
-    affinity = getattr(os, "sched_getaffinity", None)
-    return len(affinity(0)) if affinity else os.cpu_count()
-
-
 def _cpu_limit() -> float | None:
     """Read the container's share of processor time, in cores; None without a limit."""
     quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
@@ -270,12 +262,6 @@ def _cpu_limit() -> float | None:
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
         period = _read(_CGROUP / "cpu/cpu.cfs_period_us")
     return int(quota) / int(period) if quota.isdigit() and period.isdigit() else None
-
-
-def _governor() -> str | None:
-    """Name the frequency governor; all, where CPUs have different ones."""
-    files = _CPU.glob("cpu[0-9]*/cpufreq/scaling_governor")
-    return ", ".join(sorted({_read(file) for file in files} - {""})) or None
 
 
 def _turbo() -> bool | None:

@@ -108,7 +108,7 @@ class Copies:
         """
         if os.path.lexists(path):
             return content_digest(Path(path))
-        known = {e.sha256 for e in self._entries() if e.path == path}
+        known = {e.sha256 for e in _entries(self._folder) if e.path == path}
         if not known:
             return content_digest(Path(path))  # which says that there is no such file
         if len(known) > 1:
@@ -120,14 +120,11 @@ class Copies:
 
     def paths(self) -> list[str]:
         """List the paths by which cases name the files."""
-        return sorted({entry.path for entry in self._entries()})
-
-    def _entries(self) -> list[_Entry]:
-        return _entries(self._folder)
+        return sorted({entry.path for entry in _entries(self._folder)})
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
         """Name a file that is neither here nor among the copies."""
-        sizes = {e.size for e in self._entries() if e.sha256 == digest}
+        sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MOST_FILE_MIB * MIB:
             why = f"was too large to travel with the results ({_mib(size)})"

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,9 @@ def save_experiment(experiment: Experiment, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
     for name, rows in experiment.tables.items():
-        _write_csv(folder / f"{name}.csv", rows)
+        heads = list(rows[0])
+        text = csv_text(heads, ([row[head] for head in heads] for row in rows))
+        replace_file(folder / f"{name}.csv", text.encode())
     setting = {
         "setting": experiment.setting,
         "tables": list(experiment.tables),
@@ -69,13 +71,6 @@ def load_experiment(folder: Path) -> Experiment:
         raise InputError(f"{path}: not the setting of an experiment: {e}") from None
     states = {name: load_fields(folder, key) for name, key in index["states"].items()}
     return Experiment(setting=index["setting"], tables=tables, states=states)
-
-
-def _write_csv(path: Path, rows: Iterable[Row]) -> None:
-    rows = list(rows)
-    heads = list(rows[0])
-    text = csv_text(heads, ([row[head] for head in heads] for row in rows))
-    replace_file(path, text.encode())
 
 
 def _read_csv(path: Path) -> list[Row]:

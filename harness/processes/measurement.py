@@ -145,15 +145,17 @@ def measured(
     else:
         record = judged(record, whole() if by_ranks else qp, solution, prove)
     record = _within(memory_limit, noted(record, reply.message, *notes)).but(
-        sizes=sizes,
-        canary_seconds=reply.answer["canary_seconds"],
-        **{
-            table: {part: tuple(pair) for part, pair in reply.answer[table].items()}
-            for table in ("rank_seconds", "rank_counts", "rank_network")
-        },
+        sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
     lacks = found is None or None in (found["quantities"], found["bounds"])
     return Measured(record, solution, lacks and not is_pointless)
+
+
+def _as_tuples(data: Any) -> Any:
+    """Undo what JSON makes of tuples in a table."""
+    if isinstance(data, dict):
+        return {key: _as_tuples(value) for key, value in data.items()}
+    return tuple(data) if isinstance(data, list) else data
 
 
 def _timed(

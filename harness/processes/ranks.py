@@ -269,6 +269,10 @@ class Spent(NamedTuple):
     counts: Mapping[str, tuple[float, float]] = {}
     network: Mapping[str, tuple[float, float]] = {}  #: as each of them measured it
 
+    def fields(self) -> dict[str, Any]:
+        """Name the tables as fields of a record."""
+        return {f"rank_{name}": table for name, table in self._asdict().items()}
+
 
 class OnRanks:
     """A solver on rank 0, which has the others do their share, or the same.

@@ -137,7 +137,9 @@ class _Bench:
             ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
         self._ballast = np.empty(random.randrange(_MOST_BALLAST))
         if "case" in request:
-            qp = self._emitted(request, events)
+            assert self.on_ranks is not None
+            qp, told = self.on_ranks.emits(request["case"], request.get("memory_limit"))
+            events.reached("emitted", told)
         else:
             qp = self._loaded(request)
         canary = canary_seconds()
@@ -167,25 +169,22 @@ class _Bench:
             "iterations": s.iterations,
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
-            "rank_seconds": spent.seconds,
-            "rank_counts": spent.counts,
-            "rank_network": spent.network,
             "first_seconds": timed.first_seconds,
-            "canary_seconds": canary,
+            # fields of the record that the parent takes as they are
+            "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
-    def _emitted(self, request: dict[str, Any], events: Events) -> QP:
-        """Have ranks emit the QP of a case; what is left here are its sizes."""
-        assert self.on_ranks is not None
-        qp, told = self.on_ranks.emits(request["case"], request.get("memory_limit"))
-        events.reached("emitted", told)
-        return qp
-
     def _loaded(self, request: dict[str, Any]) -> QP:
-        path = Path(request["qp"])
-        self._check(path, request.get("digest"))
-        vouched = "digest" in request  # or it may be anybody's
+        path, digest = Path(request["qp"]), request.get("digest")
+        if digest is not None:
+            at = path.stat()  # a file that has not changed is known
+            seen = (at.st_ino, at.st_size, at.st_mtime_ns)
+            if self._trusted.get(digest) != seen:
+                if content_digest(path) != digest:
+                    raise ValueError(f"{path.name} was changed on disk")
+                self._trusted[digest] = seen
+        vouched = digest is not None  # or it may be anybody's
         qp, _ = load_qp(path, operators=self._operators if vouched else None)
         if self.on_ranks is not None:
             self.on_ranks.takes(path, request.get("memory_limit"))
@@ -209,17 +208,6 @@ class _Bench:
             return self._chain(qp, tol)
 
         return prepare
-
-    def _check(self, path: Path, digest: str | None) -> None:
-        """Refuse a file that is not what it was; one that has not changed is known."""
-        if digest is None:
-            return
-        at = path.stat()
-        seen = (at.st_ino, at.st_size, at.st_mtime_ns)
-        if self._trusted.get(digest) != seen:
-            if content_digest(path) != digest:
-                raise ValueError(f"{path.name} was changed on disk")
-            self._trusted[digest] = seen
 
 
 def _begun(

@@ -8,11 +8,10 @@ it off.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from json import JSONDecodeError
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 from mortarbench.harness.errors import InputError, shown, some
@@ -73,13 +72,8 @@ class Journal:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._files.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._files.__exit__(*error)
 
 
 def read_journal(
@@ -118,10 +112,16 @@ def read_journal(
                 continue
             repeated.append(f"{path}, line {number}")
             if record != records[first]:
+                place = next(
+                    f"{path}, line {number}"
+                    for path in paths
+                    for number, other in _records(path)
+                    if other.run_id == record.run_id
+                )
                 raise InputError(
                     f"{repeated[-1]}: tells of run_id {shown(record.run_id)} another "
-                    f"thing than {_first_place(paths, record.run_id)}; expected one "
-                    "line for each; delete the one that is wrong"
+                    f"thing than {place}; expected one line for each; delete the one "
+                    "that is wrong"
                 )
     if repeated:
         lines = "line is" if len(repeated) == 1 else "lines are"
@@ -130,16 +130,6 @@ def read_journal(
             f"out: {some(repeated)}"
         )
     return records
-
-
-def _first_place(paths: Iterable[Path], run_id: str) -> str:
-    """Name the first line about a measurement."""
-    return next(
-        f"{path}, line {number}"
-        for path in paths
-        for number, record in _records(path)
-        if record.run_id == run_id
-    )
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:

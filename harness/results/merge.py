@@ -94,7 +94,9 @@ def merge(
     _refuse_run(out)
     before = [out] if _journal(out).exists() else []
     folders = [*before, *read]
-    suite = _united_suite(folders)
+    paths = {str(folder): folder / "suite.toml" for folder in folders}
+    suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
+    suite = as_toml(united(suites))
     for folder in folders:
         check_copies(folder)
     with full_disk_told(out), locked(out):
@@ -109,7 +111,10 @@ def merge(
             _copy_solutions(source, out, records, tell)
         merge_copies(list(read), out, tell)
         _copy_environments(folders, out, union.records.values(), tell)
-        _merge_faults(folders, out)
+        faults = [f.to_json() for folder in folders for f in read_faults(folder)]
+        if faults:
+            text = "".join(f"{line}\n" for line in dict.fromkeys(faults))
+            replace_file(out / FAULTS, text.encode())
         replace_file(out / "suite.toml", suite.encode())
         lines = "".join(f"{r.to_json()}\n" for r in union.records.values())
         replace_file(_journal(out), lines.encode())
@@ -167,16 +172,6 @@ def _refuse_run(out: Path) -> None:
         )
 
 
-def _united_suite(folders: Sequence[Path]) -> str:
-    """Unite the suites of all folders that have one."""
-    tables: dict[str, dict[str, Any]] = {}
-    for folder in folders:
-        path = folder / "suite.toml"
-        if path.exists():
-            tables[str(folder)] = read_stored(path)
-    return as_toml(united(tables))
-
-
 def _copy_solutions(
     source: Path, out: Path, records: Sequence[Record], tell: Callable[[str], None]
 ) -> None:
@@ -211,12 +206,3 @@ def _environment(folders: Sequence[Path], digest: str) -> Mapping[str, Any] | No
         with suppress(InputError):
             return environment_of(folder, digest)
     return None
-
-
-def _merge_faults(folders: Sequence[Path], out: Path) -> None:
-    """Keep every fault once, as a line."""
-    lines = dict.fromkeys(
-        f.to_json() for folder in folders for f in read_faults(folder)
-    )
-    if lines:
-        replace_file(out / FAULTS, "".join(f"{line}\n" for line in lines).encode())

@@ -1,4 +1,4 @@
-"""What a result folder keeps of one measurement, enough to make it again."""
+"""What a result folder keeps of one measurement, enough to make or build it again."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
+from mortarbench.harness.distributed.vectors import EMITTED
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.names import CaseId, assemble
-from mortarbench.harness.plugin import Family, Solver
+from mortarbench.harness.files.qpfile import qp_digest
+from mortarbench.harness.names import CaseId, assemble, unbuilt
+from mortarbench.harness.plugin import Case, Family, Reference, Solver
 from mortarbench.harness.record import Record
 from mortarbench.harness.registry import SolverSpec, options_of, resolve
 from mortarbench.harness.results.folder import environment_of, suite_text
@@ -56,7 +58,9 @@ def open_stored_run(
     environment, text = environment_of(folder, record.environment), suite_text(folder)
     spec = _asked(record, asked_solvers(text))
     try:
-        name = assemble(_family(record, families), record.params, record.form)
+        if record.family not in families:
+            raise InputError(f"unknown family {record.family!r}")
+        name = assemble(families[record.family], record.params, record.form)
         in_sequence = record.mode != "cold"
         cases = steps_up_to(text, name, families) if in_sequence else (name,)
         spec = _with_options(record, spec, solvers)
@@ -138,12 +142,6 @@ def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
     return replace(spec, label=record.solver, role=record.role, ranks=record.ranks)
 
 
-def _family(record: Record, families: Mapping[str, Family]) -> Family:
-    if record.family not in families:
-        raise InputError(f"unknown family {record.family!r}")
-    return families[record.family]
-
-
 def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
@@ -164,3 +162,36 @@ def plugins_needed(environment: Mapping[str, Any]) -> str:
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
     return f"; it was measured with plug-ins, give {options}" if options else ""
+
+
+def rebuild(
+    r: Record, folder: Path, families: Mapping[str, Family], reference: Reference
+) -> Case:
+    """Build the case of a record.
+
+    Raises
+    ------
+    InputError
+        When its family is not known, or fails, or builds another QP than then. What
+        ranks have emitted is not compared: the whole has another digest.
+
+    """
+    if r.family not in families:
+        try:
+            needs = plugins_needed(environment_of(folder, r.environment))
+        except InputError:
+            needs = ""
+        raise InputError(f"unknown family {r.family!r}{needs}")
+    name = assemble(families[r.family], r.params, r.form)
+    try:
+        case = name.build(reference)
+    except (Exception, SystemExit) as e:  # the family's code
+        raise InputError(unbuilt(r.case, e)) from None
+    if r.qp is None or r.qp.startswith(EMITTED):
+        return case
+    if (now := qp_digest(case.qp, serialised=True)) != r.qp:
+        raise InputError(
+            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
+            "the same version of the code, of its libraries and of plug-ins"
+        )
+    return case

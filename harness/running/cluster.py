@@ -100,17 +100,39 @@ def on_cluster(
             from mortarbench.harness.running.dask_worker import ExecutorPlugin
 
             name = f"mortarbench-{client.id}"
-            with ExitStack() as ends, _scheduler_there(client, address):
+            nodes = Nodes(environment, keep, warn)
+            try:
                 _forget_lost_runs(client)
                 files = [file.resolved() for file in plugins]
-                sharing, packages = _sharing(client), packages_of(environment)
+                workers = client.scheduler_info(n_workers=-1)["workers"].values()
+                hosts = Counter(worker["host"] for worker in workers)
+                sharing, packages = (
+                    max(hosts.values(), default=1),
+                    packages_of(environment),
+                )
                 node = ExecutorPlugin(
                     commands, files, dict(operators), sharing, packages
                 )
                 client.register_plugin(node, name=name)
-                ends.callback(_end, client, name)
-                nodes = Nodes(environment, keep, warn)
-                yield _Cluster(client, name, nodes, address, warn)
+                try:
+                    yield _Cluster(client, name, nodes, address, warn)
+                finally:
+                    # end the processes of this run and of lost ones; the scheduler may
+                    # go while it is asked, as a local one does at Ctrl-C
+                    # (CommClosedError is an OSError), or not know of us yet (KeyError)
+                    with suppress(OSError, KeyError):
+                        if client.status == "running":
+                            client.unregister_worker_plugin(name)
+                            _forget_lost_runs(client)
+            except Exception as e:
+                is_gone = isinstance(e, _SchedulerGoneError)
+                is_gone = is_gone or client.status != "running"
+                if isinstance(e, InputError) or not is_gone:
+                    raise
+                raise InputError(
+                    f"the Dask scheduler at {address} is gone; start one, and the same "
+                    "command continues"
+                ) from e
 
         yield opened
 
@@ -383,48 +405,6 @@ def _interrupted_later() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if late:
         raise KeyboardInterrupt
-
-
-@contextmanager
-def _scheduler_there(client: Any, address: str) -> Iterator[None]:
-    """Turn whatever a scheduler that has gone makes Dask raise into one line.
-
-    Raises
-    ------
-    InputError
-        When the connection is closed.
-
-    """
-    try:
-        yield
-    except Exception as e:
-        is_gone = isinstance(e, _SchedulerGoneError) or client.status != "running"
-        if isinstance(e, InputError) or not is_gone:
-            raise
-        raise InputError(
-            f"the Dask scheduler at {address} is gone; start one, and the same command "
-            "continues"
-        ) from e
-
-
-def _end(client: Any, name: str) -> None:
-    """End the processes of this run and of lost ones, by their workers.
-
-    Unless the scheduler is gone.
-
-    It may go while it is asked, as a local one does at Ctrl-C (CommClosedError is an
-    OSError), or not know of us yet (KeyError); then nothing is lost.
-    """
-    with suppress(OSError, KeyError):
-        if client.status == "running":
-            client.unregister_worker_plugin(name)
-            _forget_lost_runs(client)
-
-
-def _sharing(client: Any) -> int:
-    """Count the workers of the machine that has the most."""
-    workers = client.scheduler_info(n_workers=-1)["workers"].values()
-    return max(Counter(worker["host"] for worker in workers).values(), default=1)
 
 
 def _forget_lost_runs(client: Any) -> None:

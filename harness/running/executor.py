@@ -107,7 +107,9 @@ class Executor:
                         yield result
                 return
             except (FaultError, OSError) as e:
-                reason = _in_a_line(e)
+                reason = " ".join(str(e).split())
+                if not isinstance(e, FaultError):
+                    reason = f"{type(e).__name__}: {reason}"
                 refuse_full_disk(self.scratch, reason)
             label = turn[0].solver
             self._entries = ()
@@ -351,11 +353,6 @@ def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
         yield Result(record=record.but(verdict=end.verdict, message=reason))
-
-
-def _in_a_line(e: Exception) -> str:
-    text = " ".join(str(e).split())
-    return text if isinstance(e, FaultError) else f"{type(e).__name__}: {text}"
 
 
 class _UnbuiltError(Exception):

@@ -121,6 +121,7 @@ class Schedule:
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
         """Shuffle what is left of a block; of a sequence, a solver's whole turn is."""
         left = []
+        is_given_up = any(case.name in self.unbuilt for case in group.cases)
         for spec in self.suite.solvers:
             turn = tuple(
                 new_record(
@@ -137,7 +138,7 @@ class Schedule:
                 )
                 for case in group.cases
             )
-            if self._given_up(group) or all(map(self.knows, turn)):
+            if is_given_up or all(map(self.knows, turn)):
                 self._skip(len(turn))
             else:
                 left.append(turn)
@@ -154,9 +155,6 @@ class Schedule:
             time_limit=self.suite.time_limit,
             memory_limit=self.suite.memory_limit,
         )
-
-    def _given_up(self, group: Group) -> bool:
-        return any(case.name in self.unbuilt for case in group.cases)
 
     def _skip(self, cells: int) -> None:
         for _ in range(cells):

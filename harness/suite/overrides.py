@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -64,20 +65,16 @@ def with_overrides(
     for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
         if limit is not None:
             changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
-            text = _with_limit(text, key, limit)
+            # Measurements under other limits are other measurements, unlike those of
+            # fewer solvers, cases or repeats: they make another suite. In TOML such
+            # keys come before those of any table.
+            line = f"{key} = {limit!r}"
+            if key in toml(text):
+                old = rf"^[ \t]*{key}[ \t]*=.*$"
+                text = re.sub(old, line, text, count=1, flags=re.MULTILINE)
+            else:
+                text = f"{line}\n{text}"
     return replace(suite, text=text, **changes)
-
-
-def _with_limit(text: str, key: str, limit: float) -> str:
-    """Set a limit in the TOML, where such keys come before those of any table.
-
-    Measurements under other limits are other measurements, unlike those of fewer
-    solvers, cases or repeats: they make another suite.
-    """
-    line = f"{key} = {limit!r}"
-    if key not in toml(text):
-        return f"{line}\n{text}"
-    return re.sub(rf"^[ \t]*{key}[ \t]*=.*$", line, text, count=1, flags=re.MULTILINE)
 
 
 def _chosen_cases(
@@ -87,7 +84,11 @@ def _chosen_cases(
     named = [case.name for case in suite.names]
     kept: set[str] = set()
     for pattern in patterns:
-        matched = match(_canonical_pattern(pattern, families), named)
+        canonical = pattern
+        if not set("*?[") & set(pattern):
+            with suppress(InputError):
+                canonical = parse(pattern, families).name
+        matched = match(canonical, named)
         if not matched:
             raise InputError(
                 f"--case {pattern!r} matches none of the {len(named)} cases of suite "
@@ -102,13 +103,3 @@ def _chosen_cases(
         "cases": tuple(filter(wanted, suite.cases)),
         "sequences": tuple(s for s in suite.sequences if any(map(wanted, s))),
     }
-
-
-def _canonical_pattern(pattern: str, families: Mapping[str, Family]) -> str:
-    """Write a pattern that is the name of a case canonically."""
-    if set("*?[") & set(pattern):
-        return pattern
-    try:
-        return parse(pattern, families).name
-    except InputError:
-        return pattern

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
+from math import prod
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin
@@ -154,7 +155,7 @@ def _combinations(
     name: str, solver: Solver, given: Mapping[str, Sequence[str]]
 ) -> Iterator[dict[str, Any]]:
     own = {key: given[key] for key in given if key in options_of(solver)}
-    if (count := _count(own)) > _MOST:
+    if (count := prod(map(len, own.values()))) > _MOST:
         raise InputError(
             f"--option spans {count} variants of {name}; expected at most {_MOST}"
         )
@@ -179,13 +180,6 @@ def _typed(name: str, solver: Solver, given: Mapping[str, str]) -> dict[str, Any
             raise InputError(f"{name}: {key} = {shown(text)}; expected {expected}")
         values[key] = read[0]
     return values
-
-
-def _count(given: Mapping[str, Sequence[str]]) -> int:
-    count = 1
-    for values in given.values():
-        count *= len(values)
-    return count
 
 
 def with_options(label: str, options: Mapping[str, Any]) -> str:

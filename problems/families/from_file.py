@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -17,23 +16,23 @@ if TYPE_CHECKING:
     from mortarbench.harness import Case, Reference, Solution, Value
 
 
-@dataclass(frozen=True)
 class FromFile(Family):
     """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
 
     Text and mat files may be compressed: ``file:PATH.qps.gz``.
     The digest of the file's content is a parameter of the case, so that records say
     what was measured and a changed file is not taken for it.
+
+    copies : of a result folder; None: files are read where the path leads
     """
 
-    name: str = "file"
-    path_suffix: str = ""  #: all after ``file:`` is the path
-    defaults: Mapping[str, Value] = field(
-        default_factory=lambda: MappingProxyType({"path": "", "sha256": ""}), hash=False
-    )
-    forms: tuple[str, ...] = ("qp",)
-    #: of a result folder; None: files are read where the path leads
-    copies: Copies | None = field(default=None, compare=False)
+    name = "file"
+    path_suffix = ""  #: all after ``file:`` is the path
+    defaults: Mapping[str, Value] = MappingProxyType({"path": "", "sha256": ""})
+    forms = ("qp",)
+
+    def __init__(self, copies: Copies | None = None) -> None:
+        self.copies = copies
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Fill in the digest of the file's content."""
@@ -62,7 +61,7 @@ class FromFile(Family):
 
     def with_copies(self, folder: Path) -> FromFile:
         """Return the family that takes the copies of a result folder."""
-        return replace(self, copies=Copies(folder))
+        return FromFile(Copies(folder))
 
     def copied_paths(self) -> list[str]:
         """List the paths of files of which the result folder knows."""
