@@ -184,8 +184,8 @@ def unbuilt(name: object, e: BaseException) -> str:
     return " ".join(f"{name} could not be built: {why}".split())
 
 
-def emitted_by_ranks(name: CaseId) -> bool:
-    """Whether ranks can emit the QP of a case, each its share; see `Family.emission`.
+def is_shared(name: CaseId) -> bool:
+    """Return True if ranks can make the QP of a case, see `Family.emission`.
 
     A family that fails to say so does it when it builds, too.
     """

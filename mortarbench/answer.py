@@ -28,12 +28,13 @@ from mortarbench.harness import QP, Fields, Record, Residuals, Solution, Solver,
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.names import assemble, emitted_by_ranks
+from mortarbench.harness.names import assemble, is_shared
 from mortarbench.harness.processes.measurement import (
     measured_once,
     scratch_folder,
     single_worker,
 )
+from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.solver_file import write_solver
 from mortarbench.harness.processes.termination import ended_by_signals
 from mortarbench.harness.qp import Vector, numeric_vector
@@ -387,11 +388,14 @@ def answers_of(
             repeat=0,
             environment=environment,
         )
-        emits = ranks > 1 and emitted_by_ranks(case.id)
+        source = Source.FILE
+        if ranks > 1 and is_shared(case.id):
+            ours = registries.hold_own_code_only()
+            source = Source.RANKS if ours else Source.SHARES
         with one_thread(), redirect_stdout(stderr):  # whatever the family prints
             record, solution = measured_once(
                 worker, lambda: case.made, record, registries.reference,
-                emits=emits, evaluates=emits and registries.hold_own_code_only(),
+                source=source,
             )  # fmt: skip
         return Answer(
             case=case, record=record, solution=solution, spec=spec, solver=solver,

@@ -7,8 +7,8 @@ It answers the requests of `harness.processes.protocol` with these of its own:
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
   point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
   with bounds of its error, and the deformed state in ``fields`` where there is one
-* ``{"emits": NAME}``: whether ranks can emit the QP of a case themselves, which is not
-  built: ``{"event": "done", "emits": …}``
+* ``{"shared": NAME}``: whether ranks can emit the QP of a case themselves, which is not
+  built: ``{"event": "done", "shared": …}``
 * ``{"solve": PATH, "point": PATH}``: the reference solve of the QP in the first file,
   for verdicts that residuals cannot give; it writes a point to the second, and says
   ``{"event": "done", "found": true}``, or false where it finds none
@@ -41,7 +41,7 @@ from mortarbench.harness.files.store import (
     write_arrays,
     write_point,
 )
-from mortarbench.harness.names import CaseId, emitted_by_ranks, unbuilt
+from mortarbench.harness.names import CaseId, is_shared, unbuilt
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
@@ -77,10 +77,10 @@ class CaseWorker:
         """Answer one request, whatever the family's code does."""
         if "solve" in request:
             return self._solved(Path(request["solve"]), Path(request["point"]))
-        asked = request.get("build") or request.get("describe") or request["emits"]
+        asked = request.get("build") or request.get("describe") or request["shared"]
         name = CaseId(**{**asked, "family": self.families[asked["family"]]})
-        if "emits" in request:
-            return {"emits": emitted_by_ranks(name)}
+        if "shared" in request:
+            return {"shared": is_shared(name)}
         try:
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # the family's code

@@ -21,6 +21,7 @@ from mortarbench.harness.files.store import read_point
 from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.forking import Serve
+from mortarbench.harness.processes.protocol import Source, source_of
 from mortarbench.harness.processes.ranks import without_content
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
@@ -108,7 +109,7 @@ def measured(
             threads=reply.threads,
             cpu=reply.cpu,
         )
-        if request.get("evaluates"):
+        if source_of(request) is Source.RANKS:
             qp, record = _as_told(reply.emitted, record)
         else:
             qp = whole()
@@ -130,7 +131,7 @@ def measured(
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
     record, *notes = _timed(reply, record, worker.first_seconds)
-    sizes, by_ranks = record.sizes, request.get("evaluates")
+    sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
     is_pointless = by_ranks and not has_point(solution)
     found = reply.answer["evaluated"] if by_ranks else None
     notes += found["notes"] if found is not None else []
@@ -172,8 +173,8 @@ def _timed(
     return record.but(**asdict(cost)), *notes
 
 
-def emission_request(record: Record) -> dict[str, Any]:
-    """Ask ranks to emit the QP of a record's case."""
+def case_request(record: Record) -> dict[str, Any]:
+    """Name the case of a record to ranks that make its QP."""
     case = {
         "family": record.family, "params": dict(record.params), "form": record.form
     }  # fmt: skip
@@ -282,16 +283,14 @@ def measured_once(
     record: Record,
     reference: Reference,
     *,
-    emits: bool = False,
-    evaluates: bool = False,
+    source: Source = Source.FILE,
 ) -> tuple[Record, Solution | None]:
     """Do as `measured`, without limits, and say what the point means.
 
     case : gives the case, built when it is first asked for
     reference : solves the QP where residuals cannot decide
-    emits : whether the worker is ranks that emit the QP themselves
-    evaluates : whether these evaluate the answer, too; only where no code but ours runs
-        in them. What else is asked of the case is then what they cannot tell
+    source : of the QP; ranks judge answers only where no code but ours runs in them,
+        and what is asked of the case is then what they cannot tell
 
     Raises
     ------
@@ -300,15 +299,15 @@ def measured_once(
 
     """
     with scratch_folder() as scratch:
-        request: dict[str, Any] = {"out": str(scratch / "point.npz")}
-        if emits:
-            request |= {**emission_request(record), "evaluates": evaluates}
-        if not evaluates:
+        request: dict[str, Any] = {"out": str(scratch / "point.npz"), "source": source}
+        if source.is_shared:
+            request |= case_request(record)
+        if source is not Source.RANKS:
             qp_file = scratch / "qp.npz"
             meta = {"name": record.case}
             digest = save_qp(qp_file, case().qp, meta, serialised=True)
             record = record.but(qp=digest)
-            if not emits:
+            if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
             measured, worker, lambda: case().qp, record, request,

@@ -5,9 +5,9 @@
 * any other request: it says ``{"event": "start"}`` when it begins what is to be timed
   from outside, and ``{"event": "done", …}`` with its answer. One that measures says
   ``{"event": "timed"}`` when its clock has stopped, and waits for a line before it goes
-  on: until then the parent looks at the CPU time of the process. One on ranks that emit
-  a case says ``{"event": "emitted", …}`` before "start", and ``{"event": "measured"}``
-  after "timed", before it evaluates the answer
+  on: until then the parent looks at the CPU time of the process. One on ranks that make
+  the QP of a case says ``{"event": "emitted", …}`` before "start", and
+  ``{"event": "measured"}`` after "timed", before it judges the answer
 * ``{"event": "fault", "what": …}`` in place of each: our own code failed
 
 and ends when its requests do. A library that writes to the wrong file descriptor can
@@ -22,6 +22,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
@@ -125,6 +126,19 @@ def measures(request: Mapping[str, Any]) -> bool:
     return "out" in request
 
 
-def emits(request: Mapping[str, Any]) -> bool:
-    """Return True for a measurement on ranks that emit the QP themselves."""
-    return "case" in request
+class Source(StrEnum):
+    """Where the QP of a measurement comes from, and who judges the answer."""
+
+    FILE = "file"  #: a file, which the parent reads, too, and judges by
+    SHARES = "shares"  #: ranks, each its share; the parent judges by the whole
+    RANKS = "ranks"  #: ranks, which judge the answer together: nobody has the whole
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether ranks make the QP."""
+        return self is not Source.FILE
+
+
+def source_of(request: Mapping[str, Any]) -> Source:
+    """Return the source of the QP that a request is about."""
+    return Source(request.get("source", Source.FILE))

@@ -297,7 +297,7 @@ class OnRanks:
         self.spent = Spent()
         self._own: Solution | None = None
 
-    def emits(
+    def shares(
         self, case: Mapping[str, Any], memory_limit: float | None
     ) -> tuple[QP, dict[str, Any]]:
         """Have all ranks make their shares of the next QP.
@@ -405,7 +405,7 @@ class OnRanks:
 def _emitted(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
 ) -> tuple[Emitted, dict[str, Any]]:
-    """Emit on all ranks, and tell of it what `OnRanks.emits` does.
+    """Emit on all ranks, and tell of it what `OnRanks.shares` does.
 
     Raises
     ------

@@ -40,9 +40,9 @@ from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
 from mortarbench.harness.processes.protocol import (
     LONGEST_REPLY,
     ForeignReplyError,
-    emits,
     event_of,
     measures,
+    source_of,
 )
 from mortarbench.harness.processes.turns import Turn
 from mortarbench.harness.record import Verdict
@@ -237,7 +237,8 @@ class WorkerProcess:
             self._log.write_bytes(b"")
         asked = time.monotonic()
         self._send(request)
-        if emits(request):
+        is_shared = source_of(request).is_shared
+        if is_shared:
             self._emitted = self._await(
                 "emitted", time_limit, memory_limit, stage="emission: "
             )
@@ -256,7 +257,7 @@ class WorkerProcess:
                 )
                 self._footprint.notice(self._tree())
                 self._send({"go": True})
-            if emits(request):
+            if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
                 peak = self._peak_mib  # what evaluating takes is not limited
                 stage = "evaluation of the answer: "

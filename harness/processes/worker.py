@@ -9,7 +9,7 @@ It answers the requests of `harness.processes.protocol` with these of its own:
   without which the file may hold no operator; ``memory_limit`` in MiB;
   ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence, and
   whether it ``tightens``: then every step comes with its own tolerance
-* ``{"case": {…}, "tol": TOL, "out": PATH, "evaluates": …}``: the same on ranks which
+* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks which
   emit the QP of a case themselves (`harness.plugin.Family.emission`), and evaluate the
   answer together if that is asked for. It says ``emitted`` when the QP is there, with
   its ``sizes`` and ``digest``, and ``measured`` when the point is written
@@ -44,7 +44,12 @@ from mortarbench.harness.files.store import write_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.case_folder import content_digest
-from mortarbench.harness.processes.protocol import Events, answer_requests
+from mortarbench.harness.processes.protocol import (
+    Events,
+    Source,
+    answer_requests,
+    source_of,
+)
 from mortarbench.harness.processes.ranks import OnRanks, Spent, follow
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
@@ -136,9 +141,12 @@ class _Bench:
         with suppress(AttributeError):  # glibc only
             ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
         self._ballast = np.empty(random.randrange(_MOST_BALLAST))
-        if "case" in request:
+        source = source_of(request)
+        if source.is_shared:
             assert self.on_ranks is not None
-            qp, told = self.on_ranks.emits(request["case"], request.get("memory_limit"))
+            qp, told = self.on_ranks.shares(
+                request["case"], request.get("memory_limit")
+            )
             events.reached("emitted", told)
         else:
             qp = self._loaded(request)
@@ -158,9 +166,10 @@ class _Bench:
         write_point(Path(request["out"]), s)
         spent = Spent() if self.on_ranks is None else self.on_ranks.spent
         evaluated = dict[str, Any]()
-        if "case" in request and self.on_ranks is not None:
+        if source.is_shared and self.on_ranks is not None:
             events.reached("measured", {})
-            found = self.on_ranks.evaluated() if request["evaluates"] else None
+            judges = source is Source.RANKS
+            found = self.on_ranks.evaluated() if judges else None
             evaluated = {"evaluated": found}
         return {
             **evaluated,

@@ -17,7 +17,8 @@ from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
 from mortarbench.harness.processes.case_folder import Entry, entry
-from mortarbench.harness.processes.measurement import emission_request, measured
+from mortarbench.harness.processes.measurement import case_request, measured
+from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
@@ -62,7 +63,7 @@ class Executor:
     #: of small QPs, by digest
     _optima: dict[str, Optimum | None] = field(default_factory=dict)
     #: whether ranks emit the QP, by case
-    _emitted: dict[str, bool] = field(default_factory=dict)
+    _shared: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._case_worker = WorkerProcess(
@@ -123,8 +124,8 @@ class Executor:
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        Ranks that emit a QP evaluate its answer, too, where no code but ours runs in
-        them. The case is built then only where they cannot tell something of it.
+        Ranks that make a QP judge its answer, too, where no code but ours runs in them.
+        The case is built then only where they cannot tell something of it.
 
         Raises
         ------
@@ -132,13 +133,12 @@ class Executor:
             When something else than the solver failed.
 
         """
-        emits = self._is_emitted(turn[0])
-        evaluates = emits and self.commands.own_code_only
-        if not evaluates:
+        source = self._source(turn[0])
+        if source is not Source.RANKS:
             self._build(block, turn)
-        there = turn[: len(self._entries)] if not evaluates else turn
+        there = turn if source is Source.RANKS else turn[: len(self._entries)]
         for step, record in enumerate(there):
-            request, record = self._request(block, record, step, emits, evaluates)
+            request, record = self._request(block, record, step, source)
 
             def whole(step: int = step) -> QP:
                 self._build(block, turn)
@@ -168,37 +168,40 @@ class Executor:
             yield Result(record=declined)
 
     def _request(
-        self, block: WorkUnit, record: Record, step: int, emits: bool, evaluates: bool
+        self, block: WorkUnit, record: Record, step: int, source: Source
     ) -> tuple[dict[str, Any], Record]:
         """Ask for a measurement, and fill in what is known of its case before."""
         request = {
             "out": str(self._point),
+            "source": source,
             "sample_seconds": 0.0 if block.is_sequence else SAMPLE_SECONDS,
             **({"step": step} if block.is_sequence else {}),
             **({"tightens": True} if record.tighten else {}),
         }
-        if emits:
-            request |= {**emission_request(record), "evaluates": evaluates}
-        if evaluates:
+        if source.is_shared:
+            request |= case_request(record)
+        if source is Source.RANKS:
             return request, record
         at = self._entries[step]
-        if not emits:
+        if not source.is_shared:
             request |= {"qp": str(at.qp), "digest": at.digest}
         keys = ("qp", "build_seconds", "dualise_seconds")
         known = {key: at.meta.get(key) for key in keys}
         return request, record.but(**known, step_tol=_step_tol(record, at))
 
-    def _is_emitted(self, record: Record) -> bool:
-        """Whether the QP of a record is emitted by the ranks that solve it."""
+    def _source(self, record: Record) -> Source:
+        """Return where the QP of a record comes from."""
         if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
-            return False
-        if record.case not in self._emitted:
-            request = {"emits": _case(record)}
+            return Source.FILE
+        if record.case not in self._shared:
+            request = {"shared": _case(record)}
             reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
             if reply.answer is None:
                 raise FaultError(reply.message)
-            self._emitted[record.case] = reply.answer["emits"]
-        return self._emitted[record.case]
+            self._shared[record.case] = reply.answer["shared"]
+        if not self._shared[record.case]:
+            return Source.FILE
+        return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
         """Build the cases of a block, of a sequence as many as there are; once."""

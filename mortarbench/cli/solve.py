@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, say
-from mortarbench.harness.names import assemble, emitted_by_ranks, parse
+from mortarbench.harness.names import assemble, is_shared, parse
 from mortarbench.harness.registry import check_name
 from mortarbench.harness.suite.solver_options import options_for
 from mortarbench.registries import Registries, defer_parts_of_numpy
@@ -55,7 +55,7 @@ def run(registries: Registries, options: Namespace) -> int:
     )
     with asked as solved:
         case = Case(id=parsed, registries=registries)
-        if drawn or options.mpi == 1 or not (is_ours and emitted_by_ranks(parsed)):
+        if drawn or options.mpi == 1 or not (is_ours and is_shared(parsed)):
             _build(case, drawn)  # after the fork, which has no use for it
         answer = solved(case, options.tol)
     _print(answer, options)
