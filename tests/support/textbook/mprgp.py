@@ -56,6 +56,9 @@ Expansion = Literal["std", "projcg", "mixed", "model"]
 Proportioning = Literal["cg", "model"]
 MOST_IDLE = 2
 FIRST_LOOK = 500  #: steps of a run after which its progress is looked at first
+#: slope along p relative to that of z, below which the gradient has drifted back along
+#: the directions that were taken
+DRIFT = 0.5
 NOISE = 1e-13  #: part of the terms of a cost that is taken for rounding
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
@@ -243,7 +246,9 @@ def mprgp(
     trace = ""
     at, face, known = _minimised_along(task, Point(*start), directions)
     z_of = precondition(face.free)
-    p, stay = known.conjugate(z_of(face.phi)), _Stay(0, face.phi_square)
+    z = z_of(face.phi)
+    p, stay = known.conjugate(z), _Stay(0, face.phi_square)
+    at_drift = math.inf  # ‖φ‖² when rounding along directions was taken out last
     idle, chopped = 0, math.inf  # proportionings in vain, ‖β‖² at the last
     progress, look = Progress(), FIRST_LOOK
     while not (done := stop(at, face)) and len(trace) < max_steps:
@@ -261,19 +266,34 @@ def mprgp(
             )
         else:
             Hp = H(p)
-            step = _minimise_or_expand(
-                task, at, face, p, Hp, B, stay=stay, first=not trace.strip("cp")
+            slope, expected = inner_products((at.g, p), (face.phi, z))
+            drifts = bool(known.p) and (
+                slope < DRIFT * expected and 4 * face.phi_square < at_drift
             )
+            step = _minimise_or_expand(
+                task, at, face, p, Hp, B, stay=stay, first=not trace.strip("cp"),
+                uphill=drifts and slope <= 0,
+            )  # fmt: skip
         if step is None:
             break
         letters, at, B = step
         face = split(at, bounds)
-        if letters == "c":
-            known, p = known.next(z_of(face.phi), p, Hp, rules.kept)
+        if letters == "c" and drifts:
+            if slope > 0:
+                known, _ = known.next(z, p, Hp, rules.kept)
+            at, face, known = _minimised_along(task, at, known)
+            at_drift = face.phi_square
+            z_of = precondition(face.free)
+            z = z_of(face.phi)
+            p, stay = known.conjugate(z), stay._replace(inside=stay.inside + 1)
+        elif letters == "c":
+            z = z_of(face.phi)
+            known, p = known.next(z, p, Hp, rules.kept)
             stay = stay._replace(inside=stay.inside + 1)
         else:
             z_of, known = precondition(face.free), Directions(face.free)
-            p, stay = z_of(face.phi), _Stay(0, face.phi_square)
+            p = z = z_of(face.phi)
+            stay, at_drift = _Stay(0, face.phi_square), math.inf
         trace += letters
         if watch is not None:
             watch(letters[-1], at, face)
@@ -291,8 +311,9 @@ def _minimised_along(
     if known is None or not known.p or not (known.free == face.free).all():
         return at, face, Directions(face.free)
     s, Hs = known.minimising(at.g)
-    _, feasible = kernels.lengths(*at, s, Hs, *task.bounds)
-    at = _moved(task, at, min(1.0, feasible), s, Hs)
+    if inner_products((at.g, s))[0] > 0:
+        length = min(kernels.lengths(*at, s, Hs, *task.bounds))
+        at = _moved(task, at, length, s, Hs)
     face = split(at, task.bounds)
     same = bool((known.free == face.free).all())
     return at, face, known if same else Directions(face.free)
@@ -328,15 +349,15 @@ def _proportion(
 
 def _minimise_or_expand(
     task: _Task, at: Point, face: Face, p: Vector, Hp: Vector, B: BoxModel,
-    *, stay: _Stay, first: bool,
+    *, stay: _Stay, first: bool, uphill: bool,
 ) -> Step:  # fmt: skip
-    """Take the CG step where it is feasible, else expand the active set."""
+    """Take the CG step, where it is feasible, but not uphill; else expand."""
     H, b, bounds, rules = task
     cg, feasible = kernels.lengths(*at, p, Hp, *bounds)
     if math.isinf(min(cg, feasible)):
         return None
     if cg <= feasible:
-        return "c", _moved(task, at, cg, p, Hp), B
+        return "c", _moved(task, at, 0.0 if uphill else cg, p, Hp), B
     if rules.expansion in ("projcg", "mixed") and math.isfinite(cg):
         x = np.clip(at.x - cg * p, *bounds)
         new = Point(x, H(x) - b)
@@ -466,7 +487,7 @@ def _project_gradient(
 def _change(along: tuple[float, ...], t: float) -> float:
     """Return f(x + ts) − f(x), of gᵀs and sᵀHs."""
     slope, curvature = along
-    return t * slope + 0.5 * t**2 * curvature
+    return t * (slope + 0.5 * t * curvature)
 
 
 def _moved(task: _Task, at: Point, alpha: float, p: Vector, Hp: Vector) -> Point:
