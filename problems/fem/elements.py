@@ -1,11 +1,11 @@
 """Finite elements as data: reference cells with their shape functions and facets.
 
-What is multilinear on [−1, 1]^dim is known by its corners ξ_a alone:
+A multilinear element on [−1, 1]^dim follows from its corners ξ_a alone:
 
     N_a(ξ) = Π_k (1 + ξ_ak ξ_k) / 2,   a = 1 … 2^dim,
 
-with 2^dim Gauss points, at the corners over √3, all of weight 1. An isoparametric cell
-is the image of the reference cell by x(ξ) = Σ N_a(ξ) x_a.
+with 2^dim Gauss points at ξ_a/√3, all of weight 1. An isoparametric cell is the image
+of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A multilinear element; derivatives of shape functions are of all n corners."""
+    """A multilinear element with n corners."""
 
     kind: str  #: as meshio calls its cells
     corners: NDArray[np.int64]  #: (n, dim) of the reference cell, each −1 or 1

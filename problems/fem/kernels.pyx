@@ -146,7 +146,7 @@ def add_tangents(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Sum the tangents (E, n·dim, n·dim) of the cells (E, n) into such values."""
+    """Sum the tangents (E, n·dim, n·dim) of the cells into values of the dof pattern."""
     cdef int n = cells.shape[1]
     cdef int dim = tangents.shape[1] // n
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])

@@ -53,7 +53,7 @@ class Mesh:
 
     @property
     def element(self) -> Element:
-        """What all cells are integrated as."""
+        """Element that all cells are integrated with."""
         return ELEMENTS[self.dim, self.cells.shape[1]]
 
     @property

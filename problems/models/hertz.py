@@ -132,7 +132,7 @@ def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
     )
     a = min(exact.a, RADIUS)  # as of `two_halves`
-    shape = HalfDiscs((_lower_half(a / p["n"], a, p["halvings"]),))
+    shape = HalfDiscs((_half_cylinder(RADIUS, a / p["n"], a, p["halvings"]),))
     sides = shape.sides
     return ElasticBodies(
         shape=shape, names=("cylinder",), materials=(MATERIAL,), plane=p["plane"],
@@ -237,8 +237,8 @@ def two_halves(params: Mapping[str, Value]) -> Halves:
         p["load"] * UNIT_LOAD, 1 / (1 / RADIUS + 1 / radius), 1 / compliance
     )
     a, halvings = min(exact.a, RADIUS, radius), p["halvings"]
-    upper = _lower_half(a / p["n"], a, halvings).prefixed("upper_")
-    lower = _upper_half(a / p["m"], a, radius, halvings).prefixed("lower_")
+    upper = _half_cylinder(RADIUS, a / p["n"], a, halvings).prefixed("upper_")
+    lower = _half_cylinder(-radius, a / p["m"], a, halvings).prefixed("lower_")
     return Halves((upper, lower), (MATERIAL, below), exact)
 
 
@@ -318,23 +318,17 @@ def _forgets_pressing(params: Mapping[str, Value]) -> bool:
     return params["loading"] == "static" or params["programme"] == "proportional"
 
 
-def _lower_half(h: float, a: float, halvings: int) -> HalfDisc:
-    """Divide the lower half of the cylinder above (0, 0); cells there have size h."""
-    return HalfDisc((0.0, RADIUS), *_polar(h, a, RADIUS, -np.pi / 2, halvings))
+def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc:
+    """Divide the half at (0, 0) of a cylinder with its centre at a height of `centre`.
 
-
-def _upper_half(h: float, a: float, radius: float, halvings: int) -> HalfDisc:
-    """Divide the upper half of a cylinder below (0, 0); cells there have size h."""
-    return HalfDisc((0.0, -radius), *_polar(h, a, radius, np.pi / 2, halvings))
-
-
-def _polar(
-    h: float, a: float, radius: float, towards: float, halvings: int
-) -> tuple[Vector, Vector]:
-    """Grade angles about `towards` and radii from the arc, geometrically; halve all."""
+    Angles about (0, 0) and radii from the arc are graded, from cells of size h there;
+    then all are halved.
+    """
+    radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
     arc = halved(graded(h, UNIFORM * a, radius * np.pi / 2), halvings) / radius
     angles = towards + np.concatenate([-arc[:0:-1], arc])
-    return angles, radius - halved(graded(h, 0.0, radius), halvings)[:-1]
+    radii = radius - halved(graded(h, 0.0, radius), halvings)[:-1]
+    return HalfDisc((0.0, centre), angles, radii)
 
 
 def graded(h: float, uniform: float, total: float) -> Vector:
