@@ -24,7 +24,13 @@ from mortarbench.reports.data.cells import (
     source,
 )
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import TIMED, VERDICTS, estimate, seconds
+from mortarbench.reports.document.formatting import (
+    TIMED,
+    VERDICTS,
+    estimate,
+    fixed,
+    seconds,
+)
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.sweeps import accuracy_figure
@@ -189,7 +195,7 @@ def precision(a: Analysis) -> Iterator[Part]:
                 ("tol", lambda t: Cell.tolerance(t.twin.tol)),
                 ("solver", lambda t: Cell.label(t.twin.solver)),
                 ("blocks", lambda t: Cell.number(t.ratio.pairs)),
-                ("ratio", lambda t: Cell.number(t.ratio, _ratio, title=source(t.null))),
+                ("ratio", lambda t: Cell.number(t.ratio, fixed, title=source(t.null))),
                 (
                     "half-width",
                     lambda t: Cell.number(t.ratio.half_width, "{:.1%}".format),
@@ -227,10 +233,6 @@ def _null_ratios(evidence: Evidence) -> list[_Twins]:
                 ratio = paired_ratio(null.by_block, twin.by_block)
                 found += [_Twins(twin, null, ratio)] if ratio is not None else []
     return found
-
-
-def _ratio(ratio: Ratio) -> str:
-    return f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
 
 
 def _canary_row(name: str, mine: Sequence[Record]) -> tuple[Cell, ...]:
