@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from mortarbench.harness import Record, Verdict
@@ -23,12 +22,13 @@ CASES = 6
 POOLED = "all forms"  #: instead of a form, of a group that cases of every form are in
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
-_CELL = ["kind", "case", "solver"]
+#: of repeats that all ran out of time, but for some that were verified before
+_LATE = {v for v in Verdict if v is Verdict.TIME_LIMIT or v.is_verified}
 
 Times = NDArray[np.float64]
 Pairs = NDArray[np.bool_]
 Row = Mapping[str, Outcome]  #: by solver
-Name = TypeVar("Name")
+Given = dict[str, dict[str, list[Outcome]]]  #: by case and solver
 
 
 def _no_pairs() -> Pairs:
@@ -186,59 +186,45 @@ def all_groups(
     pool_forms : put all forms into one group; each QP is still a case of its own
     """
     records = [r for r in evidence.records if not r.role]
-    if not records:
-        return ()
-    of = [kind_of(r, pool_forms=pool_forms) for r in records]
-    kinds = _numbered(of)
-    cases = _numbered(r.case for r in records)
-    solvers = _numbered(evidence.solvers)
-    verified = np.array([r.verdict.is_verified for r in records])
-    outcomes = _outcomes(
-        pd.DataFrame(
-            {
-                "kind": [kinds[kind] for kind in of],
-                "case": [cases[r.case] for r in records],
-                "solver": [solvers[r.solver] for r in records],
-                "tol": [r.tol for r in records],
-                "seconds": np.array([r.total_seconds for r in records], dtype=float),
-                "verified": verified,
-                "claimed": [r.claims_answer for r in records],
-                # one repeat in time is no answer yet
-                "late": [r.verdict is Verdict.TIME_LIMIT for r in records] | verified,
-                "declined": [r.verdict is Verdict.DECLINED for r in records],
-            }
-        )
-    )
-    limit = _limit(evidence, outcomes)
-    found = tuple(
-        _group(kind, group, [*cases], evidence.solvers, limit)
-        for kind, (_, group) in zip(kinds, outcomes.groupby("kind"), strict=True)
-    )
+    given = _given(evidence, pool_forms=pool_forms)
+    asked = evidence.suite.get("time_limit")
+    if isinstance(asked, int | float) and asked > 0:
+        limit = float(asked)
+    else:  # the longest measurement
+        every = (o for o in evidence.flat if not o.first.role)
+        limit = max((t for t in map(_seconds, every) if t > 0), default=1.0)
+    found = [_group(kind, of, evidence.solvers, limit) for kind, of in given.items()]
     if len({r.session for r in records}) > 1:
-        answers = answers_of(evidence, pool_forms=pool_forms)
-        found = tuple(_with_sessions(group, answers[group.kind]) for group in found)
-    if not pool_forms:
-        return found
-    form = {r.case: r.form for r in records}
-    return tuple(
-        replace(group, forms=Counter(form[case] for case in group.cases))
-        for group in found
-    )
+        found = [_with_sessions(group, _answers(given[group.kind])) for group in found]
+    if pool_forms:
+        form = {r.case: r.form for r in records}
+        found = [
+            replace(group, forms=Counter(form[case] for case in group.cases))
+            for group in found
+        ]
+    return tuple(found)
 
 
 def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
     """Choose the answer of every solver to every case; null arms take no part."""
-    found: dict[Kind, dict[str, dict[str, list[Outcome]]]] = {}
+    given = _given(evidence, pool_forms=pool_forms)
+    return {kind: _answers(rows) for kind, rows in given.items()}
+
+
+def _given(evidence: Evidence, *, pool_forms: bool) -> dict[Kind, Given]:
+    """Group the outcomes of every solver on every case, those of a sweep together."""
+    found: dict[Kind, Given] = {}
     for o in evidence.flat:
         if not o.first.role:
             cases = found.setdefault(kind_of(o.first, pool_forms=pool_forms), {})
             cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
+    return found
+
+
+def _answers(given: Given) -> dict[str, Row]:
     return {
-        kind: {
-            case: {solver: representative(given) for solver, given in row.items()}
-            for case, row in cases.items()
-        }
-        for kind, cases in found.items()
+        case: {solver: representative(outcomes) for solver, outcomes in row.items()}
+        for case, row in given.items()
     }
 
 
@@ -287,86 +273,60 @@ def kind_of(r: Record, *, pool_forms: bool = False) -> Kind:
     return Kind(swept, r.mode, form, r.tol if r.accuracy is None else r.accuracy)
 
 
-def _numbered(names: Iterable[Name]) -> dict[Name, int]:
-    """Map names to numbers in their order: pandas does not accept every name."""
-    return {name: number for number, name in enumerate(dict.fromkeys(names))}
-
-
-def _outcomes(records: pd.DataFrame) -> pd.DataFrame:
-    """Put repeats together, then the tolerances of a sweep: one row per cell."""
-    repeats = records.groupby([*_CELL, "tol"], sort=False).agg(
-        seconds=("seconds", "median"),
-        verified=("verified", "all"),
-        claimed=("claimed", "all"),
-        late=("late", "all"),
-        declined=("declined", "all"),
-    )
-    time = repeats["seconds"]
-    timed = time > 0
-    late = repeats["late"] & ~repeats["verified"]
-    columns = pd.DataFrame(
-        {
-            "times": time.where(repeats["verified"] & timed, np.inf),
-            "claimed": time.where(repeats["claimed"] & timed, np.inf),
-            "stopped": time.fillna(np.inf).where(late, np.nan),  # inf: at the limit
-            "declined": repeats["declined"].astype(float),
-            "longest": time,
-        }
-    )
-    return (
-        columns.groupby(level=_CELL, sort=False)
-        .agg(
-            times=("times", "min"),
-            claimed=("claimed", "min"),
-            stopped=("stopped", "max"),
-            declined=("declined", "min"),
-            longest=("longest", "max"),
-        )
-        .reset_index()
-    )
-
-
-def _limit(evidence: Evidence, outcomes: pd.DataFrame) -> float:
-    """Take the suite's limit of time, or else the longest measurement."""
-    asked = evidence.suite.get("time_limit")
-    if isinstance(asked, int | float) and asked > 0:
-        return float(asked)
-    longest = float(outcomes["longest"].max())
-    return longest if longest > 0 else 1.0
+def _seconds(outcome: Outcome) -> float:
+    """Median total time, s; NaN without one."""
+    time = outcome.seconds("total")
+    return np.nan if time is None else time.value
 
 
 def _group(
-    kind: Kind,
-    group: pd.DataFrame,
-    cases: Sequence[str],
-    solvers: Sequence[str],
-    limit: float,
+    kind: Kind, given: Given, solvers: Sequence[str], limit: float
 ) -> ComparisonGroup:
     """Keep the solvers with at least half of the cases, and cases that they all had."""
-    wide = group.pivot(index="case", columns="solver")
-    present = np.array([cases[i] for i in wide.index], dtype=object)
-    met = np.array([solvers[i] for i in wide["times"].columns], dtype=object)
-
-    def matrix(name: str) -> Times:
-        return wide[name].to_numpy(dtype=float)
-
-    times, declined = matrix("times"), matrix("declined")
+    present = np.array([*given], dtype=object)
+    known = {solver for row in given.values() for solver in row}
+    met = np.array([s for s in solvers if s in known], dtype=object)
+    cells = np.full((4, len(present), len(met)), np.nan)
+    for k, row in enumerate(given.values()):
+        for i, solver in enumerate(met):
+            if solver in row:
+                cells[:, k, i] = _cell(row[solver])
+    times, claimed, stopped, declined = cells
+    stopped = np.where(np.isinf(stopped), limit, stopped)
     seen = ~np.isnan(times)
     refused = (declined == 1).sum(axis=0) == seen.sum(axis=0)
     rare = ~refused & (2 * seen.sum(axis=0) < len(present))
     taken = ~(refused | rare)
     complete = seen[:, taken].all(axis=1)
     part = np.ix_(complete, taken)
-    stopped = matrix("stopped")[part]
     return ComparisonGroup(
         kind=kind,
         cases=tuple(present[complete]),
         solvers=tuple(met[taken]),
         times=times[part],
-        claimed=matrix("claimed")[part],
-        stopped=np.where(np.isinf(stopped), limit, stopped),
+        claimed=claimed[part],
+        stopped=stopped[part],
         limit=limit,
         refused=tuple(met[refused]),
         rare=tuple(met[rare]),
         incomplete=int((~complete).sum()),
+    )
+
+
+def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
+    """Return times, claimed and stopped of a group for one cell, and 1 if declined."""
+    times = [(_seconds(o), o) for o in outcomes]
+    verified = [t for t, o in times if o.verified and t > 0]
+    claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]
+    stopped = [
+        np.inf if np.isnan(t) else t
+        for t, o in times
+        if not o.verified and all(r.verdict in _LATE for r in o.records)
+    ]
+    declined = all(r.verdict is Verdict.DECLINED for o in outcomes for r in o.records)
+    return (
+        min(verified, default=np.inf),
+        min(claimed, default=np.inf),
+        max(stopped, default=np.nan),
+        float(declined),
     )

@@ -15,11 +15,9 @@ from mortarbench.reports.document.figure import (
     Look,
     Panel,
     Row,
-    Series,
-    numbers,
 )
 from mortarbench.reports.figures.deformed import FRICTION, length_unit, prefixed
-from mortarbench.reports.figures.style import below, legible
+from mortarbench.reports.figures.style import below, curve, legible
 
 SHOWN = 1e-6  #: tractions below this times the largest pressure are not looked for
 BESIDE = 0.15  #: of the loaded part, shown on either side of it
@@ -88,30 +86,26 @@ def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
         low=float(low / size),
         high=float(high / size),
     )
-    name, seen = legible(side.name), (low <= along) & (along <= high)
     panels = []
     for column, (kind, values) in enumerate(tractions.items(), 1):
         factor, prefix = prefixed(float(abs(values).max()))
-        marks = []
+        curves = {}
         if side.exact is not None:
-            kept = (low <= side.exact[:, 0]) & (side.exact[:, 0] <= high)
-            x, y = side.exact[kept][:, [0, column]].T
-            marks.append(
-                Series(x=numbers(x / size), y=numbers(y / factor), look=_EXACT)
-            )
+            curves[_EXACT] = side.exact[:, 0], side.exact[:, column]
         for state, style in LOOKS.items():
-            of = seen & (_states(side) == state)
-            if of.any():
-                marks.append(
-                    Series(
-                        x=numbers(along[of] / size), y=numbers(values[of] / factor),
-                        look=style,
-                    )
-                )  # fmt: skip
+            of = _states(side) == state
+            curves[style] = along[of], values[of]
+        marks = []
+        for style, (x, y) in curves.items():
+            seen = (low <= x) & (x <= high)
+            points = zip(x[seen] / size, y[seen] / factor, strict=True)
+            marks += curve(points, style)
         panels.append(
             Panel(
-                x=axis, y=Axis(label=f"{kind} in {prefix}Pa"), marks=tuple(marks),
-                title=name if column == 1 else "",
+                x=axis,
+                y=Axis(label=f"{kind} in {prefix}Pa"),
+                marks=tuple(marks),
+                title=legible(side.name) if column == 1 else "",
             )
-        )  # fmt: skip
+        )
     return tuple(panels)

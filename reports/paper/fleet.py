@@ -80,7 +80,7 @@ def places(evidence: Evidence, form: str, *, dofs: bool) -> dict[str, list[Place
                 sizes = (
                     o.size("dofs") if dofs else o.first.sizes.get("variables")
                     for o in (outcome, *row.values())
-                )  # fmt: skip
+                )
                 size = int(next(filter(None, sizes), 0))
                 found[solver].append(Place(size, outcome, dofs))
     return {s: sorted(mine, key=lambda p: p.size) for s, mine in found.items() if mine}

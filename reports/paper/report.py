@@ -148,7 +148,7 @@ def compose(
         ),
         footer="Every sample is in data/, the medians in tables/*.csv; the figures are "
         "drawn from these files alone.",
-    )  # fmt: skip
+    )
 
 
 def _section(

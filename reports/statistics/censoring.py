@@ -14,9 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import stdtrit
 
-from mortarbench.reports.statistics.intervals import COVERAGE, Interval
+from mortarbench.reports.statistics.intervals import COVERAGE, Interval, student
 
 Array = NDArray[np.float64]
 
@@ -63,7 +62,7 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     left = np.cumsum(areas[:0:-1])[::-1]  # ∫ of S from each knot to the horizon
     rest = np.maximum(at_risk - solved, 1)  # left is 0 where nobody is at risk any more
     variance = float((left**2 * solved / (at_risk * rest)).sum()) * n / (n - 1)
-    half = float(stdtrit(n - 1, 0.5 + COVERAGE / 2)) * variance**0.5
+    half = student(n - 1) * variance**0.5
     low, high = max(mean - half, 0.0), min(mean + half, horizon)
     return Restricted(
         mean=Interval(mean, low, high, COVERAGE, n),

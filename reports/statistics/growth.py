@@ -18,9 +18,13 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import stdtrit
 
-from mortarbench.reports.statistics.intervals import COVERAGE, Interval, power_law
+from mortarbench.reports.statistics.intervals import (
+    COVERAGE,
+    Interval,
+    power_law,
+    student,
+)
 
 SIZES = 4  #: fewer different sizes leave less than two degrees of freedom
 PRACTICAL = 0.10  #: relative change per decade of n that nobody need care about
@@ -88,7 +92,7 @@ class Growth:
         off = np.log(n) - x.mean()
         spread = float((x - x.mean()) @ (x - x.mean()))
         error = self.scatter * np.sqrt(1 + 1 / k + off**2 / spread)
-        half = float(stdtrit(k - 2, 0.5 + COVERAGE / 2) * error)
+        half = float(student(k - 2) * error)
         value = np.exp(self.log_factor + self.exponent * np.log(n))
         ends = value * np.exp(-half), value * np.exp(half)
         return Interval(float(value), float(ends[0]), float(ends[1]), COVERAGE, k)
@@ -112,15 +116,15 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
         raise ValueError("growth needs four different sizes, positive values")
     law = power_law(x, y)
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
-    student = float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2))
-    error = (law.high - law.low) / 2 / student
+    half = student(x.size - 2)
+    error = (law.high - law.low) / 2 / half
     if error * spread <= _ROUNDING:  # as of counts that are all the same
         error = 0.0
     p = law.exponent if abs(law.exponent) * spread > _ROUNDING else 0.0
     return Growth(
         exponent=p,
-        low=p - student * error,
-        high=p + student * error,
+        low=p - half * error,
+        high=p + half * error,
         log_factor=law.log_factor,
         scatter=error * spread,
         sizes=tuple(map(float, x)),

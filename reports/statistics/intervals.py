@@ -24,6 +24,11 @@ class Interval(NamedTuple):
     samples: int
 
 
+def student(freedom: float) -> float:
+    """Return the half-width, in standard errors, of Student's interval of 95 %."""
+    return float(stdtrit(freedom, 0.5 + COVERAGE / 2))
+
+
 def median_interval(samples: Sequence[float]) -> Interval:
     """Take the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
 
@@ -99,6 +104,6 @@ def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
     p = float(X @ Y / (X @ X))
     rest = Y - Y.mean() - p * X
     error = np.sqrt(rest @ rest / (x.size - 2) / (X @ X))
-    half = float(stdtrit(x.size - 2, 0.5 + COVERAGE / 2) * error)
+    half = float(student(x.size - 2) * error)
     log_factor = float(Y.mean() - p * np.log(x).mean())
     return PowerLaw(p, p - half, p + half, log_factor, x.size)

@@ -22,9 +22,9 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr, stdtrit
+from scipy.special import ndtr
 
-from mortarbench.reports.statistics.intervals import COVERAGE
+from mortarbench.reports.statistics.intervals import COVERAGE, student
 
 DRAWS = 2000
 
@@ -51,7 +51,7 @@ def limits(draws: Array, cases: int) -> tuple[Array, Array]:
     −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. Order is kept: a transform of the
     statistic transforms the interval.
     """
-    tail = float(ndtr(-_student(cases)))
+    tail = float(ndtr(-np.sqrt(cases / (cases - 1)) * student(cases - 1)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
     return low, high
 
@@ -163,8 +163,3 @@ def _rng(cases: Sequence[str]) -> np.random.Generator:
     return np.random.default_rng(
         crc32("\n".join(cases).encode(errors="backslashreplace"))
     )
-
-
-def _student(n: int) -> float:
-    """Half-width, in errors of the mean as resampled, of a 95 % interval from n."""
-    return float(np.sqrt(n / (n - 1)) * stdtrit(n - 1, 0.5 + COVERAGE / 2))
