@@ -16,6 +16,9 @@ from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
+from mortarbench.problems.duality.divided import torn_path
+from mortarbench.problems.duality.problem import chosen
+from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.feti.subdomains import OwnSubdomains, subdomains_of
 from mortarbench.problems.feti.torn import Kind
 from mortarbench.solvers.reference.over_ranks import reference_over_ranks
@@ -32,11 +35,10 @@ def told(name, ranks):
     """Emit by all ranks; tell the first one what each has."""
     case = parse(name, PROBLEMS)
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
-    problem = parts_of(name)
     share = made.share().qp
     rows = share.P.halo.rows
     own = rows[share.P.halo.own]
-    mine = OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    mine = own_subdomains(name, ranks)
     B = share.P.local.B.tocoo()
     Fx, factorised = forming(lambda: share.P @ probe(made.variables)[own])
     return ranks.comm.gather({
@@ -53,6 +55,17 @@ def told(name, ranks):
         "Fx": np.asarray(Fx),
         "component": mine.component,
     })  # fmt: skip
+
+
+def own_subdomains(name, ranks):
+    """Hold what ranks hold, whose shares are those of the first problem of a path."""
+    case = parse(name, PROBLEMS)
+    if isinstance(case.family, ContactFamily):
+        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
+        path = torn_path(problem, choice, ranks, reference_over_ranks)
+        return path.problem(choice.step, choice.iterate).posed.dual.own
+    problem = parts_of(name)
+    return OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 
 
 def named(kind, touched):

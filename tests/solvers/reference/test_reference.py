@@ -440,6 +440,7 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
         "mortarbench.solvers.reference", "mortarbench.solvers.reference.equilibrate",
         "mortarbench.solvers.reference.interior",
         "mortarbench.solvers.reference.polish",
+        "mortarbench.solvers.reference.projection",
         "mortarbench.solvers.reference.saddle", "mortarbench.solvers.reference.solve",
     ]  # fmt: skip
 
