@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, wraps
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,16 +75,19 @@ class Shape(Protocol):
         """Cut the bodies; what `size` means depends on the shape."""
 
 
-@dataclass(frozen=True, eq=False)
-class StructuredGrids:
-    """Structured grids, one after another; subdomains of at most size² cells."""
+B = TypeVar("B", StructuredGrid, HalfDisc)
 
-    grids: tuple[StructuredGrid, ...]
+
+@dataclass(frozen=True, eq=False)
+class _Joined(Generic[B]):
+    """Bodies of known shape in the plane, numbered one after another."""
+
+    parts: tuple[B, ...]
     dim = 2
 
     @cached_property
     def _joined(self) -> tuple[Mesh, Nodes]:
-        return join(tuple(grid.mesh() for grid in self.grids))
+        return join(tuple(part.mesh() for part in self.parts))
 
     @property
     def mesh(self) -> Mesh:
@@ -99,46 +102,27 @@ class StructuredGrids:
     @cached_property
     def sides(self) -> Mapping[str, Nodes]:
         """Chains of nodes by their names."""
-        return joined_sides(self.grids)
+        return joined_sides(self.parts)
+
+
+class StructuredGrids(_Joined[StructuredGrid]):
+    """Structured grids; subdomains of at most size² cells."""
 
     def layout(self, size: int) -> Layout:
         """Cut each grid into blocks of at most `size` cells a side."""
-        return Layout.of(self.grids, size)
+        return Layout.of(self.parts, size)
 
 
-@dataclass(frozen=True, eq=False)
-class HalfDiscs:
-    """Half discs, one after another; subdomains are blocks of rings and sectors."""
-
-    discs: tuple[HalfDisc, ...]
-    dim = 2
-
-    @cached_property
-    def _joined(self) -> tuple[Mesh, Nodes]:
-        return join(tuple(disc.mesh() for disc in self.discs))
-
-    @property
-    def mesh(self) -> Mesh:
-        """All bodies, m."""
-        return self._joined[0]
-
-    @property
-    def body(self) -> NDArray[np.int64]:
-        """Body of each cell, (E,)."""
-        return self._joined[1]
-
-    @cached_property
-    def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by their names."""
-        return joined_sides(self.discs)
+class HalfDiscs(_Joined[HalfDisc]):
+    """Half discs; subdomains are blocks of rings and sectors."""
 
     def layout(self, size: int) -> Subdivision:
         """Cut each into blocks about as long as wide, of at most size² cells.
 
         The triangles at a centre are the last ring.
         """
-        blocks = [compact_blocks(disc.lengths(), size) for disc in self.discs]
-        return half_discs_in_blocks(self.discs, blocks)
+        blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
+        return half_discs_in_blocks(self.parts, blocks)
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,7 @@ def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
     return ElasticBodies(
         shape=shape, names=("cylinder",), materials=(MATERIAL,), plane=p["plane"],
         length=RADIUS, force=exact.P, fixed=_on_axis(sides),
-        forces=_pressed(shape.discs, "flat", 1.0),
+        forces=_pressed(shape.parts, "flat", 1.0),
         pairs=(ContactPair(sides["arc"], np.zeros(0, dtype=np.int64)),),
     ), exact  # fmt: skip
 

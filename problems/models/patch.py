@@ -236,7 +236,7 @@ def bodies(params: Mapping[str, Value]) -> ElasticBodies:
     sides, force = shape.sides, PRESSURE * LENGTH
     left = np.concatenate([sides["lower_left"], sides["upper_left"]])
     rollers = dofs_of(left, 2, 0), dofs_of(sides["lower_bottom"], 2, 1)
-    pressing = -PRESSURE * nodal_lengths(shape.grids[1].side("upper_top"))
+    pressing = -PRESSURE * nodal_lengths(shape.parts[1].side("upper_top"))
     return ElasticBodies(
         shape=shape, names=NAMES, plane=p["plane"], length=LENGTH, force=force,
         materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
