@@ -18,6 +18,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, gettempdir
 from threading import Lock
 from typing import Any, cast
+from weakref import WeakValueDictionary, finalize
 
 from distributed import Worker, get_worker
 from distributed.diagnostics.plugin import WorkerPlugin
@@ -36,7 +37,6 @@ class Delivery:
     """Outcomes of a block, and where they were measured."""
 
     outcomes: list[Outcome]
-    worker: str  #: address of the Dask worker
     node: str  #: host name
     digest: str  #: of the environment
     environment: dict[str, Any]
@@ -68,7 +68,7 @@ class ExecutorPlugin(WorkerPlugin):
 
         The kernel kills solver processes with the thread that started them.
         """
-        self._worker = worker
+        self._worker = worker.id
         self._busy = Lock()
 
     def teardown(self, worker: Worker | None = None) -> None:
@@ -102,7 +102,7 @@ class ExecutorPlugin(WorkerPlugin):
 
     def _carried_out(self, block: WorkUnit) -> Delivery:
         opened = self._open = self._open or self._opened()
-        os.sched_setaffinity(0, {opened.cpu})  # of this thread, for what it starts
+        os.sched_setaffinity(0, {opened.cpu.number})  # of this thread
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
         outcomes = []
@@ -115,7 +115,6 @@ class ExecutorPlugin(WorkerPlugin):
             raise InputError(f"{platform.node()}: {e}") from None
         return Delivery(
             outcomes=outcomes,
-            worker=self._worker.address,
             node=platform.node(),
             digest=opened.digest,
             environment=opened.environment,
@@ -132,7 +131,7 @@ class ExecutorPlugin(WorkerPlugin):
         if self.sharing > 1:
             environment["machine"]["shared_by_workers"] = self.sharing
         with ExitStack() as stack:
-            cpu = stack.enter_context(cpu_of(self._worker.id))
+            cpu = _cpu_of(self._worker)
             folder = TemporaryDirectory(prefix="mortarbench-")
             scratch = Path(stack.enter_context(folder))
             operators: Mapping[str, Maker] = self.operators
@@ -180,27 +179,27 @@ def execute(name: str, block: WorkUnit) -> Delivery:
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Open:
     executor: Executor
-    cpu: int
+    cpu: _Cpu
     environment: dict[str, Any]
     digest: str
     stack: ExitStack
 
 
-class _Held:
-    """A CPU that a Dask worker holds, and the number of executors that use it."""
+class _Cpu:
+    """A CPU that a Dask worker holds as long as one of its executors refers to it."""
 
     def __init__(self) -> None:
-        self.stack = ExitStack()
-        self.cpu = own_cpu(self.stack)
-        self.users = 0
+        stack = ExitStack()
+        self.number = own_cpu(stack)
+        finalize(self, stack.close)
 
 
-_held: dict[str, _Held] = {}  # by the Dask worker of this process
+#: by the Dask worker of this process
+_held: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
 _holding = Lock()
 
 
-@contextmanager
-def cpu_of(worker: str) -> Iterator[int]:
+def _cpu_of(worker: str) -> _Cpu:
     """Hold a CPU for a Dask worker, which all its executors share.
 
     There are several where several runs measure there, or where one has died and its
@@ -213,16 +212,8 @@ def cpu_of(worker: str) -> Iterator[int]:
 
     """
     with _holding:
-        held = _held[worker] = _held.get(worker) or _Held()
-        held.users += 1
-    try:
-        yield held.cpu
-    finally:
-        with _holding:
-            held.users -= 1
-            if not held.users:
-                held.stack.close()
-                del _held[worker]
+        held = _held[worker] = _held.get(worker) or _Cpu()
+    return held
 
 
 def own_cpu(stack: ExitStack) -> int:
