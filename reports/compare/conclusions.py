@@ -17,7 +17,7 @@ from mortarbench.reports.compare.changes import (
 from mortarbench.reports.compare.conditions import environments, machines_differ
 from mortarbench.reports.compare.regressions import regressions
 from mortarbench.reports.data.environment import busy_with, dateline
-from mortarbench.reports.document.formatting import VERDICTS, plural
+from mortarbench.reports.document.formatting import VERDICTS, fixed, plural
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.statistics.intervals import COVERAGE
 
@@ -129,7 +129,7 @@ def ratio_text(ratio: Ratio | Mean) -> str:
     """Print a ratio with its interval, or without one where there is none."""
     if ratio.low == 0:
         return f"{ratio.value:.3f} [too few cells]"
-    return f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
+    return fixed(ratio)
 
 
 TEXT = Sentences(

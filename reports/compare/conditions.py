@@ -23,16 +23,16 @@ def hardware(evidence: Evidence) -> dict[str, str]:
 
     A digest whose environment the folder does not hold names itself.
     """
-    digests = {r.environment for r in evidence.records}
-    return {digest: _hardware(evidence, digest) for digest in digests}
-
-
-def _hardware(evidence: Evidence, digest: str) -> str:
-    try:
-        found = environment_of(evidence.directory, digest)
-    except InputError:
-        return digest
-    return json.dumps({part: found.get(part) for part in HARDWARE}, sort_keys=True)
+    named = {}
+    for digest in {r.environment for r in evidence.records}:
+        try:
+            found = environment_of(evidence.directory, digest)
+        except InputError:
+            named[digest] = digest
+        else:
+            parts = {part: found.get(part) for part in HARDWARE}
+            named[digest] = json.dumps(parts, sort_keys=True)
+    return named
 
 
 def machines_differ(before: Evidence, after: Evidence) -> bool:

@@ -20,8 +20,11 @@ def source(*outcomes: Outcome) -> str:
     return sources(r for o in outcomes for r in o.records)
 
 
-def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
-    """Show a verdict with symbol and words, and how many repeats it holds for."""
+def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
+    """Show a verdict with symbol and words, and how many repeats it holds for.
+
+    message : of the solver, shown when pointed at
+    """
     symbol, words = VERDICTS[outcome.verdict]
     if outcome.against_residuals:
         words += f" {BY_OPTIMUM}"
@@ -33,15 +36,16 @@ def verdict_cell(outcome: Outcome, after: str = "") -> Cell:
         symbol=symbol,
         after=after,
         kind=outcome.verdict.value,
-        title=source(outcome),
+        title=f"{message} · {source(outcome)}" if message else source(outcome),
     )
 
 
-def iterations_cell(outcome: Outcome) -> Cell:
+def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
     """Show iterations, or their range where repeats differ."""
-    its = outcome.iterations
-    least = its[0] if its else None
-    return Cell(text=span(its), value=least, title=source(outcome))
+    its, title = outcome.iterations, source(outcome)
+    if its is None:
+        return Cell(kind=kind, title=title)
+    return Cell(text=form.format(span(its)), value=its[0], kind=kind, title=title)
 
 
 def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:

@@ -65,7 +65,12 @@ def clean(text: str, limit: int = 96) -> str:
     """
     line = inert(" ".join(text.split()))
     if not line.isascii() or not line.isprintable():
-        visible = "".join("\ufffd" if _invisible(c) else c for c in line)
+        hidden = {"Cc", "Cf", "Cs", "Co"}  # controls, overrides, lone surrogates
+        kinds = map(unicodedata.category, line)
+        visible = "".join(
+            "\ufffd" if kind in hidden else c
+            for c, kind in zip(line, kinds, strict=True)
+        )
         line = _PILED.sub(r"\1", unicodedata.normalize("NFC", visible))
     if len(line) > limit:
         tail = limit // 3
@@ -76,11 +81,6 @@ def clean(text: str, limit: int = 96) -> str:
 def plain_value(value: object, limit: int = 96) -> str:
     """Print a value of plain data: a number as it is, anything else as `clean` does."""
     return str(value) if isinstance(value, int | float) else clean(str(value), limit)
-
-
-def _invisible(char: str) -> bool:
-    """Whether a character is a control, a direction override or a lone surrogate."""
-    return unicodedata.category(char) in {"Cc", "Cf", "Cs", "Co"}
 
 
 def significant(value: float | None, digits: int = 3) -> str:
@@ -156,6 +156,12 @@ def bracketed(value: float, low: float, high: float) -> str:
 def estimate(of: Sequence[float]) -> str:
     """Print a value and its interval, the first three of what describes an estimate."""
     return bracketed(*of[:3])
+
+
+def fixed(of: Sequence[float], digits: int = 3) -> str:
+    """Print a value and its interval with so many decimals each."""
+    value, low, high = (f"{v + 0.0:.{digits}f}" for v in of[:3])
+    return f"{value} [{low}, {high}]"
 
 
 def span(least_most: tuple[int, int] | None) -> str:

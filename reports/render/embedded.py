@@ -27,8 +27,12 @@ def rows_of(records: Sequence[Record]) -> Rows:
 
 def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
     """Serialise what the page needs at once; its measurements' details follow apart."""
+    looks = [(name, look(i)) for i, name in enumerate(page.solvers)]
     return script({
-        "solvers": [_solver(s, i) for i, s in enumerate(page.solvers)],
+        "solvers": [
+            {"names": [clean(s, 40), clean(s)], "colour": k.colour, "marker": k.marker}
+            for s, k in looks
+        ],
         "tables": [table(t, rows) for s in page.sections for t in s.tables],
         "plots": plots,
         "runs": _keys(page.records),
@@ -88,15 +92,6 @@ def _numbered(panel: Data, rows: Rows) -> Data:
         for t in panel["traces"]
     ]
     return {**panel, "traces": traces}
-
-
-def _solver(name: str, index: int) -> Data:
-    style = look(index)
-    return {
-        "names": [clean(name, 40), clean(name)],
-        "colour": style.colour,
-        "marker": style.marker,
-    }
 
 
 def table(t: Table, rows: Rows) -> Data:

@@ -98,16 +98,12 @@ def told(text: str, rows: Rows) -> Markup:
 
     parts = split(text)
     parts[::2] = [_RUN_ID.sub(linked, str(breakable(part))) for part in parts[::2]]
-    parts[1::2] = map(_formula, parts[1::2])
+    for i in range(1, len(parts), 2):
+        try:
+            parts[i] = mathml(parts[i])
+        except ValueError:  # a name of a foreign folder that is no formula
+            parts[i] = str(breakable(rf"\({parts[i]}\)"))
     return Markup("".join(parts))
-
-
-def _formula(tex: str) -> str:
-    """Typeset a formula; a name of a foreign folder that is none stays as it is."""
-    try:
-        return mathml(tex)
-    except ValueError:
-        return str(breakable(rf"\({tex}\)"))
 
 
 def link(cell: Cell, page: Page, rows: Rows) -> Markup:

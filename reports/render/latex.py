@@ -113,10 +113,10 @@ def escaped(text: str) -> str:
     if _PLAIN.fullmatch(text):  # most cells of a large report
         return text
     hyphens = re.sub("-(?=-)", "-\0", text)
-    safe = "".join(_SPECIAL.get(c) or _known(c) for c in hyphens)
+    safe = "".join(
+        _SPECIAL.get(c)
+        or (c if c.isascii() or ("¡" <= c <= "ÿ" and c not in _NOT_IN_OT1)
+            else f"U+{ord(c):04X}")
+        for c in hyphens
+    )  # fmt: skip
     return f"{{}}{safe}" if safe.startswith(("[", "*")) else safe
-
-
-def _known(char: str) -> str:
-    latin = "¡" <= char <= "ÿ" and char not in _NOT_IN_OT1
-    return char if char.isascii() or latin else f"U+{ord(char):04X}"

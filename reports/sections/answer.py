@@ -14,7 +14,6 @@ import numpy as np
 from mortarbench.harness import Verdict
 from mortarbench.reports.data.comparison_groups import CASES
 from mortarbench.reports.data.environment import busy_with
-from mortarbench.reports.data.evidence import Evidence
 from mortarbench.reports.data.fastest import (
     Competitor,
     FastestSolver,
@@ -99,6 +98,7 @@ def forms(a: Analysis) -> Iterator[Part]:
         yield from _form_statements(a)
         yield TIMED
         yield from _picture("forms", shown(a.fastest), a, SOLVERS)
+    del a.ways  # copies of all records
 
 
 def _within(text: str, f: FastestSolver) -> str:
@@ -340,16 +340,12 @@ def own_results(a: Analysis) -> Iterator[Statement | Picture]:
 
     Of a suite of one solver; nothing where solvers are compared.
     """
-    cold = {r.solver for r in a.evidence.records if not r.role and r.ranks == 1}
+    firsts = (o.first for o in a.evidence.flat)
+    cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
     if len(cold) != 1:
         return
     (solver,) = cold
-    claims = (
-        *_growth(solver, a.sizes),
-        *_condition(solver, a.sizes),
-        *_against_subdomains(a.evidence),
-        *_speed_up(a.evidence),
-    )
+    claims = tuple(_own_claims(solver, a))
     if not claims:
         return
     yield Statement(
@@ -380,35 +376,27 @@ def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
     reach = [n for curve in curves for n, _ in curve]
     yield TEXT("growth", solver, reach, [i for of in counts for i in of], trends)
     if len(fits) > 1:
-        for (s, fit), curve, its in [*zip(fits, curves, counts, strict=True)][
-            :MOST_TOLD
-        ]:
+        told = [*zip(fits, curves, counts, strict=True)][:MOST_TOLD]
+        for (s, fit), curve, its in told:
             yield TEXT("growth_of", s.title, curve, its, per_decade(fit))
 
 
-def _condition(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
-    """Give the range of every condition number along a series."""
-    for series in sizes:
+def _own_claims(solver: str, a: Analysis) -> Iterator[str]:
+    """Give growth, condition numbers, iterations against H/h, and speed-up."""
+    yield from _growth(solver, a.sizes)
+    for series in a.sizes:
         curve = [(float(n), o) for n, o in series.curve(solver)]
         if ranges := condition_numbers(curve):
             yield TEXT("condition", series.title, ranges)
-
-
-def _against_subdomains(evidence: Evidence) -> Iterator[str]:
-    """Give iterations at the ends of a sweep of H/h."""
-    for sweep in sweeps(evidence, "feti"):
-        ends = sweep.answers[0], sweep.answers[-1]
-        if all(o.iterations for _, o in ends):
-            yield TEXT("subdomains", sweep, ends)
-
-
-def _speed_up(evidence: Evidence) -> Iterator[str]:
-    """Give the speed-up of the solve on the most ranks that had a CPU each."""
-    for s in strong_series(evidence):
-        free = [n for n in s.several if not s.crowded(n)]
-        ratio = s.speed_up(free[-1], "solve") if free else None
+    for sweep in sweeps(a.evidence, "feti"):
+        ends_of = sweep.answers[0], sweep.answers[-1]
+        if all(o.iterations for _, o in ends_of):
+            yield TEXT("subdomains", sweep, ends_of)
+    for strong in strong_series(a.evidence):
+        free = [n for n in strong.several if not strong.crowded(n)]
+        ratio = strong.speed_up(free[-1], "solve") if free else None
         if ratio is not None:
-            yield TEXT("speed_up", s, free[-1], ratio)
+            yield TEXT("speed_up", strong, free[-1], ratio)
 
 
 TEXT = Sentences(

@@ -27,7 +27,7 @@ from mortarbench.reports.data.comparison_groups import (
     LARGEST_SHIFT,
     ComparisonGroup,
 )
-from mortarbench.reports.document.formatting import TIMED, estimate, significant
+from mortarbench.reports.document.formatting import TIMED, estimate, fixed, significant
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.profiles import (
@@ -236,8 +236,7 @@ def _profile_table(ranking: Ranking) -> Table:
     shares = [list(zip(*solved_within(of, within), strict=True)) for of in ratios.T]
 
     def share(k: int, i: int) -> Cell:
-        value, low, high = shares[i][k]
-        return Cell(text=f"{value:.2f} [{low:.2f}, {high:.2f}]", value=float(value))
+        return Cell(text=fixed(shares[i][k], 2), value=float(shares[i][k][0]))
 
     return Table.of(
         TEXT("shares_caption", group, int((~group.solved.any(axis=1)).sum())),

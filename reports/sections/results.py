@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 
 from mortarbench.harness import Verdict
@@ -18,7 +17,7 @@ from mortarbench.reports.data.cells import (
     verdict_cell,
 )
 from mortarbench.reports.data.evidence import RESIDUALS, Outcome
-from mortarbench.reports.document.formatting import clean, plain_value, power
+from mortarbench.reports.document.formatting import clean, fixed, plain_value, power
 from mortarbench.reports.document.layout import Cell, Column, Part, Table, sources
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
@@ -51,8 +50,8 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
         right, wrong = count[solver][True, True], count[solver][True, False]
         if not right + wrong:
             return Cell()
-        value, low, high = (float(part) for part in share(right, right + wrong))
-        return Cell(text=f"{value:.2f} [{low:.2f}, {high:.2f}]", value=value)
+        found = [float(part) for part in share(right, right + wrong)]
+        return Cell(text=fixed(found, 2), value=found[0])
 
     yield from TEXT.parts("claim_counts")
     yield Table.of(
@@ -106,9 +105,7 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
     claimed = [c for c in outcome.claims if c != expected]
     if claimed and outcome.verdict is not Verdict.DECLINED:
         after.append("claimed " + clean(", ".join(claimed).replace("_", " "), 40))
-    cell = verdict_cell(outcome, ", ".join(after))
-    message = clean(outcome.first.message, 240)
-    return replace(cell, title=f"{message} · {cell.title}".lstrip(" ·"))
+    return verdict_cell(outcome, ", ".join(after), clean(outcome.first.message, 240))
 
 
 @section(50, "iterations", "Iterations and counts")
@@ -130,11 +127,9 @@ def iterations(a: Analysis) -> Iterator[Part]:
 
 
 def _iterations(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
-    cell = iterations_cell(outcome)
     if outcome.verified:
-        return cell
-    known = cell.value is not None
-    return replace(cell, text=f"({cell.text})" if known else cell.text, kind="quiet")
+        return iterations_cell(outcome)
+    return iterations_cell(outcome, "({})", "quiet")
 
 
 def _counts(outcome: Outcome, names: Iterable[str]) -> Iterator[Cell]:

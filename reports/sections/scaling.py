@@ -10,7 +10,7 @@ from mortarbench.reports.data.cells import iterations_cell, source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.size_series import SIZES as SERIES
 from mortarbench.reports.data.size_series import SizeSeries, Sweep, sweeps
-from mortarbench.reports.document.formatting import TIMED, clean, exponent
+from mortarbench.reports.document.formatting import TIMED, clean, exponent, fixed
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.scaling import MOST_SERIES, scaling_figure
@@ -151,8 +151,7 @@ def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
 def _fitted(fit: Growth | None) -> Cell:
     if fit is None:
         return Cell()
-    p, low, high = (v + 0.0 for v in (fit.exponent, fit.low, fit.high))
-    return Cell(text=f"{p:.3f} [{low:.3f}, {high:.3f}]", value=fit.exponent)
+    return Cell(text=fixed((fit.exponent, fit.low, fit.high)), value=fit.exponent)
 
 
 def _per_decade(fit: Growth | None) -> Cell:

@@ -20,11 +20,17 @@ from mortarbench.reports.data.cells import (
     BY_OPTIMUM,
     case_cells,
     grid,
-    solver_columns,
     source,
 )
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.document.formatting import TIMED, VERDICTS, estimate, seconds
+from mortarbench.reports.document.formatting import (
+    TIMED,
+    VERDICTS,
+    clean,
+    estimate,
+    fixed,
+    seconds,
+)
 from mortarbench.reports.document.layout import Cell, Part, Picture, Table
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.figures.accuracy import accuracy_figure
@@ -62,29 +68,22 @@ def _charged_table(
     charged: Sequence[Mapping[str, Outcome]], solvers: Sequence[str]
 ) -> Table:
     """Charge dualising to dual forms, where it was measured; primal forms have none."""
-
-    def cell(solver: str, row: Mapping[str, Outcome]) -> Cell:
-        totals = {s: o.with_dualising for s, o in row.items() if o.verified}
-        if (total := totals.get(solver)) is None:
-            return Cell(kind="quiet")
-        ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
-        kind = "best" if total.value == min(ranked, default=None) else ""
-        return Cell.time(total, kind=kind, title=source(row[solver]))
-
-    def dualising(row: Mapping[str, Outcome]) -> Cell:
+    rows = []
+    for row in charged:
         one = next(o for o in row.values() if o.dualising is not None)
-        return Cell.time(one.dualising, title=source(one))
-
-    return Table.of(
-        TEXT("charged_caption"),
-        charged,
-        (
-            ("case", lambda row: case_cells(row)[0]),
-            ("tol", lambda row: case_cells(row)[1]),
-            ("dualising", dualising),
-            *solver_columns(solvers, cell),
-        ),
-    )
+        totals = {s: o.with_dualising for s, o in row.items() if o.verified}
+        ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
+        kinds = {min(ranked, default=None): "best"}
+        cells = (
+            Cell.time(total, kind=kinds.get(total.value, ""), title=source(row[s]))
+            if (total := totals.get(s))
+            else Cell(kind="quiet")
+            for s in solvers
+        )
+        dualising = Cell.time(one.dualising, title=source(one))
+        rows.append((*case_cells(row), dualising, *cells))
+    heads = ("case", "tol", "dualising", *(clean(s, 40) for s in solvers))
+    return Table(caption=TEXT("charged_caption"), columns=heads, rows=tuple(rows))
 
 
 def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
@@ -189,7 +188,7 @@ def precision(a: Analysis) -> Iterator[Part]:
                 ("tol", lambda t: Cell.tolerance(t.twin.tol)),
                 ("solver", lambda t: Cell.label(t.twin.solver)),
                 ("blocks", lambda t: Cell.number(t.ratio.pairs)),
-                ("ratio", lambda t: Cell.number(t.ratio, _ratio, title=source(t.null))),
+                ("ratio", lambda t: Cell.number(t.ratio, fixed, title=source(t.null))),
                 (
                     "half-width",
                     lambda t: Cell.number(t.ratio.half_width, "{:.1%}".format),
@@ -227,10 +226,6 @@ def _null_ratios(evidence: Evidence) -> list[_Twins]:
                 ratio = paired_ratio(null.by_block, twin.by_block)
                 found += [_Twins(twin, null, ratio)] if ratio is not None else []
     return found
-
-
-def _ratio(ratio: Ratio) -> str:
-    return f"{ratio.value:.3f} [{ratio.low:.3f}, {ratio.high:.3f}]"
 
 
 def _canary_row(name: str, mine: Sequence[Record]) -> tuple[Cell, ...]:

@@ -30,25 +30,13 @@ _LIMIT = Look(colour=INK, width=0.6, dash=(4, 2))
 Answer = Mapping[str, Any]
 
 
-def _refuted(a: Answer) -> bool:
-    return bool(a["refuted"])
-
-
-def _of_primal(a: Answer) -> bool:
-    return not a["refuted"] and a["form"] == "primal"
-
-
-def _of_others(a: Answer) -> bool:
-    return not a["refuted"] and a["form"] != "primal"
-
-
 _DOT = Look(colour=COLOURS[0], marker="o", dash=None, size=3.6, edge=0.6)
 _RING = Look(colour=COLOURS[0], marker="o", dash=None, size=3.6, edge=0.6, fill="none")
 _CROSS = Look(colour=COLOURS[1], marker="X", dash=None, size=5.8, edge=0.6)
 _KINDS: tuple[tuple[str, Callable[[Answer], bool], Look], ...] = (
-    ("primal form", _of_primal, _RING),
-    ("dual or other form", _of_others, _DOT),
-    ("refuted", _refuted, _CROSS),
+    ("primal form", lambda a: not a["refuted"] and a["form"] == "primal", _RING),
+    ("dual or other form", lambda a: not a["refuted"] and a["form"] != "primal", _DOT),
+    ("refuted", lambda a: bool(a["refuted"]), _CROSS),
 )
 
 
