@@ -338,7 +338,8 @@ def own_results(a: Analysis) -> Iterator[Statement | Picture]:
 
     Of a suite of one solver; nothing where solvers are compared.
     """
-    cold = {r.solver for r in a.evidence.records if not r.role and r.ranks == 1}
+    firsts = (o.first for o in a.evidence.flat)
+    cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
     if len(cold) != 1:
         return
     (solver,) = cold

@@ -12,6 +12,7 @@ from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import QUIET_LOAD, busy_with, machine
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import ENDINGS, VERDICTS, clean
+from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.document.layout import Cell, Part, Point, Table, sources
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.sections import Analysis, section
@@ -127,8 +128,8 @@ def sentences(evidence: Evidence, solver: str) -> list[str]:
 
 
 def _sentence(solver: str, tol: float, outcomes: Sequence[Outcome]) -> str:
-    by_verdict = {v: [o for o in outcomes if o.verdict is v] for v in Verdict}
-    declined = by_verdict.pop(Verdict.DECLINED)
+    by_verdict = grouped(outcomes, lambda o: o.verdict)
+    declined = by_verdict.get(Verdict.DECLINED, [])
     tried = [o for o in outcomes if o.verdict is not Verdict.DECLINED]
     bounds = [bound for o in tried if (bound := o.largest("energy_bound")) is not None]
     unclaimed = (
@@ -142,7 +143,7 @@ def _sentence(solver: str, tol: float, outcomes: Sequence[Outcome]) -> str:
         missed={
             verdict: (those, [o.worst for o in those if o.worst is not None])
             for verdict in ENDINGS
-            if (those := by_verdict[verdict])
+            if (those := by_verdict.get(verdict))
         },
         worst=max((o.worst or 0.0 for o in tried), default=0.0),
         loosest=max((o.first.step_tol or 0.0 for o in tried), default=0.0),

@@ -20,13 +20,13 @@ from mortarbench.reports.data.cells import (
     BY_OPTIMUM,
     case_cells,
     grid,
-    solver_columns,
     source,
 )
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import (
     TIMED,
     VERDICTS,
+    clean,
     estimate,
     fixed,
     seconds,
@@ -68,29 +68,22 @@ def _charged_table(
     charged: Sequence[Mapping[str, Outcome]], solvers: Sequence[str]
 ) -> Table:
     """Charge dualising to dual forms, where it was measured; primal forms have none."""
-
-    def cell(solver: str, row: Mapping[str, Outcome]) -> Cell:
-        totals = {s: o.with_dualising for s, o in row.items() if o.verified}
-        if (total := totals.get(solver)) is None:
-            return Cell(kind="quiet")
-        ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
-        kind = "best" if total.value == min(ranked, default=None) else ""
-        return Cell.time(total, kind=kind, title=source(row[solver]))
-
-    def dualising(row: Mapping[str, Outcome]) -> Cell:
+    rows = []
+    for row in charged:
         one = next(o for o in row.values() if o.dualising is not None)
-        return Cell.time(one.dualising, title=source(one))
-
-    return Table.of(
-        TEXT("charged_caption"),
-        charged,
-        (
-            ("case", lambda row: case_cells(row)[0]),
-            ("tol", lambda row: case_cells(row)[1]),
-            ("dualising", dualising),
-            *solver_columns(solvers, cell),
-        ),
-    )
+        totals = {s: o.with_dualising for s, o in row.items() if o.verified}
+        ranked = [t.value for s, t in totals.items() if t and not row[s].first.role]
+        kinds = {min(ranked, default=None): "best"}
+        cells = (
+            Cell.time(total, kind=kinds.get(total.value, ""), title=source(row[s]))
+            if (total := totals.get(s))
+            else Cell(kind="quiet")
+            for s in solvers
+        )
+        dualising = Cell.time(one.dualising, title=source(one))
+        rows.append((*case_cells(row), dualising, *cells))
+    heads = ("case", "tol", "dualising", *(clean(s, 40) for s in solvers))
+    return Table(caption=TEXT("charged_caption"), columns=heads, rows=tuple(rows))
 
 
 def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:

@@ -342,6 +342,7 @@ def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
     ("kind", "error", "note", "told"),
     [
         ("change", 0.1, "a point load", "to the next mesh only: a point load"),
+        ("limit", 0.0, "", "against the limit of fine meshes"),
         ("rounding", 1e-8, "", "the mesh holds the solution"),
         ("unknown", None, "too large", "too large"),
     ],

@@ -1,0 +1,55 @@
+"""Sections register themselves, with their places and what they need."""
+
+from pathlib import Path
+
+import pytest
+
+from mortarbench.reports import sections
+from mortarbench.reports.data.evidence import read_evidence
+from mortarbench.reports.document.layout import Cell, Point, Statement, Table
+from mortarbench.reports.sections import Analysis, section
+
+FOLDER = Path(__file__).parents[2] / "data" / "results-e247e1f-smoke"
+
+
+@pytest.fixture
+def analysis(monkeypatch):
+    """Return an analysis; what a test registers is gone after it."""
+    monkeypatch.setattr(sections, "_ENTRIES", sections._entries())
+    return Analysis(read_evidence(FOLDER))
+
+
+def test_a_section_has_its_place_and_its_parts_are_sorted_by_type(analysis):
+    table = Table.of("T", [1, 2], [("n", Cell.number)])
+    said = Statement(subject="x", claims=("yes",))
+
+    @section(13, "extra", lambda a: f"{len(a.evidence.solvers)} solvers")
+    def extra(_):
+        yield from (Point("first"), table, "A paragraph.", Point("second"), said)
+
+    found = list(sections.sections(analysis))
+    names = [one.name for one in found]
+    assert names[names.index("summary") :][:3] == ["summary", "extra", "cases"]
+    made = found[names.index("extra")]
+    assert made.title == "2 solvers"
+    assert (made.prose, made.points) == (("A paragraph.",), ("first", "second"))
+    assert (made.tables, made.statements, made.pictures) == ((table,), (said,), ())
+    assert [row[0].value for row in table.rows] == [1, 2]
+
+
+def test_a_section_without_parts_is_listed_with_what_it_needs(analysis):
+    @section(13, "extra", "Extra", "Extra: it needs a moon.")
+    def extra(_):
+        yield from ()
+
+    names = {one.name: one for one in sections.sections(analysis)}
+    assert "extra" not in names
+    assert "Extra: it needs a moon." in names["absent"].points
+    assert list(names)[-3:] == ["absent", "environment", "definitions"]
+
+
+def test_names_and_places_of_sections_differ(analysis):
+    entries = sections._entries()
+    assert len({entry.place for entry in entries}) == len(entries) > 20
+    names = [one.name for one in sections.sections(analysis)]
+    assert len(set(names)) == len(names)
