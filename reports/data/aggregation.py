@@ -135,7 +135,7 @@ class Ranking:
         logs, _ = _logs(self.group, USUAL)
         faster = resampling.told_apart(logs, self.group.cases)
         if self.group.apart.any():  # of different sessions: no pairs
-            faster = np.where(self.group.apart, self.group.told, faster)
+            faster = np.where(self.group.apart, self.group.faster, faster)
         return faster
 
     @cached_property

@@ -28,7 +28,7 @@ _LATE = {v for v in Verdict if v is Verdict.TIME_LIMIT or v.is_verified}
 Times = NDArray[np.float64]
 Pairs = NDArray[np.bool_]
 Row = Mapping[str, Outcome]  #: by solver
-Given = dict[str, dict[str, list[Outcome]]]  #: by case and solver
+Cells = dict[str, dict[str, list[Outcome]]]  #: outcomes by case and solver
 
 
 def _no_pairs() -> Pairs:
@@ -85,7 +85,7 @@ class ComparisonGroup:
     incomplete: int = 0  #: cases left out, since some solver was not measured on them
     apart: Pairs = field(default_factory=_no_pairs)
     """(solvers, solvers) whether two share no block on some case; none: all share."""
-    told: Pairs = field(default_factory=_no_pairs)
+    faster: Pairs = field(default_factory=_no_pairs)
     """(solvers, solvers) of those, True if row is faster than column on every case."""
 
     @property
@@ -186,16 +186,16 @@ def all_groups(
     pool_forms : put all forms into one group; each QP is still a case of its own
     """
     records = [r for r in evidence.records if not r.role]
-    given = _given(evidence, pool_forms=pool_forms)
+    cells = _cells(evidence, pool_forms=pool_forms)
     asked = evidence.suite.get("time_limit")
     if isinstance(asked, int | float) and asked > 0:
         limit = float(asked)
     else:  # the longest measurement
         every = (o for o in evidence.flat if not o.first.role)
         limit = max((t for t in map(_seconds, every) if t > 0), default=1.0)
-    found = [_group(kind, of, evidence.solvers, limit) for kind, of in given.items()]
+    found = [_group(kind, of, evidence.solvers, limit) for kind, of in cells.items()]
     if len({r.session for r in records}) > 1:
-        found = [_with_sessions(group, _answers(given[group.kind])) for group in found]
+        found = [_with_sessions(group, _answers(cells[group.kind])) for group in found]
     if pool_forms:
         form = {r.case: r.form for r in records}
         found = [
@@ -207,13 +207,13 @@ def all_groups(
 
 def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
     """Choose the answer of every solver to every case; null arms take no part."""
-    given = _given(evidence, pool_forms=pool_forms)
-    return {kind: _answers(rows) for kind, rows in given.items()}
+    cells = _cells(evidence, pool_forms=pool_forms)
+    return {kind: _answers(rows) for kind, rows in cells.items()}
 
 
-def _given(evidence: Evidence, *, pool_forms: bool) -> dict[Kind, Given]:
+def _cells(evidence: Evidence, *, pool_forms: bool) -> dict[Kind, Cells]:
     """Group the outcomes of every solver on every case, those of a sweep together."""
-    found: dict[Kind, Given] = {}
+    found: dict[Kind, Cells] = {}
     for o in evidence.flat:
         if not o.first.role:
             cases = found.setdefault(kind_of(o.first, pool_forms=pool_forms), {})
@@ -221,10 +221,10 @@ def _given(evidence: Evidence, *, pool_forms: bool) -> dict[Kind, Given]:
     return found
 
 
-def _answers(given: Given) -> dict[str, Row]:
+def _answers(cells: Cells) -> dict[str, Row]:
     return {
         case: {solver: representative(outcomes) for solver, outcomes in row.items()}
-        for case, row in given.items()
+        for case, row in cells.items()
     }
 
 
@@ -248,7 +248,7 @@ def time_of(outcome: Outcome) -> float | None:
 def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> ComparisonGroup:
     """Mark the solvers that were not measured together on every case."""
     n = len(group.solvers)
-    apart, told = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
+    apart, faster = np.zeros((n, n), dtype=bool), np.zeros((n, n), dtype=bool)
     for i, j in combinations(range(n), 2):
         pairs = [
             tuple(
@@ -261,9 +261,9 @@ def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> Compariso
             continue
         apart[i, j] = apart[j, i] = True
         ratios = [ratio_of(a, b) if a and b else None for a, b in pairs]
-        told[i, j] = all(r is not None and r.high < 1 for r in ratios)
-        told[j, i] = all(r is not None and r.low > 1 for r in ratios)
-    return replace(group, apart=apart, told=told)
+        faster[i, j] = all(r is not None and r.high < 1 for r in ratios)
+        faster[j, i] = all(r is not None and r.low > 1 for r in ratios)
+    return replace(group, apart=apart, faster=faster)
 
 
 def kind_of(r: Record, *, pool_forms: bool = False) -> Kind:
@@ -280,18 +280,18 @@ def _seconds(outcome: Outcome) -> float:
 
 
 def _group(
-    kind: Kind, given: Given, solvers: Sequence[str], limit: float
+    kind: Kind, cells: Cells, solvers: Sequence[str], limit: float
 ) -> ComparisonGroup:
     """Keep the solvers with at least half of the cases, and cases that they all had."""
-    present = np.array([*given], dtype=object)
-    known = {solver for row in given.values() for solver in row}
+    present = np.array([*cells], dtype=object)
+    known = {solver for row in cells.values() for solver in row}
     met = np.array([s for s in solvers if s in known], dtype=object)
-    cells = np.full((4, len(present), len(met)), np.nan)
-    for k, row in enumerate(given.values()):
+    matrices = np.full((4, len(present), len(met)), np.nan)
+    for k, row in enumerate(cells.values()):
         for i, solver in enumerate(met):
             if solver in row:
-                cells[:, k, i] = _cell(row[solver])
-    times, claimed, stopped, declined = cells
+                matrices[:, k, i] = _cell(row[solver])
+    times, claimed, stopped, declined = matrices
     stopped = np.where(np.isinf(stopped), limit, stopped)
     seen = ~np.isnan(times)
     refused = (declined == 1).sum(axis=0) == seen.sum(axis=0)

@@ -63,7 +63,7 @@ class Competitor:
     solver: str
     outcomes: Mapping[str, Outcome]  #: by case
     compared: tuple[str, ...] = ()  #: cases that it and the first solved
-    slower: bool = False  #: told to be slower than the first
+    slower: bool = False  #: slower than the first beyond chance
     ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
     by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
     form: str = ""  #: of the QPs, where forms compete with each other
@@ -107,21 +107,21 @@ class FastestSolver:
 
     @property
     def tied(self) -> tuple[Competitor, ...]:
-        """The others that are not told to be slower than the first."""
+        """The others that are not slower than the first beyond chance."""
         return tuple(c for c in self.competitors[1:] if not c.slower)
 
     @property
     def following(self) -> Competitor | None:
-        """The next that is told to be slower; None if there is none."""
+        """The next that is slower beyond chance; None without one."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
         """Return per case the fastest and those whose interval does not exclude it."""
         fronts = {}
         for case in self.cases:
-            given = [(c, c.outcomes[case]) for c in self.competitors]
-            first, its = min(given, key=lambda each: time_of(each[1]) or np.inf)
-            ratios = [(c, ratio_of(o.by_block, its.by_block)) for c, o in given]
+            answers = [(c, c.outcomes[case]) for c in self.competitors]
+            first, its = min(answers, key=lambda each: time_of(each[1]) or np.inf)
+            ratios = [(c, ratio_of(o.by_block, its.by_block)) for c, o in answers]
             tied = (c for c, r in ratios if r is None or r.low <= 1)
             fronts[case] = (first, *(c for c in tied if c is not first))
         return fronts
@@ -148,17 +148,17 @@ def fastest_solvers(
 
 def unverified(rows: Iterable[Row]) -> list[Unverified]:
     """Count what was not verified, by solver and verdict; most failures first."""
-    given = Counter[str]()
+    answered = Counter[str]()
     failed: dict[tuple[str, Verdict], list[Outcome]] = {}
     for row in rows:
         for solver, o in row.items():
-            given[solver] += 1
+            answered[solver] += 1
             if not o.verified:
                 failed.setdefault((solver, o.verdict), []).append(o)
-    solvers = list(given)
+    solvers = list(answered)
     return sorted(
         (
-            Unverified(*key, tuple(those), given[key[0]])
+            Unverified(*key, tuple(those), answered[key[0]])
             for key, those in failed.items()
         ),
         key=lambda one: (-len(one.answers), solvers.index(one.solver)),
@@ -240,7 +240,7 @@ def _compared(
     if group.apart.any():  # of different sessions: no pairs
         one, other = (group.solvers.index(s.solver) for s in (first, c))
         apart = bool(group.apart[one, other])
-        slower = slower and (not apart or bool(group.told[one, other]))
+        slower = slower and (not apart or bool(group.faster[one, other]))
     return replace(within, ratio=ratio, slower=slower, apart=apart)
 
 

@@ -118,8 +118,8 @@ def chosen(evidence: Evidence) -> list[CaseHistories]:
         key = (one.family, one.form)
         if len(found) == MOST:
             break
-        if key not in found and (told := tuple(_runs(evidence, row))):
-            found[key] = CaseHistories(runs=told, solvers=evidence.solvers)
+        if key not in found and (runs := tuple(_runs(evidence, row))):
+            found[key] = CaseHistories(runs=runs, solvers=evidence.solvers)
     return list(found.values())
 
 

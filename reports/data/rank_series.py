@@ -251,8 +251,10 @@ def rank_counts(o: Outcome) -> dict[str, Part]:
 def rank_memory(o: Outcome) -> Part | None:
     """Return the peak memory of a rank, MiB."""
     ends = ("mean", "largest")
-    told = [[r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records]
-    known = [of for of in told if all(isinstance(v, int | float) for v in of)]
+    peaks = [
+        [r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records
+    ]
+    known = [of for of in peaks if all(isinstance(v, int | float) for v in of)]
     if not known:
         return None
     mean, largest = np.median(np.array(known, dtype=float), axis=0)

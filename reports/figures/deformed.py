@@ -303,15 +303,15 @@ def _axes(span: float) -> dict[str, Any]:
 
 
 def _loaded(fields: Fields) -> list[_Loaded]:
-    """List the contacts that carry load; all as one where they are not told apart."""
-    told = [
+    """List the contacts that carry load; as one where fields do not part them."""
+    sides = [
         (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
     ]
-    if not told and fields.contact_nodes is not None:
+    if not sides and fields.contact_nodes is not None:
         assert fields.contact_forces is not None
-        told = [("", fields.contact_nodes, fields.contact_forces, None)]
+        sides = [("", fields.contact_nodes, fields.contact_forces, None)]
     found = []
-    for name, nodes, forces, friction in told:
+    for name, nodes, forces, friction in sides:
         states = np.full(len(nodes), "") if friction is None else friction
         size, apart = np.hypot(*forces.T), states == SLIDING
         active = size > _ACTIVE * size.max(initial=0.0)

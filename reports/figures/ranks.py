@@ -148,8 +148,8 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
     for i, ((s, n), of) in enumerate(zip(found, parts, strict=True)):
         o, start = s.answers[n], 0.0
         whole = t.value if (t := o.seconds("solve")) is not None else 0.0
-        told = {name: part.mean for name, part in of.items()}
-        for name, taken in {**told, "rest": whole - sum(told.values())}.items():
+        means = {name: part.mean for name, part in of.items()}
+        for name, taken in {**means, "rest": whole - sum(means.values())}.items():
             if taken > 0:
                 marks.append(
                     Segments(

@@ -91,26 +91,27 @@ def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> 
 
     solvers : of the whole report, which their looks go by
     """
-    panels = [
-        Panel(
-            x=log("median total time in s"),
-            y=log("worst residual"),
-            title=legible(case),
-            marks=tuple(
-                mark
-                for solver, outcomes in row.items()
-                for mark in _residuals(outcomes, look(solvers.index(solver)))
-            ),
-            rules=(
-                Rule(
-                    axis="y", at=next(iter(row.values()))[0].allowed,
-                    look=Look(colour=INK, width=0.8),
-                ),
-            ),
-        )
-        for case, row in swept
-    ]  # fmt: skip
+    panels = []
+    for case, row in swept:
+        marks = list[Series]()
+        for solver, outcomes in row.items():
+            marks += _residuals(outcomes, look(solvers.index(solver)))
+        allowed = next(iter(row.values()))[0].allowed
+        rules = [Rule(axis="y", at=allowed, look=Look(colour=INK, width=0.8))]
+        panels.append(_panel(case, "worst residual", marks, rules))
     return _figure(panels, swept, solvers)
+
+
+def _panel(
+    case: str, error: str, marks: Sequence[Series], rules: Sequence[Rule]
+) -> Panel:
+    return Panel(
+        x=log("median total time in s"),
+        y=log(error),
+        title=legible(case),
+        marks=tuple(marks),
+        rules=tuple(rules),
+    )
 
 
 def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
@@ -140,23 +141,15 @@ def certified_figure(
     """
     panels, lines = [], []
     for case, row in swept:
+        marks, rules = list[Series](), list[Rule]()
+        for solver in (s for s in solvers if s in row):
+            marks += _certified(row[solver], look(solvers.index(solver)))
         error = meshes.get(next(iter(row.values()))[0].physical)
         if error is not None:
             lines = [("discretisation error", _MESH), ("a tenth of it", _TENTH)]
-        names = [s for s in solvers if s in row]
-        curves = [_certified(row[s], look(solvers.index(s))) for s in names]
-        panels.append(
-            Panel(
-                x=log("median total time in s"),
-                y=log("certified relative error"),
-                title=legible(case),
-                marks=tuple(mark for marks in curves for mark in marks),
-                rules=() if error is None else (
-                    Rule(axis="y", at=error, look=_MESH),
-                    Rule(axis="y", at=SHARE * error, look=_TENTH),
-                ),
-            )
-        )  # fmt: skip
+            rules = [Rule(axis="y", at=error, look=_MESH),
+                     Rule(axis="y", at=SHARE * error, look=_TENTH)]  # fmt: skip
+        panels.append(_panel(case, "certified relative error", marks, rules))
     return _figure(panels, swept, solvers, lines)
 
 
