@@ -444,7 +444,7 @@ def _largest_von_mises(
     found: OwnSolution,
     length: float,
     materials: tuple[Material, ...],
-    plane: Plane,
+    plane: Plane | None,
 ) -> list[float]:
     """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
     D = elasticity_matrices(materials, plane)
