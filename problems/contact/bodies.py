@@ -66,7 +66,7 @@ class UnassembledBodies:
     body: NDArray[np.int64]  #: (E,) of each cell
     names: tuple[str, ...]
     materials: tuple[Material, ...]
-    plane: Plane
+    plane: Plane | None  #: None in space
     length: float  #: l, m
     force: float  #: F₀, N/m
     f: Vector  #: (n,) full load
@@ -115,7 +115,7 @@ class UnassembledBodies:
 
     @property
     def D(self) -> NDArray[np.float64]:
-        """Elasticity matrix of each cell, (E, 3, 3), Pa."""
+        """Elasticity matrix of each cell, (E, v, v), Pa."""
         return self.elasticity[self.body]
 
     @property
@@ -125,7 +125,7 @@ class UnassembledBodies:
 
     @property
     def elasticity(self) -> NDArray[np.float64]:
-        """Elasticity matrix of each body, (bodies, 3, 3), Pa."""
+        """Elasticity matrix of each body, (bodies, v, v), Pa."""
         return elasticity_matrices(self.materials, self.plane)
 
 
@@ -142,7 +142,7 @@ def assemble(
     *,
     names: tuple[str, ...],
     materials: tuple[Material, ...],
-    plane: Plane,
+    plane: Plane | None,
     units: tuple[float, float],
     fixed: Nodes,
     load: Vector,
@@ -181,17 +181,27 @@ def assembled(bodies: UnassembledBodies) -> Bodies:
     return Bodies(**known, K=stiffness(bodies.mesh, D, bodies.body))
 
 
+def _onto(bodies: Bodies, touched: Nodes) -> Interface | None:
+    """Condense onto components (k,) in the plane.
+
+    Orders that cut by coordinates do so along x and y: in space METIS orders better,
+    and there is one solve for each row of the constraints.
+    """
+    plane = bodies.mesh.dim == 2
+    return Interface(touched, bodies.mesh.points) if plane else None
+
+
 def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     """Factorise K with all its rigid modes, as Dirichlet rows in B need it.
 
-    Condensed onto what constraints can touch, or else (the paper's way) with one solve
-    per constraint row of each load step.
+    Condensed onto what constraints can touch, or else (the paper's way, and in space)
+    with one solve per constraint row of each load step.
     """
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
     touched = np.union1d(bodies.interface, bodies.B_D.indices)
-    interface = Interface(touched, bodies.mesh.points) if condense else None
+    interface = _onto(bodies, touched) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
@@ -212,19 +222,19 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
             "exist; expected form primal or dual"
         )
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), held)
-    interface = Interface(bodies.interface, bodies.mesh.points)
+    interface = _onto(bodies, bodies.interface)
     return regular_inverse(bodies.K, free, interface)
 
 
 def supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, and what else a body needs."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
-    interface = Interface(bodies.interface, bodies.mesh.points)
+    interface = _onto(bodies, bodies.interface)
     return supported_inverse(bodies.K, free, bodies.rigid, interface)
 
 
 def elasticity_matrices(
-    materials: tuple[Material, ...], plane: Plane
+    materials: tuple[Material, ...], plane: Plane | None
 ) -> NDArray[np.float64]:
-    """Return the elasticity matrix of each material, (k, 3, 3), Pa."""
+    """Return the elasticity matrix of each material, (k, v, v), Pa."""
     return np.stack([elasticity_matrix(m, plane) for m in materials])

@@ -22,6 +22,10 @@ from mortarbench.problems.contact.sides import (
 from mortarbench.problems.fem.mesh import as_vectors
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 
+#: stresses in Voigt's notation
+IN_PLANE = ("sxx", "syy", "sxy")
+IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
+
 
 class Inside(NamedTuple):
     """What is reported of the inside of bodies, away from their contact."""
@@ -201,12 +205,13 @@ def contact_forces(
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
     """Recover the stresses at the nodes (N,) from the displacement in m, Pa.
 
-    sxx, syy, sxy; szz = ν(σ_x + σ_y) in plane strain, where it is not zero; von_mises
-    of these, so that it is recovered from no averages of its own.
+    sxx, syy, sxy; szz = ν(σ_x + σ_y) in plane strain, where it is not zero; in space
+    all six; von_mises of these, so that it is recovered from no averages of its own.
     """
     stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))
     nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]
-    nodal = dict(zip(("sxx", "syy", "sxy"), stress.T, strict=True))
+    names = IN_PLANE if bodies.plane else IN_SPACE
+    nodal = dict(zip(names, stress.T, strict=True))
     if bodies.plane == "strain":
         nodal["szz"] = nu * (nodal["sxx"] + nodal["syy"])
     return nodal | {"von_mises": von_mises(stress, nu, bodies.plane)}

@@ -316,8 +316,8 @@ def _reported(problem: ContactProblem, found: FoundByRanks) -> dict[str, Any]:
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:
-    """Return C₁₁ / (C₁₁ + C₆₆) of elasticity matrices (k, 3, 3)."""
-    return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, 2, 2]))
+    """Return C₁₁ / (C₁₁ + C₆₆) of elasticity matrices (k, v, v)."""
+    return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
 def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
@@ -325,7 +325,7 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
 
     Parameters
     ----------
-    D : (k, 3, 3) elasticity matrices of the materials, without dimension
+    D : (k, v, v) elasticity matrices of the materials, without dimension
     E : (k,) their moduli, without dimension
 
     """
@@ -444,7 +444,7 @@ def _largest_von_mises(
     found: OwnSolution,
     length: float,
     materials: tuple[Material, ...],
-    plane: Plane,
+    plane: Plane | None,
 ) -> list[float]:
     """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
     D = elasticity_matrices(materials, plane)

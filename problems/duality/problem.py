@@ -156,7 +156,7 @@ class ElasticBodies:
     shape: Shape
     names: tuple[str, ...]
     materials: tuple[Material, ...]  #: of each body
-    plane: Plane
+    plane: Plane | None  #: None in space
     length: float  #: l, m: lengths of QPs are multiples of it
     force: float  #: F₀, N/m
     fixed: Nodes  #: components that are zero

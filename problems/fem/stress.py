@@ -86,8 +86,17 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return result
 
 
-def von_mises(stress: NDArray[np.float64], nu: Vector | float, plane: Plane) -> Vector:
-    """Return σ_vM of (…, 3) stresses; plane strain has σ_z = ν(σ_x + σ_y)."""
+def von_mises(
+    stress: NDArray[np.float64], nu: Vector | float, plane: Plane | None
+) -> Vector:
+    """Return σ_vM of (…, 3) stresses; plane strain has σ_z = ν(σ_x + σ_y).
+
+    In space (plane is None) stresses are (…, 6), in Voigt's notation.
+    """
+    if plane is None:
+        x, y, z, *shears = np.moveaxis(stress, -1, 0)
+        shear = np.sqrt(sum(s**2 for s in shears))
+        return von_mises_of(np.stack([x, y, shear, z], axis=-1))
     x, y, shear = np.moveaxis(stress, -1, 0)
     z = nu * (x + y) if plane == "strain" else np.zeros_like(x)
     return von_mises_of(np.stack([x, y, shear, z], axis=-1))

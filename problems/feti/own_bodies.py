@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -194,27 +195,34 @@ def _unheld_bodies(problem: ProblemInParts) -> list[int]:
 
 
 def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-    """Return the rigid motions of components of points, (k, 1) or (k, 3).
+    """Return the rigid motions (k, r) of components of points, r = d (d + 1) / 2.
+
+    Those of `problems.fem.elasticity.rigid_motions`, about the origin.
 
     axis : (k,) of each component, one of d
     """
-    if d == 1:
-        return np.ones((len(points), 1))
-    x, y = points.T
-    along_x = axis == 0
-    return np.stack([along_x, ~along_x, np.where(along_x, -y, x)], axis=1)
+    found = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
+    for k, l in combinations(range(d), 2):
+        turned = np.where(axis == l, points[:, k], 0.0)
+        found.append(np.where(axis == k, -points[:, l], turned))
+    return np.stack(found, axis=1)
 
 
 class _Extent(NamedTuple):
     """Where a body is, and how large, by its N nodes."""
 
-    centre: Vector  #: (2,)
+    centre: Vector  #: (dim,)
     radius: float  #: √ of the mean square distance from it
     size: float  #: √N
+    #: (k, k) combines rotations to such that are orthonormal; None for at most one
+    turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
         """Return its rigid motions, orthonormal in the sum over all nodes."""
-        return _motions((points - self.centre) / self.radius, axis, d) / self.size
+        found = _motions((points - self.centre) / self.radius, axis, d)
+        if self.turn is not None:
+            found[:, d:] = found[:, d:] @ self.turn
+        return found / self.size
 
 
 def _unheld(own: OwnSubdomains) -> Unheld:
@@ -255,7 +263,7 @@ def _extent(own: OwnSubdomains, points: Points, share: Vector) -> _Extent:
 
     Parameters
     ----------
-    points : of own torn nodes (M, 2)
+    points : of own torn nodes (M, dim)
     share : (M,) of all copies of a node, which add up to one in the body
 
     """
@@ -263,4 +271,11 @@ def _extent(own: OwnSubdomains, points: Points, share: Vector) -> _Extent:
     count, *moments = total(np.append(share.sum(), share @ points))
     centre = np.array(moments) / count
     spread = total(np.array([share @ ((points - centre) ** 2).sum(axis=1)]))[0]
-    return _Extent(centre, float(np.sqrt(spread / count)), float(np.sqrt(count)))
+    radius, d, turn = float(np.sqrt(spread / count)), own.problem.components, None
+    if d > 2:
+        scaled = np.repeat((points - centre) / radius, d, axis=0)
+        turns = _motions(scaled, np.tile(np.arange(d), len(points)), d)[:, d:]
+        gram = total(turns.T @ (np.repeat(share, d)[:, None] * turns) / count)
+        sizes, axes = np.linalg.eigh(gram)
+        turn = axes / np.sqrt(sizes)
+    return _Extent(centre, radius, float(np.sqrt(count)), turn)

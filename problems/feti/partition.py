@@ -1,11 +1,12 @@
 """Bodies of any mesh cut into connected parts, by a partition of the graph of cells.
 
-Two cells are neighbours if they share an edge. METIS (Karypis and Kumar 1998, SIAM J.
-Sci. Comput. 20) parts the graph of each body so that parts are about equal and the
-edges between them are short, measured by the cells around: so parts are compact where
-cells are long and thin, as those of graded meshes are. Cells that hang together in a
-node only would turn against each other: a part must be connected by edges, or it has
-more motions than a rigid body.
+Two cells are neighbours if they share a facet: an edge in the plane, a face in space.
+METIS (Karypis and Kumar 1998, SIAM J. Sci. Comput. 20) parts the graph of each body so
+that parts are about equal and the facets between them are small, measured by the cells
+around: so parts are compact where cells are long and thin, as those of graded meshes
+are. Cells that hang together in a node (or, in space, an edge) only would turn against
+each other: a part must be connected by facets, or it has more motions than a rigid
+body.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
+from mortarbench.problems.fem.elements import ELEMENTS
 from mortarbench.problems.fem.mesh import Nodes
 
 Labels = NDArray[np.int64]
 
-SQUARE = 100  #: weight of the edge between two squares
+SQUARE = 100  #: weight of the facet between two squares, or two cubes
 LARGEST = 10_000  #: weight; METIS adds them up as integers of 32 bits
 IMBALANCE = 300  #: in thousandths: the less, the more pieces are apart from their part
 
@@ -34,8 +36,8 @@ def graph_partition(
 
     Parameters
     ----------
-    points : (N, 2) of the nodes
-    cells : (E, 4) corners; a triangle repeats its last one
+    points : (N, dim) of the nodes
+    cells : (E, c) corners; a triangle repeats its last one
     body : (E,) of each cell, 0, 1, …
     parts : of all bodies together
 
@@ -73,33 +75,50 @@ def _shares(counts: Labels, parts: int) -> Labels:
 
 
 def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
-    """Return the graph of cells (E, E), with an integer weight for each shared edge.
+    """Return the graph of cells (E, E), with an integer weight for each shared facet.
 
-    That is √(L/d), in units of 1 / `SQUARE`, of an edge of length L between centres at
-    the distance d: its length, where the cells around it have the area 1.
+    In units of 1 / `SQUARE` that is √(L/d) of an edge of length L between centres at
+    the distance d, (L/d)^⅔ of a face of area L²: the length or area, where the cells
+    around it have the area or volume 1.
     """
-    edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1).reshape(-1, 2)
-    cell = np.repeat(np.arange(len(cells)), cells.shape[1])
-    is_edge = edges[:, 0] != edges[:, 1]
-    edges, cell = np.sort(edges[is_edge]), cell[is_edge]
-    order = np.lexsort(edges.T)
-    shared = np.flatnonzero((np.diff(edges[order], axis=0) == 0).all(axis=1))
+    dim = points.shape[1]
+    element = ELEMENTS[dim, cells.shape[1]]
+    corners = element.facets.shape[1]
+    facets = cells[:, element.facets].reshape(-1, corners)
+    cell = np.repeat(np.arange(len(cells)), len(element.facets))
+    names = np.sort(facets, axis=1)
+    is_facet = (names[:, 1:] != names[:, :-1]).all(axis=1)
+    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    order = np.lexsort(names.T)
+    shared = np.flatnonzero((np.diff(names[order], axis=0) == 0).all(axis=1))
     one, other = cell[order[shared]], cell[order[shared + 1]]
-    ends, centre = points[edges[order[shared]]], points[cells].mean(axis=1)
-    length = np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)
-    ratio = length / np.linalg.norm(centre[one] - centre[other], axis=1)
-    weight = np.clip(np.rint(SQUARE * np.sqrt(ratio)), 1, LARGEST).astype(np.int64)
+    ends, centre = points[facets[order[shared]]], points[cells].mean(axis=1)
+    ratio = _side(ends) / np.linalg.norm(centre[one] - centre[other], axis=1)
+    size = ratio ** ((dim - 1) / dim)
+    weight = np.clip(np.rint(SQUARE * size), 1, LARGEST).astype(np.int64)
     shape = (len(cells), len(cells))
     half = csr_array((weight, (one, other)), shape=shape)
     return csr_array(half + half.T)
+
+
+def _side(facets: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the length of edges (k, 2, 2), or the root of the area of faces (k, 4, 3).
+
+    Of corners that are not in one plane, the area of their projection that is largest.
+    """
+    if facets.shape[2] == 2:
+        return np.asarray(np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1))
+    one, other = facets[:, 2] - facets[:, 0], facets[:, 3] - facets[:, 1]
+    area = np.linalg.norm(np.cross(one, other), axis=1) / 2
+    return np.asarray(np.sqrt(area))
 
 
 def _parted(graph: csr_array, parts: int) -> Labels:
     """Part the cells of one body."""
     if connected_components(graph)[0] > 1:
         raise InputError(
-            "the cells of a body do not all hang together by edges; expected a body "
-            "for each of its pieces"
+            "the cells of a body do not all hang together by edges (faces in space); "
+            "expected a body for each of its pieces"
         )
     if parts == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)

@@ -4,12 +4,17 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Solution, Status
+from mortarbench.problems.contact.bodies import assemble, clamped, floating, supported
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.results import fields, nodal_stresses
 from mortarbench.problems.duality.undivided import primal_qp
-from mortarbench.problems.fem.elasticity import elasticity_matrix
+from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
+from mortarbench.problems.fem.inverse import NO_NODES
+from mortarbench.problems.fem.mesh import dofs_of
 from mortarbench.problems.models.beam_ring import model
+from tests.support.hexahedra import bricks
 
+STEEL = Material(E=2e11, nu=0.3)
 STRAIN = np.array([2e-3, -1e-3, 3e-3])  # ε_x, ε_y, γ_xy
 
 
@@ -73,3 +78,46 @@ def test_fields_carry_the_stresses_of_the_dimensional_displacement():
     assert list(nodal) == ["sxx", "syy", "sxy", "szz", "von_mises"]
     for name, values in nodal.items():
         assert values == pytest.approx(expected[name], rel=1e-12)
+
+
+def cube(fixed=NO_NODES):
+    mesh = bricks((3, 3, 3), (1.0, 1.0, 1.0))
+    return assemble(
+        mesh, np.zeros(27, dtype=np.int64), names=("cube",), materials=(STEEL,),
+        plane=None, units=(1.0, STEEL.E), fixed=fixed, load=np.zeros(mesh.dofs),
+        pairs=(),
+    )  # fmt: skip
+
+
+def test_all_six_stresses_of_a_body_in_space_are_known():
+    bodies, gradient = cube(), np.arange(9).reshape(3, 3) * 1e-3
+    e = (gradient + gradient.T) / 2
+    lame = STEEL.E * STEEL.nu / ((1 + STEEL.nu) * (1 - 2 * STEEL.nu))
+    sigma = lame * np.trace(e) * np.eye(3) + STEEL.E / (1 + STEEL.nu) * e
+    deviator = sigma - np.trace(sigma) / 3 * np.eye(3)
+
+    nodal = nodal_stresses(bodies, (bodies.mesh.points @ gradient.T).ravel())
+
+    assert nodal.keys() == {"sxx", "syy", "szz", "syz", "sxz", "sxy", "von_mises"}
+    for (i, j), value in np.ndenumerate(sigma):
+        if i <= j:
+            name = "s" + "xyz"[i] + "xyz"[j]
+            assert nodal[name] == pytest.approx(value, rel=1e-9)
+    norm = np.sqrt(1.5 * (deviator**2).sum())
+    assert nodal["von_mises"] == pytest.approx(norm, rel=1e-9)
+
+
+@pytest.mark.parametrize("inverse", [clamped, supported, floating])
+def test_bodies_in_space_stand_under_forces_at_one_corner(inverse):
+    """K⁺ of a cube on its clamped side, and of one that floats."""
+    held = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
+    bodies = cube(held)
+    b = np.zeros(bodies.mesh.dofs)
+    b[-3:] = 1.0, -2.0, 3.0
+    if inverse is floating:
+        b -= bodies.rigid @ (bodies.rigid.T @ b)
+        held = held[:0]
+
+    left = bodies.K @ inverse(bodies)(b) - b
+
+    assert abs(np.delete(left, held)).max() <= 1e-11

@@ -8,6 +8,7 @@ from mortarbench.harness import InputError
 from mortarbench.problems.fem.mesh import half_disc, join, rectangle
 from mortarbench.problems.feti import partition
 from mortarbench.problems.feti.partition import graph_partition, neighbours
+from tests.support.hexahedra import bricks
 
 
 def disc_and_block():
@@ -74,3 +75,28 @@ def test_parts_of_long_and_thin_cells_are_compact():
     boxes = [np.ptp(corners[label == s].reshape(-1, 2), axis=0) for s in range(16)]
 
     assert np.median([max(box) / min(box) for box in boxes]) <= 4
+
+
+def test_hexahedra_are_neighbours_where_they_share_a_face_of_some_area():
+    """Cells of 1 × 2 × 4: a face of area A is A^⅓ d^−⅔ where cells have volume 1."""
+    mesh = bricks((2, 2, 2), (2.0, 4.0, 8.0))
+    graph = neighbours(mesh.points, mesh.cells).toarray()
+
+    assert (np.count_nonzero(graph, axis=1) == 3).all()
+    for d, step in ((1.0, 4), (2.0, 2), (4.0, 1)):
+        weight = 100 * (8 / d) ** (1 / 3) / d ** (2 / 3)
+        found = graph[np.arange(8), np.arange(8) ^ step]
+        assert found == pytest.approx(weight, abs=0.5)
+
+
+@pytest.mark.parametrize("parts", [2, 5, 8])
+def test_parts_of_hexahedra_hang_together_by_faces(parts):
+    mesh = bricks((6, 4, 4), (1.5, 1.0, 1.0))
+    points, cells = mesh.points, mesh.cells
+    label = graph_partition(points, cells, np.zeros(len(cells), dtype=np.int64), parts)
+    sizes = np.bincount(label)
+
+    assert sizes.size == parts
+    assert sizes.max() <= 1.6 * len(cells) / parts + 3
+    for s in range(parts):
+        assert connected_components(neighbours(points, cells[label == s]))[0] == 1

@@ -1,0 +1,105 @@
+"""Bodies of hexahedra in subdomains: the same body, and its rigid motions."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.sparse import csr_array
+
+from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.duality.divided import described, longitudinal_share
+from mortarbench.problems.duality.problem import ElasticBodies, Meshed
+from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
+from mortarbench.problems.fem.mesh import Mesh, dofs_of
+from mortarbench.problems.feti.own_bodies import holds_all, own_bodies
+from mortarbench.problems.feti.subdomains import Contact, OwnSubdomains, on_one_process
+from tests.support.hexahedra import bricks
+
+STEEL = Material(E=2e11, nu=0.3)
+
+
+def box() -> Mesh:
+    """24 cells, no two of them alike, with principal axes along no coordinate."""
+    mesh = bricks((4, 3, 2), (2.0, 1.0, 0.7))
+    bump = 0.05 * np.sin(mesh.points @ [2.0, 3.0, 5.0])
+    shear = np.array([[1, 0.3, 0.1], [0, 1, 0.4], [0, 0, 1]])
+    return Mesh((mesh.points + bump[:, None]) @ shear, mesh.cells, {})
+
+
+def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> OwnSubdomains:
+    """Cut a body by METIS, under gravity."""
+    down = dofs_of(np.arange(len(mesh.points)), 3, 2)
+    forces = Forces(down, np.full(down.size, -1.0))
+    body = np.zeros(len(mesh.cells), dtype=np.int64)
+    of = ElasticBodies(
+        shape=Meshed(mesh, body, fixed // 3), names=("box",), materials=(STEEL,),
+        plane=None, length=1.0, force=STEEL.E, fixed=fixed, forces=forces, pairs=(),
+    )  # fmt: skip
+    (stage,) = load_steps(1, 1, forces, fixed)
+    none = Contact(csr_array((0, mesh.dofs)), np.zeros(0), np.zeros(0))
+    layout = of.shape.layout(parts)
+    return on_one_process(described(of, layout, "orthonormal", stage, none))
+
+
+def stored(own: OwnSubdomains) -> csr_array:
+    """TᵀK_T T."""
+    T, domains = own.spread, own.domains
+    blocks = [domains.kinds[k].K @ T[a:b] for k, a, b in zip(
+        domains.kind, domains.start[:-1], domains.start[1:], strict=True
+    )]  # fmt: skip
+    ends = zip(domains.start[:-1], domains.start[1:], blocks, strict=True)
+    return csr_array(sum(T[a:b].T @ block for a, b, block in ends))
+
+
+def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
+    mesh = box()
+    own = torn(mesh, dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3))
+    whole = stiffness(mesh, elasticity_matrix(STEEL, None) / STEEL.E)
+
+    assert own.number.size == 4
+    assert own.components.size == mesh.dofs
+    assert_allclose(stored(own).toarray(), whole.toarray(), atol=1e-13)
+    assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
+    free = np.setdiff1d(np.arange(mesh.dofs), own.problem.held)
+    jumps = own.rows.B @ own.spread[:, free]
+    assert abs(jumps).max() <= 1e-15  # none where copies are one
+
+
+def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
+    own = torn(box(), np.zeros(0, dtype=np.int64))
+    unheld = own_bodies(own).unheld
+    R = unheld.motions.toarray()
+
+    assert not holds_all(own.problem)
+    assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
+    assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
+    assert_allclose(unheld.left, np.eye(6))
+
+
+#: motions that a face across x leaves that is held along some axes
+LEFT = {"x": 3, "y": 4, "z": 4, "xy": 1, "xz": 1, "yz": 3, "xyz": 0}
+
+
+@pytest.mark.parametrize("axes", LEFT)
+def test_a_face_that_is_held_along_axes_leaves_the_other_motions(axes):
+    mesh = bricks((4, 3, 2), (2.0, 1.0, 0.7))
+    face = np.flatnonzero(mesh.points[:, 0] == 0)
+    fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])
+    own = torn(mesh, fixed)
+    unheld = own_bodies(own).unheld
+    left = LEFT[axes]
+
+    assert holds_all(own.problem) == (left == 0)
+    assert unheld.left.shape[1] == left
+    if left:
+        R = unheld.motions @ unheld.left
+        assert_allclose(R.T @ R, np.eye(left), atol=1e-14)
+        assert abs(R[fixed]).max() <= 1e-15
+        assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
+
+
+def test_the_longitudinal_share_is_the_same_of_plane_strain_and_space():
+    strain = elasticity_matrix(STEEL, "strain")[None]
+    space = elasticity_matrix(STEEL, None)[None]
+
+    assert longitudinal_share(strain) == pytest.approx([2 * (1 - 0.3) / (3 - 4 * 0.3)])
+    assert (longitudinal_share(strain) == longitudinal_share(space)).all()
