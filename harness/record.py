@@ -259,6 +259,15 @@ class Record(Measurement):
 _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 
 
+def in_space(quantities: Mapping[str, Any]) -> bool:
+    """Return whether these are of bodies in space, which have no thickness.
+
+    Forces are in N there and energies in J, in the plane in N/m and J/m.
+    """
+    nodes, dofs = quantities.get("nodes"), quantities.get("dofs")
+    return isinstance(nodes, int) and nodes > 0 and dofs == 3 * nodes
+
+
 def journal_name(name: str) -> str:
     """Give the name in the journal of a field."""
     return _JOURNAL_NAMES.get(name, name)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mortarbench.harness.record import Record, Verdict
+from mortarbench.harness.record import Record, Verdict, in_space
 
 if TYPE_CHECKING:
     import numpy as np
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.solution import History
 
-#: of quantities of elastic bodies, as the interface promises them; others are bare
+#: of quantities of elastic bodies in the plane, as the interface promises them; others
+#: are bare
 UNITS = {
     "energy": "J/m",
     "dissipation": "J/m",
@@ -140,7 +141,8 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         for key, value in r.options.items()
         if key not in defaults or value != defaults[key]
     )
-    units = UNITS if "dofs" in r.quantities else {}
+    per = "" if in_space(r.quantities) else "/m"
+    units = _units(per) if "dofs" in r.quantities else {}
     rows = [
         ("case", r.case),
         ("size", ", ".join(f"{count} {what}" for what, count in r.sizes.items())),
@@ -170,9 +172,14 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
             for name in r.quantities
             if name not in (_CONTACTS, _SHARE)
         ),
-        *_contacts(r.quantities.get(_CONTACTS)),
+        *_contacts(r.quantities.get(_CONTACTS), f"N{per}"),
     ]
     return [(name, value) for name, value in rows if value]
+
+
+def _units(per: str) -> Mapping[str, str]:
+    """Name the units of quantities per thickness ("/m"), or of bodies without one."""
+    return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _quantity(r: Record, name: str, unit: str) -> str:
@@ -183,8 +190,11 @@ def _quantity(r: Record, name: str, unit: str) -> str:
     return f"{text}, with {share:.2%} of the shear"
 
 
-def _contacts(pairs: object) -> list[tuple[str, str]]:
-    """Lay out what elastic bodies tell of each pair of sides that may touch."""
+def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
+    """Lay out what elastic bodies tell of each pair of sides that may touch.
+
+    force : its unit
+    """
     if not isinstance(pairs, Mapping):
         return []
     rows = []
@@ -195,7 +205,7 @@ def _contacts(pairs: object) -> list[tuple[str, str]]:
             if found.get(what) is not None
         )
         rows.append((f"contact {name}", ", ".join(parts)))
-        rows.append(("  force on", _text(found.get("force"), "N/m", digits=6)))
+        rows.append(("  force on", _text(found.get("force"), force, digits=6)))
     return rows
 
 

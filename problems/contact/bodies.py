@@ -181,27 +181,17 @@ def assembled(bodies: UnassembledBodies) -> Bodies:
     return Bodies(**known, K=stiffness(bodies.mesh, D, bodies.body))
 
 
-def _onto(bodies: Bodies, touched: Nodes) -> Interface | None:
-    """Condense onto components (k,) in the plane.
-
-    Orders that cut by coordinates do so along x and y: in space METIS orders better,
-    and there is one solve for each row of the constraints.
-    """
-    plane = bodies.mesh.dim == 2
-    return Interface(touched, bodies.mesh.points) if plane else None
-
-
 def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     """Factorise K with all its rigid modes, as Dirichlet rows in B need it.
 
-    Condensed onto what constraints can touch, or else (the paper's way, and in space)
-    with one solve per constraint row of each load step.
+    Condensed onto what constraints can touch, or else (the paper's way) with one solve
+    per constraint row of each load step.
     """
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
     touched = np.union1d(bodies.interface, bodies.B_D.indices)
-    interface = _onto(bodies, touched) if condense else None
+    interface = Interface(touched, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
@@ -222,14 +212,14 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
             "exist; expected form primal or dual"
         )
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), held)
-    interface = _onto(bodies, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
     return regular_inverse(bodies.K, free, interface)
 
 
 def supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, and what else a body needs."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
-    interface = _onto(bodies, bodies.interface)
+    interface = Interface(bodies.interface, bodies.mesh.points)
     return supported_inverse(bodies.K, free, bodies.rigid, interface)
 
 

@@ -8,6 +8,7 @@ from itertools import combinations
 from operator import itemgetter
 from typing import Any, NamedTuple
 
+from mortarbench.harness.record import in_space
 from mortarbench.reports.data.cells import source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.document.formatting import clean, significant, span
@@ -48,7 +49,8 @@ def elastic(outcome: Outcome) -> bool:
 
 def unit(outcome: Outcome, name: str) -> str:
     """Name the unit of a quantity; empty where it is a bare number."""
-    return _UNITS.get(name, "") if elastic(outcome) else ""
+    found = _UNITS.get(name, "") if elastic(outcome) else ""
+    return found.removesuffix("/m") if in_space(outcome.quantities) else found
 
 
 def known_digits(doubt: float, most: int) -> int:

@@ -104,9 +104,12 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     Raises
     ------
     InputError
-        When displacement or stress is not finite, or the bodies have no extent.
+        When displacement or stress is not finite, or the bodies have no extent or are
+        in space.
 
     """
+    if fields.dim != 2:
+        raise InputError("bodies in space: expected a .vtu, there is no picture")
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError("displacement or stress holds NaN or inf: there is no picture")

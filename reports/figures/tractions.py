@@ -33,10 +33,12 @@ LOOKS = {"open": _NODE} | {
 def traction_figure(fields: Fields) -> Figure | None:
     """Draw each contact that carries load, a row of panels; None where there is none.
 
+    Sides of bodies in space have no length to draw them along.
+
     Places are distances along the undeformed slave side from its middle.
     """
     rows, states, exact = list[Row](), set[str](), False
-    for side in fields.contacts:
+    for side in fields.contacts if fields.dim == 2 else ():
         if not side.pressure.max(initial=0.0) > 0:
             continue
         rows.append(Row(panels=_panels(fields, side)))

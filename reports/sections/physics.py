@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 
 from mortarbench.harness import InputError
 from mortarbench.harness.files.store import load_fields
+from mortarbench.harness.record import in_space
 from mortarbench.reports.data.cells import source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.quantities import (
@@ -170,7 +171,11 @@ def tractions(a: Analysis) -> Iterator[Part]:
 
 
 def _drawable(a: Analysis) -> list[Outcome]:
-    return [o for o in a.evidence.flat if o.verified and o.first.fields]
+    """List what has a stored state in the plane; ParaView shows those in space."""
+    return [
+        o for o in a.evidence.flat
+        if o.verified and o.first.fields and not in_space(o.quantities)
+    ]  # fmt: skip
 
 
 def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:

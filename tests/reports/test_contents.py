@@ -23,6 +23,7 @@ from mortarbench.reports.render.latex import latex
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.render.saving import draw
 from mortarbench.reports.statistics.intervals import PowerLaw, median_interval
+from mortarbench.text import outcome_rows
 
 ELASTIC = {
     "dofs": 20, "equality_rows": 4, "contact_rows": 10, "active": 5,
@@ -270,6 +271,34 @@ def test_a_residual_above_a_tenth_is_marked_whatever_the_tolerance(measured, pag
     found = section(page([measured(tol=0.05, dual=0.2, gap=0.05)]), "errors")
     (row,) = rows(found.tables[0])
     assert (row["dual"].kind, row["gap"].kind) == ("over", "")
+
+
+IN_SPACE = ELASTIC | {"nodes": 5, "dofs": 15, "contact_force": [-32.0943911, 0.0, 0.0]}
+
+
+def test_bodies_in_space_have_forces_in_newtons_and_others_per_metre(measured, page):
+    for quantities, per in ((IN_SPACE, ""), (IN_SPACE | {"dofs": 10}, "/m")):
+        made = [measured(quantities=quantities), measured("b", quantities=quantities)]
+        composed = page(made)
+        (heads,) = (t.columns for t in section(composed, "physics").tables[1:])
+        (energies,) = map(rows, section(composed, "energies").tables)
+        told = dict(outcome_rows(made[0], {}))
+
+        assert {f"contact force x in N{per}", f"energy in J{per}"} <= set(heads)
+        assert energies[0]["energy"].after == f"J{per}"
+        assert told["contact force"] == f"(-32.0943911, 0, 0) N{per}"
+        assert told["energy"].endswith(f" J{per}")
+
+
+@pytest.mark.usefixtures("only_svg")
+def test_a_report_draws_no_bodies_in_space(measured, tmp_path):
+    with Journal(tmp_path, "test") as journal:
+        journal.append(measured(fields="0123456789abcdef", quantities=IN_SPACE))
+    write_report(tmp_path, ["md"])
+    text = (tmp_path / "report/report.md").read_text("utf-8")
+
+    assert "no verified answer has bodies to draw" in text
+    assert "There is no picture of" not in text
 
 
 @pytest.mark.parametrize("damaged", [False, True])

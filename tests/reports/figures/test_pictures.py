@@ -31,6 +31,7 @@ from mortarbench.reports.figures.deformed import (
     triangles,
 )
 from mortarbench.reports.figures.style import look
+from mortarbench.reports.figures.tractions import traction_figure
 from mortarbench.reports.render.saving import ENDINGS, draw, save, save_all
 from mortarbench.reports.render.svg import inline
 from mortarbench.reports.render.writing import write_page
@@ -436,3 +437,17 @@ def test_the_page_shows_the_drawing_of_the_file_in_the_frame_of_the_whole_figure
     assert paths[ENDINGS.index(".svg")].read_text() == svg.text
     assert "#ffffff" in svg.text
     assert "#ffffff" not in page
+
+
+def test_bodies_in_space_are_not_drawn(bodies):
+    def lifted(values):
+        return np.column_stack([values, np.arange(float(len(values)))])
+
+    space = replace(
+        bodies, points=lifted(bodies.points), displacement=lifted(bodies.displacement)
+    )
+    with pytest.raises(InputError, match=r"in space: expected a \.vtu"):
+        deformed_figure(space)
+    loaded = (side("up on low", [4, 5], [[0, 0], [0, -3e6]]),)
+    assert traction_figure(replace(bodies, contacts=loaded)) is not None
+    assert traction_figure(replace(space, contacts=loaded)) is None
