@@ -595,7 +595,7 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     )
     local = DualOperator(
         csr_array(B[at.rows][:, columns]),
-        Subdomains(tuple(replace(domains.kinds[k]) for k in kinds), kind),
+        Subdomains(tuple(domains.kinds[k].without_factor(str(k)) for k in kinds), kind),
         operator.explicit[kinds],
         operator.equalities,
         partial(condensed_by_ranks, ranks=ranks),

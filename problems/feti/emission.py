@@ -10,7 +10,7 @@ that another one owns, of the right side q and of RᵀBᵀ; and their part of R�
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import chain, pairwise
 from typing import Any
@@ -94,7 +94,8 @@ class OwnDual:
     def share(self) -> Share:
         """Put the operator together, without any factor."""
         rows, domains, ranks = self.own.rows, self.own.domains, self.own.ranks
-        anew = Subdomains(tuple(map(replace, domains.kinds)), domains.kind)
+        kinds = tuple(kind.without_factor() for kind in domains.kinds)
+        anew = Subdomains(kinds, domains.kind)
         local = DualOperator(
             rows.B, anew, self.explicit, rows.equalities,
             partial(condensed_by_ranks, ranks=ranks),
@@ -159,6 +160,8 @@ def emitted(
 
     """
     own = dual.own
+    for part in ("explicit", "q", "G", "b"):
+        getattr(dual, part)  # made here, so that no solver pays for it in `prepare`
 
     def digest() -> str:
         names = others * [_digest(first.own)] if first else [_digest(own)]

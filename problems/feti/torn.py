@@ -13,7 +13,7 @@ displacement u (n,) of the whole is v = T u, one d×d block per torn node.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -60,6 +60,12 @@ class Kind:
             ),
             32,
         )
+
+    def without_factor(self, name: str = "") -> Kind:
+        """Return the same to be factorised anew, under its name or another one."""
+        found = replace(self)
+        vars(found)["name"] = name or self.name
+        return found
 
     def inverse(self, b: Dense) -> Dense:
         """Apply K⁺ to columns (n_k, k)."""
