@@ -149,7 +149,7 @@ class Ranks:
 
 
 def alone() -> Ranks:
-    """Make the ranks of a single process, which needs no MPI."""
+    """Return the ranks of a single process, which needs no MPI."""
     return Ranks(cast("Comm", _Alone()))
 
 

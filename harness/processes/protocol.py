@@ -127,7 +127,7 @@ def measures(request: Mapping[str, Any]) -> bool:
 
 
 class Source(StrEnum):
-    """Where the QP of a measurement comes from, and who judges the answer."""
+    """The origin of the QP of a measurement, and the judge of the answer."""
 
     FILE = "file"  #: a file, which the parent reads, too, and judges by
     SHARES = "shares"  #: ranks, each its share; the parent judges by the whole
@@ -135,7 +135,7 @@ class Source(StrEnum):
 
     @property
     def is_shared(self) -> bool:
-        """Whether ranks make the QP."""
+        """True where ranks make the QP."""
         return self is not Source.FILE
 
 

@@ -1,4 +1,4 @@
-"""What a result folder keeps of one measurement, enough to make or build it again."""
+"""One measurement as a result folder keeps it: enough to make or build it again."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Forces(NamedTuple):
 
 
 class State(NamedTuple):
-    """Where a stage begins; displacements are those that its problem is posed with."""
+    """The state that a stage begins at, by displacements as its problem takes them."""
 
     u: Vector  #: (w,) where contact is linearised
     before: Vector  #: (w,) where the slip begins

@@ -138,7 +138,7 @@ def layout_of(bodies: ElasticBodies, size: int) -> Subdivision:
 def emitted_by(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
 ) -> Emitted:
-    """Make this rank's share of the dual that is chosen; called by all ranks.
+    """Emit this rank's share of the dual that is chosen; called by all ranks.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def described(
 
 
 def looked_up(forces: Forces) -> Callable[[Nodes], Vector]:
-    """Make what looks forces up by components; zero elsewhere."""
+    """Return a function that looks forces up by components; zero elsewhere."""
     order = np.argsort(forces.component)
     known = forces.component[order]
 
@@ -261,7 +261,7 @@ def linearised(
 
 @dataclass(frozen=True, eq=False)
 class FoundByRanks:
-    """What ranks have found; see `Found`."""
+    """The answer that ranks have found; see `Found`."""
 
     solution: OwnSolution
     linearised: LinearisedSides

@@ -183,7 +183,7 @@ class ElasticBodies:
 
     @cached_property
     def is_held(self) -> bool:
-        """Whether supports leave no rigid motion of any body."""
+        """True where supports leave no rigid motion of any body."""
         rigid = self.whole.rigid
         return bool(np.linalg.matrix_rank(rigid[self.fixed]) == rigid.shape[1])
 

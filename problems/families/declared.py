@@ -96,7 +96,7 @@ class DeclaredFamily(Family):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> Emitted:
-        """Make this rank's share of the dual; called by all ranks."""
+        """Emit this rank's share of the dual; called by all ranks."""
         from mortarbench.problems.feti.emission import dual_on, emitted
 
         del reference
@@ -150,7 +150,7 @@ class ContactFamily(DeclaredFamily):
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> Emitted:
-        """Make this rank's share of the dual; called by all ranks."""
+        """Emit this rank's share of the dual; called by all ranks."""
         from mortarbench.problems.duality.divided import emitted_by
         from mortarbench.problems.duality.problem import chosen
 

@@ -128,7 +128,7 @@ def answers(
 def certified_by(
     own: OwnSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
-    """Make what bounds the error of displacements with multipliers, by subdomains.
+    """Return a bound of the error of displacements with multipliers, by subdomains.
 
     K : (n, n) of the whole, as it is stored on this one process
     """
