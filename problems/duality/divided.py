@@ -269,7 +269,7 @@ class FoundByRanks:
     problems: int
 
     def at(self, component: Nodes) -> Vector:
-        """Tell all ranks the displacement at components (k,) of the whole."""
+        """Return the displacement at components (k,) of the whole, on all ranks."""
         return self.solution.at(component)
 
     def largest(self, value: float) -> float:

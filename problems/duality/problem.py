@@ -57,7 +57,7 @@ class Shape(Protocol):
 
     @property
     def dim(self) -> int:
-        """How many coordinates points have."""
+        """Number of coordinates of a point."""
 
     @property
     def mesh(self) -> Mesh:
@@ -135,7 +135,7 @@ class Meshed:
 
     @property
     def dim(self) -> int:
-        """How many coordinates points have."""
+        """Number of coordinates of a point."""
         return self.mesh.dim
 
     @property
@@ -199,7 +199,7 @@ class ElasticBodies:
 
     @cached_property
     def supported(self) -> GeneralisedInverse:
-        """As `clamped`, also of bodies that contact alone holds."""
+        """K⁺ like `clamped`, also for bodies that contact alone holds."""
         return supported(self.assembled)
 
 
@@ -219,7 +219,7 @@ def stated(bodies: UnassembledBodies) -> ElasticBodies:
 
 
 class AtSides(NamedTuple):
-    """What is known along the sides that may touch, as of the bodies themselves."""
+    """The contact: data and solution at least at the nodes of the sides."""
 
     bodies: Bodies | ContactSides
     primal: QP  #: of the nodes of the sides at least; of P, the diagonal with friction

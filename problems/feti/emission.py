@@ -148,7 +148,7 @@ def emitted(
     first: OwnDual | None = None,
     others: int = 0,
 ) -> Emitted:
-    """Say what this rank's share of the dual is; called by all ranks.
+    """Describe this rank's share of the dual; called by all ranks.
 
     The digest of a problem that others come before is that of the first of these, with
     their number: what was solved differs by rounding where ranks are more or less.

@@ -88,7 +88,7 @@ def own_solution(own: OwnSubdomains, halo: Halo, s: Solution) -> OwnSolution:
 
 
 def contact_multipliers(own: OwnSubdomains, halo: Halo, s: Solution) -> Vector:
-    """Tell all ranks the multipliers (m,) of the rows of contact and friction."""
+    """Return multipliers (m,) of rows of contact and friction, on all ranks."""
     rows, scale = own.rows, own.problem.contact_scale
     owned = rows.number[halo.own]
     is_contact = owned >= rows.equalities

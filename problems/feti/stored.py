@@ -25,7 +25,7 @@ class StoredOperator(DualOperator):
 
     @property
     def parts(self) -> int:
-        """How many subdomains there are."""
+        """Number of subdomains."""
         return int(self.domains.kind.size)
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
