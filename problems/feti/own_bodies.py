@@ -171,12 +171,7 @@ def _carrying(problem: ProblemInParts) -> Nodes:
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
-def holds_all(problem: ProblemInParts) -> bool:
-    """Whether the supports leave no rigid motion of any body."""
-    return not _unheld_bodies(problem)
-
-
-def _unheld_bodies(problem: ProblemInParts) -> list[int]:
+def unheld_bodies(problem: ProblemInParts) -> list[int]:
     """List the bodies that supports leave some rigid motion."""
     of, d = problem.layout, problem.components
     node, axis = np.divmod(problem.held, d)
@@ -232,7 +227,7 @@ def _unheld(own: OwnSubdomains) -> Unheld:
     problem, of, d = own.problem, own.problem.layout, own.problem.components
     components = d * copy.size
     motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
-    if not (unheld := _unheld_bodies(problem)):
+    if not (unheld := unheld_bodies(problem)):
         return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
     points = np.concatenate([*of.points(own.number)])
     body = of.body[own.number][own.nodes.subdomain]
