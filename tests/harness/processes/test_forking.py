@@ -19,10 +19,11 @@ from tests.support.waiting import soon
 #: asks workers that are forks of it, prints what came of each, and is killed; a process
 #: of its own, since what forks safely has one thread
 PARENT = '''
-import atexit, json, os, signal, subprocess, sys, threading
+import atexit, json, os, signal, subprocess, sys, threading, time
 from contextlib import suppress
 from math import inf
 from pathlib import Path
+from mortarbench.harness.processes.forking import is_safe
 from mortarbench.harness.processes.protocol import answer_requests
 from mortarbench.harness.processes.reaper import descendants
 from mortarbench.harness.processes.supervisor import WorkerProcess
@@ -95,6 +96,10 @@ def beside_a_thread():
     finally:
         sleeps.set()
         thread.join()
+        for _ in range(2000):  # the kernel lets it go a little after that
+            if is_safe():
+                break
+            time.sleep(0.01)
 
 
 results = dict(
