@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from mortarbench.harness import QP, Matrix, Solution, Vector
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.solvers.smalbe import rows as orthonormal_rows
+from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.projected import Iterate, Projected
 
@@ -36,7 +37,8 @@ class SMALBE:
         problem: Projected,
         options: Options,
         preconditioned: bool,
-        M: Callable[[Vector], Vector] | None = None,
+        M: Operator | None = None,
+        step_rule: StepRule | None = None,
     ) -> None: ...
     def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
     def precondition(

@@ -43,6 +43,8 @@ from mortarbench.harness.verify cimport scales
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+from mortarbench.solvers.smalbe.extension import Step
+
 cdef extern from "vectors.h" nogil:
     ctypedef struct sparse:
         Py_ssize_t n, count

@@ -15,6 +15,7 @@ from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
+from mortarbench.solvers.smalbe.extension import checked
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import chosen, offered, structural
@@ -78,6 +79,8 @@ def prepared(
     rho = options.rho or (TORN_RHO if offered(qp) else RHO)
     history = History() if options.history else None
     eliminated = None
+    # the functions of a subclass expect the variables of the QP as given
+    eliminate = eliminate and not options.is_extended
     if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
         eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
     inner = qp if eliminated is None else eliminated.qp
@@ -209,9 +212,11 @@ def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
     """Prepare the outer loop, with the preconditioner that is asked for."""
-    kind = chosen(qp, options.preconditioner)
-    M = structural(qp, kind)
-    solver = compiled.SMALBE(problem, options, kind != "none", M)
+    own, kind = options.preconditioner_for(qp), chosen(qp, options.preconditioner)
+    M = structural(qp, kind) if own is None else checked(own)
+    solver = compiled.SMALBE(
+        problem, options, kind != "none", M, options.step_rule_for(qp)
+    )
     watch = None if history is None else partial(history.watch, problem)
     return OuterLoop(solver, problem, options, watch)
 

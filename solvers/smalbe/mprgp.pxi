@@ -28,6 +28,7 @@ cdef enum:
     PROJCG = 1
     MIXED = 2
     MODEL = 3
+    OWN = 4
 
 
 cdef double change_along(const Line *line, double alpha) noexcept:
@@ -137,7 +138,8 @@ cdef class MPRGP:
       expansion
     * e, expansion of the active set, by one of the expansions of
       `solvers.smalbe.options`
-    * f, fallback: an expansion that gained too little, done anew in the safe way
+    * f, fallback: an expansion that gained too little, done anew in the safe way; after
+      the trial point of a step rule of one's own, the standard expansion
     * p, proportioning: free components, by the model or along −β
 
     Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step
@@ -191,6 +193,7 @@ cdef class MPRGP:
     cdef object M  # v → Mv of a structural preconditioner; None for none
     cdef double M_scale  # ‖𝒫F𝒫‖, for M is one of F
     cdef object counts  # of its products
+    cdef object step_rule  # of a subclass (`solvers.smalbe.extension`); None for none
     cdef Directions directions
 
     cdef int make_room(self) except -1:
@@ -525,11 +528,19 @@ cdef class MPRGP:
         cdef Py_ssize_t n = self.n
         cdef double cg = self.line.cg
         self.knows_Cx = False
-        if self.expansion in (PROJCG, MIXED) and isfinite(cg):
+        cdef double required = 0.0  # twice the decrease of the cost that is asked of x2
+        cdef bint has_trial = self.expansion == OWN
+        if has_trial:
+            self.trial_of_rule(self.x2)
+            # B = τI with τ = ‖H‖/`alpha` here: φ̃ᵀφ/(2‖H‖), times 2
+            required = self.parts.reduced_square / (self.alpha * self.B.tau)
+        elif self.expansion in (PROJCG, MIXED) and isfinite(cg):
+            has_trial = True
             self.set.project(self.x, cg, self.p, self.x2)
+        if has_trial:
             self.gradient(self.x2, self.g2)
             if self.expansion == PROJCG or (
-                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g)
+                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g) - required
             ):
                 memcpy(self.x, self.x2, n * sizeof(double))
                 memcpy(self.g, self.g2, n * sizeof(double))
@@ -542,7 +553,36 @@ cdef class MPRGP:
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
-        return b"f" if self.expansion == MIXED else b"e"
+        return b"f" if self.expansion in (MIXED, OWN) else b"e"
+
+    cdef int trial_of_rule(self, double *y) except -1:
+        """y ← P(x_trial − x̃), where the step rule of a subclass leads.
+
+        The rule is shown x = x̃ + ν, and gradient and lengths without the factor
+        1/‖𝒫F𝒫‖ of H: those of the augmented Lagrangian of the QP as given.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef const double *shift = self.rows.x_tilde
+        cdef double size = 1 / self.inverse_norm
+        arrays = np.empty((5, n))
+        cdef double *x = numbers(arrays)
+        for i in range(n):
+            x[i] = shift[i] + self.x[i]
+            x[n + i] = size * self.g[i]
+            x[2 * n + i] = size * self.p[i]
+            x[3 * n + i] = shift[i] + self.set.lower[i]
+            x[4 * n + i] = shift[i] + self.set.upper[i]
+        trial = self.step_rule(Step(
+            *map(self.over.vector, arrays), self.line.cg * self.inverse_norm,
+            self.line.feasible * self.inverse_norm, self.inverse_norm / self.B.tau,
+        ))  # fmt: skip
+        take(trial, n, y, "the trial point of the step rule")
+        for i in range(n):
+            if not isfinite(y[i]):
+                raise ValueError("the step rule returned a point that is not finite")
+        add(-1.0, shift, y, n)
+        self.set.project(y, 0.0, y, y)
+        return 0
 
     cdef int expand_by_model(
         self, bint is_first, long most, double enough, bytearray trace

@@ -7,7 +7,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from mortarbench.harness import QP
 from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
 #: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
@@ -80,3 +82,28 @@ class Options:
                 "norm = 'power' finds no Ritz vectors; expected 'lanczos', or "
                 "expansion and preconditioner other than 'model'"
             )
+
+    def preconditioner_for(self, qp: QP) -> Operator | None:
+        """Return v ↦ Mv for this QP, or None for the option `preconditioner`.
+
+        For subclasses (`solvers.smalbe.extension`). M approximates P⁻¹ and must be
+        symmetric positive definite; the loop restricts it to the face.
+        """
+        return None
+
+    def step_rule_for(self, qp: QP) -> StepRule | None:
+        """Return a rule for this QP, or None for the option `expansion`.
+
+        For subclasses (`solvers.smalbe.extension`). The rule is asked for a trial point
+        wherever a CG step would leave the box.
+        """
+        return None
+
+    @property
+    def is_extended(self) -> bool:
+        """True for a subclass with a preconditioner or a step rule of its own."""
+        own = type(self)
+        return (
+            own.preconditioner_for is not Options.preconditioner_for
+            or own.step_rule_for is not Options.step_rule_for
+        )

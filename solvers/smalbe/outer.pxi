@@ -27,6 +27,7 @@ cdef class SMALBE(MPRGP):
     options : a `solvers.smalbe.options.Options`
     M : None, or v → Mv of a structural preconditioner
     preconditioned : whether the model, or M, preconditions in the face
+    step_rule : None, or a `solvers.smalbe.extension.StepRule` in place of the expansion
     """
 
     cdef double norm, tail, b_size
@@ -43,7 +44,7 @@ cdef class SMALBE(MPRGP):
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
     cdef long most_products  # where the energy error may still cost something
 
-    def __init__(self, problem, options, bint preconditioned, M=None):
+    def __init__(self, problem, options, bint preconditioned, M=None, step_rule=None):
         cdef const double *lower
         cdef const double *upper
         spectrum, bounds = problem.spectrum, problem.bounds
@@ -60,8 +61,11 @@ cdef class SMALBE(MPRGP):
         self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
         self.reduced = options.reduced
         self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.step_rule = step_rule
+        if step_rule is not None:
+            self.expansion = OWN
         self.proportions_by_model = options.proportioning == "model"
-        self.plain = options.expansion != "model"
+        self.plain = self.expansion != MODEL
         self.preconditioned = preconditioned
         kept = KEPT if options.recycle and not issparse(self.F.matrix) else 0
         self.directions = Directions(self.n, kept, self.over)

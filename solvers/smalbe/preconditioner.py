@@ -30,11 +30,11 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array
 
-from mortarbench.harness import QP, Structure, Vector
+from mortarbench.harness import QP, Structure
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
+from mortarbench.solvers.smalbe.extension import Operator
 from mortarbench.solvers.smalbe.rows import Mask
 
-Operator = Callable[[Vector], Vector]
 Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
 PRECONDITIONERS = get_args(Preconditioner)
 #: those with a matrix M of their own
