@@ -11,7 +11,7 @@ from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.projected import Iterate, Projected
 
 Array = NDArray[np.float64]
-Kept = NDArray[np.int32]
+Indices = NDArray[np.int32]
 
 class Reduction:
     def __init__(
@@ -27,7 +27,7 @@ class Product:
     def __call__(self, v: Vector) -> Vector: ...
 
 class Rows:
-    given: orthonormal_rows.Rows
+    source: orthonormal_rows.Rows
     def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
     def met(self, nu: Vector, tol: float, least: float) -> bool: ...
 
@@ -70,7 +70,8 @@ def residual_bound(
 def orthonormal(
     G: Array, e: Vector
 ) -> tuple[
-    tuple[Array, Array, Array, float, float, Vector, bool], tuple[Array, Kept, Vector]
+    tuple[Array, Array, Array, float, float, Vector, bool],
+    tuple[Array, Indices, Vector],
 ]: ...
 def lanczos(
     F: Product, C: Rows, start: Vector, steps: int
@@ -83,4 +84,4 @@ def homogenised(
     ub: Vector,
     norm: float,
 ) -> tuple[Vector, tuple[Vector, Vector]]: ...
-def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...
+def multipliers(m: int, R: Array, kept: Indices, size: Vector, a: Vector) -> Vector: ...
