@@ -38,6 +38,16 @@ class _Moving(NamedTuple):
     turn: float  #: anticlockwise, as a velocity at a `size` from the centre
 
 
+def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
+    """Return True if supports and closed, sticking contact leave no rigid motion.
+
+    rows : (m, n) normal rows, and tangential rows of contacts with friction
+    """
+    R, _, _ = _motions(bodies)
+    allowed = _kernel(bodies.B_D @ R)
+    return not _kernel(csr_array(rows) @ R @ allowed).shape[1]
+
+
 def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     """Refuse loads that neither supports nor contacts can balance.
 

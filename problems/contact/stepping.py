@@ -52,6 +52,23 @@ def slip_anew(left: State) -> State:
     return left._replace(before=left.u)
 
 
+def with_normal_forces(
+    begin: Callable[[State], State], force: float
+) -> Callable[[State], State]:
+    """Start Coulomb's law of each stage from the same normal force at every slave node.
+
+    The normal forces of the previous stage bound friction by what the previous load
+    needed. Where friction alone supports a body, that bound cannot balance a larger
+    load, and the first problem of the fixed point would have no solution.
+    """
+
+    def begin_with(left: State) -> State:
+        state = begin(left)
+        return state._replace(pressed=np.full_like(state.pressed, force))
+
+    return begin_with
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stage:
     """One linearisation of a load step."""

@@ -38,11 +38,11 @@ Whatever the length unit is, everything in this file is in SI units, and so are 
 E and tractions in Pa, forces in N/m, units.length in m.
 
 What stands between mesh and units may be left out for the values above; bodies that
-contact alone holds have no form dual-bounds and, with linear kinematics, ``steps = 1``.
-So may units, for the larger side of the box around the mesh and the sum of |load| over
-nodes. Without a law of its own a pair has that of the keys friction, bound and mu,
-which the file may set at its top: none by default. There, ``loading = "static"`` makes
-the slip that of the whole load.
+contact alone supports have no form dual-bounds, and need friction, or
+kinematics=finite, for more than one load step. So may units, for the larger side of the
+box around the mesh and the sum of |load| over nodes. Without a law of its own a pair
+has that of the keys friction, bound and mu, which the file may set at its top: none by
+default. There, ``loading = "static"`` makes the slip that of the whole load.
 """
 
 from __future__ import annotations

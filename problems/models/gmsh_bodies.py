@@ -6,6 +6,7 @@ The TOML file is described in `problems.models.description`.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,10 @@ from scipy.sparse import vstack
 
 from mortarbench.harness import Case, InputError, Reference, Value
 from mortarbench.harness.checked import located
-from mortarbench.problems.contact.balance import check_balance
+from mortarbench.problems.contact.balance import check_balance, is_determined
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.contact.stepping import load_steps, with_normal_forces
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
@@ -49,32 +50,42 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
     """
     p: Any = params
-    found = _problem(params)
-    if not found.bodies.is_held and not p["step"] == p["relin"] == 1:
+    stated_problem = _problem(params)
+    of = stated_problem.bodies
+    if p["step"] == p["relin"] == 1 or of.is_held:
+        return stated_problem
+    rows = by_keys(p)(of.whole, laws_of(p))(np.zeros(of.whole.mesh.dofs))
+    # without friction the displacement along the contact is not unique, nor is the next
+    # linearisation
+    if not is_determined(of.whole, vstack([rows.B, rows.T])):
         raise InputError(
-            f"{p['path']}: the supports leave a rigid motion of some body, which load "
-            "steps and re-linearisations do not allow; expected steps=1 and relin=1"
+            f"{p['path']}: supports and friction leave a rigid motion of some body, "
+            "which load steps and re-linearisations do not allow; expected steps=1 "
+            "and relin=1"
         )
-    return found
+    return stated_problem
 
 
 @remembered
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     of, laws = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]), laws_of(p)
-    is_single = p["steps"] == p["relin"] == 1 or not of.is_held
+    stages = load_steps(
+        p["steps"], p["relin"], of.forces, of.fixed, laws,
+        quasi_static=p["loading"] == "quasi-static",
+    )  # fmt: skip
+    whole_load = float(np.abs(of.forces.value).sum())
     if not of.is_held:
         rows = by_keys(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
         with located(p["path"]):  # friction may hold either way
             check_balance(of.whole, vstack([rows.B, rows.T, -rows.T]))
+        stages = tuple(
+            replace(stage, begin=with_normal_forces(stage.begin, whole_load))
+            for stage in stages
+        )
     return ContactProblem(
-        bodies=of, linearise=by_keys(p),
-        stages=load_steps(
-            p["steps"], p["relin"], of.forces, of.fixed, laws,
-            quasi_static=p["loading"] == "quasi-static",
-        ),
-        # friction may have to hold bodies
-        pressed=float(np.abs(of.forces.value).sum()) if is_single else 0.0,
+        bodies=of, linearise=by_keys(p), stages=stages,
+        pressed=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )  # fmt: skip
 
 

@@ -126,8 +126,8 @@ def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | No
     """
     if always or carry is None:
         return eliminate_free(qp, carry and carry.block)
-    found = None if carry.block is None else eliminate_free(qp, carry.block)
-    return None if found is None or found.columns else found
+    reduced = None if carry.block is None else eliminate_free(qp, carry.block)
+    return None if reduced is None or reduced.columns else reduced
 
 
 def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:

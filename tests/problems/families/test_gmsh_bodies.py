@@ -296,6 +296,100 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
         build(f"{text}/steps=1/dual-bounds")
 
 
+SHEARED = """\
+mesh = "two.msh"
+plane = "stress"
+units = { length = 4.0, force = 1e7 }
+friction = "coulomb"
+mu = 0.5
+[[bodies]]
+name = "lower"
+E = 1e9
+nu = 0
+[[bodies]]
+name = "upper"
+E = 2e9
+nu = 0
+[[supports]]
+boundary = "base"
+fix = ["x", "y"]
+[[loads]]
+boundary = "top"
+traction = [4e5, -1e6]
+[[loads]]
+boundary = "right"
+traction = [0, 4e5]
+[[loads]]
+boundary = "left"
+traction = [0, -4e5]
+[[contacts]]
+slave = "foot"
+master = "table"
+"""
+
+
+@pytest.fixture
+def sheared_blocks(described):
+    """Two squares of side 2 in a state of constant pressure and shear stress.
+
+    Their Poisson's ratio is zero, so that their common side stays straight: every load
+    step has the same contact rows. Friction alone holds the upper one sideways.
+    """
+    (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0))
+    sides = {
+        "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
+        "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
+        "left": [[0, 3], [3, 6], [9, 12], [12, 15]],
+        "right": [[2, 5], [5, 8], [11, 14], [14, 17]],
+    }  # fmt: skip
+    curves = {name: np.array(edges) for name, edges in sides.items()}
+    bodies = {"lower": cells, "upper": cells + 9}
+    mesh = msh22(np.vstack([lower, upper]), bodies, curves, {})
+    return lambda toml=SHEARED: described(mesh, toml)
+
+
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
+    sheared_blocks, contact, form, step
+):
+    """Each step has its share of the stress, and of the displacement (γy, −εy)."""
+    text = f"{sheared_blocks()}/contact={contact}/steps=3/step={step}/{form}"
+    case = build(text)
+    s = reference_solution(case.qp)
+    fields, share = case.fields(s), step / 3
+    points, u = fields.points, fields.displacement
+    shear, press = 4e5 / np.array([5e8, 1e9]), 1e6 / np.array([1e9, 2e9])
+    y, is_upper = points[:, 1], np.arange(len(points)) >= 9
+    low, high = np.where(is_upper, 2.0, y), np.where(is_upper, y - 2.0, 0.0)
+    expected = share * np.column_stack(
+        [low * shear[0] + high * shear[1], -low * press[0] - high * press[1]]
+    )
+
+    assert u == pytest.approx(expected, abs=1e-9 * abs(expected).max())
+    force = case.quantities(s)["contacts"]["upper on lower"]["force"]["upper"]
+    assert force == pytest.approx(share * np.array([-8e5, 2e6]), abs=1)
+
+
+def test_the_last_of_several_relinearisations_is_the_same_where_rows_stay(
+    sheared_blocks,
+):
+    once = build(f"{sheared_blocks()}/steps=1/dual")
+    again = build(f"{sheared_blocks()}/steps=1/relin=3/dual")
+
+    assert once.quantities(reference_solution(once.qp))["energy"] == pytest.approx(
+        again.quantities(reference_solution(again.qp))["energy"], rel=1e-9
+    )
+
+
+def test_more_shear_than_friction_bears_is_refused_in_every_step(sheared_blocks):
+    text = sheared_blocks(SHEARED.replace("4e5", "6e5"))
+    for step in (1, 2):
+        with pytest.raises(InputError, match="friction cannot hold the load"):
+            build(f"{text}/steps=2/step={step}/dual")
+
+
 @pytest.mark.parametrize(
     ("load", "told"),
     [
