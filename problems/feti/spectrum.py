@@ -22,16 +22,13 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csc_matrix, csr_array
+from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import DistributedColumns
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import RankOperator
-from mortarbench.problems.feti.operators import inverted_blocks, uncoupled
-from mortarbench.problems.feti.stored import dual_operator, made
-from mortarbench.problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 
@@ -66,31 +63,6 @@ class Spectrum(NamedTuple):
             self.smallest_error <= tol * self.smallest
             and self.largest_error <= tol * self.largest
         )
-
-
-def projector(G: csr_array, B: csr_array) -> Product:
-    """Make the orthogonal projector onto ker G ∩ range B.
-
-    Rows of B that depend on one another, those of redundant gluing, meet at a
-    crosspoint; BBᵀ has a small block there.
-
-    Parameters
-    ----------
-    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
-    B : (m, N)
-
-    """
-    gram = uncoupled(csr_array(B @ B.T), B.shape[0])
-    within = csr_array(gram @ inverted_blocks(gram))
-    if not G.shape[0]:
-        return lambda x: np.asarray(within @ x)
-    factor, GT = cholesky(csc_matrix(G @ G.T)), csr_array(G.T)
-
-    def project(x: Vector) -> Vector:
-        y = within @ x
-        return np.asarray(y - GT @ factor(G @ y))
-
-    return project
 
 
 def spectrum(
@@ -144,51 +116,27 @@ def spectrum(
     return found
 
 
-def spectra_of_equations(
-    torn: Torn,
-    preconditioners: Sequence[tuple[str, str] | None] = (None,),
-    tol: float = 1e-5,
-) -> list[Spectrum]:
-    """Find the spectra for the rows of supports and gluing, as if no contact was there.
-
-    Parameters
-    ----------
-    torn : its supports hold every body
-    preconditioners : kind and scaling of each, see `problems.feti.operators`, or none
-    tol : as of `spectrum`
-
-    """
-    B_E, m = torn.B[: torn.equalities], torn.equalities
-    F = made(dual_operator(B_E, torn.domains, m).arrays)
-    P = projector(csr_array((B_E @ torn.domains.kernel).T), B_E)
-    inverses = [p and F.preconditioner(*p) for p in preconditioners]
-    return [spectrum(F, P, m, M, tol) for M in inverses]
-
-
 def spectra_over_ranks(
     F: RankOperator,
     G: DistributedColumns,
     preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
 ) -> list[Spectrum]:
-    """Find what `spectra_of_equations` does, of a dual that ranks have made.
+    """Compute the spectra of F for the rows of supports and gluing.
 
-    Called by all ranks, which get the same.
+    Called by all ranks, which get the same; one process counts as one rank.
 
     Parameters
     ----------
-    F, G : of the dual of bodies that nothing touches
+    F, G : of the dual of a problem without contact, whose supports hold every body
+    preconditioners : kind and scaling of each, see `problems.feti.operators`; None
+        stands for PFP itself
+    tol : error bound of both eigenvalues, relative
 
     """
     at, ranks = F.halo, F.halo.ranks
-    m, within = ranks.total(np.array([float(at.own.size)]))[0], F.onto_rows()
-    coarse = cholesky(csc_matrix(G.gram())) if G.shape[0] else None
-
-    def project(x: Vector) -> Vector:
-        y = within(x)
-        if coarse is not None:
-            y -= np.asarray(G.T @ coarse(G @ y))
-        return y
+    m = ranks.total(np.array([float(at.own.size)]))[0]
+    project = projector(F, G)
 
     def plain(A: Product) -> Product:
         return lambda x: np.asarray(A(x))
@@ -201,6 +149,27 @@ def spectra_over_ranks(
         )
         for M in inverses
     ]  # fmt: skip
+
+
+def projector(F: RankOperator, G: DistributedColumns) -> Product:
+    """Return the orthogonal projector onto ker G ∩ range B; called by all ranks.
+
+    Parameters
+    ----------
+    F : operator with the rows B, which may depend on one another (redundant gluing)
+    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
+
+    """
+    within = F.onto_rows()
+    if not G.shape[0]:
+        return within
+    coarse = cholesky(csc_matrix(G.gram()))
+
+    def project(x: Vector) -> Vector:
+        y = within(x)
+        return np.asarray(y - np.asarray(G.T @ coarse(G @ y)))
+
+    return project
 
 
 def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:
