@@ -31,14 +31,14 @@ from mortarbench.harness import Mechanics, certify, no_rows
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import described
+from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import certified_by
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import certified_by
+from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.spectrum import spectra_over_ranks
-from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.beam_ring import model
@@ -68,10 +68,10 @@ def one(way, Nr, cells):
         (stage,) = load_steps(1, 1, of.forces, of.fixed)
         contact = Contact(primal.G, primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
-        parts = described(of, layout, "orthonormal", stage, contact)
+        parts = decompose(of, layout, "orthonormal", stage, contact)
         own = on_one_process(parts)
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
-        dual = torn_dual(pieces, primal)
+        pieces, in_parts = own.decomposed, certified_by(own, primal.P)
+        dual = feti_dual(pieces, primal)
     else:
         dual = dualise(primal, floating(bodies))
     lap()
@@ -100,7 +100,7 @@ def one(way, Nr, cells):
     if parts is None:
         return found
     empty = Contact(no_rows(bodies.mesh.dofs), np.zeros(0), np.zeros(0))
-    bare = OwnDual(on_one_process(replace(parts, contact=empty))).share().qp
+    bare = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
     return found | known_face(pieces, bare, dual.qp, s)
 
 

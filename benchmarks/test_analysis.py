@@ -17,7 +17,7 @@ from sksparse.cholmod import cholesky
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import path_of
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 

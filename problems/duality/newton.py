@@ -65,8 +65,8 @@ from mortarbench.problems.contact.bodies import Bodies, clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.sides import ACTIVE
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.monolithic import REFERENCE, primal_qp
 from mortarbench.problems.duality.problem import Linearise
-from mortarbench.problems.duality.undivided import REFERENCE, primal_qp
 from mortarbench.problems.fem.finite_strain import (
     Cells,
     Evaluated,

@@ -11,7 +11,7 @@ from mortarbench.harness import Reference, Value
 from mortarbench.problems.contact.bodies import Bodies, clamped
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.undivided import WholePath, path_of
+from mortarbench.problems.duality.monolithic import MonolithicPath, path_of
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.families.hertz import HertzCylinder
@@ -44,7 +44,7 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
         yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
 
 
-def _results(bodies: Bodies, path: WholePath, step: int) -> dict[str, Value]:
+def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value]:
     primal, s = path.primal(step), path.answer(step)
     found = quantities(bodies, primal, s)
     sides = bodies.mesh.boundaries

@@ -47,7 +47,7 @@ from mortarbench.problems.feti.operators import (
     touched,
     uncoupled,
 )
-from mortarbench.problems.feti.torn import Condensed, Dense, Subdomains
+from mortarbench.problems.feti.subdomain_classes import Condensed, Dense, Subdomains
 
 #: of what a kind of subdomains takes, what comes after the factor of its stiffness
 AFTER_FACTOR = 0.25
@@ -444,7 +444,7 @@ def _alike(
     return owned, inverse
 
 
-class Forming(NamedTuple):
+class Assignment(NamedTuple):
     """Who forms the blocks of one kind."""
 
     work: int  #: in some unit
@@ -453,7 +453,7 @@ class Forming(NamedTuple):
     blocks: int  #: rank that forms the blocks with that factor, and sends them
 
 
-def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
+def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
     """Share out what forms the blocks of each kind, once.
 
     Largest first, each goes to the rank that has the least to do so far (Graham 1969).
@@ -466,11 +466,11 @@ def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
         for name in one:
             have.setdefault(name, []).append(rank)
     size = {name: work[ranks[0]][name] for name, ranks in have.items()}
-    loads, found = [0.0] * len(work), dict[str, Forming]()
+    loads, found = [0.0] * len(work), dict[str, Assignment]()
     for name in sorted(have, key=lambda name: (-size[name], name)):
         rank = min(have[name], key=loads.__getitem__)
         loads[rank] += size[name]
-        found[name] = Forming(size[name], have[name], rank, rank)
+        found[name] = Assignment(size[name], have[name], rank, rank)
     for name, task in found.items():
         rank, part = min(task.have, key=loads.__getitem__), AFTER_FACTOR * task.work
         if loads[rank] + 2 * part <= loads[task.factor]:
@@ -480,7 +480,7 @@ def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
     return found
 
 
-def meanwhile(tasks: Mapping[str, Forming], rank: int) -> int:
+def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
     """Count the blocks that a rank forms until factors are given away.
 
     Of those that it forms with factors of its own; all of them if none are given away.
@@ -510,7 +510,7 @@ def condensed_by_ranks(
     ours = dict(zip(names, groups, strict=True))
     border = {name: g.kind.border(g.touched).size for name, g in ours.items()}
     work = {name: ours[name].kind.K.nnz * h for name, h in border.items()}
-    tasks = forming(ranks.comm.allgather(work))
+    tasks = assign_factorisations(ranks.comm.allgather(work))
     given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
     taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
     kept = [n for n, t in tasks.items() if t.factor == me == t.blocks]
@@ -530,7 +530,7 @@ def condensed_by_ranks(
             else:
                 found[n] = np.stack(kind.blocks(touched, factors.pop(n)))
 
-    before = meanwhile(tasks, me)
+    before = blocks_before_exchange(tasks, me)
     yield from formed(kept[:before])
     came = _exchanged(
         ranks,

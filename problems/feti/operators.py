@@ -45,7 +45,12 @@ from mortarbench.harness import Vector
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import multiply
-from mortarbench.problems.feti.torn import Condensed, Dense, Kind, Subdomains
+from mortarbench.problems.feti.subdomain_classes import (
+    Condensed,
+    Dense,
+    SubdomainClass,
+    Subdomains,
+)
 
 EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
 COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
@@ -58,7 +63,7 @@ ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
 class Group(NamedTuple):
     """The subdomains of one kind, with what rows touch of any of them."""
 
-    kind: Kind
+    kind: SubdomainClass
     explicit: bool  #: whether (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within each, ascending
@@ -368,7 +373,7 @@ def inverted_blocks(M: csr_array) -> csr_array:
     return csr_array(entries, shape=M.shape)
 
 
-def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
+def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
     """Choose the kinds whose blocks are formed: the smallest, as many as fit."""
     sizes = np.array([part.size for part in touched(B, domains)])
     order = np.argsort(sizes, kind="stable")

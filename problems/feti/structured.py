@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes, StructuredGrid, cells_of_block
-from mortarbench.problems.feti.subdivision import Integers, Points, TornNodes
+from mortarbench.problems.feti.subdivision import Integers, Points, SubdomainNodes
 from mortarbench.problems.feti.tearing import blocks
 
 
@@ -151,7 +151,7 @@ class Layout:
         _, _, columns, rows = self.corner(np.arange(self.count))
         return np.asarray(columns * rows, dtype=np.int64)
 
-    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+    def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
         """List the nodes of some blocks, row by row."""
         left, low, columns, rows = self.corner(subdomains)
         start = np.concatenate([[0], np.cumsum(columns * rows)])
@@ -168,7 +168,7 @@ class Layout:
         across = self._columns.times[self._columns.start[at.body] + at.column]
         copy = (second[1] * across + second[0]).astype(np.int8)
         times = self._times(at).astype(np.int8)  # there are many of them
-        return TornNodes(of.astype(np.int32), self._number(at), times, copy, start)
+        return SubdomainNodes(of.astype(np.int32), self._number(at), times, copy, start)
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
         """Return the columns and rows of nodes of some blocks."""

@@ -26,7 +26,7 @@ Integers = NDArray[np.integer[Any]]
 Points = NDArray[np.float64]
 
 
-class TornNodes(NamedTuple):
+class SubdomainNodes(NamedTuple):
     """The nodes of some subdomains, one after another, within each ascending."""
 
     subdomain: Integers  #: (M,) place in the list of subdomains
@@ -58,7 +58,7 @@ class Subdivision(Protocol):
     def sizes(self) -> NDArray[np.int64]:
         """Count the nodes of each subdomain, (S,)."""
 
-    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+    def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
         """List the nodes of some subdomains."""
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
@@ -128,7 +128,7 @@ class Listed:
         """How many subdomains there are, S."""
         return self.body.size
 
-    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
+    def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
         """List the nodes of some subdomains."""
         parts = [self.part(int(s))[0] for s in subdomains]
         sizes = np.array([part.size for part in parts])
@@ -144,7 +144,7 @@ class Listed:
             place[listed] * self.count + subdomains[subdomain[listed]],
         )
         copy[listed] = found - self.start[place[listed]]
-        return TornNodes(
+        return SubdomainNodes(
             subdomain, number, self.times(number).astype(np.int32), copy,
             np.concatenate([[0], np.cumsum(sizes)]),
         )  # fmt: skip

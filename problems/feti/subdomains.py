@@ -45,10 +45,14 @@ from mortarbench.problems.feti.subdivision import (
     Integers,
     Points,
     Subdivision,
-    TornNodes,
+    SubdomainNodes,
+)
+from mortarbench.problems.feti.subdomain_classes import (
+    DecomposedBodies,
+    SubdomainClass,
+    Subdomains,
 )
 from mortarbench.problems.feti.tearing import ALIKE, Part, classify, images, spread_of
-from mortarbench.problems.feti.torn import Kind, Subdomains, Torn
 
 Weights = Callable[[int], NDArray[np.float64]]
 
@@ -81,13 +85,13 @@ class Contact(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProblemInParts:
+class DecomposedProblem:
     """A contact problem on bodies in subdomains, without dimensions, nothing made."""
 
     layout: Subdivision  #: of the bodies into subdomains, S in all
     components: int  #: of a node: 2 of displacements, 1 of heights
     material: Integers  #: (S,) of each subdomain
-    kind: Callable[[Part], Kind]  #: assembles a floating subdomain
+    kind: Callable[[Part], SubdomainClass]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
     names: tuple[str, ...]  #: of the bodies
     #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
@@ -124,10 +128,10 @@ class Entries(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class OwnSubdomains:
+class LocalSubdomains:
     """What one rank holds of torn bodies."""
 
-    problem: ProblemInParts
+    problem: DecomposedProblem
     ranks: Ranks
     rank: NDArray[np.int64]  #: (S,) of each subdomain
 
@@ -137,9 +141,9 @@ class OwnSubdomains:
         return np.flatnonzero(self.rank == self.ranks.rank)
 
     @cached_property
-    def nodes(self) -> TornNodes:
+    def nodes(self) -> SubdomainNodes:
         """Its torn nodes, (M_p,)."""
-        return self.problem.layout.torn_nodes(self.number)
+        return self.problem.layout.subdomain_nodes(self.number)
 
     def torn(self, subdomain: Nodes, node: Nodes) -> Nodes:
         """Find own torn nodes (k,) by their subdomains and their nodes, (k,) both."""
@@ -231,7 +235,7 @@ class OwnSubdomains:
         return Subdomains(tuple(kinds), kind), rotation
 
     @property
-    def floating(self) -> OwnSubdomains:
+    def floating(self) -> LocalSubdomains:
         """Hold the same with supports that are rows: all its subdomains float."""
         if not self.problem.eliminated:
             return self
@@ -295,7 +299,7 @@ class OwnSubdomains:
         return np.concatenate([[0], np.cumsum(found)])
 
     @property
-    def own_motions(self) -> NDArray[np.int64]:
+    def local_motions(self) -> NDArray[np.int64]:
         """Number its rigid motions among those of all subdomains."""
         first, end = self.motions[self.number], self.motions[self.number + 1]
         return np.concatenate([np.arange(*m) for m in zip(first, end, strict=True)])
@@ -354,16 +358,16 @@ class OwnSubdomains:
         return _rows(self)
 
     @cached_property
-    def torn_bodies(self) -> Torn:
+    def decomposed(self) -> DecomposedBodies:
         """Collect what its subdomains are; rows and components are those it has."""
         domains, rows = self.domains, self.rows
-        return Torn(
+        return DecomposedBodies(
             kinds=domains.kinds, kind=domains.kind, spread=self.spread, B=rows.B,
             c=rows.c, scale=self.problem.contact_scale, f=self.f,
             equalities=rows.equalities,
         )  # fmt: skip
 
-    def bounded(self, bound: Vector) -> OwnSubdomains:
+    def bounded(self, bound: Vector) -> LocalSubdomains:
         """Hold the same with another bound (k,) of friction."""
         contact = self.problem.contact._replace(bound=bound)
         found = replace(self, problem=replace(self.problem, contact=contact))
@@ -371,7 +375,7 @@ class OwnSubdomains:
         vars(found).update({**vars(self), "problem": found.problem})
         return found
 
-    def posed(self, problem: ProblemInParts) -> OwnSubdomains:
+    def posed(self, problem: DecomposedProblem) -> LocalSubdomains:
         """Hold the same bodies with other loads, contact or supports that are rows."""
         found = replace(self, problem=problem)
         same = ("number", "nodes", "_classified", "_distinct")
@@ -390,7 +394,7 @@ class _Rows(NamedTuple):
     total: int  #: rows of the whole
 
 
-def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
+def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     """Give subdomains to ranks (S,), so that these do and hold alike much.
 
     Raises
@@ -422,7 +426,7 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
     return balanced(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
 
 
-def _rows(own: OwnSubdomains) -> _Rows:
+def _rows(own: LocalSubdomains) -> _Rows:
     """Fill the rows of B, in the order of supports, gluing and contact."""
     problem, ranks = own.problem, own.ranks
     parts = [_glued(own), _contact(own)]
@@ -453,7 +457,7 @@ def _rows(own: OwnSubdomains) -> _Rows:
     return _Rows(number, B, reach, c, E, E + scale.size)
 
 
-def _supports(own: OwnSubdomains) -> Entries:
+def _supports(own: LocalSubdomains) -> Entries:
     """One row for each copy of a component that is held, the last copy first."""
     problem, d = own.problem, own.problem.components
     node, k = np.divmod(problem.held, d)
@@ -476,7 +480,7 @@ class _Copies(NamedTuple):
     torn: NDArray[np.int64]  #: (l,) which of the own torn nodes they are
 
 
-def _own_copies(own: OwnSubdomains, node: Nodes) -> _Copies:
+def _own_copies(own: LocalSubdomains, node: Nodes) -> _Copies:
     """Find the copies of some nodes (k,), and which of them this rank holds."""
     of = own.problem.layout
     times = of.times(node)
@@ -489,7 +493,7 @@ def _own_copies(own: OwnSubdomains, node: Nodes) -> _Copies:
     return _Copies(place, copy, rank, mine, torn)
 
 
-def _glued(own: OwnSubdomains) -> Entries:
+def _glued(own: LocalSubdomains) -> Entries:
     """Rows of nodes with few copies first, and among these node by node."""
     problem, nodes, of = own.problem, own.nodes, own.problem.layout
     d = problem.components
@@ -527,7 +531,7 @@ def _glued(own: OwnSubdomains) -> Entries:
     return Entries(*(np.concatenate(p) for p in zip(*found, strict=True)))
 
 
-def _contact(own: OwnSubdomains) -> Entries:
+def _contact(own: LocalSubdomains) -> Entries:
     """Rows of contact and friction, which act on the average of copies."""
     problem, d = own.problem, own.problem.components
     entries = problem.contact.rows.tocoo()
@@ -542,7 +546,7 @@ def _contact(own: OwnSubdomains) -> Entries:
 
 
 def _turned(
-    own: OwnSubdomains,
+    own: LocalSubdomains,
     row: NDArray[np.int64],
     node: NDArray[np.int64],
     k: NDArray[np.int64],
@@ -559,7 +563,7 @@ def _turned(
     return rows[kept], column[kept], (turn * value[:, None])[kept]
 
 
-def _equalities(problem: ProblemInParts) -> int:
+def _equalities(problem: DecomposedProblem) -> int:
     """Count the rows of supports and gluing."""
     of, d = problem.layout, problem.components
     times = of.times(problem.held // d)
@@ -570,7 +574,7 @@ def _equalities(problem: ProblemInParts) -> int:
     return glued if problem.eliminated else int(times.sum()) + glued
 
 
-def on_one_process(problem: ProblemInParts) -> OwnSubdomains:
+def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
     """Hold all subdomains on a single process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
-    return OwnSubdomains(problem, alone(), every)
+    return LocalSubdomains(problem, alone(), every)

@@ -1,4 +1,4 @@
-"""Torn bodies as certificates see them: local stiffness, its kernel and its inverse."""
+"""Local problems of subdomains for certificates: stiffness, kernel and inverse."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.harness.verify.products import projected_products
-from mortarbench.problems.feti.torn import Kind, Torn
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +22,7 @@ class LocalProblems:
     Factors are made when they are needed.
     """
 
-    torn: Torn
+    torn: DecomposedBodies
     components: int = 2  #: of a node; torn unknowns are numbered node by node
 
     @property
@@ -93,12 +93,12 @@ class LocalProblems:
             found[place] = image
         return found
 
-    def _kinds(self) -> zip[tuple[Kind, NDArray[np.int64]]]:
+    def _kinds(self) -> zip[tuple[SubdomainClass, NDArray[np.int64]]]:
         """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
         return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
 
 
-def _nodal(kind: Kind, d: int) -> NDArray[np.float64]:
+def _nodal(kind: SubdomainClass, d: int) -> NDArray[np.float64]:
     """Return the blocks of K of each node, (n_k/d, d, d)."""
     blocks = np.empty((kind.K.shape[0] // d, d, d))
     for i, j in np.ndindex(d, d):

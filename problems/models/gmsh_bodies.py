@@ -24,9 +24,9 @@ from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
-    by_keys,
-    remembered,
-    stated,
+    cached_problem,
+    elastic_bodies_of,
+    keyed_linearisation,
 )
 from mortarbench.problems.models.description import (
     described_bodies,
@@ -58,17 +58,17 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     return found
 
 
-@remembered
+@cached_problem
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     of, laws = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]), laws_of(p)
     is_single = p["steps"] == p["relin"] == 1 or not of.is_held
     if not of.is_held:
-        rows = by_keys(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
+        rows = keyed_linearisation(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
         with located(p["path"]):  # friction may hold either way
             check_balance(of.whole, vstack([rows.B, rows.T, -rows.T]))
     return ContactProblem(
-        bodies=of, linearise=by_keys(p),
+        bodies=of, linearise=keyed_linearisation(p),
         stages=load_steps(
             p["steps"], p["relin"], of.forces, of.fixed, laws,
             quasi_static=p["loading"] == "quasi-static",
@@ -104,7 +104,7 @@ def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
     """State the bodies of a description; the digest tells contents apart."""
     del sha256
-    return stated(described_bodies(Path(path), plane, halvings))
+    return elastic_bodies_of(described_bodies(Path(path), plane, halvings))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:

@@ -15,9 +15,9 @@ from scipy.sparse import bsr_array, csr_array, diags_array, eye_array, vstack
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
 from mortarbench.problems.feti.subdomains import GLUE, Weights
 from mortarbench.problems.feti.tearing import Part, blocks, classify
-from mortarbench.problems.feti.torn import Kind, Torn
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -105,7 +105,7 @@ def decompose(
 
 def glue(
     decomposition: Decomposition,
-    kinds: tuple[Kind, ...],
+    kinds: tuple[SubdomainClass, ...],
     *,
     load: Vector,
     supports: csr_array,
@@ -115,7 +115,7 @@ def glue(
     E: Vector,
     shape: Vector | float = 1.0,
     rows: str = "orthonormal",
-) -> Torn:
+) -> DecomposedBodies:
     """Pose a contact problem of the whole on the subdomains.
 
     Parameters
@@ -152,7 +152,7 @@ def glue(
     scale = np.sqrt(np.append((E_of * shape)[of_row], softest / norm**2))
     values = np.zeros(of_row.size)
     values[: reached.nnz] = np.repeat(supported, np.diff(reached.indptr))
-    return Torn(
+    return DecomposedBodies(
         kinds=kinds, kind=decomposition.kind, spread=T,
         B=csr_array(diags_array(scale) @ vstack([B_E @ turn, B_I])),
         c=scale * np.append(values, c), scale=scale[of_row.size :],

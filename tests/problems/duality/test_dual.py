@@ -11,7 +11,7 @@ from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import path_of
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,

@@ -18,7 +18,7 @@ from mortarbench.problems.contact.node_to_segment import (
     rows_along,
 )
 from mortarbench.problems.contact.surface import tangents
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import path_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
 from mortarbench.problems.models.patch import model

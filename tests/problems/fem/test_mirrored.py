@@ -11,7 +11,7 @@ from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped, 
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.undivided import path_of as whole_path
+from mortarbench.problems.duality.monolithic import path_of as monolithic_path
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -56,7 +56,7 @@ def sign(bodies):
 
 @cache
 def path_of(bodies, contact, basis, relin=1):
-    return whole_path(
+    return monolithic_path(
         bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
         reference_solution, STEPS, relin,
     )  # fmt: skip

@@ -14,28 +14,28 @@ from mortarbench.harness.distributed.factor import touched_rows
 from mortarbench.problems.feti import distributed as over_ranks
 from mortarbench.problems.feti.distributed import (
     AFTER_FACTOR,
-    Forming,
+    Assignment,
     Halo,
+    assign_factorisations,
     balanced,
-    forming,
+    blocks_before_exchange,
     halo,
-    meanwhile,
     owners,
     partition,
     shared,
 )
+from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator
-from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.membranes import Membranes
+from tests.support.decomposed_bodies import torn_pair
 from tests.support.threads import on_threads, without_lock
-from tests.support.torn_bodies import torn_pair
 
 
 def loads(work):
-    """Say what each rank does, if all do what `forming` says."""
+    """Say what each rank does, if all do what `assign_factorisations` says."""
     done = np.zeros(len(work))
-    for name, task in forming(work).items():
+    for name, task in assign_factorisations(work).items():
         size = work[task.factor][name]
         done[task.factor] += (1 - AFTER_FACTOR) * size
         done[task.blocks] += AFTER_FACTOR * size
@@ -46,44 +46,44 @@ def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
     kinds = dict.fromkeys("abcdefghi", 4)
 
     assert loads([kinds, kinds]).tolist() == [18, 18]
-    factors = [task.factor for task in forming([kinds, kinds]).values()]
+    factors = [task.factor for task in assign_factorisations([kinds, kinds]).values()]
     assert sorted(np.bincount(factors)) == [4, 5]
 
 
 def test_blocks_fill_the_time_until_factors_are_given_away():
-    tasks = forming([dict.fromkeys("abcdefghi", 4)] * 2)
+    tasks = assign_factorisations([dict.fromkeys("abcdefghi", 4)] * 2)
     factors = np.bincount([task.factor for task in tasks.values()])
     more, less = factors.argmax(), factors.argmin()
 
-    assert meanwhile(tasks, more) == 0
-    assert meanwhile(tasks, less) == 3  # blocks take a third of a factor
+    assert blocks_before_exchange(tasks, more) == 0
+    assert blocks_before_exchange(tasks, less) == 3  # blocks take a third of a factor
 
 
 def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
     tasks = {
-        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "b": Forming(4, [1], factor=1, blocks=1),
-        "c": Forming(4, [1], factor=1, blocks=1),
-        "d": Forming(40, [0], factor=0, blocks=0),  # which nobody waits for
+        "a": Assignment(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
+        "b": Assignment(4, [1], factor=1, blocks=1),
+        "c": Assignment(4, [1], factor=1, blocks=1),
+        "d": Assignment(40, [0], factor=0, blocks=0),  # which nobody waits for
     }
 
-    assert meanwhile(tasks, 1) == 1
-    assert meanwhile(tasks, 0) == 0
+    assert blocks_before_exchange(tasks, 1) == 1
+    assert blocks_before_exchange(tasks, 0) == 0
 
 
 def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
     tasks = {
-        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "e": Forming(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
-        **{name: Forming(4, [1], factor=1, blocks=1) for name in "bcd"},
+        "a": Assignment(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
+        "e": Assignment(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
+        **{name: Assignment(4, [1], factor=1, blocks=1) for name in "bcd"},
     }
-    assert meanwhile(tasks, 1) == 3
+    assert blocks_before_exchange(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
-    assert meanwhile(less, 1) == 1
-    alone = {"a": less["a"], "b": Forming(11, [1], factor=1, blocks=1)}
-    assert meanwhile(alone, 1) == 1  # more than half of it fits in
+    assert blocks_before_exchange(less, 1) == 1
+    alone = {"a": less["a"], "b": Assignment(11, [1], factor=1, blocks=1)}
+    assert blocks_before_exchange(alone, 1) == 1  # more than half of it fits in
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
-    assert meanwhile(smaller, 1) == 2
+    assert blocks_before_exchange(smaller, 1) == 2
 
 
 def test_the_largest_kinds_are_shared_out_first():
@@ -92,12 +92,12 @@ def test_the_largest_kinds_are_shared_out_first():
 
 
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
-    tasks = forming([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
+    tasks = assign_factorisations([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
 
     assert tasks["a"] == (8, [0], 0, 0)
     assert tasks["b"] == (8, [0, 1], 1, 1)
     assert tasks["c"] == (40, [2], 2, 2)
-    assert [meanwhile(tasks, rank) for rank in range(3)] == [1, 1, 1]
+    assert [blocks_before_exchange(tasks, rank) for rank in range(3)] == [1, 1, 1]
 
 
 def test_one_rank_does_all():
@@ -113,7 +113,7 @@ def test_nobody_gets_more_to_do_than_who_gives_it_away():
             {str(k): int(size[k]) for k in names[: rng.integers(1, 13)]}
             for _ in range(rng.integers(1, 5))
         ]
-        tasks = forming(work)
+        tasks = assign_factorisations(work)
         whole = np.zeros(len(work))
         for name, task in tasks.items():
             assert {task.factor, task.blocks} <= set(task.have)
@@ -145,7 +145,7 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
 @pytest.fixture(
     scope="module",
     params=[
-        lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).torn_bodies,
+        lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).decomposed,
         lambda: torn_pair("chain", most=4)[2],
         lambda: torn_pair("orthonormal", most=4)[2],
     ],

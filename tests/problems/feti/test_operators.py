@@ -13,14 +13,17 @@ from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import Preconditioned
 from mortarbench.problems import OPERATORS
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.feti.operator_arrays import (
+    dual_operator,
+    dual_operator_from_arrays,
+)
 from mortarbench.problems.feti.operators import inverted_blocks
-from mortarbench.problems.feti.stored import dual_operator, made
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled, torn_by
 
 pytestmark = pytest.mark.together
 
@@ -40,7 +43,7 @@ def beam_and_ring(rows="orthonormal"):
 
 
 def membranes(rows="orthonormal"):
-    return on_one_process(Membranes(2, 4).in_subdomains(rows)).torn_bodies
+    return on_one_process(Membranes(2, 4).in_subdomains(rows)).decomposed
 
 
 @pytest.fixture(
@@ -100,22 +103,26 @@ def test_a_product_with_a_matrix_is_that_with_each_column(pair):
 
 def test_a_block_that_is_not_formed_gives_the_same_product(pair):
     arrays = operator_of(pair).arrays
-    implicit = made({**arrays, "explicit": np.zeros_like(arrays["explicit"])})
+    implicit = dual_operator_from_arrays(
+        {**arrays, "explicit": np.zeros_like(arrays["explicit"])}
+    )
     x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
-    Fx = made(arrays)(x)
+    Fx = dual_operator_from_arrays(arrays)(x)
 
     assert arrays["explicit"].all()
     assert_allclose(implicit(x), Fx, atol=1e-11 * abs(Fx).max())
     assert_allclose(implicit(x[:, 0]), Fx[:, 0], atol=1e-11 * abs(Fx).max())
     for kind in KINDS:
-        Mx = made(arrays).preconditioner(kind, "stiffness")(x)
+        Mx = dual_operator_from_arrays(arrays).preconditioner(kind, "stiffness")(x)
         found = implicit.preconditioner(kind, "stiffness")(x)
         assert_allclose(found, Mx, atol=1e-9 * abs(Mx).max())
 
 
 def test_the_diagonal_is_that_of_the_matrix(pair):
     P = operator_of(pair)
-    implicit = made({**P.arrays, "explicit": np.zeros_like(P.arrays["explicit"])})
+    implicit = dual_operator_from_arrays(
+        {**P.arrays, "explicit": np.zeros_like(P.arrays["explicit"])}
+    )
     diagonal = np.diag(P @ np.eye(P.shape[0]))
 
     assert_allclose(P.diagonal(), diagonal, rtol=1e-10)
@@ -144,7 +151,7 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
 
 def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
     """Each of two membranes in one square, of the same kind or of two."""
-    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).torn_bodies
+    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
     (kind,) = pair.kinds
     other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
     F, apart = operator_of(pair), operator_of(other)
@@ -232,7 +239,7 @@ def test_contact_rows_do_not_weigh_the_equations(kind):
 
 def test_preconditioners_bring_the_spectrum_together():
     """As the field has it: none, lumped, Dirichlet."""
-    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).torn_bodies
+    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
     F = operator_of(pair)
     _, B, R = dense(pair)
     G = R.T @ B.T
@@ -279,7 +286,7 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
 def test_equal_subdomains_share_one_stiffness_in_what_is_written():
     few, many = (
         operator_of(
-            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).torn_bodies
+            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).decomposed
         ).arrays
         for S in (1, 3)
     )

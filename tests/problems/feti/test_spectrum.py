@@ -13,10 +13,11 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Vector, no_rows
 from mortarbench.harness.distributed.vectors import DistributedColumns
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import described
+from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.feti import spectrum as module
 from mortarbench.problems.feti.distributed import shared
-from mortarbench.problems.feti.emission import OwnDual
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
@@ -25,12 +26,11 @@ from mortarbench.problems.feti.spectrum import (
     spectra_over_ranks,
     spectrum,
 )
-from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.membranes import Membranes
+from tests.support.decomposed_bodies import labelled, parts_by, torn_pair
 from tests.support.threads import on_threads, without_lock
-from tests.support.torn_bodies import labelled, parts_by, torn_pair
 
 
 def identity(x: Vector) -> Vector:
@@ -99,7 +99,7 @@ def test_both_errors_are_held_against_their_own_eigenvalue(
     assert Spectrum(1.0, 10.0, *errors, 7).within(0.01) is is_within
 
 
-def projector_of(dual: OwnDual) -> Callable[[Vector], Vector]:
+def projector_of(dual: LocalDual) -> Callable[[Vector], Vector]:
     """Return the projector onto ker G ∩ range B of a dual without contact."""
     qp = dual.share().qp
     return projector(qp.P, qp.A)
@@ -111,7 +111,7 @@ def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
     parts = parts_by(bodies, labelled(bodies, label), primal, rows=rows)
-    dual = OwnDual(on_one_process(parts))
+    dual = LocalDual(on_one_process(parts))
     P, B, G = projector_of(dual), dual.own.rows.B, dual.G
     dense = B.toarray()
     x = np.sin(np.arange(B.shape[0]) ** 2)
@@ -131,8 +131,8 @@ def spectrum_of_beam_ring(layers: int, cells: int) -> Spectrum:
     (stage,) = load_steps(1, 1, bodies.forces, bodies.fixed)
     layout = bodies.shape.layout(cells)
     contact = Contact(no_rows(2 * layout.nodes), np.zeros(0), np.zeros(0))
-    parts = described(bodies, layout, "orthonormal", stage, contact)
-    qp = OwnDual(on_one_process(parts)).share().qp
+    parts = decompose(bodies, layout, "orthonormal", stage, contact)
+    qp = LocalDual(on_one_process(parts)).share().qp
     (result,) = spectra_over_ranks(qp.P, qp.A, tol=1e-3)
     return result
 
@@ -176,7 +176,8 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
     dense = own.rows.B.toarray()
     x = np.random.default_rng(1).standard_normal(len(dense))
     P = projector(
-        OwnDual(own).share().qp.P, DistributedColumns(csr_array((0, len(x))), own.ranks)
+        LocalDual(own).share().qp.P,
+        DistributedColumns(csr_array((0, len(x))), own.ranks),
     )
     assert P(x) == pytest.approx(dense @ np.linalg.lstsq(dense, x, rcond=None)[0])
 
@@ -185,7 +186,7 @@ def test_without_equations_the_projector_is_onto_the_range_of_the_rows():
 def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch):
     """On ker G ∩ range B; without a coarse problem on range B."""
     without_lock(monkeypatch, DualOperator, "_blocks")
-    pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).torn_bodies
+    pieces = on_one_process(Membranes(2, 2).in_subdomains("redundant")).decomposed
     m = pieces.equalities
     B = pieces.B[:m]
     F = dual_operator(B, pieces.domains, m)

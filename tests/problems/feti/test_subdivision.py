@@ -9,8 +9,8 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
 from mortarbench.problems.feti.subdomains import subdomains_of
 from mortarbench.problems.feti.tearing import compact_blocks, labelled
+from tests.support.decomposed_bodies import parts_of
 from tests.support.glued import decompose, structured_bodies
-from tests.support.torn_bodies import parts_of
 
 pytestmark = pytest.mark.together
 
@@ -63,7 +63,7 @@ def known(request):
 
 def test_torn_nodes_are_numbered_as_in_the_torn_mesh(known):
     of, _, _, whole = known
-    nodes = of.torn_nodes(np.arange(of.count))
+    nodes = of.subdomain_nodes(np.arange(of.count))
 
     assert of.nodes == whole.nodes
     assert_array_equal(nodes.number, whole.node)
@@ -80,7 +80,7 @@ def test_nodes_of_subdomains_are_counted_before_they_are_listed(known):
 def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
     of, _, _, whole = known
     some = np.arange(of.count)[1::2]
-    nodes, all_ = of.torn_nodes(some), of.torn_nodes(np.arange(of.count))
+    nodes, all_ = of.subdomain_nodes(some), of.subdomain_nodes(np.arange(of.count))
     kept = np.isin(whole.subdomain, some)
 
     assert_array_equal(some[nodes.subdomain], whole.subdomain[kept])
@@ -90,7 +90,7 @@ def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
 
 def test_copies_of_a_node_are_counted_in_the_order_of_their_subdomains(known):
     of, _, _, whole = known
-    nodes = of.torn_nodes(np.arange(of.count))
+    nodes = of.subdomain_nodes(np.arange(of.count))
     times = np.bincount(whole.node)
     shared = np.flatnonzero(nodes.times > 1)
 

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
 from mortarbench.problems.feti.substructures import LocalProblems
-from tests.support.torn_bodies import torn_pair
+from tests.support.decomposed_bodies import torn_pair
 
 
 @pytest.fixture(scope="module")

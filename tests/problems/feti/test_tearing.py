@@ -9,14 +9,18 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
 from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.divided import elastic_kind, looked_up
+from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import rectangle
 from mortarbench.problems.feti.subdivision import mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    DecomposedProblem,
+    on_one_process,
+)
 from mortarbench.problems.feti.tearing import blocks, compact_blocks, labelled
+from tests.support.decomposed_bodies import torn_pair
 from tests.support.glued import decompose, glue, structured_bodies
-from tests.support.torn_bodies import torn_pair
 
 GLUING = ("orthonormal", "chain", "redundant")
 
@@ -192,7 +196,7 @@ def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> Non
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
     D, E = bodies.elasticity * (bodies.length / bodies.force), bodies.moduli
     expected = glue(
-        parts, tuple(elastic_kind(part, D, E) for part in parts.parts),
+        parts, tuple(elastic_class(part, D, E) for part in parts.parts),
         load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
         contact=csr_array(primal.G), c=primal.h, E=E[bodies.body_of_node], rows=rows,
     )  # fmt: skip
@@ -213,16 +217,16 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     held = 2 * mesh.boundaries["left"]
     load = np.arange(1.0, n + 1)
     layout = mesh_in_parts(mesh, label, np.zeros_like(label), np.arange(n // 2))
-    problem = ProblemInParts(
+    problem = DecomposedProblem(
         layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
-        kind=partial(elastic_kind, D=D, E=E), E=E, names=("plate",),
-        load=looked_up(Forces(np.arange(n), load)), held=held, glue="orthonormal",
+        kind=partial(elastic_class, D=D, E=E), E=E, names=("plate",),
+        load=force_lookup(Forces(np.arange(n), load)), held=held, glue="orthonormal",
         contact=Contact(
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),
     )  # fmt: skip
     pair, found = (
-        on_one_process(one).torn_bodies
+        on_one_process(one).decomposed
         for one in (problem, replace(problem, eliminated=True))
     )
     first, second = (found.kinds[k] for k in found.kind)

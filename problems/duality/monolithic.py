@@ -46,7 +46,7 @@ REFERENCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class WholeProblem:
+class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `Posed`."""
 
     bodies: Bodies  #: with the load and the supports of its stage
@@ -81,7 +81,7 @@ class WholeProblem:
 
 
 @dataclass(frozen=True, eq=False)
-class WholePath(LoadPath[WholeProblem]):
+class MonolithicPath(LoadPath[MonolithicLinearisation]):
     """The load steps of undivided bodies."""
 
     _answers: dict[int, Solution] = field(default_factory=dict, init=False)
@@ -114,7 +114,7 @@ def path_of(
     laws: tuple[FrictionLaw, ...] = (),
     quasi_static: bool = True,
     pressed: float = 0.0,
-) -> WholePath:
+) -> MonolithicPath:
     """Prepare the load steps of assembled bodies, linearised by the laws' own rows.
 
     Parameters
@@ -134,7 +134,7 @@ def path_of(
 
 
 @lru_cache(maxsize=4)
-def whole_path(problem: ContactProblem, reference: Reference) -> WholePath:
+def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Prepare the load steps of a contact problem on undivided bodies.
 
     Where supports hold all bodies, contact rows alone are dualised.
@@ -164,7 +164,7 @@ def _path(
     reference: Reference,
     transform: Transform,
     pressed: float,
-) -> WholePath:
+) -> MonolithicPath:
     inverse = cache(factorise)
     # loads and supports may act in several stages; K⁺f is that of a whole load
     known, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
@@ -178,7 +178,7 @@ def _path(
             known[names] = replace(bodies, f=f, B_D=held)
         return known[names]
 
-    def pose(stage: Stage, at: State) -> WholeProblem:
+    def pose(stage: Stage, at: State) -> MonolithicLinearisation:
         rows = linearise(stage.laws)(at.u * bodies.length)
         own, load = under(stage), id(stage.forces)
         primal = primal_qp(own, rows, stage.part)
@@ -192,11 +192,15 @@ def _path(
                 free[load] = inverse()(own.f)
             return transform(primal, inverse(), free[load] * stage.part, first)
 
-        return WholeProblem(own, primal, first, rows.place, dual, reference, stage.part)
+        return MonolithicLinearisation(
+            own, primal, first, rows.place, dual, reference, stage.part
+        )
 
     places = sum(pair.slave.size for pair in bodies.pairs)
     nothing = np.zeros(bodies.mesh.dofs)
-    return WholePath(stages, pose, State(nothing, nothing, np.full(places, pressed)))
+    return MonolithicPath(
+        stages, pose, State(nothing, nothing, np.full(places, pressed))
+    )
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:

@@ -11,12 +11,12 @@ from mortarbench.problems.contact.bodies import floating
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled, torn_by
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")
@@ -36,7 +36,7 @@ def dual_of(primal, friction, rows):
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 2))
     pair = torn_by(BODIES, labelled(BODIES, label), primal, friction, rows)
-    return pair, torn_dual(pair, primal, friction)
+    return pair, feti_dual(pair, primal, friction)
 
 
 def assembled(qp):

@@ -39,26 +39,26 @@ from mortarbench.problems.feti.distributed import (
     halo,
     owners,
 )
+from mortarbench.problems.feti.local_bodies import Results, answers
 from mortarbench.problems.feti.operators import (
     DualOperator,
     block_bytes,
-    explicit_kinds,
+    explicit_classes,
     touched,
 )
-from mortarbench.problems.feti.own_bodies import Results, answers
+from mortarbench.problems.feti.subdomain_classes import Subdomains
 from mortarbench.problems.feti.subdomains import (
-    OwnSubdomains,
-    ProblemInParts,
+    DecomposedProblem,
+    LocalSubdomains,
     subdomains_of,
 )
-from mortarbench.problems.feti.torn import Subdomains
 
 
 @dataclass(frozen=True, eq=False)
-class OwnDual:
+class LocalDual:
     """The rows of a dual that a rank owns; what is asked for, all ranks ask for."""
 
-    own: OwnSubdomains
+    own: LocalSubdomains
 
     @cached_property
     def at(self) -> Halo:
@@ -70,7 +70,7 @@ class OwnDual:
     @cached_property
     def explicit(self) -> NDArray[np.bool_]:
         """Kinds whose blocks are formed."""
-        return explicit_kinds(self.own.rows.B, self.own.domains)
+        return explicit_classes(self.own.rows.B, self.own.domains)
 
     @cached_property
     def q(self) -> Vector:
@@ -123,14 +123,14 @@ class OwnDual:
         upper[touching] = above[number[touching] - E]
         return distributed(lower, ranks), distributed(upper, ranks)
 
-    def bounded(self, bound: Vector) -> OwnDual:
+    def bounded(self, bound: Vector) -> LocalDual:
         """Return the same with another bound (k,) of friction."""
-        found = OwnDual(self.own.bounded(bound))
+        found = LocalDual(self.own.bounded(bound))
         vars(found).update({**vars(self), "own": found.own})
         return found
 
 
-def dual_on(problem: ProblemInParts, ranks: Ranks) -> OwnDual:
+def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
     """Give subdomains to ranks, for the rows of a dual; called by all of them.
 
     Raises
@@ -139,13 +139,13 @@ def dual_on(problem: ProblemInParts, ranks: Ranks) -> OwnDual:
         Where there are fewer subdomains than ranks, or ranks know different ones.
 
     """
-    return OwnDual(OwnSubdomains(problem, ranks, _agreed(problem, ranks)))
+    return LocalDual(LocalSubdomains(problem, ranks, _agreed(problem, ranks)))
 
 
-def emitted(
-    dual: OwnDual,
+def distributed_qp(
+    dual: LocalDual,
     results: Results | None,
-    first: OwnDual | None = None,
+    first: LocalDual | None = None,
     others: int = 0,
 ) -> Emitted:
     """Describe this rank's share of the dual; called by all ranks.
@@ -178,8 +178,8 @@ def emitted(
     )  # fmt: skip
 
 
-def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
-    """Report how bodies are torn, as `problems.duality.torn_dual.torn_quantities`.
+def _torn(own: LocalSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
+    """Report how bodies are torn, as `decomposition_quantities`.
 
     explicit_mib: what blocks take on all ranks together; one of a kind that several
     ranks have is on each of these.
@@ -197,7 +197,7 @@ def _torn(own: OwnSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _digest(own: OwnSubdomains) -> str:
+def _digest(own: LocalSubdomains) -> str:
     """Name the numbers of the QP, whichever rank has which subdomain.
 
     That of each subdomain: its kind, its load, and its columns of B; and of all of them
@@ -221,7 +221,7 @@ def _digest(own: OwnSubdomains) -> str:
     return hex_digest(content, 64)
 
 
-def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
+def _agreed(problem: DecomposedProblem, ranks: Ranks) -> NDArray[np.int64]:
     """Give subdomains to ranks (S,), if all ranks know the same subdomains.
 
     Partitions of graphs are made on every rank, by whatever library it has.
@@ -242,7 +242,7 @@ def _agreed(problem: ProblemInParts, ranks: Ranks) -> NDArray[np.int64]:
     return found
 
 
-def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
+def _coarse_rows(own: LocalSubdomains, mine: Nodes) -> csr_array:
     """Return the columns of RᵀBᵀ that belong to own rows, (3S, o)."""
     ranks, rows = own.ranks, own.rows
     B, t = rows.B, rows.number.size
@@ -263,7 +263,7 @@ def _coarse_rows(own: OwnSubdomains, mine: Nodes) -> csr_array:
     return csr_array(found.T)
 
 
-def _resultants(own: OwnSubdomains) -> Vector:
+def _resultants(own: LocalSubdomains) -> Vector:
     """Return Rᵀf (3S,) of all subdomains."""
     loaded = np.flatnonzero(own.f)
     mine = own.resultants(loaded, own.f[loaded])

@@ -11,8 +11,8 @@ from mortarbench.harness import QP
 from mortarbench.harness.distributed.vectors import Ranks, Share
 from mortarbench.harness.operators import Arrays, SerialisableOperator
 from mortarbench.problems.feti.distributed import shared
-from mortarbench.problems.feti.operators import DualOperator, explicit_kinds
-from mortarbench.problems.feti.torn import Kind, Subdomains
+from mortarbench.problems.feti.operators import DualOperator, explicit_classes
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
 
 NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
 _PARTS = ("data", "indices", "indptr")
@@ -53,25 +53,27 @@ def dual_operator(
         "fixing": np.concatenate([kind.fixing for kind in kinds]),
         "boundary": np.concatenate([kind.boundary for kind in kinds]),
         "kind": domains.kind,
-        "explicit": explicit_kinds(B, domains),
+        "explicit": explicit_classes(B, domains),
         "equalities": np.array(equalities),
     }
     for name in _OF_KINDS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
-    return SerialisableOperator(B.shape[0], NAME, arrays, {NAME: made})
+    return SerialisableOperator(
+        B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
+    )
 
 
-def made(arrays: Arrays) -> StoredOperator:
+def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
     """Put F together from the arrays of `dual_operator`."""
     ends = [np.append(0, arrays[f"{name}_ends"]) for name in _OF_KINDS]
     data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
 
-    def kind(k: int) -> Kind:
+    def kind(k: int) -> SubdomainClass:
         own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
         columns, n = indptr[own.start : own.stop + 1], own.stop - own.start
         within = slice(columns[0], columns[-1])
         K = (data[within], indices[within] - own.start, columns - columns[0])
-        return Kind(
+        return SubdomainClass(
             K=csc_array(K, shape=(n, n)),
             R=arrays["R"][own, : arrays["modes"][k]],
             fixing=arrays["fixing"][fixing],

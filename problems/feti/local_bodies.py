@@ -26,20 +26,20 @@ from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import Halo
 from mortarbench.problems.feti.subdivision import Points
 from mortarbench.problems.feti.subdomains import (
-    OwnSubdomains,
-    ProblemInParts,
+    DecomposedProblem,
+    LocalSubdomains,
 )
 from mortarbench.problems.feti.substructures import LocalProblems
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class OwnSolution:
+class LocalSolution:
     """What one rank has of a displacement, and the forces along all contacts.
 
     Its methods are called by all ranks, and give them the same.
     """
 
-    subdomains: OwnSubdomains
+    subdomains: LocalSubdomains
     bodies: OwnBodies
     u: Vector  #: (n,) at `bodies.components`, the same of copies on several ranks
     z: Vector  #: (m,) multipliers of all rows of contact and friction, on every rank
@@ -66,28 +66,28 @@ class OwnSolution:
 
 
 #: of what ranks have found → physical results, SI, the same on all ranks
-Results = Callable[[OwnSolution], Mapping[str, Any]]
+Results = Callable[[LocalSolution], Mapping[str, Any]]
 
 
-def own_solution(own: OwnSubdomains, halo: Halo, s: Solution) -> OwnSolution:
+def local_solution(own: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
     """Go back from multipliers to displacements, on each rank for its own.
 
-    It is the way of `problems.duality.torn_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
+    It is the way of `problems.duality.feti_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
     multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
     supports eliminate are zero.
     """
     bodies, times = _bodies(own.floating)
-    T, alpha = bodies.parts.spread, np.asarray(s.y)[own.own_motions]
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[own.local_motions]
     touched = halo.gathered(np.asarray(s.x))
     v = np.zeros(T.shape[0])
     v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
     v[own.kept] -= own.domains.kernel @ alpha
     u = bodies.among.completed(T.T @ v) / times
     z = contact_multipliers(own, halo, s)
-    return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
+    return LocalSolution(subdomains=own, bodies=bodies, u=u, z=z)
 
 
-def contact_multipliers(own: OwnSubdomains, halo: Halo, s: Solution) -> Vector:
+def contact_multipliers(own: LocalSubdomains, halo: Halo, s: Solution) -> Vector:
     """Return multipliers (m,) of rows of contact and friction, on all ranks."""
     rows, scale = own.rows, own.problem.contact_scale
     owned = rows.number[halo.own]
@@ -98,7 +98,7 @@ def contact_multipliers(own: OwnSubdomains, halo: Halo, s: Solution) -> Vector:
 
 
 def answers(
-    own: OwnSubdomains,
+    own: LocalSubdomains,
     halo: Halo,
     torn: Mapping[str, Any],
     reported: Results | None,
@@ -107,14 +107,14 @@ def answers(
 
     Parameters
     ----------
-    torn : how the bodies are torn, as of `problems.duality.torn_dual.torn_quantities`
+    torn : how the bodies are torn, as of `decomposition_quantities`
     reported : reports more of an answer; None where only the whole tells
 
     """
     problem = own.problem
 
     def answer(s: Solution) -> Answered:
-        found, results = own_solution(own, halo, s), None
+        found, results = local_solution(own, halo, s), None
         if reported is not None:
 
             def results() -> Mapping[str, Any]:
@@ -126,22 +126,22 @@ def answers(
 
 
 def certified_by(
-    own: OwnSubdomains, K: csc_array
+    own: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
     """Return a bound of the error of displacements with multipliers, by subdomains.
 
     K : (n, n) of the whole, as it is stored on this one process
     """
-    bodies = cache(lambda: replace(own_bodies(own), stored=csr_array(K)))
+    bodies = cache(lambda: replace(local_bodies(own), stored=csr_array(K)))
     return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
 
 
-def own_bodies(own: OwnSubdomains) -> OwnBodies:
+def local_bodies(own: LocalSubdomains) -> OwnBodies:
     """Gather what certificates need of this rank's subdomains."""
     return _bodies(own.floating)[0]
 
 
-def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
+def _bodies(own: LocalSubdomains) -> tuple[OwnBodies, Vector]:
     """Gather what this rank has, and count the copies (n,) of its components.
 
     own : its subdomains float
@@ -150,11 +150,11 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     contact, kept = problem.contact, _carrying(problem)
     times = np.empty(components.size)
     times[place] = own.times
-    parts = LocalProblems(own.torn_bodies, problem.components)
+    parts = LocalProblems(own.decomposed, problem.components)
     return OwnBodies(
         ranks=own.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=times.size) < times,
-        coarse=own.own_motions,
+        coarse=own.local_motions,
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(
@@ -165,13 +165,13 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     ), times  # fmt: skip
 
 
-def _carrying(problem: ProblemInParts) -> Nodes:
+def _carrying(problem: DecomposedProblem) -> Nodes:
     """List the rows of contact, and those of friction with a bound above zero."""
     m, bound = problem.contact.rows.shape[0], problem.contact.bound
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
-def unheld_bodies(problem: ProblemInParts) -> list[int]:
+def unheld_bodies(problem: DecomposedProblem) -> list[int]:
     """List the bodies that supports leave some rigid motion."""
     of, d = problem.layout, problem.components
     node, axis = np.divmod(problem.held, d)
@@ -220,7 +220,7 @@ class _Extent(NamedTuple):
         return found / self.size
 
 
-def _unheld(own: OwnSubdomains) -> Unheld:
+def _unheld(own: LocalSubdomains) -> Unheld:
     """Gather the rigid motions of the bodies that supports leave any."""
     #: of each own node, in turn, a copy among the own torn nodes
     copy = np.unique(own.nodes.number, return_index=True)[1]
@@ -253,7 +253,7 @@ def _unheld(own: OwnSubdomains) -> Unheld:
     )
 
 
-def _extent(own: OwnSubdomains, points: Points, share: Vector) -> _Extent:
+def _extent(own: LocalSubdomains, points: Points, share: Vector) -> _Extent:
     """Measure a body whose nodes all ranks have; called by all of them.
 
     Parameters

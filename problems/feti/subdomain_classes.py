@@ -33,7 +33,7 @@ _STRIP = 256  #: right-hand sides that are solved for at once
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Kind:
+class SubdomainClass:
     """A subdomain, up to its place: what all subdomains of one kind share.
 
     K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
@@ -61,7 +61,7 @@ class Kind:
             32,
         )
 
-    def without_factor(self, name: str = "") -> Kind:
+    def without_factor(self, name: str = "") -> SubdomainClass:
         """Return the same to be factorised anew, under its name or another one."""
         found = replace(self)
         vars(found)["name"] = name or self.name
@@ -172,7 +172,7 @@ class Elimination(NamedTuple):
 class Subdomains:
     """S subdomains, each of one of few kinds, that nothing holds together yet."""
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[SubdomainClass, ...]
     kind: NDArray[np.int64]  #: (S,) of each subdomain
 
     @cached_property
@@ -207,7 +207,7 @@ class Subdomains:
 
     def without(self, free: NDArray[np.bool_]) -> Subdomains:
         """Return the subdomains without all but their free torn unknowns (N,)."""
-        kinds, kind = list[Kind](), np.empty_like(self.kind)
+        kinds, kind = list[SubdomainClass](), np.empty_like(self.kind)
         known = dict[tuple[int, bytes], int]()
         for s, k in enumerate(self.kind):
             mine = free[self.start[s] : self.start[s + 1]]
@@ -227,7 +227,7 @@ class Subdomains:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Torn:
+class DecomposedBodies:
     """A contact problem on torn bodies, without dimensions.
 
     ::
@@ -239,7 +239,7 @@ class Torn:
     they were is scale·λ.
     """
 
-    kinds: tuple[Kind, ...]
+    kinds: tuple[SubdomainClass, ...]
     kind: NDArray[np.int64]  #: (S,) of each subdomain
     spread: csr_array  #: T (N, n)
     B: csr_array  #: (m, N), scaled
@@ -263,14 +263,14 @@ def _symmetric(M: Dense) -> Dense:
     return np.asarray((M + M.T) / 2)
 
 
-def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:
+def _held(kind: SubdomainClass, free: NDArray[np.bool_]) -> SubdomainClass:
     """Return a subdomain without all but its free components (n_k,)."""
     if free.all():
         return kind
     R = kind.R @ null_space(kind.R[~free])
     R = np.linalg.qr(R[free])[0]
     number = np.cumsum(free) - 1
-    return Kind(
+    return SubdomainClass(
         K=csc_array(kind.K[free][:, free]), R=R,
         fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
         boundary=number[kind.boundary[free[kind.boundary]]],
