@@ -36,7 +36,7 @@ from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.feti_dual import feti_dual
 from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import certified_by
+from mortarbench.problems.feti.local_bodies import certifier
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.spectrum import spectra_over_ranks
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
@@ -70,7 +70,7 @@ def one(way, Nr, cells):
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
         own = on_one_process(parts)
-        pieces, in_parts = own.decomposed, certified_by(own, primal.P)
+        pieces, in_parts = own.decomposed, certifier(own, primal.P)
         dual = feti_dual(pieces, primal)
     else:
         dual = dualise(primal, floating(bodies))

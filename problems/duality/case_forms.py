@@ -25,8 +25,8 @@ from mortarbench.harness import (
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
-from mortarbench.problems.duality.decomposed import decompose, layout_of
-from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
+from mortarbench.problems.duality.decomposed import cached_layout, decompose
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
     feti_dual,
@@ -41,7 +41,7 @@ from mortarbench.problems.duality.problem import (
 )
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.local_bodies import certified_by
+from mortarbench.problems.feti.local_bodies import certifier
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
@@ -65,7 +65,7 @@ def case_of(
     if choice.size:
         contact = Contact(*contact_rows(primal, friction), friction.bound)
         stage = problem.stages[path.last_of(choice.step)]
-        layout = layout_of(of, choice.size)
+        layout = cached_layout(of, choice.size)
         parts = decompose(of, layout, choice.glue, stage, contact)
     bodies = of.assembled
 
@@ -80,10 +80,10 @@ def case_of(
         floating=lambda: of.floating, clamped=lambda: of.clamped,
         supported=lambda: of.supported, quantities=results, friction=friction,
     )  # fmt: skip
-    return case if problem.exact is None else beside(case, problem.exact)
+    return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
 
-def beside(case: Case, exact: NDArray[np.float64]) -> Case:
+def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
     """Draw the exact tractions beside the contact, see `ContactProblem.exact`."""
     solved = case.fields
     assert solved is not None
@@ -153,14 +153,14 @@ def contact_case(
     if parts is not None:
         start = perf_counter()
         own = on_one_process(parts)
-        pieces, in_parts = own.decomposed, certified_by(own, primal.P)
+        pieces, in_parts = own.decomposed, certifier(own, primal.P)
         new = feti_dual(pieces, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
         matrices = feti_matrices(pieces, new.qp)
         decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "primal":
-        new = posed(primal, friction)
+        new = primal_form(primal, friction)
     else:
         inverse = floating() if form == "dual" else clamped()
         start = perf_counter()

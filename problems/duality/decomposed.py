@@ -64,7 +64,7 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import Subdivision
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem
-from mortarbench.problems.feti.tearing import Part
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +96,13 @@ class DecomposedLinearisation:
     def normal(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
         dual = self.dual
-        z = contact_multipliers(dual.own, dual.at, s)
+        z = contact_multipliers(dual.subdomains, dual.halo, s)
         return z[: self.sides.place.size]
 
     def left(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) at the sides, without dimension, and the normal forces."""
         dual, sides = self.dual, self.sides
-        found = local_solution(dual.own, dual.at, s)
+        found = local_solution(dual.subdomains, dual.halo, s)
         vars(self).pop("_qp", None)  # explicit blocks are large, and done with
         forces = forces_at_nodes(self.normal(s), sides.place, sides.places)
         return found.at(sides.component), forces
@@ -115,14 +115,14 @@ def decomposed_path(
 
     reference : solves shares of a dual, on all ranks together
     """
-    layout, of = layout_of(problem.bodies, choice.size), problem.bodies
+    layout, of = cached_layout(problem.bodies, choice.size), problem.bodies
     known = list[LocalDual]()
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
         sides = linearised(problem, layout, stage, at)
         parts = decompose(of, layout, choice.glue, stage, sides.contact)
         if known:  # the bodies are the same, and so are what was made of them alone
-            known[0] = LocalDual(known[0].own.posed(parts))
+            known[0] = LocalDual(known[0].subdomains.with_problem(parts))
         else:
             known.append(dual_on(parts, ranks))
         return DecomposedLinearisation(stage, known[0], sides, reference)
@@ -134,7 +134,7 @@ def decomposed_path(
 
 
 @lru_cache(maxsize=4)
-def layout_of(bodies: ElasticBodies, size: int) -> Subdivision:
+def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
     """Cut bodies; see `Shape.layout`."""
     return bodies.shape.layout(size)
 
@@ -164,7 +164,7 @@ def distributed_qp_of(
             problem, DistributedSolution(found, sides, problem.bodies, count)
         )
 
-    dual = posed.dual.bounded(chosen.friction.bound)
+    dual = posed.dual.with_bound(chosen.friction.bound)
     first = before[0].posed.dual if before else None
     return distributed_qp(dual, reported, first, len(before))
 
@@ -181,7 +181,7 @@ def decompose(
     force = stage.forces._replace(value=stage.forces.value * stage.part)
     return DecomposedProblem(
         layout=layout, components=bodies.shape.dim, material=layout.body,
-        kind=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
+        assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         held=stage.fixed, load=force_lookup(force), glue=glue, contact=contact,
     )  # fmt: skip
@@ -326,7 +326,9 @@ def longitudinal_share(D: NDArray[np.float64]) -> Vector:
     return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
-def elastic_class(part: Part, D: NDArray[np.float64], E: Vector) -> SubdomainClass:
+def elastic_class(
+    part: SubdomainMesh, D: NDArray[np.float64], E: Vector
+) -> SubdomainClass:
     """Assemble one floating subdomain.
 
     Parameters
@@ -346,8 +348,10 @@ def elastic_class(part: Part, D: NDArray[np.float64], E: Vector) -> SubdomainCla
     )
 
 
-BATCH = 2**15  #: nodes of subdomains that are evaluated at once
-REACH = 3  #: cells from a node to the last that its recovered stress may depend on
+BATCH_NODES = 2**15  #: nodes of subdomains that are evaluated at once
+STRESS_LAYERS = (
+    3  #: cells from a node to the last that its recovered stress may depend on
+)
 
 
 def local_meshes(
@@ -386,12 +390,12 @@ def local_meshes(
 
 
 def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
-    """Put subdomains of one body together, up to `BATCH` nodes or one subdomain."""
+    """Group subdomains of one body, up to `BATCH_NODES` nodes or one subdomain."""
     sizes = np.diff(layout.subdomain_nodes(subdomains).start)
     first, held = [0], 0
     for s, size in enumerate(sizes):
         other = layout.body[subdomains[s]] != layout.body[subdomains[first[-1]]]
-        if s > first[-1] and (other or held + size > BATCH):
+        if s > first[-1] and (other or held + size > BATCH_NODES):
             first.append(s)
             held = 0
         held += int(size)
@@ -439,10 +443,10 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
     """List the subdomains that have any of some nodes besides others."""
-    times = layout.times(node)
-    several = times > 1
-    copies = range(int(times.max(initial=1)))
-    held = [layout.holder(node[several & (times > c)], c) for c in copies]
+    multiplicity = layout.multiplicity(node)
+    several = multiplicity > 1
+    copies = range(int(multiplicity.max(initial=1)))
+    held = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
     return np.unique(np.concatenate(held))
 
 
@@ -455,7 +459,7 @@ def _largest_von_mises(
     """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
     D = elasticity_matrices(materials, plane)
     largest = np.zeros(len(materials))
-    for b, mesh, inner, u in local_meshes(found, length, REACH):
+    for b, mesh, inner, u in local_meshes(found, length, STRESS_LAYERS):
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
         most = von_mises(stress, materials[b].nu, plane).max()
         largest[b] = max(largest[b], most)

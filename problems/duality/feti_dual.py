@@ -21,7 +21,7 @@ from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.duality.dualisation import Transformed
 from mortarbench.problems.feti.operator_arrays import dual_operator
-from mortarbench.problems.feti.operators import block_bytes, touched
+from mortarbench.problems.feti.operators import block_bytes, touched_components
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 
 
@@ -83,13 +83,13 @@ def decomposition_quantities(torn: DecomposedBodies, dual: QP) -> dict[str, Any]
     formed, the others solve in every product. explicit_mib: what they take, MiB.
     """
     explicit = dual.P.arrays["explicit"]
-    sizes = np.array([part.size for part in touched(torn.B, torn.domains)])
+    sizes = np.array([part.size for part in touched_components(torn.B, torn.domains)])
     taken = block_bytes(sizes, torn.domains)
     return {
-        "subdomains": torn.kind.size,
-        "kinds": len(torn.kinds),
+        "subdomains": torn.class_of.size,
+        "kinds": len(torn.classes),
         "torn_dofs": torn.f.size,
         "multipliers": torn.c.size,
-        "explicit_subdomains": int(explicit[torn.kind].sum()),
+        "explicit_subdomains": int(explicit[torn.class_of].sum()),
         "explicit_mib": float(taken[explicit].sum() / 2**20),
     }

@@ -31,9 +31,9 @@ from mortarbench.problems.contact.stepping import (
 )
 from mortarbench.problems.duality.dualisation import (
     Transformed,
-    bounded,
     dual_bounds,
     dualise,
+    with_friction_bound,
 )
 from mortarbench.problems.duality.problem import ContactProblem, Linearise
 from mortarbench.problems.fem.inverse import GeneralisedInverse
@@ -42,7 +42,7 @@ from mortarbench.problems.fem.mesh import Nodes
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
 #: residual that a reference solve may leave: the next step is linearised there
-REFERENCE = 1e-6
+MAX_REFERENCE_RESIDUAL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +59,12 @@ class MonolithicLinearisation:
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the bound of a friction."""
-        qp = bounded(self.dual().qp, friction)
+        qp = with_friction_bound(self.dual().qp, friction)
         s = self.reference(qp)
-        if not (worst := kkt_residuals(qp, s).worst) <= REFERENCE:
+        if not (worst := kkt_residuals(qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
             raise ArithmeticError(
                 f"the reference solve at load factor {self.part:g} left a residual "
-                f"of {worst:.1e}, more than {REFERENCE:g}"
+                f"of {worst:.1e}, more than {MAX_REFERENCE_RESIDUAL:g}"
             )
         return s
 
@@ -77,7 +77,7 @@ class MonolithicLinearisation:
         """Return u (n,), right on the contact sides, and the normal forces."""
         places = sum(pair.slave.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal(s), self.place, places)
-        return self.dual().touched(s), forces
+        return self.dual().interface_displacement(s), forces
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class MonolithicPath(LoadPath[MonolithicLinearisation]):
         return self.answer(k).x if k else self.rest.u
 
 
-def path_of(
+def load_path(
     bodies: Bodies,
     linearise: Linearise,
     factorise: Callable[[], GeneralisedInverse],
@@ -148,11 +148,11 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
             return of.floating
         return floating(replace(bodies, B_D=supports(bodies.mesh, held)))
 
-    is_held = of.is_held and all(stage.fixed is of.fixed for stage in stages)
+    is_supported = of.is_supported and all(stage.fixed is of.fixed for stage in stages)
     return _path(
         bodies, stages, lambda laws: problem.linearise(bodies, laws),
-        (lambda: of.clamped) if is_held else factor, reference,
-        dual_bounds if is_held else dualise, problem.pressed,
+        (lambda: of.clamped) if is_supported else factor, reference,
+        dual_bounds if is_supported else dualise, problem.pressed,
     )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import (
     Subdivision,
     half_discs_in_blocks,
-    mesh_in_parts,
+    mesh_in_subdomains,
 )
 from mortarbench.problems.feti.tearing import compact_blocks
 
@@ -146,7 +146,7 @@ class Meshed:
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies by graph partitioning."""
         label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
-        return mesh_in_parts(self.mesh, label, self.body, self.named)
+        return mesh_in_subdomains(self.mesh, label, self.body, self.named)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -182,7 +182,7 @@ class ElasticBodies:
         )  # fmt: skip
 
     @cached_property
-    def is_held(self) -> bool:
+    def is_supported(self) -> bool:
         """True where supports leave no rigid motion of any body."""
         rigid = self.whole.rigid
         return bool(np.linalg.matrix_rank(rigid[self.fixed]) == rigid.shape[1])

@@ -38,19 +38,19 @@ from mortarbench.harness.distributed.vectors import (
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.operators import (
-    ROUNDING,
-    SHIFT,
+    CONTACT_SHIFT,
+    COUPLING_ROUNDING,
     DualOperator,
     Group,
+    decouple_contact,
     gram_inverse,
     scaled_columns,
-    touched,
-    uncoupled,
+    touched_components,
 )
 from mortarbench.problems.feti.subdomain_classes import Condensed, Dense, Subdomains
 
 #: of what a kind of subdomains takes, what comes after the factor of its stiffness
-AFTER_FACTOR = 0.25
+BLOCK_SHARE = 0.25
 
 
 class Parts(NamedTuple):
@@ -70,22 +70,22 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
         Where there are fewer subdomains than ranks.
 
     """
-    S = domains.kind.size
+    S = domains.class_of.size
     rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
     sub = np.searchsorted(domains.start, B.indices, side="right") - 1
     ones = np.ones(rows.size, dtype=np.int32)
     touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
     touches.data[:] = 1
     work, size = _work(B, domains), np.diff(domains.start)
-    rank = balanced(csr_array(touches.T @ touches), work, size, ranks)
+    rank = balanced_partition(csr_array(touches.T @ touches), work, size, ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
     reach.data[:] = 1
-    return Parts(rank, reach, owners(np.arange(B.shape[0]), reach))
+    return Parts(rank, reach, assign_owners(np.arange(B.shape[0]), reach))
 
 
-def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
+def assign_owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
     """Choose one of the ranks that touch each of some rows (t,), in turn.
 
     rows : their numbers
@@ -97,16 +97,16 @@ def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
     """Count what a product does in each subdomain: its dense block."""
-    sizes = np.array([part.size for part in touched(B, domains)])
-    return (sizes**2)[domains.kind]
+    sizes = np.array([part.size for part in touched_components(B, domains)])
+    return (sizes**2)[domains.class_of]
 
 
-EVEN = 1.1  #: largest/mean of what ranks do, or hold, that is good enough
-SEEDS = 12  #: of METIS, that are tried
-SHARES = (0.25, 0.5, 1.0)  #: of size in the weight, beside work
+MAX_IMBALANCE = 1.1  #: largest/mean of what ranks do, or hold, that is good enough
+METIS_SEEDS = 12  #: of METIS, that are tried
+SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: of size in the weight, beside work
 
 
-def balanced(
+def balanced_partition(
     graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
     """Partition the graph of subdomains that share rows, by work and size (S,).
@@ -134,12 +134,12 @@ def balanced(
 
     rank = _partitioned(graph, work // max(int(work.min()), 1), ranks)
     best = uneven(size, rank)
-    for seed, share in product(range(SEEDS), SHARES):
-        if best <= EVEN:
+    for seed, share in product(range(METIS_SEEDS), SIZE_WEIGHTS):
+        if best <= MAX_IMBALANCE:
             break
         weight = work / work.mean() + share * size / size.mean()
         other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
-        if uneven(work, other) <= EVEN and uneven(size, other) < best:
+        if uneven(work, other) <= MAX_IMBALANCE and uneven(size, other) < best:
             rank, best = other, uneven(size, other)
     return rank
 
@@ -172,54 +172,58 @@ class Halo:
 
     ranks: Ranks
     rows: Nodes  #: (t,) all that its subdomains touch or that it owns, ascending
-    own: Nodes  #: (o,) places of the owned ones in `rows`
+    owned: Nodes  #: (o,) places of the owned ones in `rows`
     #: (l,) places in the owned ones of what others need, neighbour by neighbour
-    lent: Nodes
+    exported: Nodes
     #: (t − o,) places in `rows` of what others own, neighbour by neighbour
-    borrowed: Nodes
-    lends: NDArray[np.int64]  #: (ranks,) how many go to each, l in all
-    borrows: NDArray[np.int64]  #: (ranks,) how many come from each
+    ghosts: Nodes
+    export_counts: NDArray[np.int64]  #: (ranks,) how many go to each, l in all
+    ghost_counts: NDArray[np.int64]  #: (ranks,) how many come from each
 
     @property
     def is_shared(self) -> NDArray[np.bool_]:
         """Which of its rows other ranks touch, too."""
         shared = np.zeros(self.rows.size, dtype=bool)
-        shared[self.borrowed] = shared[self.own[self.lent]] = True
+        shared[self.ghosts] = shared[self.owned[self.exported]] = True
         return shared
 
-    def borrowing(self, x: Vector) -> Callable[[], Vector]:
+    def start_gather(self, x: Vector) -> Callable[[], Vector]:
         """Send of the owned rows (o,) what others need; returns theirs (t − o,)."""
         with self.ranks.clocked("exchange"):
-            return self.ranks.exchange(x[self.lent], self.lends, self.borrows)
+            return self.ranks.exchange(
+                x[self.exported], self.export_counts, self.ghost_counts
+            )
 
-    def returning(self, y: Vector) -> Callable[[Vector], Vector]:
+    def start_accumulate(self, y: Vector) -> Callable[[Vector], Vector]:
         """Send what this rank has for rows of others (t − o,).
 
         Returns what adds that of the others to what it has for its own rows (o,).
         """
         with self.ranks.clocked("exchange"):
-            arrived = self.ranks.exchange(y, self.borrows, self.lends)
+            arrived = self.ranks.exchange(y, self.ghost_counts, self.export_counts)
 
         def added(own: Vector) -> Vector:
             with self.ranks.clocked("exchange"):
-                np.add.at(own, self.lent, arrived())
+                np.add.at(own, self.exported, arrived())
             return own
 
         return added
 
     def gathered(self, x: Vector) -> Vector:
         """Complete the owned rows (o,) to all that are touched (t,)."""
-        arrived, found = self.borrowing(x), np.empty(self.rows.size)
-        found[self.own] = x
-        found[self.borrowed] = arrived()
+        arrived, found = self.start_gather(x), np.empty(self.rows.size)
+        found[self.owned] = x
+        found[self.ghosts] = arrived()
         return found
 
     def added(self, y: Vector) -> Vector:
         """Add up what all ranks have for the rows that this one owns (o,)."""
-        return self.returning(y[self.borrowed])(y[self.own])
+        return self.start_accumulate(y[self.ghosts])(y[self.owned])
 
 
-def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) -> Halo:
+def build_halo(
+    ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]
+) -> Halo:
     """Find what this rank exchanges with the others.
 
     Parameters
@@ -231,16 +235,17 @@ def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) 
     """
     me, touched_by = ranks.rank, reach.tocsc()
     own = np.flatnonzero(owner == me)
-    lent, borrowed = [], []
+    exported, ghosts = [], []
     for r in range(ranks.size):
         theirs = touched_by.indices[touched_by.indptr[r] : touched_by.indptr[r + 1]]
         needed = np.sort(theirs[(owner[theirs] == me) & (r != me)])
-        lent.append(np.searchsorted(own, needed))
-        borrowed.append(np.flatnonzero((owner == r) & (r != me)))
+        exported.append(np.searchsorted(own, needed))
+        ghosts.append(np.flatnonzero((owner == r) & (r != me)))
     return Halo(
-        ranks=ranks, rows=rows, own=own,
-        lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
-        lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
+        ranks=ranks, rows=rows, owned=own,
+        exported=np.concatenate(exported), ghosts=np.concatenate(ghosts),
+        export_counts=np.array([*map(len, exported)]),
+        ghost_counts=np.array([*map(len, ghosts)]),
     )  # fmt: skip
 
 
@@ -252,37 +257,37 @@ class RowsOverRanks:
     """
 
     at: Halo
-    own: CompressedRows  #: (o, M) of owned rows
+    owned: CompressedRows  #: (o, M) of owned rows
     transposed: CompressedRows  #: (M, o)
-    borrowed: CompressedRows  #: (t − o, M) of the neighbours' rows
+    ghosts: CompressedRows  #: (t − o, M) of the neighbours' rows
     #: (k, t − o) rows of its transpose, without zero ones
-    borrowed_transposed: CompressedRows
+    ghosts_transposed: CompressedRows
     reached: Nodes  #: (k,) which ones they are
 
     @classmethod
     def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
         """Split B (t, M) of all rows that a rank touches."""
-        own, borrowed = csr_array(B[at.own]), csr_array(B[at.borrowed])
-        reached = np.unique(borrowed.indices)
+        own, ghosts = csr_array(B[at.owned]), csr_array(B[at.ghosts])
+        reached = np.unique(ghosts.indices)
         return cls(
             at, CompressedRows(own), CompressedRows(csr_array(own.T)),
-            CompressedRows(borrowed),
-            CompressedRows(csr_array(borrowed[:, reached].T)), reached,
+            CompressedRows(ghosts),
+            CompressedRows(csr_array(ghosts[:, reached].T)), reached,
         )  # fmt: skip
 
     def transposed_times(self, x: Vector) -> Vector:
         """Return Bᵀx (M,) of this rank's slice x (o,)."""
-        arrived = self.at.borrowing(x)
+        arrived = self.at.start_gather(x)
         with self.at.ranks.clocked("products"):
             X = self.transposed @ x
-            X[self.reached] += self.borrowed_transposed @ arrived()
+            X[self.reached] += self.ghosts_transposed @ arrived()
         return X
 
     def times(self, X: Vector) -> Vector:
         """Return this rank's slice (o,) of Σ_ranks B X, with X (M,) of each."""
         with self.at.ranks.clocked("products"):
-            added = self.at.returning(self.borrowed @ X)
-            return added(self.own @ X)
+            added = self.at.start_accumulate(self.ghosts @ X)
+            return added(self.owned @ X)
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +300,7 @@ class RankOperator:
     @property
     def shape(self) -> tuple[int, int]:
         """Rows that this rank owns, twice."""
-        return (self.halo.own.size,) * 2
+        return (self.halo.owned.size,) * 2
 
     def __call__(self, x: Dense) -> DistributedVector:
         """Multiply with F."""
@@ -318,7 +323,7 @@ class RankOperator:
     ) -> Vector:
         X = rows.transposed_times(x)
         with self.halo.ranks.clocked("products"):
-            Y = self.local.packed.multiplied(blocks, X)
+            Y = self.local.packed.block_products(blocks, X)
         return rows.times(Y)
 
     def onto_rows(self) -> Product:
@@ -356,11 +361,11 @@ class RankOperator:
         solves = []
         if contact.few_shared:
             of_contact = csc_array(part[is_contact][:, is_contact])
-            solves.append(_rank_by_rank(of_contact, contact, at, diagonal))
+            solves.append(_distributed_inverse(of_contact, contact, at, diagonal))
         else:
             coupled |= is_contact
         if at.ranks.extreme(float(coupled.any()), np.max):
-            solves.append(_alike(part, coupled, at, equalities))
+            solves.append(_replicated_inverse(part, coupled, at, equalities))
 
         def solve(x: Dense) -> Dense:
             x = np.asarray(x)
@@ -382,7 +387,7 @@ def _coupled(
     size = np.sqrt(at.gathered(diagonal))
     share = part.data[beside] / (size[row] * size[column])
     between = at.is_shared[row] & at.is_shared[column]
-    found = at.rows[row[~between & (np.abs(share) > ROUNDING)]]
+    found = at.rows[row[~between & (np.abs(share) > COUPLING_ROUNDING)]]
     between &= share != 0
     told = [v[between] for v in (at.rows[row], at.rows[column], share)]
     rows, columns, shares = map(
@@ -390,10 +395,10 @@ def _coupled(
     )
     pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
     total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
-    return np.concatenate([found, pairs[0, total > ROUNDING]])
+    return np.concatenate([found, pairs[0, total > COUPLING_ROUNDING]])
 
 
-def _rank_by_rank(
+def _distributed_inverse(
     part: csc_array, rows: Touched, at: Halo, diagonal: Vector
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
     """Invert the sum of the ranks' parts (k, k) of B W Bᵀ on some rows.
@@ -403,9 +408,9 @@ def _rank_by_rank(
     """
     size = 1 / np.sqrt(at.gathered(diagonal)[np.searchsorted(at.rows, rows.rows)])
     unit = csc_array(diags_array(size) @ part @ diags_array(size))
-    unit += csc_array(diags_array(SHIFT * unit.diagonal()))
+    unit += csc_array(diags_array(CONTACT_SHIFT * unit.diagonal()))
     factor = local_factor(unit, rows).completed()
-    _, mine, owned = np.intersect1d(rows.rows, at.rows[at.own], return_indices=True)
+    _, mine, owned = np.intersect1d(rows.rows, at.rows[at.owned], return_indices=True)
 
     def inverse(x: Dense) -> Dense:
         t = np.zeros(rows.rows.size)
@@ -415,10 +420,10 @@ def _rank_by_rank(
     return owned, inverse
 
 
-def _alike(
+def _replicated_inverse(
     part: csr_array, some: NDArray[np.bool_], at: Halo, equalities: int
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Do as `_rank_by_rank`, the same on all ranks.
+    """Do as `_distributed_inverse`, the same on all ranks.
 
     some : (t,) which of the touched rows
     """
@@ -433,8 +438,8 @@ def _alike(
     places = np.searchsorted(known, row), np.searchsorted(known, column)
     gram = csr_array((data, places), shape=(known.size,) * 2)
     first = int(np.searchsorted(known, equalities))
-    solve = gram_inverse(uncoupled(gram, first), first)
-    _, place, owned = np.intersect1d(known, at.rows[at.own], return_indices=True)
+    solve = gram_inverse(decouple_contact(gram, first), first)
+    _, place, owned = np.intersect1d(known, at.rows[at.owned], return_indices=True)
 
     def inverse(x: Dense) -> Dense:
         whole = np.zeros(known.size)
@@ -472,7 +477,7 @@ def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assign
         loads[rank] += size[name]
         found[name] = Assignment(size[name], have[name], rank, rank)
     for name, task in found.items():
-        rank, part = min(task.have, key=loads.__getitem__), AFTER_FACTOR * task.work
+        rank, part = min(task.have, key=loads.__getitem__), BLOCK_SHARE * task.work
         if loads[rank] + 2 * part <= loads[task.factor]:
             loads[rank] += part
             loads[task.factor] -= part
@@ -488,16 +493,16 @@ def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
     factors: dict[int, float] = {}
     for task in tasks.values():
         if len(task.have) > 1:
-            made = (1 - AFTER_FACTOR) * task.work
+            made = (1 - BLOCK_SHARE) * task.work
             factors[task.factor] = factors.get(task.factor, 0.0) + made
     giving = [factors[t.factor] for t in tasks.values() if t.factor != t.blocks]
     left = max(giving, default=np.inf) - factors.get(rank, 0.0)
     own = [t for t in tasks.values() if t.factor == t.blocks == rank]
-    takes = [t.work * (AFTER_FACTOR if len(t.have) > 1 else 1.0) for t in own]
+    takes = [t.work * (BLOCK_SHARE if len(t.have) > 1 else 1.0) for t in own]
     return int(np.count_nonzero(np.cumsum(takes) - np.array(takes) / 2 < left))
 
 
-def condensed_by_ranks(
+def condense_over_ranks(
     groups: Sequence[Group], ranks: Ranks
 ) -> Iterator[tuple[int, Condensed]]:
     """Form the blocks of equal groups on one of the ranks that have them.
@@ -508,8 +513,8 @@ def condensed_by_ranks(
     """
     me, names = ranks.rank, [_name(group) for group in groups]
     ours = dict(zip(names, groups, strict=True))
-    border = {name: g.kind.border(g.touched).size for name, g in ours.items()}
-    work = {name: ours[name].kind.K.nnz * h for name, h in border.items()}
+    border = {name: g.template.border(g.touched).size for name, g in ours.items()}
+    work = {name: ours[name].template.K.nnz * h for name, h in border.items()}
     tasks = assign_factorisations(ranks.comm.allgather(work))
     given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
     taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
@@ -517,22 +522,22 @@ def condensed_by_ranks(
     alone = {n for n in kept if len(tasks[n].have) == 1}
     place = {name: i for i, name in enumerate(names)}
     factors = {
-        n: ours[n].kind.border_factor(ours[n].touched)
+        n: ours[n].template.border_factor(ours[n].touched)
         for n in given + kept if n not in alone
     }  # fmt: skip
     found = dict[str, Dense]()  # (2, b, b) of what several ranks have
 
     def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
         for n in some:
-            kind, touched = ours[n].kind, ours[n].touched
+            kind, touched = ours[n].template, ours[n].touched
             if n in alone:
-                yield place[n], kind.condensed(touched)
+                yield place[n], kind.condense(touched)
             else:
                 found[n] = np.stack(kind.blocks(touched, factors.pop(n)))
 
     before = blocks_before_exchange(tasks, me)
     yield from formed(kept[:before])
-    came = _exchanged(
+    came = _exchange_blocks(
         ranks,
         [(tasks[n].blocks, np.ascontiguousarray(factors.pop(n).T)) for n in given],
         [(tasks[n].factor, (border[n], border[n])) for n in taken],
@@ -541,7 +546,7 @@ def condensed_by_ranks(
     yield from formed(kept[before:] + taken)
     others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
     to = [(r, n) for n in tasks if n in found for r in tasks[n].have if r != me]
-    came = _exchanged(
+    came = _exchange_blocks(
         ranks,
         [(r, found[n]) for r, n in to],
         [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
@@ -551,7 +556,7 @@ def condensed_by_ranks(
     yield from ((place[n], Condensed(*found.pop(n))) for n in list(found))
 
 
-def _exchanged(
+def _exchange_blocks(
     ranks: Ranks,
     out: Sequence[tuple[int, Dense]],
     coming: Sequence[tuple[int, tuple[int, ...]]],
@@ -571,10 +576,10 @@ def _exchanged(
 
 def _name(group: Group) -> str:
     """Name what the blocks of a group depend on."""
-    return f"{group.kind.name} {hex_digest((group.touched.tobytes(),), 32)}"
+    return f"{group.template.name} {hex_digest((group.touched.tobytes(),), 32)}"
 
 
-def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
+def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     """Take this rank's share of a dual of torn bodies.
 
     Raises
@@ -587,20 +592,22 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     parts = partition(B, domains, ranks.size)
     touched_here = np.flatnonzero(parts.reach[:, [ranks.rank]].toarray())
     reach = csr_array(parts.reach[touched_here])
-    at = halo(ranks, touched_here, reach, parts.owner[touched_here])
+    at = build_halo(ranks, touched_here, reach, parts.owner[touched_here])
     mine = np.flatnonzero(parts.rank == ranks.rank)
-    kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
+    classes, kind = np.unique(domains.class_of[mine], return_inverse=True)
     columns = np.concatenate(
         [np.arange(domains.start[s], domains.start[s + 1]) for s in mine]
     )
     local = DualOperator(
         csr_array(B[at.rows][:, columns]),
-        Subdomains(tuple(domains.kinds[k].without_factor(str(k)) for k in kinds), kind),
-        operator.explicit[kinds],
+        Subdomains(
+            tuple(domains.classes[k].without_factor(str(k)) for k in classes), kind
+        ),
+        operator.explicit[classes],
         operator.equalities,
-        partial(condensed_by_ranks, ranks=ranks),
+        partial(condense_over_ranks, ranks=ranks),
     )
-    own = at.rows[at.own]
+    own = at.rows[at.owned]
     q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))
     part = QP(
         P=RankOperator(local, at),
@@ -608,14 +615,14 @@ def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         A=DistributedColumns(csr_array(qp.A[:, own]), ranks), b=np.array(qp.b),
     )  # fmt: skip
 
-    return Share(part, gathered_on_one(at, qp.q.size))
+    return Share(part, gather_on_rank_0(at, qp.q.size))
 
 
-def gathered_on_one(at: Halo, count: int) -> Callable[[Solution], Solution | None]:
+def gather_on_rank_0(at: Halo, count: int) -> Callable[[Solution], Solution | None]:
     """Make what gathers a solution of so many multipliers on rank 0."""
 
     def whole(s: Solution) -> Solution | None:
-        told = at.rows[at.own], np.asarray(s.x), np.asarray(s.z_box)
+        told = at.rows[at.owned], np.asarray(s.x), np.asarray(s.z_box)
         found = at.ranks.comm.gather(told)
         if found is None:
             return None

@@ -34,17 +34,17 @@ from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import (
     Halo,
     RankOperator,
-    condensed_by_ranks,
-    gathered_on_one,
-    halo,
-    owners,
+    assign_owners,
+    build_halo,
+    condense_over_ranks,
+    gather_on_rank_0,
 )
 from mortarbench.problems.feti.local_bodies import Results, answers
 from mortarbench.problems.feti.operators import (
     DualOperator,
     block_bytes,
     explicit_classes,
-    touched,
+    touched_components,
 )
 from mortarbench.problems.feti.subdomain_classes import Subdomains
 from mortarbench.problems.feti.subdomains import (
@@ -58,75 +58,79 @@ from mortarbench.problems.feti.subdomains import (
 class LocalDual:
     """The rows of a dual that a rank owns; what is asked for, all ranks ask for."""
 
-    own: LocalSubdomains
+    subdomains: LocalSubdomains
 
     @cached_property
-    def at(self) -> Halo:
+    def halo(self) -> Halo:
         """The rows, and what is exchanged of them."""
-        rows = self.own.rows
-        owner = owners(rows.number, rows.reach)
-        return halo(self.own.ranks, rows.number, rows.reach, owner)
+        rows = self.subdomains.rows
+        owner = assign_owners(rows.number, rows.reach)
+        return build_halo(self.subdomains.ranks, rows.number, rows.reach, owner)
 
     @cached_property
     def explicit(self) -> NDArray[np.bool_]:
         """Kinds whose blocks are formed."""
-        return explicit_classes(self.own.rows.B, self.own.domains)
+        return explicit_classes(self.subdomains.rows.B, self.subdomains.domains)
 
     @cached_property
     def q(self) -> Vector:
         """C − BK⁺f (o,) of own rows."""
-        own = self.own
+        own = self.subdomains
         return np.asarray(
-            own.rows.c[self.at.own]
-            - self.at.added(own.rows.B @ own.domains.inverse(own.f))
+            own.rows.c[self.halo.owned]
+            - self.halo.added(own.rows.B @ own.domains.inverse(own.f))
         )
 
     @cached_property
     def G(self) -> csr_array:
         """RᵀBᵀ (r, o) of own rows."""
-        return _coarse_rows(self.own, self.at.rows[self.at.own])
+        return _coarse_rows(self.subdomains, self.halo.rows[self.halo.owned])
 
     @cached_property
     def b(self) -> Vector:
         """Rᵀf (r,)."""
-        return _resultants(self.own)
+        return _resultants(self.subdomains)
 
     def share(self) -> Share:
         """Put the operator together, without any factor."""
-        rows, domains, ranks = self.own.rows, self.own.domains, self.own.ranks
-        kinds = tuple(kind.without_factor() for kind in domains.kinds)
-        anew = Subdomains(kinds, domains.kind)
+        rows, domains, ranks = (
+            self.subdomains.rows,
+            self.subdomains.domains,
+            self.subdomains.ranks,
+        )
+        classes = tuple(kind.without_factor() for kind in domains.classes)
+        anew = Subdomains(classes, domains.class_of)
         local = DualOperator(
             rows.B, anew, self.explicit, rows.equalities,
-            partial(condensed_by_ranks, ranks=ranks),
+            partial(condense_over_ranks, ranks=ranks),
         )  # fmt: skip
-        lower, upper = self.bounds(self.own.problem.contact.bound)
+        lower, upper = self.bounds(self.subdomains.problem.contact.bound)
         part = QP(
-            P=RankOperator(local, self.at), q=distributed(self.q, ranks),
+            P=RankOperator(local, self.halo), q=distributed(self.q, ranks),
             lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
             A=DistributedColumns(self.G, ranks), b=self.b,
         )  # fmt: skip
-        return Share(part, gathered_on_one(self.at, rows.total))
+        return Share(part, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
         """Bound the multipliers of own rows (o,), those of friction by (k,)."""
-        ranks, E = self.own.ranks, self.own.rows.equalities
-        scale = self.own.problem.contact_scale
+        ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
+        scale = self.subdomains.problem.contact_scale
         pressing = scale.size - bound.size
         bound = bound / scale[pressing:]
         below = np.concatenate([np.zeros(pressing), -bound])
         above = np.concatenate([np.full(pressing, np.inf), bound])
-        number = self.at.rows[self.at.own]
+        number = self.halo.rows[self.halo.owned]
         touching = number >= E
         lower, upper = (np.full(number.size, x) for x in (-np.inf, np.inf))
         lower[touching] = below[number[touching] - E]
         upper[touching] = above[number[touching] - E]
         return distributed(lower, ranks), distributed(upper, ranks)
 
-    def bounded(self, bound: Vector) -> LocalDual:
+    def with_bound(self, bound: Vector) -> LocalDual:
         """Return the same with another bound (k,) of friction."""
-        found = LocalDual(self.own.bounded(bound))
-        vars(found).update({**vars(self), "own": found.own})
+        found = LocalDual(self.subdomains.with_bound(bound))
+        vars(found).update({**vars(self), "subdomains": found.subdomains})
         return found
 
 
@@ -159,12 +163,12 @@ def distributed_qp(
     first, others : the first problem that came before, and how many did
 
     """
-    own = dual.own
+    own = dual.subdomains
     for part in ("explicit", "q", "G", "b"):
         getattr(dual, part)  # made here, so that no solver pays for it in `prepare`
 
     def digest() -> str:
-        names = others * [_digest(first.own)] if first else [_digest(own)]
+        names = others * [_digest(first.subdomains)] if first else [_digest(own)]
         return EMITTED + hex_digest(map(str.encode, names), 16)
 
     limits = dual.bounds(own.problem.contact.bound)
@@ -173,7 +177,7 @@ def distributed_qp(
         bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in limits),
         share=dual.share, digest=digest,
         answer=answers(
-            own, dual.at, _torn(own, dual.explicit), results
+            own, dual.halo, _torn(own, dual.explicit), results
         ),
     )  # fmt: skip
 
@@ -185,13 +189,13 @@ def _torn(own: LocalSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
     ranks have is on each of these.
     """
     domains, rows, ranks = own.domains, own.rows, own.ranks
-    sizes = np.array([part.size for part in touched(rows.B, domains)])
+    sizes = np.array([part.size for part in touched_components(rows.B, domains)])
     taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
-    counts = [own.f.size, explicit[domains.kind].sum(), taken]
+    counts = [own.f.size, explicit[domains.class_of].sum(), taken]
     torn_dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
-    kinds = ranks.comm.allgather({kind.name for kind in domains.kinds})
+    classes = ranks.comm.allgather({kind.name for kind in domains.classes})
     return {
-        "subdomains": own.rank.size, "kinds": len(set().union(*kinds)),
+        "subdomains": own.rank.size, "kinds": len(set().union(*classes)),
         "torn_dofs": int(torn_dofs), "multipliers": rows.total,
         "explicit_subdomains": int(formed), "explicit_mib": mib,
     }  # fmt: skip
@@ -204,7 +208,7 @@ def _digest(own: LocalSubdomains) -> str:
     in turn, with what every rank has of the contact.
     """
     domains, rows, contact = own.domains, own.rows, own.problem.contact
-    names = [kind.name.encode() for kind in domains.kinds]
+    names = [kind.name.encode() for kind in domains.classes]
     B = csc_array(rows.B)
     B.sort_indices()
     told = []
@@ -213,7 +217,7 @@ def _digest(own: LocalSubdomains) -> str:
         entries = slice(ends[0], ends[-1])
         parts = rows.number[B.indices[entries]], B.data[entries], ends - ends[0]
         numbers = (*map(np.ndarray.tobytes, parts), own.f[begin:end].tobytes())
-        name = hex_digest((names[domains.kind[s]], *numbers))
+        name = hex_digest((names[domains.class_of[s]], *numbers))
         told.append((int(own.number[s]), name))
     of_all = sorted(chain.from_iterable(own.ranks.comm.allgather(told)))
     shared = contact.rows.data, contact.c, contact.bound
@@ -233,7 +237,9 @@ def _agreed(problem: DecomposedProblem, ranks: Ranks) -> NDArray[np.int64]:
 
     """
     found = subdomains_of(problem, ranks.size)
-    known = hex_digest(x.tobytes() for x in (found, *problem.layout.sharing()))
+    known = hex_digest(
+        x.tobytes() for x in (found, *problem.layout.shared_node_counts())
+    )
     if len(set(ranks.comm.allgather(known))) > 1:
         raise InputError(
             "ranks have cut the bodies into different subdomains; expected the same "
@@ -250,7 +256,7 @@ def _coarse_rows(own: LocalSubdomains, mine: Nodes) -> csr_array:
     R = own.resultants(unknown, np.ones(unknown.size))
     touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
     part = csr_array(touched @ R)
-    owner = owners(rows.number, rows.reach)
+    owner = assign_owners(rows.number, rows.reach)
     told: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
     for one in set(range(ranks.size)) - {ranks.rank}:
         theirs = np.flatnonzero(owner == one)

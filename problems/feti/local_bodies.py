@@ -76,13 +76,13 @@ def local_solution(own: LocalSubdomains, halo: Halo, s: Solution) -> LocalSoluti
     multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
     supports eliminate are zero.
     """
-    bodies, times = _bodies(own.floating)
+    bodies, multiplicity = _bodies(own.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[own.local_motions]
     touched = halo.gathered(np.asarray(s.x))
     v = np.zeros(T.shape[0])
     v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
     v[own.kept] -= own.domains.kernel @ alpha
-    u = bodies.among.completed(T.T @ v) / times
+    u = bodies.among.completed(T.T @ v) / multiplicity
     z = contact_multipliers(own, halo, s)
     return LocalSolution(subdomains=own, bodies=bodies, u=u, z=z)
 
@@ -90,7 +90,7 @@ def local_solution(own: LocalSubdomains, halo: Halo, s: Solution) -> LocalSoluti
 def contact_multipliers(own: LocalSubdomains, halo: Halo, s: Solution) -> Vector:
     """Return multipliers (m,) of rows of contact and friction, on all ranks."""
     rows, scale = own.rows, own.problem.contact_scale
-    owned = rows.number[halo.own]
+    owned = rows.number[halo.owned]
     is_contact = owned >= rows.equalities
     z = np.zeros(scale.size)
     z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
@@ -125,7 +125,7 @@ def answers(
     return answer
 
 
-def certified_by(
+def certifier(
     own: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
     """Return a bound of the error of displacements with multipliers, by subdomains.
@@ -148,12 +148,12 @@ def _bodies(own: LocalSubdomains) -> tuple[OwnBodies, Vector]:
     """
     problem, components, place = own.problem, own.components, own.place
     contact, kept = problem.contact, _carrying(problem)
-    times = np.empty(components.size)
-    times[place] = own.times
+    multiplicity = np.empty(components.size)
+    multiplicity[place] = own.multiplicity
     parts = LocalProblems(own.decomposed, problem.components)
     return OwnBodies(
         ranks=own.ranks, parts=parts, components=components,
-        shared=np.bincount(place, minlength=times.size) < times,
+        shared=np.bincount(place, minlength=multiplicity.size) < multiplicity,
         coarse=own.local_motions,
         motions=own.coarse, f=own.f,
         held=np.flatnonzero(np.isin(components, problem.held)),
@@ -162,7 +162,7 @@ def _bodies(own: LocalSubdomains) -> tuple[OwnBodies, Vector]:
             bound=contact.bound[contact.bound > 0],
         ),
         unheld=_unheld(own),
-    ), times  # fmt: skip
+    ), multiplicity  # fmt: skip
 
 
 def _carrying(problem: DecomposedProblem) -> Nodes:
@@ -171,7 +171,7 @@ def _carrying(problem: DecomposedProblem) -> Nodes:
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
-def unheld_bodies(problem: DecomposedProblem) -> list[int]:
+def floating_bodies(problem: DecomposedProblem) -> list[int]:
     """List the bodies that supports leave some rigid motion."""
     of, d = problem.layout, problem.components
     node, axis = np.divmod(problem.held, d)
@@ -227,14 +227,16 @@ def _unheld(own: LocalSubdomains) -> Unheld:
     problem, of, d = own.problem, own.problem.layout, own.problem.components
     components = d * copy.size
     motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
-    if not (unheld := unheld_bodies(problem)):
+    if not (unheld := floating_bodies(problem)):
         return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
     points = np.concatenate([*of.points(own.number)])
     body = of.body[own.number][own.nodes.subdomain]
     held, axis = np.divmod(problem.held, d)
     body_held = of.body[of.holder(held)]
     for b in unheld:
-        extent = _extent(own, points, np.where(body == b, 1 / own.nodes.times, 0.0))
+        extent = _extent(
+            own, points, np.where(body == b, 1 / own.nodes.multiplicity, 0.0)
+        )
         of_body = body_held == b
         at_held = extent.motions(of.position(held[of_body]), axis[of_body], d)
         left.append(null_space(at_held) if of_body.any() else np.eye(at_held.shape[1]))

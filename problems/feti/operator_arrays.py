@@ -10,7 +10,7 @@ from scipy.sparse import block_diag, csc_array, csr_array
 from mortarbench.harness import QP
 from mortarbench.harness.distributed.vectors import Ranks, Share
 from mortarbench.harness.operators import Arrays, SerialisableOperator
-from mortarbench.problems.feti.distributed import shared
+from mortarbench.problems.feti.distributed import local_share
 from mortarbench.problems.feti.operators import DualOperator, explicit_classes
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
 
@@ -26,11 +26,11 @@ class StoredOperator(DualOperator):
     @property
     def parts(self) -> int:
         """Number of subdomains."""
-        return int(self.domains.kind.size)
+        return int(self.domains.class_of.size)
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
         """Take this rank's share of a dual with this F."""
-        return shared(qp, self, ranks)
+        return local_share(qp, self, ranks)
 
 
 def dual_operator(
@@ -40,24 +40,26 @@ def dual_operator(
 
     equalities : rows of B that are equations, the first ones
     """
-    kinds = domains.kinds
-    K = csc_array(block_diag([kind.K for kind in kinds], format="csc"))
-    modes = np.array([kind.R.shape[1] for kind in kinds])
-    R = [np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in kinds]
+    classes = domains.classes
+    K = csc_array(block_diag([kind.K for kind in classes], format="csc"))
+    modes = np.array([kind.R.shape[1] for kind in classes])
+    R = [
+        np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in classes
+    ]
     arrays = {
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
         **{f"B_{part}": getattr(B, part) for part in _PARTS},
         "R": np.concatenate(R),
         "modes": modes,
-        "stiffness": np.concatenate([kind.stiffness for kind in kinds]),
-        "fixing": np.concatenate([kind.fixing for kind in kinds]),
-        "boundary": np.concatenate([kind.boundary for kind in kinds]),
-        "kind": domains.kind,
+        "stiffness": np.concatenate([kind.stiffness for kind in classes]),
+        "fixing": np.concatenate([kind.fixing for kind in classes]),
+        "boundary": np.concatenate([kind.boundary for kind in classes]),
+        "kind": domains.class_of,
         "explicit": explicit_classes(B, domains),
         "equalities": np.array(equalities),
     }
     for name in _OF_KINDS:
-        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in kinds])
+        arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
     return SerialisableOperator(
         B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
     )

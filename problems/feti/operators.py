@@ -52,26 +52,28 @@ from mortarbench.problems.feti.subdomain_classes import (
     Subdomains,
 )
 
-EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
-COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
+MAX_EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
+STRIP_COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
 #: of the diagonal of B W Bᵀ, added where contact rows might depend on one another
-SHIFT = 1e-8
-SINGULAR = 1e-10  #: of the largest eigenvalue of a block of B W Bᵀ: taken for zero
-ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
+CONTACT_SHIFT = 1e-8
+EIGENVALUE_CUTOFF = (
+    1e-10  #: of the largest eigenvalue of a block of B W Bᵀ: taken for zero
+)
+COUPLING_ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
 
 
 class Group(NamedTuple):
     """The subdomains of one kind, with what rows touch of any of them."""
 
-    kind: SubdomainClass
+    template: SubdomainClass
     explicit: bool  #: whether (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
     touched: Nodes  #: b (n_g,) components within each, ascending
 
 
-def condensed(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
+def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
     """Form (K⁺)_bb and S_bb of each group, when it is asked for, with its place."""
-    return ((i, g.kind.condensed(g.touched)) for i, g in enumerate(groups))
+    return ((i, g.template.condense(g.touched)) for i, g in enumerate(groups))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,9 +89,9 @@ class Packed:
 
     def congruence(self, blocks: Sequence[Any], x: Dense) -> Dense:
         """Multiply  B_b diag(blocks) B_bᵀ  with x (m,) or (m, k)."""
-        return np.asarray(self.B @ self.multiplied(blocks, self.BT @ x))
+        return np.asarray(self.B @ self.block_products(blocks, self.BT @ x))
 
-    def multiplied(self, blocks: Sequence[Any], X: Dense) -> Dense:
+    def block_products(self, blocks: Sequence[Any], X: Dense) -> Dense:
         """Multiply each subdomain's part of X (M,) or (M, k) with its group's block."""
         Y, end = np.empty_like(X), 0
         for block, group in zip(blocks, self.groups, strict=True):
@@ -132,12 +134,12 @@ class Packed:
         return total
 
 
-def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
+def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
     """Pack the columns of B (m, N)."""
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
-    parts = touched(B, domains)
+    parts = touched_components(B, domains)
     for k, (kind, members) in enumerate(
-        zip(domains.kinds, domains.members, strict=True)
+        zip(domains.classes, domains.members, strict=True)
     ):
         groups.append(Group(kind, bool(explicit[k]), members, parts[k]))
         places = domains.start[members] + parts[k][:, None]
@@ -148,7 +150,7 @@ def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Pa
     return Packed(tuple(groups), B_b, csr_array(B_b.T))
 
 
-def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
+def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
     """List the components that rows touch of any subdomain of each kind, ascending."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
@@ -156,9 +158,9 @@ def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
     sub = np.searchsorted(domains.start, found, side="right") - 1
     largest = int(np.diff(domains.start).max())
     kind, at = np.divmod(
-        np.unique(domains.kind[sub] * largest + found - domains.start[sub]), largest
+        np.unique(domains.class_of[sub] * largest + found - domains.start[sub]), largest
     )
-    ends = np.cumsum(np.bincount(kind, minlength=len(domains.kinds)))
+    ends = np.cumsum(np.bincount(kind, minlength=len(domains.classes)))
     return np.split(at, ends[:-1])
 
 
@@ -171,7 +173,9 @@ class DualOperator:
     explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
     equalities: int  #: rows that are equations, the first ones; the others are contact
     #: forms (K⁺)_bb and S_bb of explicit groups, in any order, with their places
-    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = condensed
+    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
+        condense_groups
+    )
 
     def __call__(self, x: Dense) -> Dense:
         """Multiply with F."""
@@ -195,11 +199,11 @@ class DualOperator:
         """
         blocks, weights = self.weighted_blocks(kind, scaling)
         BW = scaled_columns(self.packed.B, weights)
-        gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
+        gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
         WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
         def product(x: Dense) -> Dense:
-            return solve(BW @ self.packed.multiplied(blocks, WB @ solve(x)))
+            return solve(BW @ self.packed.block_products(blocks, WB @ solve(x)))
 
         return product
 
@@ -220,11 +224,12 @@ class DualOperator:
                 raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
         groups = self.packed.groups
         blocks = (
-            [g.kind.block(g.touched) for g in groups] if kind == "lumped"
+            [g.template.block(g.touched) for g in groups] if kind == "lumped"
             else [schur for _, schur in self._blocks]
         )  # fmt: skip
         softness = [
-            np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
+            np.repeat(1 / g.template.stiffness[g.touched], g.members.size)
+            for g in groups
         ]
         weights = np.concatenate(softness)
         if scaling == "multiplicity":
@@ -234,7 +239,7 @@ class DualOperator:
     @cached_property
     def packed(self) -> Packed:
         """Its rows on what they touch."""
-        return packed(self.B, self.domains, self.explicit)
+        return pack(self.B, self.domains, self.explicit)
 
     @property
     def inverses(self) -> list[Any]:
@@ -263,7 +268,7 @@ def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
 
 
 def _implicit(group: Group) -> tuple[Any, Any]:
-    kind, b = group.kind, group.touched
+    kind, b = group.template, group.touched
     g = np.union1d(kind.boundary, b)
     at = np.searchsorted(g, b)
     return _Part(kind.K.shape[0], b, kind.inverse), _Part(
@@ -306,9 +311,9 @@ def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
     if not isinstance(block, _Part):
         return np.asarray(block[i, j])
     found, n = np.empty(i.size), block.b.size
-    for first in range(0, n, COLUMNS):
-        part = (first <= j) & (j < first + COLUMNS)
-        unit = np.eye(n, min(COLUMNS, n - first), -first)
+    for first in range(0, n, STRIP_COLUMNS):
+        part = (first <= j) & (j < first + STRIP_COLUMNS)
+        unit = np.eye(n, min(STRIP_COLUMNS, n - first), -first)
         found[part] = (block @ unit)[i[part], j[part] - first]
     return found
 
@@ -318,12 +323,12 @@ def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
     return csr_array((B.data * weights[B.indices], B.indices, B.indptr), shape=B.shape)
 
 
-def uncoupled(gram: csr_array, equalities: int) -> csr_array:
+def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     """Leave out of B W Bᵀ what couples contact rows with equations, and rounding."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])
-    kept = (np.abs(gram.data) > ROUNDING * size) & (
+    kept = (np.abs(gram.data) > COUPLING_ROUNDING * size) & (
         (rows < equalities) == (columns < equalities)
     )
     parts = (gram.data[kept], (rows[kept], columns[kept]))
@@ -331,13 +336,15 @@ def uncoupled(gram: csr_array, equalities: int) -> csr_array:
 
 
 def gram_inverse(gram: csr_array, equalities: int) -> Product:
-    """Make x ↦ (B W Bᵀ)⁺x of what `uncoupled` leaves."""
+    """Make x ↦ (B W Bᵀ)⁺x of what `decouple_contact` leaves."""
     m = gram.shape[0]
-    inverse = inverted_blocks(csr_array(gram[:equalities, :equalities]))
+    inverse = block_pseudoinverse(csr_array(gram[:equalities, :equalities]))
     if equalities == m:
         return lambda x: np.asarray(inverse @ x)
     contact = csc_matrix(gram[equalities:, equalities:])
-    factor = cholesky(csc_matrix(contact + diags_array(SHIFT * contact.diagonal())))
+    factor = cholesky(
+        csc_matrix(contact + diags_array(CONTACT_SHIFT * contact.diagonal()))
+    )
 
     def solve(x: Dense) -> Dense:
         y = np.empty_like(x)
@@ -348,7 +355,7 @@ def gram_inverse(gram: csr_array, equalities: int) -> Product:
     return solve
 
 
-def inverted_blocks(M: csr_array) -> csr_array:
+def block_pseudoinverse(M: csr_array) -> csr_array:
     """Return M⁺ of a symmetric M with many small blocks, in whatever order of rows."""
     if not M.nnz:
         return M
@@ -367,7 +374,9 @@ def inverted_blocks(M: csr_array) -> csr_array:
         at = number[block[rows[of]]], within[rows[of]], within[columns[of]]
         dense[at] = M.data[of]
         members = order[mine[block[order]]].reshape(-1, n)
-        data.append(np.linalg.pinv(dense, rcond=SINGULAR, hermitian=True).ravel())
+        data.append(
+            np.linalg.pinv(dense, rcond=EIGENVALUE_CUTOFF, hermitian=True).ravel()
+        )
         places.append([np.repeat(members, n), np.tile(members, n).ravel()])
     entries = np.concatenate(data), tuple(np.concatenate(places, axis=1))
     return csr_array(entries, shape=M.shape)
@@ -375,10 +384,12 @@ def inverted_blocks(M: csr_array) -> csr_array:
 
 def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
     """Choose the kinds whose blocks are formed: the smallest, as many as fit."""
-    sizes = np.array([part.size for part in touched(B, domains)])
+    sizes = np.array([part.size for part in touched_components(B, domains)])
     order = np.argsort(sizes, kind="stable")
     found = np.zeros(sizes.size, dtype=bool)
-    found[order] = np.cumsum(block_bytes(sizes, domains)[order]) <= EXPLICIT_MIB * 2**20
+    found[order] = (
+        np.cumsum(block_bytes(sizes, domains)[order]) <= MAX_EXPLICIT_MIB * 2**20
+    )
     return found
 
 

@@ -22,9 +22,11 @@ from mortarbench.problems.fem.mesh import Nodes
 
 Labels = NDArray[np.int64]
 
-SQUARE = 100  #: weight of the facet between two squares, or two cubes
-LARGEST = 10_000  #: weight; METIS adds them up as integers of 32 bits
-IMBALANCE = 300  #: in thousandths: the less, the more pieces are apart from their part
+UNIT_WEIGHT = 100  #: weight of the facet between two squares, or two cubes
+MAX_WEIGHT = 10_000  #: weight; METIS adds them up as integers of 32 bits
+MAX_IMBALANCE = (
+    300  #: in thousandths: the less, the more pieces are apart from their part
+)
 
 
 def graph_partition(
@@ -77,9 +79,9 @@ def _shares(counts: Labels, parts: int) -> Labels:
 def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     """Return the graph of cells (E, E), with an integer weight for each shared facet.
 
-    In units of 1 / `SQUARE` that is √(L/d) of an edge of length L between centres at
-    the distance d, (L/d)^⅔ of a face of area L²: the length or area, where the cells
-    around it have the area or volume 1.
+    The weight is `UNIT_WEIGHT` times √(L/d) for an edge of length L between cell
+    centres at the distance d, and times (L/d)^⅔ for a face of area L². Where the two
+    cells have the area (volume) 1, this is the length of the edge (area of the face).
     """
     dim = points.shape[1]
     element = ELEMENTS[dim, cells.shape[1]]
@@ -95,7 +97,7 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     ends, centre = points[facets[order[shared]]], points[cells].mean(axis=1)
     ratio = _side(ends) / np.linalg.norm(centre[one] - centre[other], axis=1)
     size = ratio ** ((dim - 1) / dim)
-    weight = np.clip(np.rint(SQUARE * size), 1, LARGEST).astype(np.int64)
+    weight = np.clip(np.rint(UNIT_WEIGHT * size), 1, MAX_WEIGHT).astype(np.int64)
     shape = (len(cells), len(cells))
     half = csr_array((weight, (one, other)), shape=shape)
     return csr_array(half + half.T)
@@ -114,7 +116,7 @@ def _side(facets: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _parted(graph: csr_array, parts: int) -> Labels:
-    """Part the cells of one body."""
+    """SubdomainMesh the cells of one body."""
     if connected_components(graph)[0] > 1:
         raise InputError(
             "the cells of a body do not all hang together by edges (faces in space); "
@@ -127,7 +129,7 @@ def _parted(graph: csr_array, parts: int) -> Labels:
     adjacency, weights = CSRAdjacency(graph.indptr, graph.indices), graph.data
     # k-way parts are better, but some may be empty where parts have few cells
     for recursive in (False, True):
-        options = Options(ufactor=IMBALANCE, contig=int(not recursive))
+        options = Options(ufactor=MAX_IMBALANCE, contig=int(not recursive))
         _, found = part_graph(
             parts, adjacency, eweights=weights, recursive=recursive, options=options
         )

@@ -32,8 +32,8 @@ from mortarbench.problems.feti.distributed import RankOperator
 
 Product = Callable[[Vector], Vector]
 
-EXHAUSTED = 1e-10  #: length of a new vector, of the largest Ritz value: none is left
-CHECKED = 5  #: steps from one look at the Ritz values to the next
+BREAKDOWN = 1e-10  #: length of a new vector, of the largest Ritz value: none is left
+CHECK_INTERVAL = 5  #: steps from one look at the Ritz values to the next
 _CHUNK = 64  #: vectors that memory is taken for at once
 
 
@@ -107,8 +107,8 @@ def spectrum(
         v = P(v - total(WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
         length = float(np.sqrt(max(dot(v, Wv), 0.0)))
-        over = length <= EXHAUSTED * max(alpha)
-        if over or k % CHECKED == CHECKED - 1 or k == n - 1:
+        over = length <= BREAKDOWN * max(alpha)
+        if over or k % CHECK_INTERVAL == CHECK_INTERVAL - 1 or k == n - 1:
             found = ritz_bounds(np.array(alpha), np.array(beta), length)
             if over or found.within(tol):
                 break
@@ -135,7 +135,7 @@ def spectra_over_ranks(
 
     """
     at, ranks = F.halo, F.halo.ranks
-    m = ranks.total(np.array([float(at.own.size)]))[0]
+    m = ranks.total(np.array([float(at.owned.size)]))[0]
     project = projector(F, G)
 
     def plain(A: Product) -> Product:
@@ -145,7 +145,7 @@ def spectra_over_ranks(
     return [
         spectrum(
             plain(F), project, int(m), M, tol,
-            rows=at.rows[at.own], total=ranks.total,
+            rows=at.rows[at.owned], total=ranks.total,
         )
         for M in inverses
     ]  # fmt: skip

@@ -165,10 +165,12 @@ class Layout:
                 (self._rows, self.block.row, at.row),
             )
         ]
-        across = self._columns.times[self._columns.start[at.body] + at.column]
+        across = self._columns.multiplicity[self._columns.start[at.body] + at.column]
         copy = (second[1] * across + second[0]).astype(np.int8)
-        times = self._times(at).astype(np.int8)  # there are many of them
-        return SubdomainNodes(of.astype(np.int32), self._number(at), times, copy, start)
+        multiplicity = self._times(at).astype(np.int8)  # there are many of them
+        return SubdomainNodes(
+            of.astype(np.int32), self._number(at), multiplicity, copy, start
+        )
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
         """Return the columns and rows of nodes of some blocks."""
@@ -208,14 +210,14 @@ class Layout:
             found[own] = self.grids[b].position(node[own] - self.node_start[b])
         return found
 
-    def times(self, node: Nodes) -> NDArray[np.int64]:
+    def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,) of nodes."""
         return self._times(self.places(node))
 
     def _times(self, at: Places) -> NDArray[np.int64]:
         return np.asarray(
-            self._columns.times[self._columns.start[at.body] + at.column]
-            * self._rows.times[self._rows.start[at.body] + at.row]
+            self._columns.multiplicity[self._columns.start[at.body] + at.column]
+            * self._rows.multiplicity[self._rows.start[at.body] + at.row]
         )
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
@@ -226,7 +228,7 @@ class Layout:
         at = self.places(node)
         column = self._columns.start[at.body] + at.column
         row = self._rows.start[at.body] + at.row
-        up, right = np.divmod(copy, self._columns.times[column])
+        up, right = np.divmod(copy, self._columns.multiplicity[column])
         across = self._columns.first[column] + right
         return np.asarray(
             self.block_start[at.body]
@@ -241,7 +243,7 @@ class Layout:
         """
         found = []
         for lines, line in ((self._rows, at.row), (self._columns, at.column)):
-            passed = lines.times[lines.start[at.body] + line] == 2
+            passed = lines.multiplicity[lines.start[at.body] + line] == 2
             if ends:
                 last = np.diff(lines.start)[at.body] - 1
                 passed |= (line == 0) | (line == last)
@@ -298,16 +300,16 @@ class Layout:
         """Count, of each node (k,), those before it that have as many copies."""
         columns, rows, at = self._columns, self._rows, self.places(node)
         column, row = columns.start[at.body] + at.column, rows.start[at.body] + at.row
-        m = columns.times[column] * rows.times[row]
-        in_row = columns.before[columns.times[column] - 1, column]
+        m = columns.multiplicity[column] * rows.multiplicity[row]
+        in_row = columns.before[columns.multiplicity[column] - 1, column]
         found = np.zeros(m.size, dtype=np.int64)
-        for times, (in_rows, _) in self._counts.items():
-            of = m == times
+        for multiplicity, (in_rows, _) in self._counts.items():
+            of = m == multiplicity
             found[of] = in_rows[row[of]] + in_row[of]
         return found
 
     @property
-    def having(self) -> Mapping[int, int]:
+    def nodes_by_multiplicity(self) -> Mapping[int, int]:
         """How many nodes have several copies, by the number of these."""
         return {m: count for m, (_, count) in self._counts.items() if m > 1 and count}
 
@@ -317,10 +319,10 @@ class Layout:
         columns, rows = self._columns, self._rows
         body = np.repeat(np.arange(len(self.grids)), np.diff(rows.start))
         of_columns = [
-            np.add.reduceat(columns.times == a, columns.start[:-1])[body]
+            np.add.reduceat(columns.multiplicity == a, columns.start[:-1])[body]
             for a in (1, 2)
         ]
-        once, twice = (rows.times == b for b in (1, 2))
+        once, twice = (rows.multiplicity == b for b in (1, 2))
         in_row = {
             1: once * of_columns[0],
             2: once * of_columns[1] + twice * of_columns[0],
@@ -331,7 +333,7 @@ class Layout:
             for m, count in in_row.items()
         }
 
-    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
         """List pairs of blocks that share a side, and its number of nodes: all (k,)."""
         body, column, row = self.block
         all_ = np.arange(self.count)
@@ -353,8 +355,8 @@ class Layout:
             (self._columns, left, columns), (self._rows, low, rows),
         ):  # fmt: skip
             at = lines.start[self.block.body] + first
-            ends = (lines.times[at] == 2).astype(int) + (
-                lines.times[at + count - 1] == 2
+            ends = (lines.multiplicity[at] == 2).astype(int) + (
+                lines.multiplicity[at + count - 1] == 2
             )
             alone.append(count - ends)
         return np.asarray(columns * rows - alone[0] * alone[1])
@@ -396,7 +398,7 @@ class _Lines(NamedTuple):
     """Columns, or rows, of all grids one after another."""
 
     start: NDArray[np.int64]  #: (grids + 1,) first of each grid, and k, how many in all
-    times: NDArray[
+    multiplicity: NDArray[
         np.int64
     ]  #: (k,) blocks that meet there along this direction, 1 or 2
     first: NDArray[np.int64]  #: (k,) the first block that has it
@@ -407,16 +409,17 @@ class _Lines(NamedTuple):
 
 
 def _lines(cuts: list[Nodes]) -> _Lines:
-    times, first, before = [], [], []
+    multiplicity, first, before = [], [], []
     for cut in cuts:
         line = np.arange(cut[-1] + 1)
         of = np.ones_like(line)
         of[cut[1:-1]] = 2
-        times.append(of)
+        multiplicity.append(of)
         first.append(np.searchsorted(cut[1:], line))
         before.append([np.cumsum(of == a) - (of == a) for a in (1, 2)])
     return _Lines(
-        start=np.cumsum([0, *map(len, times)]), times=np.concatenate(times),
+        start=np.cumsum([0, *map(len, multiplicity)]),
+        multiplicity=np.concatenate(multiplicity),
         first=np.concatenate(first), before=np.concatenate(before, axis=1),
         cut=np.concatenate(cuts), cut_start=np.cumsum([0, *map(len, cuts)]),
     )  # fmt: skip

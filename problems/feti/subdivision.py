@@ -3,8 +3,8 @@
 What tearing and gluing number (`problems.feti.tearing`, `problems.feti.gluing`) can be
 counted once it is known which subdomains have a node. In blocks of structured grids
 that follows from tables as long as their sides (`problems.feti.structured.Layout`). For
-anything else, the nodes that several subdomains have are listed with these (`Listed`):
-a list as long as the interfaces are.
+anything else, the nodes that several subdomains have are listed with these
+(`ListedSubdivision`): a list as long as the interfaces are.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from scipy.sparse import coo_array, csr_array, triu
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.problems.fem.mesh import HalfDisc, Mesh, Nodes
-from mortarbench.problems.feti.tearing import Block, labelled
+from mortarbench.problems.feti.tearing import Block, label_blocks
 
 Integers = NDArray[np.integer[Any]]
 Points = NDArray[np.float64]
@@ -31,7 +31,7 @@ class SubdomainNodes(NamedTuple):
 
     subdomain: Integers  #: (M,) place in the list of subdomains
     number: Nodes  #: (M,) of the whole
-    times: Integers  #: (M,) copies of it in all subdomains
+    multiplicity: Integers  #: (M,) copies of it in all subdomains
     copy: Integers  #: (M,) which of these it is, from 0 on
     start: NDArray[np.int64]  #: (subdomains + 1,) first of each, and M
 
@@ -74,7 +74,7 @@ class Subdivision(Protocol):
     def label(self) -> NDArray[np.int64]:
         """Subdomain of each cell of the whole mesh, (E,)."""
 
-    def times(self, node: Nodes) -> NDArray[np.int64]:
+    def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,)."""
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
@@ -90,10 +90,10 @@ class Subdivision(Protocol):
         """Count, of each, those before it that have as many copies."""
 
     @property
-    def having(self) -> Mapping[int, int]:
+    def nodes_by_multiplicity(self) -> Mapping[int, int]:
         """How many nodes have several copies, by the number of these."""
 
-    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
         """List pairs of subdomains, and how many nodes these share: all (k,)."""
 
     def glued(self) -> NDArray[np.int64]:
@@ -101,7 +101,7 @@ class Subdivision(Protocol):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Listed:
+class ListedSubdivision:
     """Subdomains whose common nodes are listed; see `Subdivision`.
 
     Only of what is listed can copies, holders and points be asked for.
@@ -112,7 +112,7 @@ class Listed:
     sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
     node: Nodes  #: (k,) listed ones, ascending
     start: NDArray[np.int64]  #: (k + 1,) first holder of each, and l
-    held_by: Nodes  #: (l,) subdomains that have it, ascending for each
+    holders: Nodes  #: (l,) subdomains that have it, ascending for each
     #: nodes (n,) of a subdomain, ascending, and its cells (E, 4) as places in these
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
@@ -140,12 +140,12 @@ class Listed:
         # holders are ascending for each listed node, so pairs are in order
         pairs = np.repeat(np.arange(self.node.size), np.diff(self.start))
         found = np.searchsorted(
-            pairs * self.count + self.held_by,
+            pairs * self.count + self.holders,
             place[listed] * self.count + subdomains[subdomain[listed]],
         )
         copy[listed] = found - self.start[place[listed]]
         return SubdomainNodes(
-            subdomain, number, self.times(number).astype(np.int32), copy,
+            subdomain, number, self.multiplicity(number).astype(np.int32), copy,
             np.concatenate([[0], np.cumsum(sizes)]),
         )  # fmt: skip
 
@@ -166,14 +166,14 @@ class Listed:
         """Find listed nodes."""
         return np.searchsorted(self.node, node)
 
-    def times(self, node: Nodes) -> NDArray[np.int64]:
+    def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
         """Count the copies (k,); one of what is not listed."""
         place = np.minimum(self._place(node), self.node.size - 1)
         return np.where(self.node[place] == node, np.diff(self.start)[place], 1)
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
         """Find the subdomain (k,) that has a copy of each listed node."""
-        return np.asarray(self.held_by[self.start[self._place(node)] + copy])
+        return np.asarray(self.holders[self.start[self._place(node)] + copy])
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
         """Count, of each listed node, those before it that have as many copies."""
@@ -181,35 +181,37 @@ class Listed:
 
     @cached_property
     def _before(self) -> NDArray[np.int64]:
-        times = np.diff(self.start)
-        found = np.empty_like(times)
-        for m in np.unique(times):
-            of = np.flatnonzero(times == m)
+        multiplicity = np.diff(self.start)
+        found = np.empty_like(multiplicity)
+        for m in np.unique(multiplicity):
+            of = np.flatnonzero(multiplicity == m)
             found[of] = np.arange(of.size)
         return found
 
     @cached_property
-    def having(self) -> Mapping[int, int]:
+    def nodes_by_multiplicity(self) -> Mapping[int, int]:
         """How many nodes have several copies, by the number of these."""
-        times, count = np.unique(np.diff(self.start), return_counts=True)
-        return {int(m): int(n) for m, n in zip(times, count, strict=True) if m > 1}
+        multiplicity, count = np.unique(np.diff(self.start), return_counts=True)
+        return {
+            int(m): int(n) for m, n in zip(multiplicity, count, strict=True) if m > 1
+        }
 
-    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
         """List pairs of subdomains, and how many nodes these share: all (k,)."""
         shape = (self.node.size, self.count)
-        ones = np.ones(self.held_by.size, dtype=np.int64)
-        has = csr_array((ones, self.held_by, self.start), shape=shape)
+        ones = np.ones(self.holders.size, dtype=np.int64)
+        has = csr_array((ones, self.holders, self.start), shape=shape)
         pairs = coo_array(triu(has.T @ has, k=1))
         return pairs.row, pairs.col, pairs.data
 
     def glued(self) -> NDArray[np.int64]:
         """Count the nodes of each subdomain that have several copies, (S,)."""
-        times = np.diff(self.start)
-        several = np.repeat(times > 1, times)
-        return np.bincount(self.held_by[several], minlength=self.count)
+        multiplicity = np.diff(self.start)
+        several = np.repeat(multiplicity > 1, multiplicity)
+        return np.bincount(self.holders[several], minlength=self.count)
 
 
-def listed_by_holders(
+def sort_holders(
     number: Nodes, subdomain: Nodes, subdomains: int
 ) -> tuple[Nodes, NDArray[np.int64], Nodes]:
     """Sort pairs of a node and a subdomain that has it, each there once or more.
@@ -218,17 +220,17 @@ def listed_by_holders(
 
     Returns
     -------
-    `node`, `start` and `held_by` of `Listed`
+    `node`, `start` and `holders` of `ListedSubdivision`
 
     """
-    node, held_by = np.divmod(np.unique(number * subdomains + subdomain), subdomains)
+    node, holders = np.divmod(np.unique(number * subdomains + subdomain), subdomains)
     first = np.flatnonzero(np.diff(node, prepend=-1))
-    return node[first], np.append(first, node.size), held_by
+    return node[first], np.append(first, node.size), holders
 
 
 def half_discs_in_blocks(
     discs: Sequence[HalfDisc], blocks: Sequence[Sequence[Block]]
-) -> Listed:
+) -> ListedSubdivision:
     """Know half discs by the perimeters of the blocks that their cells form.
 
     blocks : rings and angles of cells, of each disc, in the order of the subdomains
@@ -253,13 +255,11 @@ def half_discs_in_blocks(
         return found
 
     subdomain = np.repeat(np.arange(len(every)), [nodes.size for nodes in around])
-    node, start, held_by = listed_by_holders(
-        np.concatenate(around), subdomain, len(every)
-    )
-    return Listed(
+    node, start, holders = sort_holders(np.concatenate(around), subdomain, len(every))
+    return ListedSubdivision(
         nodes=int(first[-1]), body=body,
         sizes=np.array([_nodes(disc, *block) for disc, _, *block in every]),
-        node=node, start=start, held_by=held_by,
+        node=node, start=start, holders=holders,
         part=part, position=position, labelling=lambda: _labels(blocks),
     )  # fmt: skip
 
@@ -268,7 +268,7 @@ def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
     """Label the cells of discs, one disc after another."""
     first = np.cumsum([0, *map(len, blocks)])
     return np.concatenate(
-        [labelled(own) + begin for own, begin in zip(blocks, first, strict=False)]
+        [label_blocks(own) + begin for own, begin in zip(blocks, first, strict=False)]
     )
 
 
@@ -290,9 +290,9 @@ def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
     return np.concatenate([a * rings.start + i, inner, *ends])
 
 
-def mesh_in_parts(
+def mesh_in_subdomains(
     mesh: Mesh, label: NDArray[np.int64], body: NDArray[np.int64], named: Nodes
-) -> Listed:
+) -> ListedSubdivision:
     """Know a mesh of any kind by the labels of its cells; it is kept as a whole.
 
     Parameters
@@ -310,16 +310,16 @@ def mesh_in_parts(
     kept = np.bincount(number, minlength=N) > 1
     kept[named] = True
     several = kept[number]
-    node, start, held_by = listed_by_holders(number[several], subdomain[several], S)
+    node, start, holders = sort_holders(number[several], subdomain[several], S)
 
     def part(s: int) -> tuple[Nodes, Nodes]:
         own = cells[by_label[ends[s] : ends[s + 1]]]
         nodes, corner = np.unique(own, return_inverse=True)
         return nodes, corner.reshape(own.shape)
 
-    return Listed(
+    return ListedSubdivision(
         nodes=N, body=body[by_label[ends[:-1]]],
         sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
-        held_by=held_by, part=part, position=points.__getitem__,
+        holders=holders, part=part, position=points.__getitem__,
         labelling=lambda: label,
     )  # fmt: skip

@@ -75,7 +75,7 @@ class SubdomainClass:
         """Return K_bb."""
         return csr_array(self.K[b][:, b])
 
-    def condensed(self, b: Nodes) -> Condensed:
+    def condense(self, b: Nodes) -> Condensed:
         """Condense onto components b: what is inside is eliminated once for both.
 
         ::
@@ -92,7 +92,7 @@ class SubdomainClass:
         return np.union1d(np.union1d(self.boundary, b), self.fixing)
 
     def border_factor(self, b: Nodes) -> Dense:
-        """Return L (h, h) of S_ρ = LLᵀ, the greater part of the work of `condensed`."""
+        """Return L (h, h) of S_ρ = LLᵀ, the greater part of the work of `condense`."""
         h = self.border(b)
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         if i.size:
@@ -104,7 +104,7 @@ class SubdomainClass:
         return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def blocks(self, b: Nodes, L: Dense) -> Condensed:
-        """Do what is left of `condensed`, with L of `border_factor`."""
+        """Do what is left of `condense`, with L of `border_factor`."""
         g, h = np.union1d(self.boundary, b), self.border(b)
         at, fixed = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
         C = cho_solve((L, True), np.eye(h.size)[:, at])[at]
@@ -172,28 +172,28 @@ class Elimination(NamedTuple):
 class Subdomains:
     """S subdomains, each of one of few kinds, that nothing holds together yet."""
 
-    kinds: tuple[SubdomainClass, ...]
-    kind: NDArray[np.int64]  #: (S,) of each subdomain
+    classes: tuple[SubdomainClass, ...]
+    class_of: NDArray[np.int64]  #: (S,) of each subdomain
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
         """First torn unknown of each subdomain, and N: (S + 1,)."""
-        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
+        sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
     @cached_property
     def members(self) -> tuple[NDArray[np.int64], ...]:
         """Subdomains of each kind."""
-        order = np.argsort(self.kind, kind="stable")
-        ends = np.cumsum(np.bincount(self.kind, minlength=len(self.kinds)))
+        order = np.argsort(self.class_of, kind="stable")
+        ends = np.cumsum(np.bincount(self.class_of, minlength=len(self.classes)))
         return tuple(np.split(order, ends[:-1]))
 
     @cached_property
     def kernel(self) -> csr_array:
         """R = diag(R_1 … R_S), (N, Σr)."""
-        modes = np.array([kind.R.shape[1] for kind in self.kinds])[self.kind]
+        modes = np.array([kind.R.shape[1] for kind in self.classes])[self.class_of]
         sizes = np.diff(self.start)
-        entries = np.concatenate([self.kinds[k].R.ravel() for k in self.kind])
+        entries = np.concatenate([self.classes[k].R.ravel() for k in self.class_of])
         per_row = np.repeat(modes, sizes)
         ends = np.concatenate([[0], np.cumsum(per_row)])
         along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
@@ -202,25 +202,25 @@ class Subdomains:
 
     def places(self) -> Iterator[NDArray[np.int64]]:
         """Give the torn unknowns of each kind, (n_k, S_k): a column per subdomain."""
-        for kind, members in zip(self.kinds, self.members, strict=True):
+        for kind, members in zip(self.classes, self.members, strict=True):
             yield self.start[members] + np.arange(kind.R.shape[0])[:, None]
 
     def without(self, free: NDArray[np.bool_]) -> Subdomains:
         """Return the subdomains without all but their free torn unknowns (N,)."""
-        kinds, kind = list[SubdomainClass](), np.empty_like(self.kind)
+        classes, kind = list[SubdomainClass](), np.empty_like(self.class_of)
         known = dict[tuple[int, bytes], int]()
-        for s, k in enumerate(self.kind):
+        for s, k in enumerate(self.class_of):
             mine = free[self.start[s] : self.start[s + 1]]
-            found = known.setdefault((int(k), mine.tobytes()), len(kinds))
-            if found == len(kinds):
-                kinds.append(_held(self.kinds[k], mine))
+            found = known.setdefault((int(k), mine.tobytes()), len(classes))
+            if found == len(classes):
+                classes.append(_held(self.classes[k], mine))
             kind[s] = found
-        return Subdomains(tuple(kinds), kind)
+        return Subdomains(tuple(classes), kind)
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""
         v = np.empty_like(b)
-        for kind, place in zip(self.kinds, self.places(), strict=True):
+        for kind, place in zip(self.classes, self.places(), strict=True):
             own = b[place]
             v[place] = kind.inverse(own) if own.any() else 0.0
         return v
@@ -239,8 +239,8 @@ class DecomposedBodies:
     they were is scale·λ.
     """
 
-    kinds: tuple[SubdomainClass, ...]
-    kind: NDArray[np.int64]  #: (S,) of each subdomain
+    classes: tuple[SubdomainClass, ...]
+    class_of: NDArray[np.int64]  #: (S,) of each subdomain
     spread: csr_array  #: T (N, n)
     B: csr_array  #: (m, N), scaled
     c: Vector  #: (m,), scaled
@@ -256,7 +256,7 @@ class DecomposedBodies:
     @cached_property
     def domains(self) -> Subdomains:
         """The subdomains on their own, with what is factorised once."""
-        return Subdomains(self.kinds, self.kind)
+        return Subdomains(self.classes, self.class_of)
 
 
 def _symmetric(M: Dense) -> Dense:

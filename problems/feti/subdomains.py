@@ -40,7 +40,7 @@ from scipy.sparse import bsr_array, coo_array, csr_array
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import Ranks, alone
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.distributed import balanced
+from mortarbench.problems.feti.distributed import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
     Points,
@@ -52,7 +52,13 @@ from mortarbench.problems.feti.subdomain_classes import (
     SubdomainClass,
     Subdomains,
 )
-from mortarbench.problems.feti.tearing import ALIKE, Part, classify, images, spread_of
+from mortarbench.problems.feti.tearing import (
+    CONGRUENCE_TOL,
+    SubdomainMesh,
+    classify,
+    congruent,
+    spread_of,
+)
 
 Weights = Callable[[int], NDArray[np.float64]]
 
@@ -91,7 +97,9 @@ class DecomposedProblem:
     layout: Subdivision  #: of the bodies into subdomains, S in all
     components: int  #: of a node: 2 of displacements, 1 of heights
     material: Integers  #: (S,) of each subdomain
-    kind: Callable[[Part], SubdomainClass]  #: assembles a floating subdomain
+    assemble_class: Callable[
+        [SubdomainMesh], SubdomainClass
+    ]  #: assembles a floating subdomain
     E: Vector  #: (bodies,) stiffness that rows are scaled by
     names: tuple[str, ...]  #: of the bodies
     #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
@@ -113,7 +121,7 @@ class DecomposedProblem:
             return np.zeros(0)
         node = rows.indices // self.components
         E = self.E[of.body[of.holder(node)]]
-        norm2 = np.add.reduceat(rows.data**2 / of.times(node), rows.indptr[:-1])
+        norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
         return np.asarray(np.sqrt(softest / norm2))
 
@@ -145,7 +153,7 @@ class LocalSubdomains:
         """Its torn nodes, (M_p,)."""
         return self.problem.layout.subdomain_nodes(self.number)
 
-    def torn(self, subdomain: Nodes, node: Nodes) -> Nodes:
+    def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
         """Find own torn nodes (k,) by their subdomains and their nodes, (k,) both."""
         nodes, N = self.nodes, self.problem.layout.nodes
         known = nodes.subdomain * np.int64(N) + nodes.number
@@ -198,10 +206,10 @@ class LocalSubdomains:
         return csr_array(T[self.kept]) if self.problem.eliminated else T
 
     @property
-    def times(self) -> NDArray[np.int64]:
+    def multiplicity(self) -> NDArray[np.int64]:
         """How many copies it has on all ranks together, (N_p,)."""
-        times = np.repeat(self.nodes.times, self.problem.components)
-        return np.asarray(times[self.kept])
+        multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
+        return np.asarray(multiplicity[self.kept])
 
     @cached_property
     def kept(self) -> slice | Nodes:
@@ -221,25 +229,27 @@ class LocalSubdomains:
         leader = self._leaders(
             [(int(self.number[s]), keys[s], points[s]) for s in first]
         )
-        kinds = []
+        classes = []
         for k, s in enumerate(first):
             number, at = leader[int(self.number[s])]
             if number != self.number[s]:
                 mine = np.flatnonzero(kind == k)
-                turn = images(np.stack([at, *(points[s] for s in mine.tolist())]))[1]
+                turn = congruent(np.stack([at, *(points[s] for s in mine.tolist())]))[1]
                 rotation[mine] = turn[1:]
             cells = of.cells(int(self.number[s]))
-            kinds.append(
-                problem.kind(Part(at, cells, np.full(len(cells), material[s])))
+            classes.append(
+                problem.assemble_class(
+                    SubdomainMesh(at, cells, np.full(len(cells), material[s]))
+                )
             )
-        return Subdomains(tuple(kinds), kind), rotation
+        return Subdomains(tuple(classes), kind), rotation
 
     @property
     def floating(self) -> LocalSubdomains:
         """Hold the same with supports that are rows: all its subdomains float."""
         if not self.problem.eliminated:
             return self
-        return self.posed(replace(self.problem, eliminated=False))
+        return self.with_problem(replace(self.problem, eliminated=False))
 
     @cached_property
     def domains(self) -> Subdomains:
@@ -268,7 +278,9 @@ class LocalSubdomains:
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * ALIKE * np.sqrt(at.size)  # a little more than `classify` allows
+            off = (
+                3 * CONGRUENCE_TOL * np.sqrt(at.size)
+            )  # a little more than `classify` allows
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
         asked = [one for one in own if may_be_elsewhere(*one[1:])]
@@ -291,9 +303,9 @@ class LocalSubdomains:
     @cached_property
     def motions(self) -> NDArray[np.int64]:
         """First rigid motion of each subdomain of the whole, and how many: (S + 1,)."""
-        modes = np.array([kind.R.shape[1] for kind in self.domains.kinds])
+        modes = np.array([kind.R.shape[1] for kind in self.domains.classes])
         found = np.zeros(self.rank.size, dtype=np.int64)
-        own = self.number, modes[self.domains.kind]
+        own = self.number, modes[self.domains.class_of]
         for number, count in self.ranks.comm.allgather(own):
             found[number] = count
         return np.concatenate([[0], np.cumsum(found)])
@@ -313,8 +325,8 @@ class LocalSubdomains:
     def f(self) -> Vector:
         """Its part of the load, (N_p,) in the axes of subdomains."""
         d = self.problem.components
-        times = np.repeat(self.nodes.times, d)
-        found = self.problem.load(self._component) / times
+        multiplicity = np.repeat(self.nodes.multiplicity, d)
+        found = self.problem.load(self._component) / multiplicity
         if d > 1:
             loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
             turn = self.rotation[self.nodes.subdomain[loaded]]
@@ -329,10 +341,10 @@ class LocalSubdomains:
         """
         domains = self.domains
         of = np.searchsorted(domains.start, unknown, side="right") - 1
-        R = np.concatenate([kind.R.ravel() for kind in domains.kinds])
-        first = np.cumsum([0, *(kind.R.size for kind in domains.kinds)])
+        R = np.concatenate([kind.R.ravel() for kind in domains.classes])
+        first = np.cumsum([0, *(kind.R.size for kind in domains.classes)])
         modes = np.diff(self.motions)[self.number[of]]
-        at = first[domains.kind[of]] + modes * (unknown - domains.start[of])
+        at = first[domains.class_of[of]] + modes * (unknown - domains.start[of])
         ends = np.concatenate([[0], np.cumsum(modes)])
         along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
         entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
@@ -362,12 +374,12 @@ class LocalSubdomains:
         """Collect what its subdomains are; rows and components are those it has."""
         domains, rows = self.domains, self.rows
         return DecomposedBodies(
-            kinds=domains.kinds, kind=domains.kind, spread=self.spread, B=rows.B,
-            c=rows.c, scale=self.problem.contact_scale, f=self.f,
-            equalities=rows.equalities,
+            classes=domains.classes, class_of=domains.class_of,
+            spread=self.spread, B=rows.B, c=rows.c,
+            scale=self.problem.contact_scale, f=self.f, equalities=rows.equalities,
         )  # fmt: skip
 
-    def bounded(self, bound: Vector) -> LocalSubdomains:
+    def with_bound(self, bound: Vector) -> LocalSubdomains:
         """Hold the same with another bound (k,) of friction."""
         contact = self.problem.contact._replace(bound=bound)
         found = replace(self, problem=replace(self.problem, contact=contact))
@@ -375,7 +387,7 @@ class LocalSubdomains:
         vars(found).update({**vars(self), "problem": found.problem})
         return found
 
-    def posed(self, problem: DecomposedProblem) -> LocalSubdomains:
+    def with_problem(self, problem: DecomposedProblem) -> LocalSubdomains:
         """Hold the same bodies with other loads, contact or supports that are rows."""
         found = replace(self, problem=problem)
         same = ("number", "nodes", "_classified", "_distinct")
@@ -407,11 +419,11 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     S = of.count
     if ranks == 1:
         return np.zeros(S, dtype=np.int64)
-    one, other, nodes = of.sharing()
+    one, other, nodes = of.shared_node_counts()
     graph = coo_array((d * nodes, (one, other)), shape=(S, S))
     touched = of.glued()
     node = np.unique(np.concatenate([problem.held, problem.contact.rows.indices]) // d)
-    single = of.times(node) == 1
+    single = of.multiplicity(node) == 1
     touched = touched + np.bincount(of.holder(node[single]), minlength=S)
     entries = problem.contact.rows.tocoo()
     touches = csr_array(
@@ -423,7 +435,7 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     )
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    return balanced(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
+    return balanced_partition(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
 
 
 def _rows(own: LocalSubdomains) -> _Rows:
@@ -461,10 +473,10 @@ def _supports(own: LocalSubdomains) -> Entries:
     """One row for each copy of a component that is held, the last copy first."""
     problem, d = own.problem, own.problem.components
     node, k = np.divmod(problem.held, d)
-    times = problem.layout.times(node)
+    multiplicity = problem.layout.multiplicity(node)
     copies = _own_copies(own, node)
     of = copies.node[copies.mine]
-    row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
+    row = np.cumsum(multiplicity)[of] - 1 - copies.copy[copies.mine]
     value = np.sqrt(own.stiffness(copies.torn, held=True))
     reached = np.stack([row, np.full(row.size, own.ranks.rank)], axis=1)
     return Entries(*_turned(own, row, copies.torn, k[of], value), reached)
@@ -483,13 +495,15 @@ class _Copies(NamedTuple):
 def _own_copies(own: LocalSubdomains, node: Nodes) -> _Copies:
     """Find the copies of some nodes (k,), and which of them this rank holds."""
     of = own.problem.layout
-    times = of.times(node)
-    place = np.repeat(np.arange(times.size), times)
-    copy = np.arange(place.size) - np.repeat(np.cumsum(times) - times, times)
+    multiplicity = of.multiplicity(node)
+    place = np.repeat(np.arange(multiplicity.size), multiplicity)
+    copy = np.arange(place.size) - np.repeat(
+        np.cumsum(multiplicity) - multiplicity, multiplicity
+    )
     subdomain = of.holder(node[place], copy)
     rank = own.rank[subdomain]
     mine = np.flatnonzero(rank == own.ranks.rank)
-    torn = own.torn(subdomain[mine], node[place[mine]])
+    torn = own.local_nodes(subdomain[mine], node[place[mine]])
     return _Copies(place, copy, rank, mine, torn)
 
 
@@ -498,14 +512,14 @@ def _glued(own: LocalSubdomains) -> Entries:
     problem, nodes, of = own.problem, own.nodes, own.problem.layout
     d = problem.components
     held = np.sort(problem.held)
-    held_times = of.times(held // d)
+    held_times = of.multiplicity(held // d)
     base = 0 if problem.eliminated else int(held_times.sum())
     none = np.zeros(0, dtype=np.int64)
     found = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
-    for m, nodes_with in sorted(of.having.items()):
+    for m, nodes_with in sorted(of.nodes_by_multiplicity.items()):
         W = GLUE[problem.glue](m)
         held_m = held[held_times == m]
-        several = np.flatnonzero(nodes.times == m)
+        several = np.flatnonzero(nodes.multiplicity == m)
         number = nodes.number[several]
         before = of.before(number)
         ranks = np.stack([own.rank[of.holder(number, p)] for p in range(m)], axis=1)
@@ -539,8 +553,8 @@ def _contact(own: LocalSubdomains) -> Entries:
     copies = _own_copies(own, node)
     row = _equalities(problem) + entries.row.astype(np.int64)
     reached = np.stack([row[copies.node], copies.rank], axis=1)
-    times = problem.layout.times(node)
-    share = problem.contact_scale[entries.row] * entries.data / times
+    multiplicity = problem.layout.multiplicity(node)
+    share = problem.contact_scale[entries.row] * entries.data / multiplicity
     of = copies.node[copies.mine]
     return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
 
@@ -566,12 +580,12 @@ def _turned(
 def _equalities(problem: DecomposedProblem) -> int:
     """Count the rows of supports and gluing."""
     of, d = problem.layout, problem.components
-    times = of.times(problem.held // d)
+    multiplicity = of.multiplicity(problem.held // d)
     glued = sum(
-        len(GLUE[problem.glue](m)) * (d * count - int((times == m).sum()))
-        for m, count in of.having.items()
+        len(GLUE[problem.glue](m)) * (d * count - int((multiplicity == m).sum()))
+        for m, count in of.nodes_by_multiplicity.items()
     )
-    return glued if problem.eliminated else int(times.sum()) + glued
+    return glued if problem.eliminated else int(multiplicity.sum()) + glued
 
 
 def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:

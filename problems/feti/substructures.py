@@ -64,7 +64,7 @@ class LocalProblems:
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
         """Apply PKP in the precision of v."""
         found, domains = np.zeros_like(v), self.torn.domains
-        for kind, members in zip(domains.kinds, domains.members, strict=True):
+        for kind, members in zip(domains.classes, domains.members, strict=True):
             K, R = kind.K, np.ascontiguousarray(kind.R)
             projected_products(
                 K.data, K.indices, K.indptr, R, domains.start[members], v, found
@@ -95,7 +95,7 @@ class LocalProblems:
 
     def _kinds(self) -> zip[tuple[SubdomainClass, NDArray[np.int64]]]:
         """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
-        return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
+        return zip(self.torn.classes, self.torn.domains.places(), strict=True)
 
 
 def _nodal(kind: SubdomainClass, d: int) -> NDArray[np.float64]:

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
 
-ALIKE = 1e-11  #: distance of the points of equal subdomains, of their diameter
+CONGRUENCE_TOL = 1e-11  #: distance of the points of equal subdomains, of their diameter
 
 
-class Part(NamedTuple):
+class SubdomainMesh(NamedTuple):
     """One subdomain on its own, with nodes 0 … n_k − 1."""
 
     points: NDArray[np.float64]  #: (n_k, dim)
@@ -88,10 +88,10 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
         if lengths[0].size * lengths[1].size <= most**2 or not any(size):
             found.append((rows, columns))
             continue
-        k = int(size[1] > size[0] * (1 + ALIKE))
+        k = int(size[1] > size[0] * (1 + CONGRUENCE_TOL))
         ends = np.cumsum(lengths[k])
         off = np.abs(ends[:-1] - ends[-1] / 2)
-        nearest = int(np.argmax(off <= off.min() + ALIKE * ends[-1]))
+        nearest = int(np.argmax(off <= off.min() + CONGRUENCE_TOL * ends[-1]))
         cut = (rows, columns)[k]
         at = cut.start + nearest + 1
         for part in (slice(at, cut.stop), slice(cut.start, at)):
@@ -99,7 +99,7 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
     return found
 
 
-def labelled(found: Sequence[Block]) -> NDArray[np.int64]:
+def label_blocks(found: Sequence[Block]) -> NDArray[np.int64]:
     """Label cells, row by row, by the blocks that cover them."""
     shape = [max(block[k].stop for block in found) for k in (0, 1)]
     label = np.empty(shape, dtype=np.int64)
@@ -134,10 +134,10 @@ def classify(
         left = np.array(group)
         spread = np.array([spread_of(points[s]) for s in group])
         # of images, ‖x − x̄‖ differs by no more than their points do
-        off = 2 * ALIKE * np.sqrt(points[group[0]].size)
+        off = 2 * CONGRUENCE_TOL * np.sqrt(points[group[0]].size)
         while left.size:
             near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
-            same, turn = images(np.stack([points[s] for s in left[near]]))
+            same, turn = congruent(np.stack([points[s] for s in left[near]]))
             found = left[near[same]]
             kind[found], rotation[found] = len(first), turn[same]
             first.append(int(left[0]))
@@ -151,7 +151,7 @@ def spread_of(points: NDArray[np.float64]) -> float:
     return float(np.linalg.norm(points - points.mean(axis=0)))
 
 
-def images(
+def congruent(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
     """Say which of equally many points (g, n, dim) are images of the first, and how.
@@ -162,7 +162,7 @@ def images(
 
     """
     x = points - points.mean(axis=1, keepdims=True)
-    near = ALIKE * np.linalg.norm(x[0], axis=1).max()
+    near = CONGRUENCE_TOL * np.linalg.norm(x[0], axis=1).max()
     U, _, Vt = np.linalg.svd(np.einsum("gni,nj->gij", x, x[0]))
     U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
     Q = U @ Vt

@@ -50,7 +50,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     """
     p: Any = params
     found = _problem(params)
-    if not found.bodies.is_held and not p["step"] == p["relin"] == 1:
+    if not found.bodies.is_supported and not p["step"] == p["relin"] == 1:
         raise InputError(
             f"{p['path']}: the supports leave a rigid motion of some body, which load "
             "steps and re-linearisations do not allow; expected steps=1 and relin=1"
@@ -62,8 +62,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     of, laws = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]), laws_of(p)
-    is_single = p["steps"] == p["relin"] == 1 or not of.is_held
-    if not of.is_held:
+    is_single = p["steps"] == p["relin"] == 1 or not of.is_supported
+    if not of.is_supported:
         rows = keyed_linearisation(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
         with located(p["path"]):  # friction may hold either way
             check_balance(of.whole, vstack([rows.B, rows.T, -rows.T]))

@@ -54,7 +54,7 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid_plane import above_plane
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
-from mortarbench.problems.duality.case_forms import beside
+from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
@@ -113,7 +113,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
         path, form, 1, int(params["newton"]),
         lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
     )  # fmt: skip
-    return beside(case, _curve(exact))
+    return with_exact_tractions(case, _curve(exact))
 
 
 @lru_cache(maxsize=4)

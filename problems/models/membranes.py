@@ -26,7 +26,7 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
 from mortarbench.harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.duality.dualisation import posed
+from mortarbench.problems.duality.dualisation import primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
     feti_dual,
@@ -44,7 +44,7 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certified_by
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
@@ -52,7 +52,7 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import Part
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
@@ -66,11 +66,11 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     decomposition: Mapping[str, Any] = {}
     seconds, in_parts = None, None
     if form == "primal":
-        new = posed(pair.qp)
+        new = primal_form(pair.qp)
     else:
         start = perf_counter()
         own = on_one_process(pair.in_subdomains(p["glue"]))
-        pieces, in_parts = own.decomposed, certified_by(own, pair.qp.P)
+        pieces, in_parts = own.decomposed, certifier(own, pair.qp.P)
         new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
         matrices = feti_matrices(pieces, new.qp)
@@ -157,8 +157,8 @@ class Membranes:
         G = _touching(sides, layout.nodes)
         return DecomposedProblem(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
-            kind=membrane_class, E=np.ones(2), names=NAMES, load=self.load, glue=rows,
-            held=np.sort(sides["left left"]),
+            assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
+            glue=rows, held=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 
@@ -213,7 +213,7 @@ def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
     return Membranes(p["S"], p["n"]).results
 
 
-def membrane_class(part: Part, h: float = 1.0) -> SubdomainClass:
+def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
     """Assemble one floating block of a grid, under unit tension.
 
     Its kernel are the constants. Its nodes are numbered as those of `grid_stiffness`.

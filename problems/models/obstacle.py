@@ -60,9 +60,9 @@ from mortarbench.problems.fem.inverse import (
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certified_by
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
@@ -92,7 +92,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         new = with_bounds(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
-        pieces, in_parts = own.decomposed, certified_by(own, rows.P)
+        pieces, in_parts = own.decomposed, certifier(own, rows.P)
         new = feti_dual(pieces, rows)
         decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "dual":
@@ -137,7 +137,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
     return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
+        assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
         names=("membrane",), load=partial(_load, grid, shape), held=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
     )  # fmt: skip
@@ -147,11 +147,11 @@ def _string_in_subdomains(n: int, most: int, glue: str) -> DecomposedProblem:
     """Describe the dual of a string; its mesh is listed as a whole."""
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_parts(mesh, blocks((n,), most), body, np.arange(n + 1))
+    layout = mesh_in_subdomains(mesh, blocks((n,), most), body, np.arange(n + 1))
     qp = problem.qp
     return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
+        assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
         names=("string",), load=lambda node: -qp.q[node], held=qp.A.indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
     )  # fmt: skip

@@ -37,7 +37,7 @@ from mortarbench.harness import (
 )
 from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
-from mortarbench.problems.duality.dualisation import Transformed, posed
+from mortarbench.problems.duality.dualisation import Transformed, primal_form
 from mortarbench.problems.duality.feti_dual import (
     decomposition_quantities,
     feti_dual,
@@ -60,7 +60,7 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.feti.distributed_dual import LocalDual
-from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certified_by
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
@@ -91,7 +91,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     plate = model(tuple(params.items()))
     mesh = plate.mesh
-    new = plate.dual if form == "dual" else posed(plate.primal)
+    new = plate.dual if form == "dual" else primal_form(plate.primal)
 
     def results(s: Solution) -> Mapping[str, Any]:
         counts = quantities(plate, new.recover(s))
@@ -117,7 +117,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 np.zeros(mesh.dofs),
             ),
             in_parts=(
-                certified_by(plate.own, plate.primal.P) if form == "dual" else None
+                certifier(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),
     )  # fmt: skip
@@ -212,7 +212,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     return DecomposedProblem(
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
-        kind=partial(elastic_class, D=D, E=moduli),
+        assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(Forces(*_pull(grid, p["load"]))),
         held=dofs_of(grid.sides["left"], 2),
         eliminated=p["supports"] == "eliminated",

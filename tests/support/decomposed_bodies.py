@@ -18,7 +18,7 @@ from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
 from mortarbench.problems.duality.problem import elastic_bodies_of, qp_choice
 from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_parts
+from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
@@ -30,10 +30,10 @@ from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 
 
-def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
+def labelled_subdivision(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
     """Know the bodies by the labels (E,) of their cells; all nodes are listed."""
     every = np.arange(len(bodies.mesh.points))
-    return mesh_in_parts(bodies.mesh, label, bodies.body, every)
+    return mesh_in_subdomains(bodies.mesh, label, bodies.body, every)
 
 
 def torn_by(
@@ -89,4 +89,8 @@ def torn_pair(
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
     label = of_beam_ring(*geometry).shape.layout(most).label
-    return bodies, primal, torn_by(bodies, labelled(bodies, label), primal, rows=rows)
+    return (
+        bodies,
+        primal,
+        torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows),
+    )

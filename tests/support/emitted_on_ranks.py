@@ -37,14 +37,14 @@ def told(name, ranks):
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
     share = made.share().qp
     rows = share.P.halo.rows
-    own = rows[share.P.halo.own]
+    own = rows[share.P.halo.owned]
     mine = own_subdomains(name, ranks)
     B = share.P.local.B.tocoo()
     Fx, factorised = forming(lambda: share.P @ probe(made.variables)[own])
     return ranks.comm.gather({
         "factorised": factorised,
         "formed": [
-            named(group.kind, group.touched)
+            named(group.template, group.touched)
             for group in share.P.local.packed.groups if group.explicit
         ],
         "sizes": [made.variables, made.equality_rows],
@@ -66,7 +66,7 @@ def own_subdomains(name, ranks):
             qp_choice("dual", case.params),
         )
         path = decomposed_path(problem, choice, ranks, reference_over_ranks)
-        return path.problem(choice.step, choice.iterate).posed.dual.own
+        return path.problem(choice.step, choice.iterate).posed.dual.subdomains
     problem = parts_of(name)
     return LocalSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 

@@ -18,12 +18,12 @@ from mortarbench.problems.feti.operator_arrays import (
     dual_operator,
     dual_operator_from_arrays,
 )
-from mortarbench.problems.feti.operators import inverted_blocks
+from mortarbench.problems.feti.operators import block_pseudoinverse
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled_subdivision, torn_by
 
 pytestmark = pytest.mark.together
 
@@ -39,7 +39,7 @@ def beam_and_ring(rows="orthonormal"):
     )
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
-    return torn_by(bodies, labelled(bodies, label), primal, rows=rows)
+    return torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)
 
 
 def membranes(rows="orthonormal"):
@@ -62,7 +62,7 @@ def operator_of(pair):
 
 def dense(pair):
     """K as a whole, with B and R."""
-    K = block_diag(*(pair.kinds[k].K.toarray() for k in pair.kind))
+    K = block_diag(*(pair.classes[k].K.toarray() for k in pair.class_of))
     return K, pair.B.toarray(), pair.domains.kernel.toarray()
 
 
@@ -135,12 +135,12 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     sizes = [
         np.unique(np.concatenate([
             pair.B[:, pair.start[s] : pair.start[s + 1]].indices
-            for s in np.flatnonzero(pair.kind == k)
-        ])).size for k in range(len(pair.kinds))
+            for s in np.flatnonzero(pair.class_of == k)
+        ])).size for k in range(len(pair.classes))
     ]  # fmt: skip
     assert len(set(sizes)) > 1
     room = 16 * (np.square(sizes).sum() - 1) / 2**20
-    monkeypatch.setattr("mortarbench.problems.feti.operators.EXPLICIT_MIB", room)
+    monkeypatch.setattr("mortarbench.problems.feti.operators.MAX_EXPLICIT_MIB", room)
 
     explicit = operator_of(pair).arrays["explicit"]
 
@@ -152,8 +152,8 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
 def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
     """Each of two membranes in one square, of the same kind or of two."""
     pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
-    (kind,) = pair.kinds
-    other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
+    (kind,) = pair.classes
+    other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))
     F, apart = operator_of(pair), operator_of(other)
     x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
 
@@ -169,8 +169,8 @@ def definition(pair, kind, scaling):
     _, B, _ = dense(pair)
     touched = np.abs(B).sum(axis=0) > 0
     D, softness = [], []
-    for s, k in enumerate(pair.kind):
-        own, part = pair.kinds[k], touched[pair.start[s] : pair.start[s + 1]]
+    for s, k in enumerate(pair.class_of):
+        own, part = pair.classes[k], touched[pair.start[s] : pair.start[s + 1]]
         S = own.K.toarray().copy()
         edge = np.zeros(len(S), dtype=bool)
         edge[own.boundary] = True
@@ -219,7 +219,7 @@ def test_small_blocks_are_inverted_as_moore_and_penrose_do():
     turn = rng.permutation(len(M))
     M = M[turn][:, turn]
 
-    found = inverted_blocks(csr_array(M)).toarray()
+    found = block_pseudoinverse(csr_array(M)).toarray()
     assert_allclose(found, np.linalg.pinv(M), atol=1e-14)
 
 
@@ -296,7 +296,7 @@ def test_equal_subdomains_share_one_stiffness_in_what_is_written():
 
 def test_a_kind_without_kernel_has_its_inverse():
     """Where supports are eliminated, as in FETI-1."""
-    (kind,) = membranes().kinds
+    (kind,) = membranes().classes
     n = kind.K.shape[0]
     K = csc_array(kind.K + eye_array(n))
     nothing = np.zeros(0, dtype=np.int64)

@@ -10,7 +10,7 @@ from mortarbench.problems.duality.decomposed import decompose, longitudinal_shar
 from mortarbench.problems.duality.problem import ElasticBodies, Meshed
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
-from mortarbench.problems.feti.local_bodies import local_bodies, unheld_bodies
+from mortarbench.problems.feti.local_bodies import floating_bodies, local_bodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
     LocalSubdomains,
@@ -47,8 +47,8 @@ def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> LocalSubdomains:
 def stored(own: LocalSubdomains) -> csr_array:
     """TᵀK_T T."""
     T, domains = own.spread, own.domains
-    blocks = [domains.kinds[k].K @ T[a:b] for k, a, b in zip(
-        domains.kind, domains.start[:-1], domains.start[1:], strict=True
+    blocks = [domains.classes[k].K @ T[a:b] for k, a, b in zip(
+        domains.class_of, domains.start[:-1], domains.start[1:], strict=True
     )]  # fmt: skip
     ends = zip(domains.start[:-1], domains.start[1:], blocks, strict=True)
     return csr_array(sum(T[a:b].T @ block for a, b, block in ends))
@@ -73,7 +73,7 @@ def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
     unheld = local_bodies(own).unheld
     R = unheld.motions.toarray()
 
-    assert unheld_bodies(own.problem)
+    assert floating_bodies(own.problem)
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
     assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
     assert_allclose(unheld.left, np.eye(6))
@@ -92,7 +92,7 @@ def test_a_face_that_is_held_along_axes_leaves_the_other_motions(axes):
     unheld = local_bodies(own).unheld
     left = LEFT[axes]
 
-    assert (not unheld_bodies(own.problem)) == (left == 0)
+    assert (not floating_bodies(own.problem)) == (left == 0)
     assert unheld.left.shape[1] == left
     if left:
         R = unheld.motions @ unheld.left

@@ -15,7 +15,7 @@ from mortarbench.harness.distributed.vectors import DistributedColumns
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.feti import spectrum as module
-from mortarbench.problems.feti.distributed import shared
+from mortarbench.problems.feti.distributed import local_share
 from mortarbench.problems.feti.distributed_dual import LocalDual
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator
@@ -29,7 +29,7 @@ from mortarbench.problems.feti.spectrum import (
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import labelled, parts_by, torn_pair
+from tests.support.decomposed_bodies import labelled_subdivision, parts_by, torn_pair
 from tests.support.threads import on_threads, without_lock
 
 
@@ -110,9 +110,9 @@ def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
     bodies, primal, _ = torn_pair(rows)
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
-    parts = parts_by(bodies, labelled(bodies, label), primal, rows=rows)
+    parts = parts_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)
     dual = LocalDual(on_one_process(parts))
-    P, B, G = projector_of(dual), dual.own.rows.B, dual.G
+    P, B, G = projector_of(dual), dual.subdomains.rows.B, dual.G
     dense = B.toarray()
     x = np.sin(np.arange(B.shape[0]) ** 2)
     y = P(x)
@@ -197,16 +197,16 @@ def test_ranks_find_the_eigenvalues_of_the_dense_operator(floating, monkeypatch)
         P=F, q=np.zeros(m), A=G, b=np.zeros(G.shape[0]), G=no_rows(m), h=np.zeros(0),
         lb=np.full(m, -np.inf), ub=np.full(m, np.inf),
     )  # fmt: skip
-    kinds = (None, ("lumped", "stiffness"))
+    classes = (None, ("lumped", "stiffness"))
 
     def work(ranks):
-        share = shared(qp, F.build(), ranks)
-        return spectra_over_ranks(share.qp.P, share.qp.A, kinds, tol=1e-9)
+        share = local_share(qp, F.build(), ranks)
+        return spectra_over_ranks(share.qp.P, share.qp.A, classes, tol=1e-9)
 
     Q = orth(B.toarray())
     Q = Q @ null_space(G.toarray() @ Q)
     dense = Q.T @ F.build()(np.eye(m)) @ Q
-    M = Q.T @ F.build().preconditioner(*kinds[1])(np.eye(m)) @ Q
+    M = Q.T @ F.build().preconditioner(*classes[1])(np.eye(m)) @ Q
     known = [np.linalg.eigvalsh(dense), np.sort(np.linalg.eigvals(M @ dense).real)]
     for found in on_threads(3, work):
         for got, values in zip(found, known, strict=True):

@@ -17,7 +17,7 @@ def parts() -> LocalProblems:
 
 def dense(parts: LocalProblems) -> np.ndarray:
     torn = parts.torn
-    return np.asarray(block_diag(*(torn.kinds[k].K.toarray() for k in torn.kind)))
+    return np.asarray(block_diag(*(torn.classes[k].K.toarray() for k in torn.class_of)))
 
 
 def test_a_solve_takes_the_rigid_part_from_forces_and_from_motions(
