@@ -78,7 +78,7 @@ class LocalDual:
         own = self.subdomains
         return np.asarray(
             own.rows.c[self.halo.owned]
-            - self.halo.added(own.rows.B @ own.domains.inverse(own.f))
+            - self.halo.accumulate(own.rows.B @ own.domains.inverse(own.f))
         )
 
     @cached_property

@@ -78,7 +78,7 @@ def local_solution(own: LocalSubdomains, halo: Halo, s: Solution) -> LocalSoluti
     """
     bodies, multiplicity = _bodies(own.floating)
     T, alpha = bodies.parts.spread, np.asarray(s.y)[own.local_motions]
-    touched = halo.gathered(np.asarray(s.x))
+    touched = halo.gather(np.asarray(s.x))
     v = np.zeros(T.shape[0])
     v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
     v[own.kept] -= own.domains.kernel @ alpha

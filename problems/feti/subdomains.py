@@ -258,7 +258,7 @@ class LocalSubdomains:
         if self.problem.eliminated:
             free = np.zeros(int(found.start[-1]), dtype=bool)
             free[self.kept] = True
-            found = found.without(free)
+            found = found.restrict(free)
         return found
 
     def _leaders(

@@ -36,9 +36,9 @@ def loads(work):
     """Say what each rank does, if all do what `assign_factorisations` says."""
     done = np.zeros(len(work))
     for name, task in assign_factorisations(work).items():
-        size = work[task.factor][name]
-        done[task.factor] += (1 - BLOCK_SHARE) * size
-        done[task.blocks] += BLOCK_SHARE * size
+        size = work[task.factor_rank][name]
+        done[task.factor_rank] += (1 - BLOCK_SHARE) * size
+        done[task.block_rank] += BLOCK_SHARE * size
     return done
 
 
@@ -47,14 +47,14 @@ def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
 
     assert loads([classes, classes]).tolist() == [18, 18]
     factors = [
-        task.factor for task in assign_factorisations([classes, classes]).values()
+        task.factor_rank for task in assign_factorisations([classes, classes]).values()
     ]
     assert sorted(np.bincount(factors)) == [4, 5]
 
 
 def test_blocks_fill_the_time_until_factors_are_given_away():
     tasks = assign_factorisations([dict.fromkeys("abcdefghi", 4)] * 2)
-    factors = np.bincount([task.factor for task in tasks.values()])
+    factors = np.bincount([task.factor_rank for task in tasks.values()])
     more, less = factors.argmax(), factors.argmin()
 
     assert blocks_before_exchange(tasks, more) == 0
@@ -63,10 +63,10 @@ def test_blocks_fill_the_time_until_factors_are_given_away():
 
 def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
     tasks = {
-        "a": Assignment(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "b": Assignment(4, [1], factor=1, blocks=1),
-        "c": Assignment(4, [1], factor=1, blocks=1),
-        "d": Assignment(40, [0], factor=0, blocks=0),  # which nobody waits for
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "b": Assignment(4, [1], factor_rank=1, block_rank=1),
+        "c": Assignment(4, [1], factor_rank=1, block_rank=1),
+        "d": Assignment(40, [0], factor_rank=0, block_rank=0),  # which nobody waits for
     }
 
     assert blocks_before_exchange(tasks, 1) == 1
@@ -75,14 +75,16 @@ def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
 
 def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
     tasks = {
-        "a": Assignment(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "e": Assignment(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
-        **{name: Assignment(4, [1], factor=1, blocks=1) for name in "bcd"},
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "e": Assignment(
+            16, [1, 2], factor_rank=2, block_rank=1
+        ),  # whose factor takes 12
+        **{name: Assignment(4, [1], factor_rank=1, block_rank=1) for name in "bcd"},
     }
     assert blocks_before_exchange(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
     assert blocks_before_exchange(less, 1) == 1
-    alone = {"a": less["a"], "b": Assignment(11, [1], factor=1, blocks=1)}
+    alone = {"a": less["a"], "b": Assignment(11, [1], factor_rank=1, block_rank=1)}
     assert blocks_before_exchange(alone, 1) == 1  # more than half of it fits in
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
     assert blocks_before_exchange(smaller, 1) == 2
@@ -118,8 +120,8 @@ def test_nobody_gets_more_to_do_than_who_gives_it_away():
         tasks = assign_factorisations(work)
         whole = np.zeros(len(work))
         for name, task in tasks.items():
-            assert {task.factor, task.blocks} <= set(task.have)
-            whole[task.factor] += work[task.factor][name]
+            assert {task.factor_rank, task.block_rank} <= set(task.ranks)
+            whole[task.factor_rank] += work[task.factor_rank][name]
         assert set(tasks) == set().union(*work)
         assert loads(work).max() <= whole.max()
 
@@ -136,7 +138,11 @@ def test_what_several_neighbours_return_for_one_row_is_added_up():
         ghosts=np.zeros(0, dtype=np.int64), export_counts=np.array([0, 2, 2]),
         ghost_counts=np.zeros(3, dtype=np.int64),
     )  # fmt: skip
-    assert at.added(np.array([0.5, 0.25, 0.125])).tolist() == [101.5, 1000.25, 10.125]
+    assert at.accumulate(np.array([0.5, 0.25, 0.125])).tolist() == [
+        101.5,
+        1000.25,
+        10.125,
+    ]
 
 
 @pytest.fixture(autouse=True)
@@ -440,7 +446,7 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
     def work(ranks):
         at = halo_of(ranks, here)
         part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        diagonal = at.added(part.diagonal())
+        diagonal = at.accumulate(part.diagonal())
         return over_ranks._coupled(part, at, diagonal, at.rows != 8)
 
     assert set(np.concatenate(on_threads(2, work)).tolist()) == {1, 2, 3, 9}
@@ -471,7 +477,7 @@ def test_the_sum_of_parts_is_inverted_rank_by_rank():
         rows = touched_rows(at.rows, ranks)
         part = csc_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
         owned, inverse = over_ranks._distributed_inverse(
-            part, rows, at, at.added(part.diagonal())
+            part, rows, at, at.accumulate(part.diagonal())
         )
         own = at.rows[at.owned]
         assert owned.tolist() == list(range(own.size))
