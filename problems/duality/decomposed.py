@@ -183,7 +183,7 @@ def decompose(
         layout=layout, components=bodies.shape.dim, material=layout.body,
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
-        held=stage.fixed, load=force_lookup(force), glue=glue, contact=contact,
+        fixed=stage.fixed, load=force_lookup(force), glue=glue, contact=contact,
     )  # fmt: skip
 
 
@@ -309,7 +309,7 @@ def _reported(problem: ContactProblem, found: DistributedSolution) -> dict[str, 
     layout = own.problem.layout
     cells = sum(len(layout.cells(int(s))) for s in own.number)
     inside = Inside(
-        nodes=layout.nodes, supports=own.problem.held.size,
+        nodes=layout.nodes, supports=own.problem.fixed.size,
         elements=int(own.ranks.total(np.array([float(cells)]))[0]),
         energy=found.solution.energy * of.force * of.length,
         max_von_mises=_largest_von_mises(

@@ -1,11 +1,11 @@
-"""The dual of bodies in subdomains, made by the ranks that hold it.
+"""The dual of decomposed bodies, assembled in distributed form by all ranks.
 
-Each rank makes the rows that it owns, of what its subdomains are
-(`problems.feti.subdomains`). Contact rows are linearised from the sides alone.
+Each rank assembles the rows that it owns from its local subdomains
+(`problems.feti.subdomains`). Contact rows are linearised from the contact sides alone.
 
-What ranks tell one another: of subdomains that may be alike, the points of one of each
-kind, so that subdomains of one kind have one frame on all ranks; what they add to rows
-that another one owns, of the right side q and of RᵀBᵀ; and their part of Rᵀf.
+Messages between ranks: the points of one subdomain of each class that may occur on
+several ranks, so that congruent subdomains have the same frame everywhere; the
+contributions to rows of q and RᵀBᵀ that other ranks own; and the parts of Rᵀf.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from mortarbench.problems.feti.distributed import (
     condense_over_ranks,
     gather_on_rank_0,
 )
-from mortarbench.problems.feti.local_bodies import Results, answers
+from mortarbench.problems.feti.local_bodies import Results, evaluation
 from mortarbench.problems.feti.operators import (
     DualOperator,
     block_bytes,
@@ -56,64 +56,64 @@ from mortarbench.problems.feti.subdomains import (
 
 @dataclass(frozen=True, eq=False)
 class LocalDual:
-    """The rows of a dual that a rank owns; what is asked for, all ranks ask for."""
+    """The rows of a dual that a rank owns; all ranks evaluate members together."""
 
     subdomains: LocalSubdomains
 
     @cached_property
     def halo(self) -> Halo:
-        """The rows, and what is exchanged of them."""
+        """Owned rows and ghosts of this rank."""
         rows = self.subdomains.rows
         owner = assign_owners(rows.number, rows.reach)
         return build_halo(self.subdomains.ranks, rows.number, rows.reach, owner)
 
     @cached_property
     def explicit(self) -> NDArray[np.bool_]:
-        """Kinds whose blocks are formed."""
+        """Flags of the classes with explicit blocks."""
         return explicit_classes(self.subdomains.rows.B, self.subdomains.domains)
 
     @cached_property
     def q(self) -> Vector:
-        """C − BK⁺f (o,) of own rows."""
-        own = self.subdomains
+        """The linear term −d = c − BK⁺f (o,) at owned rows."""
+        local = self.subdomains
         return np.asarray(
-            own.rows.c[self.halo.owned]
-            - self.halo.accumulate(own.rows.B @ own.domains.inverse(own.f))
+            local.rows.c[self.halo.owned]
+            - self.halo.accumulate(local.rows.B @ local.domains.inverse(local.f))
         )
 
     @cached_property
     def G(self) -> csr_array:
-        """RᵀBᵀ (r, o) of own rows."""
+        """Columns of RᵀBᵀ (r, o) for owned rows."""
         return _coarse_rows(self.subdomains, self.halo.rows[self.halo.owned])
 
     @cached_property
     def b(self) -> Vector:
-        """Rᵀf (r,)."""
+        """Right-hand side Rᵀf (r,), on every rank."""
         return _resultants(self.subdomains)
 
     def share(self) -> Share:
-        """Put the operator together, without any factor."""
+        """Return the share of this rank in the dual QP; nothing is factorised yet."""
         rows, domains, ranks = (
             self.subdomains.rows,
             self.subdomains.domains,
             self.subdomains.ranks,
         )
         classes = tuple(kind.without_factor() for kind in domains.classes)
-        anew = Subdomains(classes, domains.class_of)
+        unfactored = Subdomains(classes, domains.class_of)
         local = DualOperator(
-            rows.B, anew, self.explicit, rows.equalities,
+            rows.B, unfactored, self.explicit, rows.equalities,
             partial(condense_over_ranks, ranks=ranks),
         )  # fmt: skip
         lower, upper = self.bounds(self.subdomains.problem.contact.bound)
-        part = QP(
+        qp = QP(
             P=RankOperator(local, self.halo), q=distributed(self.q, ranks),
             lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
             A=DistributedColumns(self.G, ranks), b=self.b,
         )  # fmt: skip
-        return Share(part, gather_on_rank_0(self.halo, rows.total))
+        return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
-        """Bound the multipliers of own rows (o,), those of friction by (k,)."""
+        """Return bounds of the multipliers of owned rows, with friction bounds (k,)."""
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
         scale = self.subdomains.problem.contact_scale
         pressing = scale.size - bound.size
@@ -128,22 +128,25 @@ class LocalDual:
         return distributed(lower, ranks), distributed(upper, ranks)
 
     def with_bound(self, bound: Vector) -> LocalDual:
-        """Return the same with another bound (k,) of friction."""
-        found = LocalDual(self.subdomains.with_bound(bound))
-        vars(found).update({**vars(self), "subdomains": found.subdomains})
-        return found
+        """Return a copy with another friction bound (k,); cached results are kept."""
+        copy = LocalDual(self.subdomains.with_bound(bound))
+        vars(copy).update({**vars(self), "subdomains": copy.subdomains})
+        return copy
 
 
 def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
-    """Give subdomains to ranks, for the rows of a dual; called by all of them.
+    """Distribute the subdomains of a problem over ranks; called by all of them.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks, or ranks know different ones.
+        If there are fewer subdomains than ranks, or ranks have cut the bodies
+        differently.
 
     """
-    return LocalDual(LocalSubdomains(problem, ranks, _agreed(problem, ranks)))
+    return LocalDual(
+        LocalSubdomains(problem, ranks, _replicated_partition(problem, ranks))
+    )
 
 
 def distributed_qp(
@@ -152,128 +155,138 @@ def distributed_qp(
     first: LocalDual | None = None,
     others: int = 0,
 ) -> Emitted:
-    """Describe this rank's share of the dual; called by all ranks.
+    """Return the dual QP as distributed over ranks; called by all of them.
 
-    The digest of a problem that others come before is that of the first of these, with
-    their number: what was solved differs by rounding where ranks are more or less.
+    If solutions of previous problems enter the QP, they depend on the number of ranks
+    by rounding. The digest is then that of the first of these problems, with their
+    number, so that it does not depend on the ranks.
 
     Parameters
     ----------
-    results : what an answer means physically; None where only the whole tells
-    first, others : the first problem that came before, and how many did
+    results : physical results of an answer; None if they need the undivided bodies
+    first, others : first of the previous problems, and their number
 
     """
-    own = dual.subdomains
+    local = dual.subdomains
     for part in ("explicit", "q", "G", "b"):
-        getattr(dual, part)  # made here, so that no solver pays for it in `prepare`
+        getattr(
+            dual, part
+        )  # computed here, so that it is not part of the time of `prepare`
 
     def digest() -> str:
-        names = others * [_digest(first.subdomains)] if first else [_digest(own)]
+        names = others * [_digest(first.subdomains)] if first else [_digest(local)]
         return EMITTED + hex_digest(map(str.encode, names), 16)
 
-    limits = dual.bounds(own.problem.contact.bound)
+    bounds = dual.bounds(local.problem.contact.bound)
     return Emitted(
-        variables=own.rows.total, equality_rows=own.coarse,
-        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in limits),
+        variables=local.rows.total, equality_rows=local.coarse_size,
+        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
         share=dual.share, digest=digest,
-        answer=answers(
-            own, dual.halo, _torn(own, dual.explicit), results
+        answer=evaluation(
+            local, dual.halo, _decomposition(local, dual.explicit), results
         ),
     )  # fmt: skip
 
 
-def _torn(own: LocalSubdomains, explicit: NDArray[np.bool_]) -> dict[str, Any]:
-    """Report how bodies are torn, as `decomposition_quantities`.
+def _decomposition(
+    local: LocalSubdomains, explicit: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Return the quantities of `decomposition_quantities`, on all ranks.
 
-    explicit_mib: what blocks take on all ranks together; one of a kind that several
-    ranks have is on each of these.
+    explicit_mib: memory for blocks on all ranks together; a block of a class that
+    occurs on several ranks is stored on each of them.
     """
-    domains, rows, ranks = own.domains, own.rows, own.ranks
+    domains, rows, ranks = local.domains, local.rows, local.ranks
     sizes = np.array([part.size for part in touched_components(rows.B, domains)])
     taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
-    counts = [own.f.size, explicit[domains.class_of].sum(), taken]
-    torn_dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
+    counts = [local.f.size, explicit[domains.class_of].sum(), taken]
+    dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
     classes = ranks.comm.allgather({kind.name for kind in domains.classes})
     return {
-        "subdomains": own.rank.size, "kinds": len(set().union(*classes)),
-        "torn_dofs": int(torn_dofs), "multipliers": rows.total,
+        "subdomains": local.rank.size, "kinds": len(set().union(*classes)),
+        "torn_dofs": int(dofs), "multipliers": rows.total,
         "explicit_subdomains": int(formed), "explicit_mib": mib,
     }  # fmt: skip
 
 
-def _digest(own: LocalSubdomains) -> str:
-    """Name the numbers of the QP, whichever rank has which subdomain.
+def _digest(local: LocalSubdomains) -> str:
+    """Return a digest of the QP that does not depend on the distribution over ranks.
 
-    That of each subdomain: its kind, its load, and its columns of B; and of all of them
-    in turn, with what every rank has of the contact.
+    It combines the digests of all subdomains in order (class, load and columns of B)
+    and the contact data, which are replicated.
     """
-    domains, rows, contact = own.domains, own.rows, own.problem.contact
+    domains, rows, contact = local.domains, local.rows, local.problem.contact
     names = [kind.name.encode() for kind in domains.classes]
     B = csc_array(rows.B)
     B.sort_indices()
-    told = []
+    digests = []
     for s, (begin, end) in enumerate(pairwise(domains.start)):
         ends = B.indptr[begin : end + 1]
         entries = slice(ends[0], ends[-1])
         parts = rows.number[B.indices[entries]], B.data[entries], ends - ends[0]
-        numbers = (*map(np.ndarray.tobytes, parts), own.f[begin:end].tobytes())
+        numbers = (*map(np.ndarray.tobytes, parts), local.f[begin:end].tobytes())
         name = hex_digest((names[domains.class_of[s]], *numbers))
-        told.append((int(own.number[s]), name))
-    of_all = sorted(chain.from_iterable(own.ranks.comm.allgather(told)))
+        digests.append((int(local.number[s]), name))
+    every = sorted(chain.from_iterable(local.ranks.comm.allgather(digests)))
     shared = contact.rows.data, contact.c, contact.bound
-    content = (*(name.encode() for _, name in of_all), *(v.tobytes() for v in shared))
+    content = (*(name.encode() for _, name in every), *(v.tobytes() for v in shared))
     return hex_digest(content, 64)
 
 
-def _agreed(problem: DecomposedProblem, ranks: Ranks) -> NDArray[np.int64]:
-    """Give subdomains to ranks (S,), if all ranks know the same subdomains.
+def _replicated_partition(
+    problem: DecomposedProblem, ranks: Ranks
+) -> NDArray[np.int64]:
+    """Return the rank of each subdomain (S,), the same on all ranks.
 
-    Partitions of graphs are made on every rank, by whatever library it has.
+    Every rank partitions the graph with its own library, and different versions may
+    give different results.
 
     Raises
     ------
     InputError
-        Where they know others, or there are fewer subdomains than ranks.
+        If they do, or if there are fewer subdomains than ranks.
 
     """
-    found = subdomains_of(problem, ranks.size)
-    known = hex_digest(
-        x.tobytes() for x in (found, *problem.layout.shared_node_counts())
+    ranks_of = subdomains_of(problem, ranks.size)
+    digest = hex_digest(
+        x.tobytes() for x in (ranks_of, *problem.layout.shared_node_counts())
     )
-    if len(set(ranks.comm.allgather(known))) > 1:
+    if len(set(ranks.comm.allgather(digest))) > 1:
         raise InputError(
             "ranks have cut the bodies into different subdomains; expected the same "
             "version of METIS on all nodes"
         )
-    return found
+    return ranks_of
 
 
-def _coarse_rows(own: LocalSubdomains, mine: Nodes) -> csr_array:
-    """Return the columns of RᵀBᵀ that belong to own rows, (3S, o)."""
-    ranks, rows = own.ranks, own.rows
+def _coarse_rows(local: LocalSubdomains, mine: Nodes) -> csr_array:
+    """Return the columns (r, o) of RᵀBᵀ for the owned rows, numbered `mine`."""
+    ranks, rows = local.ranks, local.rows
     B, t = rows.B, rows.number.size
     unknown, place = np.unique(B.indices, return_inverse=True)
-    R = own.resultants(unknown, np.ones(unknown.size))
+    R = local.resultants(unknown, np.ones(unknown.size))
     touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
     part = csr_array(touched @ R)
     owner = assign_owners(rows.number, rows.reach)
-    told: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
+    messages: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
     for one in set(range(ranks.size)) - {ranks.rank}:
-        theirs = np.flatnonzero(owner == one)
-        entries = coo_array(part[theirs])
-        told[one] = rows.number[theirs][entries.row], entries.col, entries.data
-    found = csr_array(part[np.flatnonzero(owner == ranks.rank)])
-    for row, column, data in filter(None, ranks.comm.alltoall(told)):
+        foreign = np.flatnonzero(owner == one)
+        entries = coo_array(part[foreign])
+        messages[one] = rows.number[foreign][entries.row], entries.col, entries.data
+    G = csr_array(part[np.flatnonzero(owner == ranks.rank)])
+    for row, column, data in filter(None, ranks.comm.alltoall(messages)):
         places = np.searchsorted(mine, row), column
-        found += csr_array((data, places), shape=found.shape)
-    return csr_array(found.T)
+        G += csr_array((data, places), shape=G.shape)
+    return csr_array(G.T)
 
 
-def _resultants(own: LocalSubdomains) -> Vector:
-    """Return Rᵀf (3S,) of all subdomains."""
-    loaded = np.flatnonzero(own.f)
-    mine = own.resultants(loaded, own.f[loaded])
-    found = np.zeros(own.coarse)
-    for number, part in own.ranks.comm.allgather((mine.indices, mine.data)):
-        np.add.at(found, number, part)
-    return found
+def _resultants(local: LocalSubdomains) -> Vector:
+    """Return Rᵀf (r,) of all subdomains, on every rank."""
+    loaded = np.flatnonzero(local.f)
+    resultants = local.resultants(loaded, local.f[loaded])
+    total = np.zeros(local.coarse_size)
+    for number, part in local.ranks.comm.allgather(
+        (resultants.indices, resultants.data)
+    ):
+        np.add.at(total, number, part)
+    return total

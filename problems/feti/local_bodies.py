@@ -1,4 +1,4 @@
-"""What a rank has of torn bodies and of an answer, to certify and to report it."""
+"""Local bodies and solutions of a rank, for certificates and physical results."""
 
 from __future__ import annotations
 
@@ -34,245 +34,255 @@ from mortarbench.problems.feti.substructures import LocalProblems
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalSolution:
-    """What one rank has of a displacement, and the forces along all contacts.
+    """Local part of a displacement, and the contact forces, replicated on all ranks.
 
-    Its methods are called by all ranks, and give them the same.
+    Its methods are called by all ranks together and return the same values on each.
     """
 
     subdomains: LocalSubdomains
     bodies: OwnBodies
-    u: Vector  #: (n,) at `bodies.components`, the same of copies on several ranks
-    z: Vector  #: (m,) multipliers of all rows of contact and friction, on every rank
+    u: Vector  #: (n,) at `bodies.components`; equal on all ranks that share a component
+    z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
-        """Tell all ranks the displacement at components (w,) of the whole."""
+        """Return the displacement at global components (w,)."""
         return np.asarray(self.bodies.among.traced(self.u, component))
 
     def diagonal(self, component: Nodes) -> Vector:
-        """Tell all ranks the diagonal of K at components (w,) of the whole."""
+        """Return the diagonal of K at global components (w,)."""
         among = self.bodies.among
         places, here = among.places(component)
-        known = np.unique(places[here])
-        found = np.zeros(self.u.size)
-        found[known] = self.bodies.parts.diagonal(known)
-        return np.asarray(among.traced(among.completed(found), component))
+        local = np.unique(places[here])
+        values = np.zeros(self.u.size)
+        values[local] = self.bodies.parts.diagonal(local)
+        return np.asarray(among.traced(among.completed(values), component))
 
     @cached_property
     def energy(self) -> float:
-        """½uᵀKu − fᵀu of the whole."""
+        """½uᵀKu − fᵀu, summed over all ranks."""
         v = self.bodies.parts.spread @ self.u
         work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
         return self.bodies.among.total(float(work))[0]
 
 
-#: of what ranks have found → physical results, SI, the same on all ranks
+#: solution → physical results in SI units, the same on all ranks
 Results = Callable[[LocalSolution], Mapping[str, Any]]
 
 
-def local_solution(own: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
-    """Go back from multipliers to displacements, on each rank for its own.
+def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
+    """Recover the local displacement from the multipliers of the dual.
 
-    It is the way of `problems.duality.feti_dual`: v = K⁺(f − Bᵀλ) − Rα with α the
-    multipliers of RᵀBᵀλ = Rᵀf, averaged over the copies on all ranks. Components that
+    As in `problems.duality.feti_dual`, v = K⁺(f − Bᵀλ) − Rα is averaged over the copies
+    of each node on all ranks; α are the multipliers of RᵀBᵀλ = Rᵀf. Components that
     supports eliminate are zero.
     """
-    bodies, multiplicity = _bodies(own.floating)
-    T, alpha = bodies.parts.spread, np.asarray(s.y)[own.local_motions]
-    touched = halo.gather(np.asarray(s.x))
+    bodies, multiplicity = _local_bodies(local.floating)
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_motions]
+    multipliers = halo.gather(np.asarray(s.x))
     v = np.zeros(T.shape[0])
-    v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
-    v[own.kept] -= own.domains.kernel @ alpha
+    v[local.free] = local.domains.inverse(local.f - local.rows.B.T @ multipliers)
+    v[local.free] -= local.domains.kernel @ alpha
     u = bodies.among.completed(T.T @ v) / multiplicity
-    z = contact_multipliers(own, halo, s)
-    return LocalSolution(subdomains=own, bodies=bodies, u=u, z=z)
+    z = contact_multipliers(local, halo, s)
+    return LocalSolution(subdomains=local, bodies=bodies, u=u, z=z)
 
 
-def contact_multipliers(own: LocalSubdomains, halo: Halo, s: Solution) -> Vector:
-    """Return multipliers (m,) of rows of contact and friction, on all ranks."""
-    rows, scale = own.rows, own.problem.contact_scale
+def contact_multipliers(local: LocalSubdomains, halo: Halo, s: Solution) -> Vector:
+    """Return the multipliers (m,) of all unscaled contact and friction rows."""
+    rows, scale = local.rows, local.problem.contact_scale
     owned = rows.number[halo.owned]
     is_contact = owned >= rows.equalities
     z = np.zeros(scale.size)
     z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
-    return np.asarray(scale * own.ranks.total(z))
+    return np.asarray(scale * local.ranks.total(z))
 
 
-def answers(
-    own: LocalSubdomains,
+def evaluation(
+    local: LocalSubdomains,
     halo: Halo,
-    torn: Mapping[str, Any],
+    decomposition: Mapping[str, Any],
     reported: Results | None,
 ) -> Callable[[Solution], Answered]:
-    """Make what says what an answer means, on each rank for its own.
+    """Return a function that evaluates physical results for the local subdomains.
 
     Parameters
     ----------
-    torn : how the bodies are torn, as of `decomposition_quantities`
-    reported : reports more of an answer; None where only the whole tells
+    decomposition : its quantities, see `decomposition_quantities`
+    reported : physical results of a solution; None if they need the undivided bodies
 
     """
-    problem = own.problem
+    problem = local.problem
 
     def answer(s: Solution) -> Answered:
-        found, results = local_solution(own, halo, s), None
+        solution, results = local_solution(local, halo, s), None
         if reported is not None:
 
             def results() -> Mapping[str, Any]:
-                return {**reported(found), **torn}
+                return {**reported(solution), **decomposition}
 
-        return Answered((found.bodies, found.u, found.z[_carrying(problem)]), results)
+        return Answered(
+            (solution.bodies, solution.u, solution.z[_force_rows(problem)]), results
+        )
 
     return answer
 
 
 def certifier(
-    own: LocalSubdomains, K: csc_array
+    local: LocalSubdomains, K: csc_array
 ) -> Callable[[Vector, Vector], Certificate]:
-    """Return a bound of the error of displacements with multipliers, by subdomains.
+    """Return a function that bounds the error of a displacement with multipliers.
 
-    K : (n, n) of the whole, as it is stored on this one process
+    K : (n, n) stiffness matrix of the undivided bodies, stored on this one process
     """
-    bodies = cache(lambda: replace(local_bodies(own), stored=csr_array(K)))
+    bodies = cache(lambda: replace(local_bodies(local), stored=csr_array(K)))
     return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
 
 
-def local_bodies(own: LocalSubdomains) -> OwnBodies:
-    """Gather what certificates need of this rank's subdomains."""
-    return _bodies(own.floating)[0]
+def local_bodies(local: LocalSubdomains) -> OwnBodies:
+    """Return the local data of certificates; supports are rows."""
+    return _local_bodies(local.floating)[0]
 
 
-def _bodies(own: LocalSubdomains) -> tuple[OwnBodies, Vector]:
-    """Gather what this rank has, and count the copies (n,) of its components.
+def _local_bodies(local: LocalSubdomains) -> tuple[OwnBodies, Vector]:
+    """Return the local data of certificates, and the multiplicities (n,).
 
-    own : its subdomains float
+    local : subdomains that all float
     """
-    problem, components, place = own.problem, own.components, own.place
-    contact, kept = problem.contact, _carrying(problem)
+    problem, components, place = local.problem, local.components, local.place
+    contact, active = problem.contact, _force_rows(problem)
     multiplicity = np.empty(components.size)
-    multiplicity[place] = own.multiplicity
-    parts = LocalProblems(own.decomposed, problem.components)
+    multiplicity[place] = local.multiplicity
+    parts = LocalProblems(local.decomposed, problem.components)
     return OwnBodies(
-        ranks=own.ranks, parts=parts, components=components,
+        ranks=local.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=multiplicity.size) < multiplicity,
-        coarse=own.local_motions,
-        motions=own.coarse, f=own.f,
-        held=np.flatnonzero(np.isin(components, problem.held)),
+        coarse=local.local_motions,
+        motions=local.coarse_size, f=local.f,
+        held=np.flatnonzero(np.isin(components, problem.fixed)),
         contact=Contact(
-            rows=csr_array(contact.rows[kept]), c=contact.c[kept],
+            rows=csr_array(contact.rows[active]), c=contact.c[active],
             bound=contact.bound[contact.bound > 0],
         ),
-        unheld=_unheld(own),
+        unheld=_floating_bodies(local),
     ), multiplicity  # fmt: skip
 
 
-def _carrying(problem: DecomposedProblem) -> Nodes:
-    """List the rows of contact, and those of friction with a bound above zero."""
+def _force_rows(problem: DecomposedProblem) -> Nodes:
+    """Return the rows of contact, and of friction with a positive bound."""
     m, bound = problem.contact.rows.shape[0], problem.contact.bound
     return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
 
 
 def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """List the bodies that supports leave some rigid motion."""
-    of, d = problem.layout, problem.components
-    node, axis = np.divmod(problem.held, d)
-    body = of.body[of.holder(node)]
+    """Return the numbers of the bodies that supports leave a rigid motion."""
+    layout, d = problem.layout, problem.components
+    node, axis = np.divmod(problem.fixed, d)
+    body = layout.body[layout.holder(node)]
 
-    def is_held(b: int) -> bool:
-        own = body == b
-        if not own.any():
+    def is_supported(b: int) -> bool:
+        fixed = body == b
+        if not fixed.any():
             return False
-        points = of.position(node[own])
+        points = layout.position(node[fixed])
         size = np.ptp(points, axis=0).max() or 1.0
-        motions = _motions((points - points[0]) / size, axis[own], d)
+        motions = _motions((points - points[0]) / size, axis[fixed], d)
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    return [b for b in range(problem.E.size) if not is_held(b)]
+    return [b for b in range(problem.E.size) if not is_supported(b)]
 
 
 def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-    """Return the rigid motions (k, r) of components of points, r = d (d + 1) / 2.
+    """Return the rigid motions (k, r) at components of points, r = d (d + 1) / 2.
 
-    Those of `problems.fem.elasticity.rigid_motions`, about the origin.
+    The modes are those of `problems.fem.elasticity.rigid_motions`, about the origin.
 
-    axis : (k,) of each component, one of d
+    axis : (k,) axis of each component, 0 … d − 1
     """
-    found = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
+    columns = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
     for k, l in combinations(range(d), 2):
-        turned = np.where(axis == l, points[:, k], 0.0)
-        found.append(np.where(axis == k, -points[:, l], turned))
-    return np.stack(found, axis=1)
+        column = np.where(axis == l, points[:, k], 0.0)
+        columns.append(np.where(axis == k, -points[:, l], column))
+    return np.stack(columns, axis=1)
 
 
 class _Extent(NamedTuple):
-    """Where a body is, and how large, by its N nodes."""
+    """Centre and size of a body with N nodes."""
 
     centre: Vector  #: (dim,)
-    radius: float  #: √ of the mean square distance from it
+    radius: float  #: root mean square distance of the nodes from the centre
     size: float  #: √N
-    #: (k, k) combines rotations to such that are orthonormal; None for at most one
+    #: (k, k) combinations of the rotations that are orthonormal; None for at most one
     turn: NDArray[np.float64] | None
 
     def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
-        """Return its rigid motions, orthonormal in the sum over all nodes."""
-        found = _motions((points - self.centre) / self.radius, axis, d)
+        """Return the rigid motions at some points, orthonormal over all nodes."""
+        motions = _motions((points - self.centre) / self.radius, axis, d)
         if self.turn is not None:
-            found[:, d:] = found[:, d:] @ self.turn
-        return found / self.size
+            motions[:, d:] = motions[:, d:] @ self.turn
+        return motions / self.size
 
 
-def _unheld(own: LocalSubdomains) -> Unheld:
-    """Gather the rigid motions of the bodies that supports leave any."""
-    #: of each own node, in turn, a copy among the own torn nodes
-    copy = np.unique(own.nodes.number, return_index=True)[1]
-    problem, of, d = own.problem, own.problem.layout, own.problem.components
+def _floating_bodies(local: LocalSubdomains) -> Unheld:
+    """Return the rigid motions of all floating bodies at the local components."""
+    #: one copy of each local node among the local torn nodes
+    copy = np.unique(local.nodes.number, return_index=True)[1]
+    problem, layout, d = local.problem, local.problem.layout, local.problem.components
     components = d * copy.size
-    motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
-    if not (unheld := floating_bodies(problem)):
+    motions, remaining, names = [csr_array((components, 0))], list[Any](), list[str]()
+    if not (numbers := floating_bodies(problem)):
         return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
-    points = np.concatenate([*of.points(own.number)])
-    body = of.body[own.number][own.nodes.subdomain]
-    held, axis = np.divmod(problem.held, d)
-    body_held = of.body[of.holder(held)]
-    for b in unheld:
+    points = np.concatenate([*layout.points(local.number)])
+    body = layout.body[local.number][local.nodes.subdomain]
+    fixed, axis = np.divmod(problem.fixed, d)
+    body_fixed = layout.body[layout.holder(fixed)]
+    for b in numbers:
         extent = _extent(
-            own, points, np.where(body == b, 1 / own.nodes.multiplicity, 0.0)
+            local, points, np.where(body == b, 1 / local.nodes.multiplicity, 0.0)
         )
-        of_body = body_held == b
-        at_held = extent.motions(of.position(held[of_body]), axis[of_body], d)
-        left.append(null_space(at_held) if of_body.any() else np.eye(at_held.shape[1]))
-        mine = np.flatnonzero(body[copy] == b)
-        at = np.repeat(points[copy[mine]], d, axis=0)
-        found = extent.motions(at, np.tile(np.arange(d), mine.size), d)
-        rows = (d * mine[:, None] + np.arange(d)).ravel()
-        one = csr_array(
+        of_body = body_fixed == b
+        at_fixed = extent.motions(layout.position(fixed[of_body]), axis[of_body], d)
+        remaining.append(
+            null_space(at_fixed) if of_body.any() else np.eye(at_fixed.shape[1])
+        )
+        nodes = np.flatnonzero(body[copy] == b)
+        at = np.repeat(points[copy[nodes]], d, axis=0)
+        modes = extent.motions(at, np.tile(np.arange(d), nodes.size), d)
+        rows = (d * nodes[:, None] + np.arange(d)).ravel()
+        embedding = csr_array(
             (np.ones(rows.size), (rows, np.arange(rows.size))),
             shape=(components, rows.size),
         )
-        motions.append(one @ csr_array(found))
+        motions.append(embedding @ csr_array(modes))
         names.append(problem.names[b])
     return Unheld(
-        motions=csr_array(hstack(motions)), left=block_diag(*left), names=tuple(names)
+        motions=csr_array(hstack(motions)),
+        left=block_diag(*remaining),
+        names=tuple(names),
     )
 
 
-def _extent(own: LocalSubdomains, points: Points, share: Vector) -> _Extent:
-    """Measure a body whose nodes all ranks have; called by all of them.
+def _extent(local: LocalSubdomains, points: Points, share: Vector) -> _Extent:
+    """Return the extent of a body that is distributed over ranks; called by all.
 
     Parameters
     ----------
-    points : of own torn nodes (M, dim)
-    share : (M,) of all copies of a node, which add up to one in the body
+    points : (M, dim) of the local torn nodes
+    share : (M,) weights; those of all copies of a node of the body add up to one
 
     """
-    total = own.ranks.total
+    total = local.ranks.total
     count, *moments = total(np.append(share.sum(), share @ points))
     centre = np.array(moments) / count
     spread = total(np.array([share @ ((points - centre) ** 2).sum(axis=1)]))[0]
-    radius, d, turn = float(np.sqrt(spread / count)), own.problem.components, None
+    radius, d, rotations = (
+        float(np.sqrt(spread / count)),
+        local.problem.components,
+        None,
+    )
     if d > 2:
         scaled = np.repeat((points - centre) / radius, d, axis=0)
-        turns = _motions(scaled, np.tile(np.arange(d), len(points)), d)[:, d:]
-        gram = total(turns.T @ (np.repeat(share, d)[:, None] * turns) / count)
+        modes = _motions(scaled, np.tile(np.arange(d), len(points)), d)[:, d:]
+        gram = total(modes.T @ (np.repeat(share, d)[:, None] * modes) / count)
         sizes, axes = np.linalg.eigh(gram)
-        turn = axes / np.sqrt(sizes)
-    return _Extent(centre, radius, float(np.sqrt(count)), turn)
+        rotations = axes / np.sqrt(sizes)
+    return _Extent(centre, radius, float(np.sqrt(count)), rotations)

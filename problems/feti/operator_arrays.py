@@ -1,4 +1,4 @@
-"""The dual operator of Total FETI as plain arrays, for files and processes."""
+"""The dual operator of Total FETI as plain arrays, for files and other processes."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mortarbench.problems.feti.distributed import local_share
 from mortarbench.problems.feti.operators import DualOperator, explicit_classes
 from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
 
-NAME = "tfeti"  #: of the maker, in `problems.OPERATORS`
+NAME = "tfeti"  #: name in `problems.OPERATORS`, stored in files
 _PARTS = ("data", "indices", "indptr")
-_OF_KINDS = ("stiffness", "fixing", "boundary")  #: whose lengths differ by kind
+_BY_CLASS = ("stiffness", "fixing", "boundary")  #: of lengths that depend on the class
 
 
 @dataclass(frozen=True, eq=False)
 class StoredOperator(DualOperator):
-    """F put together from its arrays, which ranks can divide among themselves."""
+    """F restored from its arrays, which can be distributed over ranks."""
 
     @property
     def parts(self) -> int:
@@ -29,36 +29,37 @@ class StoredOperator(DualOperator):
         return int(self.domains.class_of.size)
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Take this rank's share of a dual with this F."""
+        """Return the share of this rank in a dual with this F."""
         return local_share(qp, self, ranks)
 
 
 def dual_operator(
     B: csr_array, domains: Subdomains, equalities: int
 ) -> SerialisableOperator:
-    """Make F as an operator that can be written: every kind once, and B.
+    """Return F as a serialisable operator: B, and the data of every class once.
 
-    equalities : rows of B that are equations, the first ones
+    equalities : number of equality rows of B, which come first
     """
     classes = domains.classes
-    K = csc_array(block_diag([kind.K for kind in classes], format="csc"))
-    modes = np.array([kind.R.shape[1] for kind in classes])
+    K = csc_array(block_diag([template.K for template in classes], format="csc"))
+    modes = np.array([template.R.shape[1] for template in classes])
     R = [
-        np.pad(kind.R, ((0, 0), (0, modes.max() - kind.R.shape[1]))) for kind in classes
+        np.pad(template.R, ((0, 0), (0, modes.max() - template.R.shape[1])))
+        for template in classes
     ]
     arrays = {
         **{f"K_{part}": getattr(K, part) for part in _PARTS},
         **{f"B_{part}": getattr(B, part) for part in _PARTS},
         "R": np.concatenate(R),
         "modes": modes,
-        "stiffness": np.concatenate([kind.stiffness for kind in classes]),
-        "fixing": np.concatenate([kind.fixing for kind in classes]),
-        "boundary": np.concatenate([kind.boundary for kind in classes]),
+        "stiffness": np.concatenate([template.stiffness for template in classes]),
+        "fixing": np.concatenate([template.fixing for template in classes]),
+        "boundary": np.concatenate([template.boundary for template in classes]),
         "kind": domains.class_of,
         "explicit": explicit_classes(B, domains),
         "equalities": np.array(equalities),
     }
-    for name in _OF_KINDS:
+    for name in _BY_CLASS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
     return SerialisableOperator(
         B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
@@ -66,24 +67,26 @@ def dual_operator(
 
 
 def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
-    """Put F together from the arrays of `dual_operator`."""
-    ends = [np.append(0, arrays[f"{name}_ends"]) for name in _OF_KINDS]
+    """Restore F from the arrays of `dual_operator`."""
+    ends = [np.append(0, arrays[f"{name}_ends"]) for name in _BY_CLASS]
     data, indices, indptr = (arrays[f"K_{part}"] for part in _PARTS)
 
-    def kind(k: int) -> SubdomainClass:
-        own, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
-        columns, n = indptr[own.start : own.stop + 1], own.stop - own.start
+    def subdomain_class(k: int) -> SubdomainClass:
+        rows, fixing, boundary = (slice(end[k], end[k + 1]) for end in ends)
+        columns, n = indptr[rows.start : rows.stop + 1], rows.stop - rows.start
         within = slice(columns[0], columns[-1])
-        K = (data[within], indices[within] - own.start, columns - columns[0])
+        K = (data[within], indices[within] - rows.start, columns - columns[0])
         return SubdomainClass(
             K=csc_array(K, shape=(n, n)),
-            R=arrays["R"][own, : arrays["modes"][k]],
+            R=arrays["R"][rows, : arrays["modes"][k]],
             fixing=arrays["fixing"][fixing],
             boundary=arrays["boundary"][boundary],
-            stiffness=arrays["stiffness"][own],
+            stiffness=arrays["stiffness"][rows],
         )
 
-    domains = Subdomains(tuple(map(kind, range(ends[0].size - 1))), arrays["kind"])
+    domains = Subdomains(
+        tuple(map(subdomain_class, range(ends[0].size - 1))), arrays["kind"]
+    )
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
     return StoredOperator(B, domains, arrays["explicit"], int(arrays["equalities"]))

@@ -1,18 +1,18 @@
 """Extreme eigenvalues of F on the null space of its equations, with error bounds.
 
-With P the orthogonal projector onto ker G ∩ range B, the condition numbers are those of
+With P the orthogonal projector onto ker G ∩ range B, these are the spectra of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
 
-the latter with a preconditioner M ≈ F⁻¹; both on the range of P. Both are self-adjoint
-there, so that one Lanczos process serves both (Parlett 1998, Chapter 13). Each vector
-is orthogonalised against the last two, as the recurrence says, then against all, so
-that nothing is found twice; and it is projected anew, as what rounding leaves of a
-kernel grows from step to step.
+the latter with a preconditioner M ≈ F⁻¹, both on the range of P. Both operators are
+self-adjoint there, and one Lanczos process serves both (Parlett 1998, Chapter 13). Each
+vector is orthogonalised against the last two, as in the recurrence, then against all
+previous ones, which excludes spurious copies of eigenvalues. It is projected again in
+every step, because components in the kernel that stem from rounding grow.
 
-Of a Ritz value θ with residual r an eigenvalue is no farther than ‖r‖, and ‖r‖ is what
-the last row of the tridiagonal matrix says.
+The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue,
+and ‖r‖ follows from the last components of the eigenvectors of the tridiagonal matrix.
 """
 
 from __future__ import annotations
@@ -32,17 +32,19 @@ from mortarbench.problems.feti.distributed import RankOperator
 
 Product = Callable[[Vector], Vector]
 
-BREAKDOWN = 1e-10  #: length of a new vector, of the largest Ritz value: none is left
-CHECK_INTERVAL = 5  #: steps from one look at the Ritz values to the next
-_CHUNK = 64  #: vectors that memory is taken for at once
+#: a new vector below this share of the largest Ritz value ends the Lanczos process: the
+#: Krylov space is invariant up to rounding
+BREAKDOWN = 1e-10
+CHECK_INTERVAL = 5  #: steps between evaluations of the Ritz values
+_CHUNK = 64  #: vectors per allocation
 
 
 class Spectrum(NamedTuple):
-    """The extreme eigenvalues of an operator, without zeros."""
+    """The extreme eigenvalues of an operator on the range of P."""
 
     smallest: float
     largest: float
-    smallest_error: float  #: an eigenvalue is within this of `smallest`
+    smallest_error: float  #: bound of the distance from `smallest` to an eigenvalue
     largest_error: float
     steps: int  #: products with F
 
@@ -53,12 +55,12 @@ class Spectrum(NamedTuple):
 
     @property
     def condition_error(self) -> float:
-        """By how much κ may be wrong, to first order in the errors."""
+        """Bound of the error of κ, to first order in the errors of both eigenvalues."""
         relative = self.smallest_error / self.smallest
         return self.condition * (relative + self.largest_error / self.largest)
 
     def within(self, tol: float) -> bool:
-        """Say whether both errors are at most `tol`, relative."""
+        """Return True if both relative errors are at most `tol`."""
         return (
             self.smallest_error <= tol * self.smallest
             and self.largest_error <= tol * self.largest
@@ -69,7 +71,7 @@ def spectrum(
     F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5,
     *, rows: Nodes | None = None, total: Product = np.asarray,
 ) -> Spectrum:  # fmt: skip
-    """Find the extreme eigenvalues of PFP, or of PMPF, on the range of P.
+    """Compute the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
     Parameters
     ----------
@@ -77,11 +79,11 @@ def spectrum(
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
     tol : error bound of both eigenvalues, relative
-    rows : components that this rank has, of n; all of them unless given
-    total : adds numbers (k,) over all ranks, which get the same
+    rows : components on this rank; None for all n of them
+    total : sums numbers (k,) over all ranks; returns the same sum on each of them
 
     """
-    own = np.arange(n) if rows is None else rows
+    local = np.arange(n) if rows is None else rows
 
     def dot(x: Vector, y: Vector) -> float:
         return float(total(np.atleast_1d(x @ y))[0])
@@ -89,15 +91,15 @@ def spectrum(
     #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + own**2))
-    V = np.empty((_CHUNK, own.size))
+    v = P(np.sin(1.0 + local**2))  # any start with a part of every eigenvector
+    V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
     length = float(np.sqrt(dot(v, Wv)))
     for k in range(n):
         if k == len(V):
-            more = np.empty((_CHUNK, own.size))
+            more = np.empty((_CHUNK, local.size))
             V = np.concatenate([V, more])
             WV = V if M is None else np.concatenate([WV, more])
         V[k], WV[k] = v / length, Wv / length
@@ -109,11 +111,11 @@ def spectrum(
         length = float(np.sqrt(max(dot(v, Wv), 0.0)))
         over = length <= BREAKDOWN * max(alpha)
         if over or k % CHECK_INTERVAL == CHECK_INTERVAL - 1 or k == n - 1:
-            found = ritz_bounds(np.array(alpha), np.array(beta), length)
-            if over or found.within(tol):
+            result = ritz_bounds(np.array(alpha), np.array(beta), length)
+            if over or result.within(tol):
                 break
         beta.append(length)
-    return found
+    return result
 
 
 def spectra_over_ranks(
@@ -134,8 +136,8 @@ def spectra_over_ranks(
     tol : error bound of both eigenvalues, relative
 
     """
-    at, ranks = F.halo, F.halo.ranks
-    m = ranks.total(np.array([float(at.owned.size)]))[0]
+    halo, ranks = F.halo, F.halo.ranks
+    m = ranks.total(np.array([float(halo.owned.size)]))[0]
     project = projector(F, G)
 
     def plain(A: Product) -> Product:
@@ -145,7 +147,7 @@ def spectra_over_ranks(
     return [
         spectrum(
             plain(F), project, int(m), M, tol,
-            rows=at.rows[at.owned], total=ranks.total,
+            rows=halo.rows[halo.owned], total=ranks.total,
         )
         for M in inverses
     ]  # fmt: skip
@@ -163,11 +165,11 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
     within = F.onto_rows()
     if not G.shape[0]:
         return within
-    coarse = cholesky(csc_matrix(G.gram()))
+    factor = cholesky(csc_matrix(G.gram()))
 
     def project(x: Vector) -> Vector:
         y = within(x)
-        return np.asarray(y - np.asarray(G.T @ coarse(G @ y)))
+        return np.asarray(y - np.asarray(G.T @ factor(G @ y)))
 
     return project
 

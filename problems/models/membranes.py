@@ -158,7 +158,7 @@ class Membranes:
         return DecomposedProblem(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
             assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
-            glue=rows, held=np.sort(sides["left left"]),
+            glue=rows, fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 

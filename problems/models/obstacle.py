@@ -138,7 +138,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
         assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
-        names=("membrane",), load=partial(_load, grid, shape), held=held,
+        names=("membrane",), load=partial(_load, grid, shape), fixed=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
     )  # fmt: skip
 
@@ -152,7 +152,7 @@ def _string_in_subdomains(n: int, most: int, glue: str) -> DecomposedProblem:
     return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
         assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
-        names=("string",), load=lambda node: -qp.q[node], held=qp.A.indices,
+        names=("string",), load=lambda node: -qp.q[node], fixed=qp.A.indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
     )  # fmt: skip
 

@@ -214,7 +214,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         material=_material(p, column, row),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(Forces(*_pull(grid, p["load"]))),
-        held=dofs_of(grid.sides["left"], 2),
+        fixed=dofs_of(grid.sides["left"], 2),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
     )  # fmt: skip
@@ -235,7 +235,7 @@ def _found_by_ranks(
         "nodes": grid.nodes,
         "elements": int(np.prod(grid.divisions)),
         "dofs": 2 * grid.nodes,
-        "equality_rows": own.problem.held.size,
+        "equality_rows": own.problem.fixed.size,
         "energy": found.energy * LOAD * LENGTH,
         "tip": (found.at(tip) * LENGTH).tolist(),
     }

@@ -63,7 +63,7 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert own.components.size == mesh.dofs
     assert_allclose(stored(own).toarray(), whole.toarray(), atol=1e-13)
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
-    free = np.setdiff1d(np.arange(mesh.dofs), own.problem.held)
+    free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
     jumps = own.rows.B @ own.spread[:, free]
     assert abs(jumps).max() <= 1e-15  # none where copies are one
 

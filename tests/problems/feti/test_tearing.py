@@ -224,7 +224,7 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     problem = DecomposedProblem(
         layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=("plate",),
-        load=force_lookup(Forces(np.arange(n), load)), held=held, glue="orthonormal",
+        load=force_lookup(Forces(np.arange(n), load)), fixed=held, glue="orthonormal",
         contact=Contact(
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),
