@@ -18,7 +18,7 @@ from scipy.stats import linregress, t
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 

@@ -17,7 +17,7 @@ from sksparse.cholmod import cholesky
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -54,7 +54,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
         assert s.status == "solved"
         return s
 
-    path = path_of(
+    path = load_path(
         bodies, linearise, lambda: inverse, solve, steps, transform=transform
     )
     u = path.solution(steps) * bodies.length

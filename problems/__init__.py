@@ -34,5 +34,9 @@ PROBLEMS: Registry[Family] = Registry(
 
 #: what puts an operator P of these families together, see `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
-    {"tfeti": entry("mortarbench.problems.feti.stored", "made")}
+    {
+        "tfeti": entry(
+            "mortarbench.problems.feti.operator_arrays", "dual_operator_from_arrays"
+        )
+    }
 )

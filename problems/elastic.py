@@ -26,8 +26,8 @@ from mortarbench.problems.duality.case_forms import FORMS, case_of
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    by_keys,
-    stated,
+    elastic_bodies_of,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
@@ -117,11 +117,11 @@ def one_step(
         )
     law = FrictionLaw() if friction is None else _checked(friction, reference)
     laws = (law,) * len(bodies.pairs)
-    of = stated(bodies)
+    of = elastic_bodies_of(bodies)
     rows = linearisation(bodies, contact, basis, laws)(np.zeros(bodies.mesh.dofs))
     check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))  # it may hold either way
     problem = ContactProblem(
-        bodies=of, linearise=by_keys({"contact": contact, "basis": basis}),
+        bodies=of, linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, of.forces, of.fixed, laws),
         # friction may have to hold bodies
         pressed=float(np.abs(of.forces.value).sum()),

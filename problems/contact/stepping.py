@@ -3,7 +3,7 @@
 A load step begins where the one before has ended. Its contact rows are linearised at
 that solution, and `relin` − 1 more times at its own; each linearisation is a `Stage`,
 and its QP is posed by whoever holds the bodies: one process undivided ones
-(`problems.duality.undivided`), ranks their subdomains (`problems.duality.divided`).
+(`problems.duality.monolithic`), ranks their subdomains (`problems.duality.decomposed`).
 With relin = 1 this is the paper's scheme, of first order in 1/steps.
 
 With friction, slip is that of the load step (``quasi-static``: T(u − u_prev), which

@@ -25,24 +25,28 @@ from mortarbench.harness import (
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
-from mortarbench.problems.duality.divided import described, layout_of
-from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
+from mortarbench.problems.duality.decomposed import cached_layout, decompose
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
+)
+from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.duality.problem import (
-    AtSides,
     Choice,
     ContactProblem,
     DisplacedMesh,
+    InterfaceState,
 )
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
-)
-from mortarbench.problems.duality.undivided import whole_path
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.own_bodies import certified_by
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
+from mortarbench.problems.feti.local_bodies import certifier
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    DecomposedProblem,
+    on_one_process,
+)
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -55,18 +59,20 @@ def case_of(
 ) -> Case:
     """Emit the QP of a contact problem that is chosen, in one of FORMS."""
     of = problem.bodies
-    path, parts = whole_path(problem, reference), None
+    path, parts = monolithic_path(problem, reference), None
     whole, friction, _ = path.problem(choice.step, choice.iterate)
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:
         contact = Contact(*contact_rows(primal, friction), friction.bound)
         stage = problem.stages[path.last_of(choice.step)]
-        layout = layout_of(of, choice.size)
-        parts = described(of, layout, choice.glue, stage, contact)
+        layout = cached_layout(of, choice.size)
+        parts = decompose(of, layout, choice.glue, stage, contact)
     bodies = of.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
-        found = FoundInWhole(AtSides(bodies, primal, s, friction), bodies, count)
+        found = MonolithicSolution(
+            InterfaceState(bodies, primal, s, friction), bodies, count
+        )
         return {**quantities(bodies, primal, s, friction), **problem.results(found)}
 
     case = contact_case(
@@ -74,10 +80,10 @@ def case_of(
         floating=lambda: of.floating, clamped=lambda: of.clamped,
         supported=lambda: of.supported, quantities=results, friction=friction,
     )  # fmt: skip
-    return case if problem.exact is None else beside(case, problem.exact)
+    return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
 
-def beside(case: Case, exact: NDArray[np.float64]) -> Case:
+def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
     """Draw the exact tractions beside the contact, see `ContactProblem.exact`."""
     solved = case.fields
     assert solved is not None
@@ -91,10 +97,10 @@ def beside(case: Case, exact: NDArray[np.float64]) -> Case:
 
 
 @dataclass(frozen=True, eq=False)
-class FoundInWhole:
-    """An answer to the problem of undivided bodies; see `Found`."""
+class MonolithicSolution:
+    """An answer to the problem of undivided bodies; see `ContactSolution`."""
 
-    sides: AtSides
+    sides: InterfaceState
     bodies: Bodies
     problems: int
 
@@ -124,7 +130,7 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    parts: ProblemInParts | None = None,
+    parts: DecomposedProblem | None = None,
 ) -> Case:
     """Emit the primal QP of a contact problem in one of FORMS.
 
@@ -147,14 +153,14 @@ def contact_case(
     if parts is not None:
         start = perf_counter()
         own = on_one_process(parts)
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
-        new = torn_dual(pieces, primal, friction)
+        pieces, in_parts = own.decomposed, certifier(own, primal.P)
+        new = feti_dual(pieces, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
-        matrices = torn_matrices(pieces, new.qp)
-        decomposition = torn_quantities(pieces, new.qp)
+        matrices = feti_matrices(pieces, new.qp)
+        decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "primal":
-        new = posed(primal, friction)
+        new = primal_form(primal, friction)
     else:
         inverse = floating() if form == "dual" else clamped()
         start = perf_counter()

@@ -31,10 +31,10 @@ class Transformed(NamedTuple):
     sign: float  #: old objective = sign·new objective + constant, at the solutions
     constant: float
     #: old point (n,), right where constraints can touch it; cheaper than `recover`
-    touched: Callable[[Solution], Vector]
+    interface_displacement: Callable[[Solution], Vector]
 
 
-def posed(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
+def primal_form(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
     """Pose the problem as the QP that it is itself, with the work of the friction.
 
     Its way back drops the variables of `harness.mechanics.with_friction` and takes λ_t
@@ -99,11 +99,13 @@ def dualise(
             u = u - R @ s.y
         return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
 
-    def touched(s: Solution) -> Vector:
+    def interface_displacement(s: Solution) -> Vector:
         u = free - inverse.at_constraints(B.T @ s.x)
         return u - R @ s.y if R.shape[1] else u
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
+    return Transformed(
+        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
+    )
 
 
 def dual_bounds(
@@ -141,13 +143,15 @@ def dual_bounds(
         reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
         return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
-    def touched(s: Solution) -> Vector:
+    def interface_displacement(s: Solution) -> Vector:
         return free - clamped.at_constraints(B.T @ s.x)
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
+    return Transformed(
+        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
+    )
 
 
-def bounded(dual: QP, friction: Friction) -> QP:
+def with_friction_bound(dual: QP, friction: Friction) -> QP:
     """Return a dual with other bounds of its friction; the way back is the same."""
     g = friction.bound
     if not g.size:

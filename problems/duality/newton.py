@@ -35,8 +35,8 @@ between two segments. When the iteration comes to no end, nodes that press keep 
 segments that are the closest there, and may leave them by a little on their lines.
 
 *Convergence*: equilibrium and gaps at the new u, with the multipliers of the QP, to
-SETTLED; see `NewtonPath.residual`. *Load*: where that is not reached, the load step is
-halved and what is left of it follows, down to its part 2^−HALVINGS.
+TOLERANCE; see `NewtonPath.residual`. *Load*: where that is not reached, the load step
+is halved and the rest of it follows, down to the fraction 2^−MAX_HALVINGS.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ from mortarbench.problems.contact.bodies import Bodies, clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.sides import ACTIVE
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.monolithic import MAX_REFERENCE_RESIDUAL, primal_qp
 from mortarbench.problems.duality.problem import Linearise
-from mortarbench.problems.duality.undivided import REFERENCE, primal_qp
 from mortarbench.problems.fem.finite_strain import (
     Cells,
     Evaluated,
@@ -84,16 +84,18 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.mesh import dofs_of
 
-SETTLED = 1e-9  #: residual of equilibrium and gaps at the end of a step
+TOLERANCE = 1e-9  #: residual of equilibrium and gaps at the end of a step
 ROUNDING = 2 * float(np.finfo(float).eps)  #: of the forces |K||u| within cells
-MOST_ITERATIONS = 60  #: of Newton's method at one load
+MAX_ITERATIONS = 60  #: of Newton's method at one load
 KEEP_AFTER = 20  #: of them after which nodes that press keep their segments
-HALVINGS = 8  #: of a load step
-SHORTEST = 2.0**-16  #: step of the line search
-NOISE = 8 * float(np.finfo(float).eps)  #: of the merit function, relative to energies
-ARMIJO = 1e-4  #: part of the predicted decrease that a step has to bring
-ABOVE = 1.5  #: weight of the penalty over the largest multiplier
-TURNING = 1e-8  #: part of a rigid motion that is a rotation, beyond rounding
+MAX_HALVINGS = 8  #: of a load step
+MIN_STEP = 2.0**-16  #: step of the line search
+MERIT_ROUNDING = 8 * float(
+    np.finfo(float).eps
+)  #: of the merit function, relative to energies
+ARMIJO_FRACTION = 1e-4  #: part of the predicted decrease that a step has to bring
+PENALTY_FACTOR = 1.5  #: weight of the penalty over the largest multiplier
+MAX_ROTATION = 1e-8  #: part of a rigid motion that is a rotation, beyond rounding
 
 #: displacement (n,) in m, multipliers (m,) in N/m → blocks (m, k, k) in Pa of
 #: −Σ λ_i g_i''(u), and the components (m, k) that they are of
@@ -107,7 +109,7 @@ class Gaps(NamedTuple):
     curvature: Curvature | None = None  #: left out where there is none
     #: at a displacement (n,) in m, the gaps for which the slave nodes (places,) named
     #: keep the segments that are the closest there; none where there is no such choice
-    keeping: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
+    keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
 class NoEquilibriumError(ArithmeticError):
@@ -176,7 +178,7 @@ class NewtonPath:
     def iterations(self, k: int) -> list[Iteration]:
         """List the Newton iterations of step k at its full load."""
         while len(self._steps) < k:
-            found, parts = self._stepped(len(self._steps) + 1)
+            found, parts = self._load_step(len(self._steps) + 1)
             self._steps.append(found)
             self._parts.append(parts)
         return self._steps[k - 1]
@@ -204,12 +206,12 @@ class NewtonPath:
         penetration = float((-gap).max(initial=0.0))
         return reached.energy, self.residual(reached, lam, at.load_factor), penetration
 
-    def _stepped(self, k: int) -> tuple[list[Iteration], int]:
+    def _load_step(self, k: int) -> tuple[list[Iteration], int]:
         """Go from step k − 1 to step k, in halves of what is left where it fails."""
-        if self._unfit:
-            raise InputError(self._unfit)
+        if self._kernel_defect:
+            raise InputError(self._kernel_defect)
         reached, target = (k - 1) / self.steps, k / self.steps
-        least = (target - reached) / 2**HALVINGS
+        least = (target - reached) / 2**MAX_HALVINGS
         size, parts = target - reached, 0
         u, lam = self._start(k)
         while True:
@@ -217,7 +219,7 @@ class NewtonPath:
                 target if reached + size > target - least / 2 else reached + size
             )
             try:
-                found = self._solved(load_factor, u, lam)
+                found = self._solve_load(load_factor, u, lam)
             except NoEquilibriumError as e:
                 size /= 2
                 if size < least:
@@ -237,7 +239,7 @@ class NewtonPath:
 
         Entries of F = I + ∂u/∂X are known to the rounding of 1: of cells of size h that
         leaves forces of about h|K|·1, whatever the load. Beside a tiny load they are
-        more than SETTLED.
+        more than TOLERANCE.
         """
         h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
         rounded = h * self._free_norm(
@@ -246,11 +248,11 @@ class NewtonPath:
         share = (
             ROUNDING * rounded / (load_factor * self._free_norm(self.bodies.f) or 1.0)
         )
-        if share <= SETTLED:
+        if share <= TOLERANCE:
             return "a smaller load, or supports that hold the bodies better"
         return (
             f"a larger load, or kinematics=linear: of strains this small, rounding "
-            f"leaves {share:.0e} of the forces, and {SETTLED:g} is asked for"
+            f"leaves {share:.0e} of the forces, and {TOLERANCE:g} is asked for"
         )
 
     def _start(self, k: int) -> tuple[Vector, Vector]:
@@ -272,7 +274,9 @@ class NewtonPath:
         force[at.rows.place] = np.maximum(at.answer.z, 0.0)
         return force
 
-    def _solved(self, load_factor: float, u: Vector, lam: Vector) -> list[Iteration]:
+    def _solve_load(
+        self, load_factor: float, u: Vector, lam: Vector
+    ) -> list[Iteration]:
         """Iterate at one load, from u and the multipliers (places,).
 
         Where that does not settle, nodes that press keep their segments from there on.
@@ -281,35 +285,37 @@ class NewtonPath:
         at = self._configuration(u, load_factor, gaps)
         best, weight = self.residual(at, lam, load_factor), 0.0
         found: list[Iteration] = []
-        while len(found) < MOST_ITERATIONS:
+        while len(found) < MAX_ITERATIONS:
             stuck = ""
-            if len(found) < KEEP_AFTER or gaps.keeping is None:
-                posed = self._posed(at, lam, load_factor, gaps)
+            if len(found) < KEEP_AFTER or gaps.keep_segments is None:
+                posed = self._linearise(at, lam, load_factor, gaps)
                 lam = self._at_places(posed)
-                weight = max(weight, ABOVE * lam.max(initial=0.0))
+                weight = max(weight, PENALTY_FACTOR * lam.max(initial=0.0))
                 try:
-                    at, length, residual = self._moved(at, posed, lam, weight, best)
+                    at, length, residual = self._line_search(
+                        at, posed, lam, weight, best
+                    )
                 except NoEquilibriumError as e:
                     stuck = str(e)
                 else:
                     best = min(best, residual)
                     found.append(replace(posed, length=length, residual=residual))
-                    if length == 1 and residual <= SETTLED + self._rounding(
+                    if length == 1 and residual <= TOLERANCE + self._rounding(
                         at, lam, posed
                     ):
                         return found
                     continue
-            if gaps.keeping is None:
+            if gaps.keep_segments is None:
                 raise NoEquilibriumError(
                     f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
                     f"residual of {best:.1e}: {stuck}"
                 )
             pressing = lam > ACTIVE * lam.max(initial=0.0)
-            gaps = gaps.keeping(at.u * self.bodies.length, pressing)
+            gaps = gaps.keep_segments(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
         raise NoEquilibriumError(
-            f"at {load_factor:.6g}, {MOST_ITERATIONS} iterations left a residual of "
+            f"at {load_factor:.6g}, {MAX_ITERATIONS} iterations left a residual of "
             f"{best:.1e}"
         )
 
@@ -359,7 +365,7 @@ class NewtonPath:
         rounded = self._free_norm(abs(posed.tangent.K) @ np.abs(at.u))
         return ROUNDING * rounded / self._forces(at, lam, posed.load_factor)
 
-    def _posed(
+    def _linearise(
         self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps
     ) -> Iteration:
         """Pose (1) and solve it."""
@@ -425,21 +431,21 @@ class NewtonPath:
 
     def _inverse(self, K: csc_array) -> GeneralisedInverse:
         tangent = replace(self.bodies, K=K)
-        return clamped(tangent) if self._held else guided(tangent)
+        return clamped(tangent) if self._is_supported else sliding_inverse(tangent)
 
     @cached_property
-    def _held(self) -> bool:
+    def _is_supported(self) -> bool:
         """Whether the supports alone hold every body."""
-        return not motions_left(self.bodies).shape[1]
+        return not free_rigid_motions(self.bodies).shape[1]
 
     @cached_property
-    def _unfit(self) -> str:
+    def _kernel_defect(self) -> str:
         """Say why the tangent's kernel is not translations; empty where it is."""
         try:
-            translations_left(self.bodies)
+            free_translations(self.bodies)
         except InputError as e:
             return str(e)
-        if self.gaps.curvature is not None and not self._held:
+        if self.gaps.curvature is not None and not self._is_supported:
             return (
                 "contact_stiffness=geometric where contact alone holds a body is not "
                 "built: its translations change the contact forces; expected "
@@ -448,7 +454,7 @@ class NewtonPath:
         return ""
 
     def _solve(self, primal: QP, inverse: GeneralisedInverse) -> Solution:
-        transform = dual_bounds if self._held else dualise
+        transform = dual_bounds if self._is_supported else dualise
         new = transform(primal, inverse)
         if not new.qp.q.size:
             none = np.zeros(0)
@@ -459,14 +465,14 @@ class NewtonPath:
             s = self.reference(new.qp)
         except ArithmeticError as e:
             raise NoEquilibriumError(f"its QP was not solved: {e}") from None
-        if not (worst := kkt_residuals(new.qp, s).worst) <= REFERENCE:
+        if not (worst := kkt_residuals(new.qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
             raise NoEquilibriumError(
                 f"its reference solve left a residual of {worst:.1e}, more than "
-                f"{REFERENCE:g}"
+                f"{MAX_REFERENCE_RESIDUAL:g}"
             )
         return new.recover(s)
 
-    def _moved(
+    def _line_search(
         self, at: Configuration, posed: Iteration, lam: Vector, weight: float,
         best: float,
     ) -> tuple[Configuration, float, float]:  # fmt: skip
@@ -474,10 +480,10 @@ class NewtonPath:
         load_factor = posed.load_factor
         d = posed.answer.x - at.u
         merit = _merit(at, weight)
-        noise = NOISE * (abs(at.cells.energy) + abs(at.energy))
+        noise = MERIT_ROUNDING * (abs(at.cells.energy) + abs(at.energy))
         slope = float(at.r @ d) - weight * float(np.maximum(-at.gap, 0.0).sum())
         length, inverted = 1.0, None
-        while length >= SHORTEST:
+        while length >= MIN_STEP:
             try:
                 new = self._configuration(at.u + length * d, load_factor, posed.gaps)
             except InvertedCellError as e:
@@ -486,7 +492,7 @@ class NewtonPath:
                 residual = self.residual(new, lam, load_factor)
                 if (length == 1 and residual <= best / 2) or (
                     _merit(new, weight)
-                    <= merit + ARMIJO * length * min(slope, 0.0) + noise
+                    <= merit + ARMIJO_FRACTION * length * min(slope, 0.0) + noise
                 ):
                     return new, length, residual
             length /= 2
@@ -500,7 +506,7 @@ def _merit(at: Configuration, weight: float) -> float:
     return at.energy + weight * float(np.maximum(-at.gap, 0.0).sum())
 
 
-def motions_left(bodies: Bodies) -> NDArray[np.float64]:
+def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
     """Return an orthonormal basis (n, r) of the rigid motions that the supports leave.
 
     Of the undeformed bodies; exact for translations, whatever the deformation.
@@ -510,7 +516,7 @@ def motions_left(bodies: Bodies) -> NDArray[np.float64]:
     return np.asarray(rigid @ null_space(held)) if held.size else rigid
 
 
-def translations_left(bodies: Bodies) -> list[NDArray[np.float64]]:
+def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
     """Find per body an orthonormal basis (2N_body, r) of the translations left.
 
     Raises
@@ -528,7 +534,7 @@ def translations_left(bodies: Bodies) -> list[NDArray[np.float64]]:
         own = dofs_of(np.flatnonzero(owner == b), bodies.mesh.dim)
         R = rigid[own][:, 3 * b : 3 * b + 3]
         left = null_space(R[held[own]]) if held[own].any() else np.eye(3)
-        if np.abs(left[2]).max(initial=0.0) > TURNING:
+        if np.abs(left[2]).max(initial=0.0) > MAX_ROTATION:
             raise InputError(
                 f"kinematics=finite: the supports leave body {name!r} to rotate, where "
                 "a stressed body has a stiffness of either sign; expected supports "
@@ -538,9 +544,9 @@ def translations_left(bodies: Bodies) -> list[NDArray[np.float64]]:
     return found
 
 
-def guided(tangent: Bodies) -> GeneralisedInverse:
+def sliding_inverse(tangent: Bodies) -> GeneralisedInverse:
     """Factorise K with the translations that its supports leave, as `dual` needs it."""
-    kernels = translations_left(tangent)
+    kernels = free_translations(tangent)
     owner, points = tangent.body_of_node, tangent.mesh.points
     dim, none = tangent.mesh.dim, np.zeros(0, dtype=np.int64)
     fixing = [

@@ -19,7 +19,12 @@ from mortarbench.problems.contact.linearise import (
 )
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.newton import Gaps, Iteration, NewtonPath, guided
+from mortarbench.problems.duality.newton import (
+    Gaps,
+    Iteration,
+    NewtonPath,
+    sliding_inverse,
+)
 from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.fem.finite_strain import (
     Cells,
@@ -53,14 +58,16 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
     """Collect the gaps of slave nodes to segments, which have second derivatives."""
     geometric = stiffness == "geometric"
 
-    def keeping(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
+    def keep_segments(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
         kept = np.where(pressing, closest_segments(bodies, u), -1)
         return Gaps(
             linearisation(bodies, "nts", None, kept=kept),
             contact_stiffness(bodies, kept) if geometric else None,
         )
 
-    return Gaps(linearise, contact_stiffness(bodies) if geometric else None, keeping)
+    return Gaps(
+        linearise, contact_stiffness(bodies) if geometric else None, keep_segments
+    )
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
@@ -112,7 +119,7 @@ def newton_case(
 
     case = contact_case(
         bodies, primal, form,
-        floating=lambda: guided(bodies), clamped=lambda: clamped(bodies),
+        floating=lambda: sliding_inverse(bodies), clamped=lambda: clamped(bodies),
         supported=lambda: supported(bodies), quantities=collected,
     )  # fmt: skip
     assert case.mechanics is not None

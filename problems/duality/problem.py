@@ -1,7 +1,7 @@
 """A contact problem as a family states it: once, and nothing assembled.
 
-Of it follow the QPs of undivided bodies (`problems.duality.undivided`) and those of
-subdomains, on one process or on several ranks (`problems.duality.divided`).
+Of it follow the QPs of undivided bodies (`problems.duality.monolithic`) and those of
+subdomains, on one process or on several ranks (`problems.duality.decomposed`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import (
     Subdivision,
     half_discs_in_blocks,
-    mesh_in_parts,
+    mesh_in_subdomains,
 )
 from mortarbench.problems.feti.tearing import compact_blocks
 
@@ -146,7 +146,7 @@ class Meshed:
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies by graph partitioning."""
         label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
-        return mesh_in_parts(self.mesh, label, self.body, self.named)
+        return mesh_in_subdomains(self.mesh, label, self.body, self.named)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -182,7 +182,7 @@ class ElasticBodies:
         )  # fmt: skip
 
     @cached_property
-    def is_held(self) -> bool:
+    def is_supported(self) -> bool:
         """True where supports leave no rigid motion of any body."""
         rigid = self.whole.rigid
         return bool(np.linalg.matrix_rank(rigid[self.fixed]) == rigid.shape[1])
@@ -203,7 +203,7 @@ class ElasticBodies:
         return supported(self.assembled)
 
 
-def stated(bodies: UnassembledBodies) -> ElasticBodies:
+def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
     """State bodies that there is a mesh of already; their own stiffness is kept."""
     fixed = bodies.B_D.indices
     named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
@@ -218,7 +218,7 @@ def stated(bodies: UnassembledBodies) -> ElasticBodies:
     return found
 
 
-class AtSides(NamedTuple):
+class InterfaceState(NamedTuple):
     """The contact: data and solution at least at the nodes of the sides."""
 
     bodies: Bodies | ContactSides
@@ -236,11 +236,11 @@ class DisplacedMesh(NamedTuple):
     u: Vector  #: (2N,) m
 
 
-class Found(Protocol):
+class ContactSolution(Protocol):
     """An answer to a contact problem; on ranks, all of them call what they call."""
 
     @property
-    def sides(self) -> AtSides:
+    def sides(self) -> InterfaceState:
         """The contact."""
 
     @property
@@ -257,7 +257,7 @@ class Found(Protocol):
         """Return the largest of the numbers of all ranks."""
 
 
-def nothing_more(found: Found) -> dict[str, Any]:
+def no_further_results(found: ContactSolution) -> dict[str, Any]:
     """Report nothing besides what all elastic bodies report."""
     return {}
 
@@ -275,7 +275,7 @@ class ContactProblem:
     #: normal force of each slave node that the first bound of Coulomb's law is of
     pressed: float = 0.0
     #: reports more of an answer than of all elastic bodies
-    results: Callable[[Found], Mapping[str, Any]] = nothing_more
+    results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
     #: (k, 3) x, m, exact pressure and shear, Pa, of the slave side, where it is known
     exact: NDArray[np.float64] | None = None
 
@@ -293,7 +293,7 @@ class Choice(NamedTuple):
 CHOICES = ("step", "iterate", "feti", "parts", "glue")
 
 
-def chosen(form: str, params: Mapping[str, Value]) -> Choice:
+def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
     """Return what keys say of the QP that is emitted.
 
     Raises
@@ -314,7 +314,7 @@ def chosen(form: str, params: Mapping[str, Value]) -> Choice:
     )
 
 
-def remembered(
+def cached_problem(
     state: Callable[[Mapping[str, Any]], ContactProblem],
 ) -> Callable[[Mapping[str, Value]], ContactProblem]:
     """State a problem once for all QPs that keys choose of it; keep the last few."""
@@ -327,7 +327,7 @@ def remembered(
     return problem
 
 
-def by_keys(
+def keyed_linearisation(
     params: Mapping[str, Any],
 ) -> Callable[[UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise]:
     """Linearise contact by the method that the keys `contact` and `basis` name."""

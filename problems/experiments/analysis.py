@@ -17,7 +17,7 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.results import fields
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.experiments.clock import Laps, Stopwatch, race
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
@@ -64,7 +64,7 @@ def analyse(
         solved.append((qp, solution))
         return solution
 
-    path = path_of(
+    path = load_path(
         bodies, linearise, lambda: inverse, solve_dual, steps, transform=dualise
     )  # fmt: skip
     path.solution(steps)

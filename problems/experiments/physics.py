@@ -11,7 +11,7 @@ from mortarbench.harness import Reference, Value
 from mortarbench.problems.contact.bodies import Bodies, clamped
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.undivided import WholePath, path_of
+from mortarbench.problems.duality.monolithic import MonolithicPath, load_path
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.families.hertz import HertzCylinder
@@ -40,11 +40,11 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     inverse, linearise = clamped(bodies), linearisation(bodies, "nts", "dual")
     ways = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*ways, SETTLED):
-        path = path_of(bodies, linearise, lambda: inverse, solve, steps, relin)
+        path = load_path(bodies, linearise, lambda: inverse, solve, steps, relin)
         yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
 
 
-def _results(bodies: Bodies, path: WholePath, step: int) -> dict[str, Value]:
+def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value]:
     primal, s = path.primal(step), path.answer(step)
     found = quantities(bodies, primal, s)
     sides = bodies.mesh.boundaries
@@ -73,7 +73,7 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     lengths = nodal_lengths(points)
     for contact in ("nts", "mortar"):
         linearise = linearisation(bodies, contact, "dual")
-        path = path_of(bodies, linearise, lambda: inverse, solve, plan.steps)
+        path = load_path(bodies, linearise, lambda: inverse, solve, plan.steps)
         for step in range(1, plan.steps + 1):
             s = path.answer(step)
             on_nodes = (path.primal(step).G.T @ s.z).reshape(-1, 2)[slave]

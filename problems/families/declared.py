@@ -97,11 +97,11 @@ class DeclaredFamily(Family):
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> Emitted:
         """Emit this rank's share of the dual; called by all ranks."""
-        from mortarbench.problems.feti.emission import dual_on, emitted
+        from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
         del reference
         dual = dual_on(_model(f"{self.subdomains}.in_subdomains")(params), ranks)
-        return emitted(dual, _model(f"{self.subdomains}.results")(params, dual))
+        return distributed_qp(dual, _model(f"{self.subdomains}.results")(params, dual))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
@@ -142,21 +142,21 @@ class ContactFamily(DeclaredFamily):
             return super().build(form, params, reference)
         self.check(params)
         from mortarbench.problems.duality.case_forms import case_of
-        from mortarbench.problems.duality.problem import chosen
+        from mortarbench.problems.duality.problem import qp_choice
 
-        choice = chosen(form, params)
+        choice = qp_choice(form, params)
         return case_of(self.stated(params), form, choice, reference)
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
     ) -> Emitted:
         """Emit this rank's share of the dual; called by all ranks."""
-        from mortarbench.problems.duality.divided import emitted_by
-        from mortarbench.problems.duality.problem import chosen
+        from mortarbench.problems.duality.decomposed import distributed_qp_of
+        from mortarbench.problems.duality.problem import qp_choice
 
         self.check(params)
-        choice = chosen("dual", params)
-        return emitted_by(ranks, self.stated(params), choice, reference)
+        choice = qp_choice("dual", params)
+        return distributed_qp_of(ranks, self.stated(params), choice, reference)
 
 
 def _model(place: str) -> Callable[..., Any]:

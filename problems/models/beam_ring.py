@@ -29,8 +29,8 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     StructuredGrids,
-    by_keys,
-    remembered,
+    cached_problem,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
@@ -48,14 +48,14 @@ BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """State the benchmark; its load grows in `steps`."""
     p: Any = params
     of = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"])
     tip = _tip(of.shape.sides)
     return ContactProblem(
-        bodies=of, linearise=by_keys(p),
+        bodies=of, linearise=keyed_linearisation(p),
         stages=load_steps(
             p["steps"], p["relin"], of.forces, of.fixed, (law_of(p),),
             quasi_static=p["loading"] == "quasi-static",

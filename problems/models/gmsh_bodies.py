@@ -25,9 +25,9 @@ from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
-    by_keys,
-    remembered,
-    stated,
+    cached_problem,
+    elastic_bodies_of,
+    keyed_linearisation,
 )
 from mortarbench.problems.models.description import (
     described_bodies,
@@ -52,9 +52,9 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     stated_problem = _problem(params)
     of = stated_problem.bodies
-    if p["step"] == p["relin"] == 1 or of.is_held:
+    if p["step"] == p["relin"] == 1 or of.is_supported:
         return stated_problem
-    rows = by_keys(p)(of.whole, laws_of(p))(np.zeros(of.whole.mesh.dofs))
+    rows = keyed_linearisation(p)(of.whole, laws_of(p))(np.zeros(of.whole.mesh.dofs))
     # without friction the displacement along the contact is not unique, nor is the next
     # linearisation
     if not is_determined(of.whole, vstack([rows.B, rows.T])):
@@ -66,7 +66,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     return stated_problem
 
 
-@remembered
+@cached_problem
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     of, laws = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]), laws_of(p)
@@ -75,8 +75,8 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
         quasi_static=p["loading"] == "quasi-static",
     )  # fmt: skip
     whole_load = float(np.abs(of.forces.value).sum())
-    if not of.is_held:
-        rows = by_keys(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
+    if not of.is_supported:
+        rows = keyed_linearisation(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
         with located(p["path"]):  # friction may hold either way
             check_balance(of.whole, vstack([rows.B, rows.T, -rows.T]))
         stages = tuple(
@@ -84,7 +84,7 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
             for stage in stages
         )
     return ContactProblem(
-        bodies=of, linearise=by_keys(p), stages=stages,
+        bodies=of, linearise=keyed_linearisation(p), stages=stages,
         pressed=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )  # fmt: skip
 
@@ -115,7 +115,7 @@ def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
     """State the bodies of a description; the digest tells contents apart."""
     del sha256
-    return stated(described_bodies(Path(path), plane, halvings))
+    return elastic_bodies_of(described_bodies(Path(path), plane, halvings))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:

@@ -27,7 +27,7 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     StructuredGrids,
-    remembered,
+    cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle_grid
@@ -41,7 +41,7 @@ PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x ther
 FORCE_AT = 38.75e-3  #: m
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """State the plate with n × n cells."""
     p: Any = params

@@ -54,16 +54,16 @@ from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
 from mortarbench.problems.contact.rigid_plane import above_plane
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
-from mortarbench.problems.duality.case_forms import beside
+from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
+    ContactSolution,
     ElasticBodies,
-    Found,
     HalfDiscs,
     Linearise,
-    remembered,
+    cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
@@ -86,12 +86,12 @@ UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
 CURVE = 601  #: points of exact tractions in pictures, over that part
 
 
-@remembered
+@cached_problem
 def on_plane(params: Mapping[str, Value]) -> ContactProblem:
     """State the linear problem of a cylinder on a rigid plane."""
     of, exact = _on_plane(params)
 
-    def results(found: Found) -> dict[str, Any]:
+    def results(found: ContactSolution) -> dict[str, Any]:
         bodies, primal, s, _ = found.sides
         return pressure_quantities(bodies, primal, exact, s)
 
@@ -113,7 +113,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
         path, form, 1, int(params["newton"]),
         lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
     )  # fmt: skip
-    return beside(case, _curve(exact))
+    return with_exact_tractions(case, _curve(exact))
 
 
 @lru_cache(maxsize=4)
@@ -150,7 +150,7 @@ class Halves(NamedTuple):
     exact: LineContact
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """State two cylinders, with contact linearised at the undeformed state.
 
@@ -166,7 +166,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         rows = linearisation(bodies, p["contact"], p["basis"], laws)
         return lambda u: rows(np.zeros_like(u))
 
-    def results(found: Found) -> dict[str, Any]:
+    def results(found: ContactSolution) -> dict[str, Any]:
         bodies, primal, s, friction = found.sides
         told = pressure_quantities(bodies, primal, exact, s)
         if shear is not None:

@@ -26,11 +26,11 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
 from mortarbench.harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.duality.dualisation import posed
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
+from mortarbench.problems.duality.dualisation import primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
 )
 from mortarbench.problems.fem.fixing import fixing_nodes
 from mortarbench.problems.fem.inverse import GeneralisedInverse, supported_inverse
@@ -43,16 +43,16 @@ from mortarbench.problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    ProblemInParts,
+    DecomposedProblem,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import Part
-from mortarbench.problems.feti.torn import Kind
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
 LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
@@ -66,15 +66,15 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     decomposition: Mapping[str, Any] = {}
     seconds, in_parts = None, None
     if form == "primal":
-        new = posed(pair.qp)
+        new = primal_form(pair.qp)
     else:
         start = perf_counter()
         own = on_one_process(pair.in_subdomains(p["glue"]))
-        pieces, in_parts = own.torn_bodies, certified_by(own, pair.qp.P)
-        new = torn_dual(pieces, pair.qp)
+        pieces, in_parts = own.decomposed, certifier(own, pair.qp.P)
+        new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
-        matrices = torn_matrices(pieces, new.qp)
-        decomposition = torn_quantities(pieces, new.qp)
+        matrices = feti_matrices(pieces, new.qp)
+        decomposition = decomposition_quantities(pieces, new.qp)
     dofs = pair.qp.q.size
     return Case(
         qp=new.qp,
@@ -150,15 +150,15 @@ class Membranes:
         along = shares(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def in_subdomains(self, rows: str) -> ProblemInParts:
+    def in_subdomains(self, rows: str) -> DecomposedProblem:
         """Describe the dual, glued by `rows`, one of `GLUE`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
         G = _touching(sides, layout.nodes)
-        return ProblemInParts(
+        return DecomposedProblem(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
-            kind=membrane_kind, E=np.ones(2), names=NAMES, load=self.load, glue=rows,
-            held=np.sort(sides["left left"]),
+            assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
+            glue=rows, fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 
@@ -180,7 +180,7 @@ class Membranes:
         """
         return self._reported(s.z, self.qp.objective(s.x), float(s.x.min()))
 
-    def results(self, found: OwnSolution) -> dict[str, Any]:
+    def results(self, found: LocalSolution) -> dict[str, Any]:
         """Report what ranks have found, as `quantities`; called by all of them."""
         lowest = found.bodies.ranks.extreme(float(found.u.min()), np.min)
         return self._reported(found.z, found.energy, lowest)
@@ -200,20 +200,20 @@ class Membranes:
         }
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Describe the dual, of which ranks can emit their shares."""
     p: Any = params
     return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
     """Report what ranks have found, as `Membranes.quantities`."""
     del dual
     p: Any = params
     return Membranes(p["S"], p["n"]).results
 
 
-def membrane_kind(part: Part, h: float = 1.0) -> Kind:
+def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
     """Assemble one floating block of a grid, under unit tension.
 
     Its kernel are the constants. Its nodes are numbered as those of `grid_stiffness`.
@@ -225,7 +225,7 @@ def membrane_kind(part: Part, h: float = 1.0) -> Kind:
     nodes = len(part.points)
     at = np.indices([x.size for x in places]).reshape(len(cells), -1)
     last = np.array(cells)[:, None]
-    return Kind(
+    return SubdomainClass(
         K=grid_stiffness(cells, h),
         R=np.full((nodes, 1), nodes**-0.5),
         fixing=fixing_nodes(part.points),

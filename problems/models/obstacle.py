@@ -51,7 +51,7 @@ from mortarbench.harness import (
 )
 from mortarbench.problems.contact.sides import ACTIVE
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
-from mortarbench.problems.duality.torn_dual import torn_dual, torn_quantities
+from mortarbench.problems.duality.feti_dual import decomposition_quantities, feti_dual
 from mortarbench.problems.fem.inverse import (
     GeneralisedInverse,
     regular_inverse,
@@ -59,17 +59,17 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    ProblemInParts,
+    DecomposedProblem,
     on_one_process,
 )
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.models.membranes import membrane_kind
+from mortarbench.problems.models.membranes import membrane_class
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
@@ -92,9 +92,9 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         new = with_bounds(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
-        pieces, in_parts = own.torn_bodies, certified_by(own, rows.P)
-        new = torn_dual(pieces, rows)
-        decomposition = torn_quantities(pieces, new.qp)
+        pieces, in_parts = own.decomposed, certifier(own, rows.P)
+        new = feti_dual(pieces, rows)
+        decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "dual":
         new = dualise(rows, problem.floating())
     else:
@@ -122,7 +122,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     )  # fmt: skip
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Describe the dual on a grid in blocks; every node within has a row of contact."""
     p: Any = params
     if p["dim"] == 1:
@@ -135,29 +135,29 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     psi = obstacle_height(grid.block(all_, all_)[free], shape)
     ends = np.arange(free.size + 1)
     rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
-        names=("membrane",), load=partial(_load, grid, shape), held=held,
+        assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
+        names=("membrane",), load=partial(_load, grid, shape), fixed=held,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
     )  # fmt: skip
 
 
-def _string_in_subdomains(n: int, most: int, glue: str) -> ProblemInParts:
+def _string_in_subdomains(n: int, most: int, glue: str) -> DecomposedProblem:
     """Describe the dual of a string; its mesh is listed as a whole."""
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_parts(mesh, blocks((n,), most), body, np.arange(n + 1))
+    layout = mesh_in_subdomains(mesh, blocks((n,), most), body, np.arange(n + 1))
     qp = problem.qp
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_kind, h=2 * HALF["flat"] / n), E=np.ones(1),
-        names=("string",), load=lambda node: -qp.q[node], held=qp.A.indices,
+        assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
+        names=("string",), load=lambda node: -qp.q[node], fixed=qp.A.indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
     )  # fmt: skip
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
     """Report what ranks have found, as `obstacle_quantities`."""
     del dual
     p: Any = params
@@ -165,7 +165,7 @@ def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
 
 
 def _found_by_ranks(
-    grid: StructuredGrid, shape: str, found: OwnSolution
+    grid: StructuredGrid, shape: str, found: LocalSolution
 ) -> Mapping[str, Any]:
     """Report what ranks have found, as `obstacle_quantities`; called by all of them.
 

@@ -45,11 +45,11 @@ from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
+    ContactSolution,
     ElasticBodies,
-    Found,
     StructuredGrids,
-    by_keys,
-    remembered,
+    cached_problem,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.finite_strain import cauchy_stress, strain_energy
@@ -71,14 +71,14 @@ PRESSURE = 1e6  #: p, Pa
 E_UPPER, NU = 10e6, 0.3  #: Pa
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """State the linear problem of the blocks."""
     p: Any = params
     of = bodies(p)
     D = elasticity_matrices(of.materials, of.plane)
 
-    def error(found: Found) -> dict[str, Any]:
+    def error(found: ContactSolution) -> dict[str, Any]:
         """Find the largest |σ_y + p|/p over all Gauss points."""
         largest = 0.0
         for part in found.meshes():
@@ -88,7 +88,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return {"stress_error": found.largest(largest)}
 
     return ContactProblem(
-        bodies=of, linearise=by_keys(p), results=error,
+        bodies=of, linearise=keyed_linearisation(p), results=error,
         stages=load_steps(1, 1, of.forces, of.fixed, (law_of(p),)),
         # friction may have to hold the blocks
         pressed=float(np.abs(of.forces.value).sum()),

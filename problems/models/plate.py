@@ -36,12 +36,12 @@ from mortarbench.harness import (
     no_rows,
 )
 from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.divided import elastic_kind, looked_up
-from mortarbench.problems.duality.dualisation import Transformed, posed
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
+from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
+from mortarbench.problems.duality.dualisation import Transformed, primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
 )
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -59,21 +59,21 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
 )
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    OwnSubdomains,
-    ProblemInParts,
+    DecomposedProblem,
+    LocalSubdomains,
     on_one_process,
 )
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.feti.torn import Torn
 
 LENGTH = 1.0  #: l, m
 LOAD = 1e6  #: F₀, N/m
@@ -91,7 +91,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
     """Emit the QP in one form."""
     plate = model(tuple(params.items()))
     mesh = plate.mesh
-    new = plate.dual if form == "dual" else posed(plate.primal)
+    new = plate.dual if form == "dual" else primal_form(plate.primal)
 
     def results(s: Solution) -> Mapping[str, Any]:
         counts = quantities(plate, new.recover(s))
@@ -107,7 +107,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
-        matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
+        matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal, back=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
@@ -117,7 +117,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 np.zeros(mesh.dofs),
             ),
             in_parts=(
-                certified_by(plate.own, plate.primal.P) if form == "dual" else None
+                certifier(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),
     )  # fmt: skip
@@ -134,27 +134,27 @@ class Plate:
     moduli: Vector  #: of the materials; the first is that of steel
     D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials
     primal: QP
-    parts: ProblemInParts
+    parts: DecomposedProblem
 
     @cached_property
-    def own(self) -> OwnSubdomains:
+    def own(self) -> LocalSubdomains:
         """The plate in its subdomains, all of them."""
         return on_one_process(self.parts)
 
     @property
-    def torn(self) -> Torn:
+    def torn(self) -> DecomposedBodies:
         """The same with what was made of them."""
-        return self.own.torn_bodies
+        return self.own.decomposed
 
     @cached_property
     def dual(self) -> Transformed:
         """The dual of the torn plate."""
-        return torn_dual(self.torn, self.primal)
+        return feti_dual(self.torn, self.primal)
 
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
         """Spectra of F on its equations, alone and with preconditioners."""
-        return _spectra(self.moduli, OwnDual(self.own))
+        return _spectra(self.moduli, LocalDual(self.own))
 
     @property
     def held(self) -> NDArray[np.int64]:
@@ -167,7 +167,7 @@ class Plate:
         return regular_inverse(self.primal.P, free)
 
 
-def _spectra(moduli: Vector, dual: OwnDual) -> Mapping[str, Spectrum]:
+def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
     """Find the spectra by the names of `PRECONDITIONERS`; called by all ranks."""
     qp = dual.share().qp
     names = dict(PRECONDITIONERS)
@@ -202,31 +202,31 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     )  # fmt: skip
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Describe the dual of the plate."""
     p: Any = params
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
     column, row = (x.astype(np.int64) for x in layout.block[1:])
     none = np.zeros(0)
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
-        kind=partial(elastic_kind, D=D, E=moduli),
-        load=looked_up(Forces(*_pull(grid, p["load"]))),
-        held=dofs_of(grid.sides["left"], 2),
+        assemble_class=partial(elastic_class, D=D, E=moduli),
+        load=force_lookup(Forces(*_pull(grid, p["load"]))),
+        fixed=dofs_of(grid.sides["left"], 2),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
     )  # fmt: skip
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
     """Report what ranks have found, as `quantities`."""
     return partial(_found_by_ranks, _grid(params), _stiffness(params)[0], dual)
 
 
 def _found_by_ranks(
-    grid: StructuredGrid, moduli: Vector, dual: OwnDual, found: OwnSolution
+    grid: StructuredGrid, moduli: Vector, dual: LocalDual, found: LocalSolution
 ) -> dict[str, Any]:
     """Report what ranks have found; called by all of them."""
     own = found.subdomains
@@ -235,7 +235,7 @@ def _found_by_ranks(
         "nodes": grid.nodes,
         "elements": int(np.prod(grid.divisions)),
         "dofs": 2 * grid.nodes,
-        "equality_rows": own.problem.held.size,
+        "equality_rows": own.problem.fixed.size,
         "energy": found.energy * LOAD * LENGTH,
         "tip": (found.at(tip) * LENGTH).tolist(),
     }
@@ -315,7 +315,7 @@ def dual_quantities(plate: Plate) -> dict[str, Any]:
     kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
     preconditioners, by multiplicity but for the last. Each has an `…_error`.
     """
-    torn = torn_quantities(plate.torn, plate.dual.qp)
+    torn = decomposition_quantities(plate.torn, plate.dual.qp)
     return conditions(plate.spectra) | torn
 
 

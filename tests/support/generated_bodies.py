@@ -23,7 +23,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import (
     Mesh,

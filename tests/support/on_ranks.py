@@ -154,7 +154,7 @@ def operator(name, ranks):
     whole = qp.P.build()
     share = whole.share(qp, ranks)
     P, x = share.qp.P, np.random.default_rng(1).standard_normal(qp.q.size)
-    own = P.halo.rows[P.halo.own]
+    own = P.halo.rows[P.halo.owned]
     errors = {
         "product": (P @ x[own], whole(x)[own]),
         "diagonal": (P.diagonal(), whole.diagonal()[own]),
@@ -171,7 +171,7 @@ def operator(name, ranks):
     by_rank, alike = projected(share.qp, factor.FILL), projected(share.qp, 0)
     worst["coarse"] = float(np.abs(by_rank - alike).max() / np.abs(alike).max())
     solved = share.whole(SMALBE().prepare(share.qp, TOL)())
-    everywhere = ranks.comm.gather((worst, own.size, P.local.domains.kind.size))
+    everywhere = ranks.comm.gather((worst, own.size, P.local.domains.class_of.size))
     if solved is None:
         return None
     alone = SMALBE().prepare(qp, TOL)()

@@ -13,7 +13,11 @@ from mortarbench.harness import Case, Solution, Status, UncertifiableError, cert
 from mortarbench.harness.mechanics import Extended, Mechanics, Real, cancelling
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify import certificate
-from mortarbench.harness.verify.admissible import _newton, admissible, balanced
+from mortarbench.harness.verify.admissible import (
+    _newton,
+    admissible,
+    balanced_partition,
+)
 from mortarbench.harness.verify.certificate import Certificate, _charge, _Reach
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.references import reference_point
@@ -318,7 +322,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
     rng, motions = np.random.default_rng(1), mechanics.motions
     for size in (1e-12, 1e-3):
         start = np.maximum(lam * (1 + size * rng.standard_normal(lam.size)), 0)
-        found = balanced(mechanics, start, u)
+        found = balanced_partition(mechanics, start, u)
         left = (
             motions.felt.T @ mechanics.exact.f - motions.KR.T @ u - motions.G.T @ found
         )

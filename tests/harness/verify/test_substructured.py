@@ -29,14 +29,14 @@ from mortarbench.harness.verify.references import ReferencePoint, reference_poin
 from mortarbench.harness.verify.substructured import neighbour, still
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.own_bodies import own_bodies
+from mortarbench.problems.feti.local_bodies import local_bodies
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import labelled_subdivision, parts_by
 from tests.support.disturbed import DISTURBANCES
-from tests.support.torn_bodies import labelled, parts_by
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
@@ -108,13 +108,13 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
     whole, bodies = case.mechanics, bodies_of(name)
     assert whole is not None
-    layout = labelled(bodies, boxes(bodies, parts))
+    layout = labelled_subdivision(bodies, boxes(bodies, parts))
 
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
     subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
-    own = own_bodies(subdomains)
+    own = local_bodies(subdomains)
     mechanics = replace(
         whole, factorise=never, in_parts=lambda u, z: certify_over_ranks(own, u, z)
     )
@@ -271,7 +271,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
 def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
     parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
-    K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
+    K = block_diag([parts.torn.classes[k].K for k in parts.torn.class_of])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)

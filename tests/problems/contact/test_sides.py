@@ -7,7 +7,7 @@ from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.sides import contact_sides, rows_of_pairs
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import nodal_lengths

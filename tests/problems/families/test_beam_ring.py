@@ -10,7 +10,7 @@ from mortarbench.harness.suite.suite import load_suite
 from mortarbench.problems.contact.bodies import clamped, floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import primal_qp, whole_path
+from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.registries import suites_folder
@@ -142,7 +142,7 @@ def test_steps_are_the_same_in_whatever_order_they_are_asked_for():
     orders = [(5, 2, 4), (2, 4, 5)]
     seen = []
     for order in orders:
-        whole_path.cache_clear()
+        monolithic_path.cache_clear()
         given = {k: FAMILY.complete(dict(Nr=4, Nh=3, steps=5, step=k)) for k in order}
         seen.append({k: gaps(k, given[k]) for k in order})
 

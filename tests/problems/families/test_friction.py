@@ -18,7 +18,7 @@ from mortarbench.problems.contact.node_to_segment import (
     rows_along,
 )
 from mortarbench.problems.contact.surface import tangents
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
 from mortarbench.problems.models.patch import model
@@ -329,7 +329,7 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     first = np.zeros(1, dtype=np.int64)
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
-    path = path_of(
+    path = load_path(
         bodies, lambda u: rows, lambda: clamped(bodies), reference_solution, 1,
         laws=laws,
     )  # fmt: skip

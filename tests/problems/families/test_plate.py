@@ -68,7 +68,7 @@ def test_the_cantilever_of_msolve_has_its_sizes():
     assert torn.c.size == 190  # no gluing of what is held
     assert rows.f.size == 1056
     assert torn.f.size == 1056 - 44
-    modes = [torn.kinds[k].R.shape[1] for k in torn.kind]
+    modes = [torn.classes[k].R.shape[1] for k in torn.class_of]
     assert modes == [0, 3, 3, 3] * 2  # the column at the held edge does not float
 
 

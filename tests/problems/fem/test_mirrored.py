@@ -11,7 +11,7 @@ from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped, 
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.undivided import path_of as whole_path
+from mortarbench.problems.duality.monolithic import load_path as monolithic_path
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -55,8 +55,8 @@ def sign(bodies):
 
 
 @cache
-def path_of(bodies, contact, basis, relin=1):
-    return whole_path(
+def load_path(bodies, contact, basis, relin=1):
+    return monolithic_path(
         bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
         reference_solution, STEPS, relin,
     )  # fmt: skip
@@ -65,7 +65,7 @@ def path_of(bodies, contact, basis, relin=1):
 @cache
 def results(bodies, contact, basis, form):
     """Solve the QP of the last step in `form`: u in m, and what it means in SI."""
-    primal = path_of(bodies, contact, basis).primal(STEPS)
+    primal = load_path(bodies, contact, basis).primal(STEPS)
     case = contact_case(
         bodies, primal, form, floating=lambda: floating(bodies),
         clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
@@ -110,7 +110,7 @@ def kinked(bodies):
 def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
     """Where nodes have slid along segments, and at a corner; in the other order."""
     there, flip = mirrored(bodies, about), sign(bodies)
-    loaded = path_of(bodies, contact, basis).solution(1) * bodies.length
+    loaded = load_path(bodies, contact, basis).solution(1) * bodies.length
     u = loaded if state == "loaded" else kinked(bodies)
     here, other = (
         linearisation(b, contact, basis)(v) for b, v in ((bodies, u), (there, flip * u))
@@ -125,7 +125,7 @@ def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
 @pytest.mark.parametrize("relin", [1, 2])
 def test_the_mirrored_path_is_the_mirror_of_the_path(bodies, contact, basis, relin):
     there = mirrored(bodies, 1.0)
-    here, other = (path_of(b, contact, basis, relin) for b in (bodies, there))
+    here, other = (load_path(b, contact, basis, relin) for b in (bodies, there))
 
     for k in range(1, STEPS + 1):
         u, v = here.solution(k), other.solution(k)

@@ -7,7 +7,7 @@ from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.bodies import assemble, clamped, floating, supported
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.results import fields, nodal_stresses
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.inverse import NO_NODES
 from mortarbench.problems.fem.mesh import dofs_of

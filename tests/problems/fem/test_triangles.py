@@ -7,7 +7,7 @@ from skfem import Basis, ElementTriP1, ElementVector, MeshTri
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.elasticity import (
     Material,

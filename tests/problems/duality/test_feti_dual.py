@@ -11,12 +11,12 @@ from mortarbench.problems.contact.bodies import floating
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled_subdivision, torn_by
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")
@@ -35,8 +35,8 @@ def posed(law):
 def dual_of(primal, friction, rows):
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 2))
-    pair = torn_by(BODIES, labelled(BODIES, label), primal, friction, rows)
-    return pair, torn_dual(pair, primal, friction)
+    pair = torn_by(BODIES, labelled_subdivision(BODIES, label), primal, friction, rows)
+    return pair, feti_dual(pair, primal, friction)
 
 
 def assembled(qp):
@@ -57,7 +57,7 @@ def test_the_solution_is_that_of_the_whole(rows, law):
     assert found.x == pytest.approx(expected.x, abs=1e-10 * abs(expected.x).max())
     assert found.y == pytest.approx(expected.y, abs=1e-9 * abs(expected.y).max())
     assert found.z == pytest.approx(expected.z, abs=1e-9 * abs(expected.z).max())
-    assert torn_apart.touched(s) == pytest.approx(found.x)
+    assert torn_apart.interface_displacement(s) == pytest.approx(found.x)
     if not law:
         assert kkt_residuals(primal, found).worst < 1e-9
     else:

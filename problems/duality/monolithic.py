@@ -31,9 +31,9 @@ from mortarbench.problems.contact.stepping import (
 )
 from mortarbench.problems.duality.dualisation import (
     Transformed,
-    bounded,
     dual_bounds,
     dualise,
+    with_friction_bound,
 )
 from mortarbench.problems.duality.problem import ContactProblem, Linearise
 from mortarbench.problems.fem.inverse import GeneralisedInverse
@@ -42,11 +42,11 @@ from mortarbench.problems.fem.mesh import Nodes
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
 #: residual that a reference solve may leave: the next step is linearised there
-REFERENCE = 1e-6
+MAX_REFERENCE_RESIDUAL = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class WholeProblem:
+class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `Posed`."""
 
     bodies: Bodies  #: with the load and the supports of its stage
@@ -59,12 +59,12 @@ class WholeProblem:
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
         """Solve the dual with the bound of a friction."""
-        qp = bounded(self.dual().qp, friction)
+        qp = with_friction_bound(self.dual().qp, friction)
         s = self.reference(qp)
-        if not (worst := kkt_residuals(qp, s).worst) <= REFERENCE:
+        if not (worst := kkt_residuals(qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
             raise ArithmeticError(
                 f"the reference solve at load factor {self.part:g} left a residual "
-                f"of {worst:.1e}, more than {REFERENCE:g}"
+                f"of {worst:.1e}, more than {MAX_REFERENCE_RESIDUAL:g}"
             )
         return s
 
@@ -77,11 +77,11 @@ class WholeProblem:
         """Return u (n,), right on the contact sides, and the normal forces."""
         places = sum(pair.slave.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal(s), self.place, places)
-        return self.dual().touched(s), forces
+        return self.dual().interface_displacement(s), forces
 
 
 @dataclass(frozen=True, eq=False)
-class WholePath(LoadPath[WholeProblem]):
+class MonolithicPath(LoadPath[MonolithicLinearisation]):
     """The load steps of undivided bodies."""
 
     _answers: dict[int, Solution] = field(default_factory=dict, init=False)
@@ -102,7 +102,7 @@ class WholePath(LoadPath[WholeProblem]):
         return self.answer(k).x if k else self.rest.u
 
 
-def path_of(
+def load_path(
     bodies: Bodies,
     linearise: Linearise,
     factorise: Callable[[], GeneralisedInverse],
@@ -114,7 +114,7 @@ def path_of(
     laws: tuple[FrictionLaw, ...] = (),
     quasi_static: bool = True,
     pressed: float = 0.0,
-) -> WholePath:
+) -> MonolithicPath:
     """Prepare the load steps of assembled bodies, linearised by the laws' own rows.
 
     Parameters
@@ -134,7 +134,7 @@ def path_of(
 
 
 @lru_cache(maxsize=4)
-def whole_path(problem: ContactProblem, reference: Reference) -> WholePath:
+def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
     """Prepare the load steps of a contact problem on undivided bodies.
 
     Where supports hold all bodies, contact rows alone are dualised.
@@ -148,11 +148,11 @@ def whole_path(problem: ContactProblem, reference: Reference) -> WholePath:
             return of.floating
         return floating(replace(bodies, B_D=supports(bodies.mesh, held)))
 
-    is_held = of.is_held and all(stage.fixed is of.fixed for stage in stages)
+    is_supported = of.is_supported and all(stage.fixed is of.fixed for stage in stages)
     return _path(
         bodies, stages, lambda laws: problem.linearise(bodies, laws),
-        (lambda: of.clamped) if is_held else factor, reference,
-        dual_bounds if is_held else dualise, problem.pressed,
+        (lambda: of.clamped) if is_supported else factor, reference,
+        dual_bounds if is_supported else dualise, problem.pressed,
     )  # fmt: skip
 
 
@@ -164,7 +164,7 @@ def _path(
     reference: Reference,
     transform: Transform,
     pressed: float,
-) -> WholePath:
+) -> MonolithicPath:
     inverse = cache(factorise)
     # loads and supports may act in several stages; K⁺f is that of a whole load
     known, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
@@ -178,7 +178,7 @@ def _path(
             known[names] = replace(bodies, f=f, B_D=held)
         return known[names]
 
-    def pose(stage: Stage, at: State) -> WholeProblem:
+    def pose(stage: Stage, at: State) -> MonolithicLinearisation:
         rows = linearise(stage.laws)(at.u * bodies.length)
         own, load = under(stage), id(stage.forces)
         primal = primal_qp(own, rows, stage.part)
@@ -192,11 +192,15 @@ def _path(
                 free[load] = inverse()(own.f)
             return transform(primal, inverse(), free[load] * stage.part, first)
 
-        return WholeProblem(own, primal, first, rows.place, dual, reference, stage.part)
+        return MonolithicLinearisation(
+            own, primal, first, rows.place, dual, reference, stage.part
+        )
 
     places = sum(pair.slave.size for pair in bodies.pairs)
     nothing = np.zeros(bodies.mesh.dofs)
-    return WholePath(stages, pose, State(nothing, nothing, np.full(places, pressed)))
+    return MonolithicPath(
+        stages, pose, State(nothing, nothing, np.full(places, pressed))
+    )
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:

@@ -20,12 +20,14 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.duality.dualisation import Transformed
-from mortarbench.problems.feti.operators import block_bytes, touched
-from mortarbench.problems.feti.stored import dual_operator
-from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.feti.operator_arrays import dual_operator
+from mortarbench.problems.feti.operators import block_bytes, touched_components
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 
 
-def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
+def feti_dual(
+    torn: DecomposedBodies, primal: QP, friction: Friction = NO_FRICTION
+) -> Transformed:
     """Turn a contact problem on torn bodies into its dual.
 
     The way back takes  v = K⁺(f − Bᵀλ) − Rα  with α the multipliers of RᵀBᵀλ = Rᵀf,
@@ -67,13 +69,13 @@ def torn_dual(torn: Torn, primal: QP, friction: Friction = NO_FRICTION) -> Trans
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
 
 
-def torn_matrices(torn: Torn, dual: QP) -> dict[str, Any]:
+def feti_matrices(torn: DecomposedBodies, dual: QP) -> dict[str, Any]:
     """Name the matrices of the dual as the paper does: F, d, B, c and R."""
     R = torn.domains.kernel
     return {"F": dual.P, "d": -dual.q, "B": torn.B, "c": torn.c, "R": R}
 
 
-def torn_quantities(torn: Torn, dual: QP) -> dict[str, Any]:
+def decomposition_quantities(torn: DecomposedBodies, dual: QP) -> dict[str, Any]:
     """Report how bodies are torn, and how F is multiplied with.
 
     kinds: of subdomains, each with one factor. torn_dofs: all copies counted.
@@ -81,13 +83,13 @@ def torn_quantities(torn: Torn, dual: QP) -> dict[str, Any]:
     formed, the others solve in every product. explicit_mib: what they take, MiB.
     """
     explicit = dual.P.arrays["explicit"]
-    sizes = np.array([part.size for part in touched(torn.B, torn.domains)])
+    sizes = np.array([part.size for part in touched_components(torn.B, torn.domains)])
     taken = block_bytes(sizes, torn.domains)
     return {
-        "subdomains": torn.kind.size,
-        "kinds": len(torn.kinds),
+        "subdomains": torn.class_of.size,
+        "kinds": len(torn.classes),
         "torn_dofs": torn.f.size,
         "multipliers": torn.c.size,
-        "explicit_subdomains": int(explicit[torn.kind].sum()),
+        "explicit_subdomains": int(explicit[torn.class_of].sum()),
         "explicit_mib": float(taken[explicit].sum() / 2**20),
     }

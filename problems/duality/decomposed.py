@@ -34,11 +34,11 @@ from mortarbench.problems.contact.friction import forces_at_nodes, friction_of
 from mortarbench.problems.contact.results import Inside, results_of
 from mortarbench.problems.contact.stepping import Forces, LoadPath, Stage, State
 from mortarbench.problems.duality.problem import (
-    AtSides,
     Choice,
     ContactProblem,
     DisplacedMesh,
     ElasticBodies,
+    InterfaceState,
 )
 from mortarbench.problems.fem.elasticity import Material, Plane, rigid_modes, stiffness
 from mortarbench.problems.fem.fixing import fixing_nodes
@@ -50,28 +50,32 @@ from mortarbench.problems.fem.mesh import (
     dofs_of,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
-from mortarbench.problems.feti.emission import OwnDual, dual_on, emitted
-from mortarbench.problems.feti.own_bodies import (
-    OwnSolution,
+from mortarbench.problems.feti.distributed_dual import (
+    LocalDual,
+    distributed_qp,
+    dual_on,
+)
+from mortarbench.problems.feti.local_bodies import (
+    LocalSolution,
     contact_multipliers,
-    own_solution,
+    local_solution,
 )
 from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import Subdivision
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts
-from mortarbench.problems.feti.tearing import Part
-from mortarbench.problems.feti.torn import Kind
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
+from mortarbench.problems.feti.subdomains import Contact, DecomposedProblem
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 
 @dataclass(frozen=True, eq=False)
-class TornProblem:
+class DecomposedLinearisation:
     """A linearised contact problem of bodies in subdomains; see `Posed`.
 
     Its methods are called by all ranks, and give them the same.
     """
 
     stage: Stage
-    dual: OwnDual
+    dual: LocalDual
     sides: LinearisedSides
     reference: ReferenceOverRanks
 
@@ -92,36 +96,36 @@ class TornProblem:
     def normal(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
         dual = self.dual
-        z = contact_multipliers(dual.own, dual.at, s)
+        z = contact_multipliers(dual.subdomains, dual.halo, s)
         return z[: self.sides.place.size]
 
     def left(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) at the sides, without dimension, and the normal forces."""
         dual, sides = self.dual, self.sides
-        found = own_solution(dual.own, dual.at, s)
+        found = local_solution(dual.subdomains, dual.halo, s)
         vars(self).pop("_qp", None)  # explicit blocks are large, and done with
         forces = forces_at_nodes(self.normal(s), sides.place, sides.places)
         return found.at(sides.component), forces
 
 
-def torn_path(
+def decomposed_path(
     problem: ContactProblem, choice: Choice, ranks: Ranks, reference: ReferenceOverRanks
-) -> LoadPath[TornProblem]:
+) -> LoadPath[DecomposedLinearisation]:
     """Prepare the load steps of a contact problem in subdomains; called by all ranks.
 
     reference : solves shares of a dual, on all ranks together
     """
-    layout, of = layout_of(problem.bodies, choice.size), problem.bodies
-    known = list[OwnDual]()
+    layout, of = cached_layout(problem.bodies, choice.size), problem.bodies
+    known = list[LocalDual]()
 
-    def pose(stage: Stage, at: State) -> TornProblem:
+    def pose(stage: Stage, at: State) -> DecomposedLinearisation:
         sides = linearised(problem, layout, stage, at)
-        parts = described(of, layout, choice.glue, stage, sides.contact)
+        parts = decompose(of, layout, choice.glue, stage, sides.contact)
         if known:  # the bodies are the same, and so are what was made of them alone
-            known[0] = OwnDual(known[0].own.posed(parts))
+            known[0] = LocalDual(known[0].subdomains.with_problem(parts))
         else:
             known.append(dual_on(parts, ranks))
-        return TornProblem(stage, known[0], sides, reference)
+        return DecomposedLinearisation(stage, known[0], sides, reference)
 
     nothing = np.zeros(of.shape.dim * side_nodes(of.pairs).size)
     places = sum(pair.slave.size for pair in of.pairs)
@@ -130,12 +134,12 @@ def torn_path(
 
 
 @lru_cache(maxsize=4)
-def layout_of(bodies: ElasticBodies, size: int) -> Subdivision:
+def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
     """Cut bodies; see `Shape.layout`."""
     return bodies.shape.layout(size)
 
 
-def emitted_by(
+def distributed_qp_of(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
 ) -> Emitted:
     """Emit this rank's share of the dual that is chosen; called by all ranks.
@@ -147,7 +151,7 @@ def emitted_by(
         Coulomb's law does not settle or has less problems than are asked for.
 
     """
-    path = torn_path(problem, choice, ranks, reference)
+    path = decomposed_path(problem, choice, ranks, reference)
     chosen = path.problem(choice.step, choice.iterate)
     last = path.last_of(choice.step)
     before = [one for i in range(last) for one in path.problems(i)]
@@ -155,33 +159,35 @@ def emitted_by(
     posed, count = chosen.posed, len(path.problems(last))
     sides = replace(posed.sides, friction=chosen.friction)
 
-    def reported(found: OwnSolution) -> dict[str, Any]:
-        return _reported(problem, FoundByRanks(found, sides, problem.bodies, count))
+    def reported(found: LocalSolution) -> dict[str, Any]:
+        return _reported(
+            problem, DistributedSolution(found, sides, problem.bodies, count)
+        )
 
-    dual = posed.dual.bounded(chosen.friction.bound)
+    dual = posed.dual.with_bound(chosen.friction.bound)
     first = before[0].posed.dual if before else None
-    return emitted(dual, reported, first, len(before))
+    return distributed_qp(dual, reported, first, len(before))
 
 
-def described(
+def decompose(
     bodies: ElasticBodies, layout: Subdivision, glue: str, stage: Stage,
     contact: Contact,
-) -> ProblemInParts:  # fmt: skip
+) -> DecomposedProblem:  # fmt: skip
     """Describe elastic bodies under the load of a stage, before they are torn."""
     unit = bodies.length / bodies.force
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
     share = longitudinal_share(D)
     force = stage.forces._replace(value=stage.forces.value * stage.part)
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=bodies.shape.dim, material=layout.body,
-        kind=partial(elastic_kind, D=D, E=E), E=E, names=bodies.names,
+        assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
-        held=stage.fixed, load=looked_up(force), glue=glue, contact=contact,
+        fixed=stage.fixed, load=force_lookup(force), glue=glue, contact=contact,
     )  # fmt: skip
 
 
-def looked_up(forces: Forces) -> Callable[[Nodes], Vector]:
+def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
     """Return a function that looks forces up by components; zero elsewhere."""
     order = np.argsort(forces.component)
     known = forces.component[order]
@@ -260,10 +266,10 @@ def linearised(
 
 
 @dataclass(frozen=True, eq=False)
-class FoundByRanks:
-    """The answer that ranks have found; see `Found`."""
+class DistributedSolution:
+    """The answer that ranks have found; see `ContactSolution`."""
 
-    solution: OwnSolution
+    solution: LocalSolution
     linearised: LinearisedSides
     of: ElasticBodies
     problems: int
@@ -278,10 +284,10 @@ class FoundByRanks:
 
     def meshes(self) -> Iterator[DisplacedMesh]:
         """Give the displaced subdomains of each rank."""
-        return own_meshes(self.solution, self.of.length)
+        return local_meshes(self.solution, self.of.length)
 
     @cached_property
-    def sides(self) -> AtSides:
+    def sides(self) -> InterfaceState:
         """Gather what ranks have found along the sides."""
         sides, at = self.linearised, self.linearised.component
         diagonal = self.solution.diagonal(at) if sides.friction.bound.size else 0 * at
@@ -294,16 +300,16 @@ class FoundByRanks:
             status=Status.SOLVED, x=self.at(at), y=np.zeros(0), z=self.solution.z,
             z_box=np.zeros(at.size),
         )  # fmt: skip
-        return AtSides(sides.bodies, primal, s, sides.friction)
+        return InterfaceState(sides.bodies, primal, s, sides.friction)
 
 
-def _reported(problem: ContactProblem, found: FoundByRanks) -> dict[str, Any]:
+def _reported(problem: ContactProblem, found: DistributedSolution) -> dict[str, Any]:
     """Report what ranks have found; called by all of them."""
     of, own = problem.bodies, found.solution.subdomains
     layout = own.problem.layout
     cells = sum(len(layout.cells(int(s))) for s in own.number)
     inside = Inside(
-        nodes=layout.nodes, supports=own.problem.held.size,
+        nodes=layout.nodes, supports=own.problem.fixed.size,
         elements=int(own.ranks.total(np.array([float(cells)]))[0]),
         energy=found.solution.energy * of.force * of.length,
         max_von_mises=_largest_von_mises(
@@ -320,7 +326,9 @@ def longitudinal_share(D: NDArray[np.float64]) -> Vector:
     return np.asarray(D[:, 0, 0] / (D[:, 0, 0] + D[:, -1, -1]))
 
 
-def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
+def elastic_class(
+    part: SubdomainMesh, D: NDArray[np.float64], E: Vector
+) -> SubdomainClass:
     """Assemble one floating subdomain.
 
     Parameters
@@ -331,7 +339,7 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
     """
     cells, dim = part.cells, part.points.shape[1]
     around = np.bincount(cells.ravel(), np.repeat(E[part.material], cells.shape[1]))
-    return Kind(
+    return SubdomainClass(
         K=stiffness(Mesh(part.points, cells, {}), D, part.material),
         R=rigid_modes(part.points),
         fixing=dofs_of(fixing_nodes(part.points), dim),
@@ -340,12 +348,14 @@ def elastic_kind(part: Part, D: NDArray[np.float64], E: Vector) -> Kind:
     )
 
 
-BATCH = 2**15  #: nodes of subdomains that are evaluated at once
-REACH = 3  #: cells from a node to the last that its recovered stress may depend on
+BATCH_NODES = 2**15  #: nodes of subdomains that are evaluated at once
+STRESS_LAYERS = (
+    3  #: cells from a node to the last that its recovered stress may depend on
+)
 
 
-def own_meshes(
-    found: OwnSolution, length: float, reach: int = 0
+def local_meshes(
+    found: LocalSolution, length: float, reach: int = 0
 ) -> Iterator[DisplacedMesh]:
     """Give the displaced subdomains of each rank; called by all ranks.
 
@@ -380,12 +390,12 @@ def own_meshes(
 
 
 def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
-    """Put subdomains of one body together, up to `BATCH` nodes or one subdomain."""
-    sizes = np.diff(layout.torn_nodes(subdomains).start)
+    """Group subdomains of one body, up to `BATCH_NODES` nodes or one subdomain."""
+    sizes = np.diff(layout.subdomain_nodes(subdomains).start)
     first, held = [0], 0
     for s, size in enumerate(sizes):
         other = layout.body[subdomains[s]] != layout.body[subdomains[first[-1]]]
-        if s > first[-1] and (other or held + size > BATCH):
+        if s > first[-1] and (other or held + size > BATCH_NODES):
             first.append(s)
             held = 0
         held += int(size)
@@ -402,7 +412,7 @@ class _Around(NamedTuple):
 
 def _around(layout: Subdivision, subdomains: Nodes, reach: int) -> _Around:
     """Take subdomains of one body and so many layers of cells around them."""
-    own = np.unique(layout.torn_nodes(subdomains).number)
+    own = np.unique(layout.subdomain_nodes(subdomains).number)
     taken = np.union1d(subdomains, _holders(layout, own)) if reach else subdomains
     nodes, cells = _cells_of(layout, taken)
     reached, kept = own, np.ones(len(cells), dtype=bool)
@@ -422,7 +432,7 @@ def _around(layout: Subdivision, subdomains: Nodes, reach: int) -> _Around:
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
     """Return the nodes of subdomains, and their cells (E, 4) as places in these."""
-    torn = layout.torn_nodes(subdomains)
+    torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [
         place[begin + layout.cells(int(s))]
@@ -433,15 +443,15 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
     """List the subdomains that have any of some nodes besides others."""
-    times = layout.times(node)
-    several = times > 1
-    copies = range(int(times.max(initial=1)))
-    held = [layout.holder(node[several & (times > c)], c) for c in copies]
+    multiplicity = layout.multiplicity(node)
+    several = multiplicity > 1
+    copies = range(int(multiplicity.max(initial=1)))
+    held = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
     return np.unique(np.concatenate(held))
 
 
 def _largest_von_mises(
-    found: OwnSolution,
+    found: LocalSolution,
     length: float,
     materials: tuple[Material, ...],
     plane: Plane | None,
@@ -449,7 +459,7 @@ def _largest_von_mises(
     """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
     D = elasticity_matrices(materials, plane)
     largest = np.zeros(len(materials))
-    for b, mesh, inner, u in own_meshes(found, length, REACH):
+    for b, mesh, inner, u in local_meshes(found, length, STRESS_LAYERS):
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
         most = von_mises(stress, materials[b].nu, plane).max()
         largest[b] = max(largest[b], most)
