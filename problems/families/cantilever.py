@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
-from mortarbench.problems.ranges import KINEMATICS, STEPS, declared, fits, key, size
+from mortarbench.problems.ranges import (
+    KINEMATICS,
+    STEPS,
+    check_memory,
+    key,
+    schema,
+    size,
+)
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
@@ -21,14 +28,14 @@ class Cantilever(DeclaredFamily):
     """A slender cantilever under an end load at finite strain: the elastica."""
 
     name = "cantilever"
-    keys = declared(
+    keys = schema(
         slenderness=size(20.0),
         load=size(1.0),
         nx=key(0, 1),
         ny=key(10, 1),
         nu=key(0.3),
         material=KINEMATICS["material"],
-        steps=STEPS.but(1),
+        steps=STEPS.with_default(1),
         step=key(0, 1),
         newton=KINEMATICS["newton"],
     )
@@ -60,4 +67,4 @@ class Cantilever(DeclaredFamily):
             raise InputError(
                 f"{self.name}: nu={p['nu']:g} must be between 0 and {MOST_NU:g}"
             )
-        fits(self.name, 2 * (p["nx"] + 1) * (p["ny"] + 1))
+        check_memory(self.name, 2 * (p["nx"] + 1) * (p["ny"] + 1))

@@ -69,13 +69,13 @@ from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
+    LAW_PARAMETERS,
     LAWS,
+    MAX_STEPS,
     METHODS,
-    MOST_STEPS,
-    NEEDED,
     PLANES,
     SETTINGS,
-    fits,
+    check_memory,
     physical,
 )
 
@@ -122,7 +122,7 @@ def read_description(path: Path) -> dict[str, Any]:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
             default = SETTINGS[key].default
-            checked.at_least_one(key, table.get(key, default), MOST_STEPS)
+            checked.at_least_one(key, table.get(key, default), MAX_STEPS)
         chosen = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
         _check_choices(table, chosen)
         for entry in checked.filled_list("contacts", table["contacts"]):
@@ -144,7 +144,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
     """
     table = read_description(path)
     named = read_msh(path.parent / table["mesh"])
-    fits(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
+    check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
     for _ in range(halvings):
         named = halved(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
@@ -291,7 +291,7 @@ def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
 def _friction(entry: Mapping[str, Any]) -> None:
     """Check the values of what an entry says of friction."""
     _check_choices(entry, ("friction", "loading"))
-    for key, what in NEEDED.items():
+    for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
             raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
 
@@ -316,19 +316,21 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
     _friction(entry)
     law = entry.get("friction", params["friction"])
     needed = LAWS[law]
-    for key in NEEDED:
+    for key in LAW_PARAMETERS:
         if key in entry and key != needed:
             raise InputError(f"{key} is not used by friction {law!r}; expected none")
     given = {"friction": law, "bound": 0.0, "mu": 0.0}
     if needed:
         given[needed] = entry.get(needed, params[needed])
         if given[needed] < 0:
-            raise InputError(f"friction {law!r} needs {needed}, {NEEDED[needed]}")
+            raise InputError(
+                f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}"
+            )
     return law_of(given)
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    checked.only_keys(entry, ("slave", "master", "friction", *NEEDED))
+    checked.only_keys(entry, ("slave", "master", "friction", *LAW_PARAMETERS))
     _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
     for side in _SIDES:

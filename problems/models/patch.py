@@ -63,7 +63,7 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import gauss_stress
-from mortarbench.problems.ranges import SHORTEST
+from mortarbench.problems.ranges import MIN_STRETCH
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 NAMES = ("lower", "upper")
@@ -144,7 +144,7 @@ def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
 
 def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
     """Find the state under a nominal pressure, Pa."""
-    least = max(_softest(material), SHORTEST)
+    least = max(_softest(material), MIN_STRETCH)
     stretch = float(brentq(
         lambda stretch: homogeneous(material, stretch).nominal + pressure, least, 1.0,
         xtol=1e-15,
@@ -154,10 +154,12 @@ def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
 
 def _softest(material: Hyperelastic) -> float:
     """Return the stretch at which the pressure is largest; 0 where there is none."""
-    if homogeneous(material, SHORTEST).stiffness > 0:
+    if homogeneous(material, MIN_STRETCH).stiffness > 0:
         return 0.0
     return float(
-        brentq(lambda stretch: homogeneous(material, stretch).stiffness, SHORTEST, 1.0)
+        brentq(
+            lambda stretch: homogeneous(material, stretch).stiffness, MIN_STRETCH, 1.0
+        )
     )
 
 
