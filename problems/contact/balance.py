@@ -22,7 +22,7 @@ from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.fem.elasticity import rigid_motions
 
 #: part of the load that may be left: rounding of coordinates, normals and tractions
-UNBALANCED = 1e-6
+MAX_IMBALANCE = 1e-6
 _SLIGHT = 1e-3  #: parts of a motion that are not worth a word
 _AXES = "xyz"
 
@@ -54,7 +54,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
     if not allowed.shape[1]:  # the supports hold every body
         return
     load, closing = R.T @ bodies.f, csr_array(B) @ R
-    least = UNBALANCED * np.abs(bodies.f).sum()
+    least = MAX_IMBALANCE * np.abs(bodies.f).sum()
     of_body, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
     sliding = [
         (b, axis)
@@ -115,7 +115,7 @@ def check_friction(
         A_eq=np.hstack([forces, eye, -eye]), b_eq=load,
         bounds=limits + [(0, None)] * (2 * len(eye)), method="highs",
     )  # fmt: skip
-    if found.x is not None and found.fun > UNBALANCED * size:
+    if found.x is not None and found.fun > MAX_IMBALANCE * size:
         raise InputError(
             f"load step {step}: friction cannot hold the load; within the bound of "
             f"Tresca's law nothing balances {found.fun / size:.2%} of it; expected "

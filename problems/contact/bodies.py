@@ -160,28 +160,28 @@ def assemble(
 
     """
     length, force = units
-    return assembled(
+    return assemble_stiffness(
         UnassembledBodies(
             mesh=mesh, body=body, names=names, materials=materials, plane=plane,
             length=length, force=force, f=load / force,
-            B_D=supports(mesh, fixed), pairs=pairs,
+            B_D=support_rows(mesh, fixed), pairs=pairs,
         )
     )  # fmt: skip
 
 
-def supports(mesh: Mesh, fixed: Nodes) -> csr_array:
+def support_rows(mesh: Mesh, fixed: Nodes) -> csr_array:
     """Return the rows (m_E, n) of prescribed components."""
     return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
 
 
-def assembled(bodies: UnassembledBodies) -> Bodies:
+def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
     """Assemble their stiffness."""
     known = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
     D = bodies.elasticity * (bodies.length / bodies.force)
     return Bodies(**known, K=stiffness(bodies.mesh, D, bodies.body))
 
 
-def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
+def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     """Factorise K with all its rigid modes, as Dirichlet rows in B need it.
 
     Condensed onto what constraints can touch, or else (the paper's way) with one solve
@@ -195,7 +195,7 @@ def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
-def clamped(bodies: Bodies) -> GeneralisedInverse:
+def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, which must hold every body.
 
     Raises
@@ -216,7 +216,7 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
     return regular_inverse(bodies.K, free, interface)
 
 
-def supported(bodies: Bodies) -> GeneralisedInverse:
+def factorise_supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components, and what else a body needs."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
     interface = Interface(bodies.interface, bodies.mesh.points)

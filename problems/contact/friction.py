@@ -31,9 +31,9 @@ from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 
-SETTLED = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
-MOST_ITERATES = 1000  #: Tresca problems of a fixed point
-PATIENCE = 30  #: of them that need not come nearer to it
+FIXED_POINT_TOLERANCE = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
+MAX_ITERATES = 1000  #: Tresca problems of a fixed point
+MAX_STAGNATION = 30  #: of them that need not come nearer to it
 
 
 @dataclass(frozen=True)
@@ -64,17 +64,17 @@ def friction_of(
     bodies: UnassembledBodies | ContactSides,
     rows: ContactRows,
     laws: Sequence[FrictionLaw],
-    before: Vector,
-    pressed: Vector,
+    slip_origin: Vector,
+    normal_forces: Vector,
 ) -> Friction:
     """Take the friction of linearised contact, without dimensions.
 
     Parameters
     ----------
     laws : one per pair
-    before : (n,) displacement where the slip begins
-    pressed : (places,) normal force of each slave node, which Coulomb's law bounds
-        friction by
+    slip_origin : (n,) displacement where the slip begins
+    normal_forces : (places,) normal force of each slave node, which Coulomb's law
+        bounds friction by
 
     """
     if not rows.row.size:
@@ -87,12 +87,12 @@ def friction_of(
     )
     cohesion = bound * rows.share[rows.row] / bodies.force
     return Friction(
-        T=rows.T, bound=cohesion + mu * pressed[place], start=rows.T @ before,
-        row=rows.row, cohesion=cohesion, mu=mu,
+        T=rows.T, bound=cohesion + mu * normal_forces[place],
+        start=rows.T @ slip_origin, row=rows.row, cohesion=cohesion, mu=mu,
     )  # fmt: skip
 
 
-def settled(
+def coulomb_fixed_point(
     first: Friction, normal: Callable[[Friction], Vector], step: int
 ) -> list[Friction]:
     """Settle Coulomb's law: the friction of each problem of its fixed point.
@@ -114,7 +114,7 @@ def settled(
 
     """
     found, residuals, friction = list[Friction](), list[float](), first
-    while len(found) < MOST_ITERATES:
+    while len(found) < MAX_ITERATES:
         try:
             forces = normal(friction)
         except ArithmeticError as e:
@@ -124,10 +124,10 @@ def settled(
                 f"load; expected supports or friction that hold the bodies: {e}"
             ) from None
         residuals.append(friction.residual(forces))
-        if residuals[-1] <= SETTLED:
+        if residuals[-1] <= FIXED_POINT_TOLERANCE:
             return [*found, friction]
         found.append(replace(friction, unsettled=residuals[-1]))
-        if len(found) - int(np.argmin(residuals)) > PATIENCE:
+        if len(found) - int(np.argmin(residuals)) > MAX_STAGNATION:
             break
         friction = replace(friction, bound=friction.demanded(forces))
     raise InputError(
@@ -137,7 +137,7 @@ def settled(
     )
 
 
-def iterate_of(problems: Sequence[T], iterate: int, step: int) -> T:
+def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
     """Choose a problem of the fixed point of a load step: 1, 2, …; 0 is the last.
 
     Raises

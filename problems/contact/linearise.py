@@ -29,22 +29,23 @@ def linearisation(
     contact: str,
     basis: Any,
     laws: Sequence[FrictionLaw] = (),
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> Callable[[Vector], ContactRows]:
     """Return the map from a displacement (n,) in m to the rows of all pairs.
 
     It raises InputError where at u = 0 there is no row at all.
 
     laws : of friction, one per pair; none for no friction at all
-    kept : of node-to-segment contact: see `closest_segments`; −1 for the closest one
+    fixed_segments : of node-to-segment contact: see `closest_segments`; −1 for the
+        closest one
     """
     pairs = len(bodies.pairs)
     methods: list[Callable[..., ContactRows]] = [
         node_to_segment if contact == "nts" else partial(mortar, basis=basis)
     ] * pairs
-    if kept is not None:
-        parts = _of_pairs(bodies, kept)
-        methods = [partial(node_to_segment, kept=part) for part in parts]
+    if fixed_segments is not None:
+        parts = _of_pairs(bodies, fixed_segments)
+        methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
     rough = [law.acts for law in laws] or [False] * pairs
 
     def linearise(u: Vector) -> ContactRows:
@@ -78,16 +79,20 @@ def linearisation(
 
 
 def contact_stiffness(
-    bodies: Bodies, kept: Nodes | None = None
+    bodies: Bodies, fixed_segments: Nodes | None = None
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return the map from u (n,) in m and λ (m,) in N/m to the blocks −λ_i g_i''(u).
 
     The rows are those of node-to-segment contact, one for every slave node, see
     `problems.contact.node_to_segment.geometric_stiffness`.
 
-    kept : as of `linearisation`
+    fixed_segments : as of `linearisation`
     """
-    segments = [None] * len(bodies.pairs) if kept is None else _of_pairs(bodies, kept)
+    segments = (
+        [None] * len(bodies.pairs)
+        if fixed_segments is None
+        else _of_pairs(bodies, fixed_segments)
+    )
 
     def blocks(u: Vector, multipliers: Vector) -> tuple[NDArray[np.float64], Nodes]:
         forces = _of_pairs(bodies, multipliers)

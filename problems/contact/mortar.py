@@ -64,7 +64,7 @@ from scipy.sparse import coo_array, csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.segment_search import Reach, facing
+from mortarbench.problems.contact.segment_search import Reach, facing_segments
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -75,9 +75,9 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
 #: shorter integration segments, in ξ, are noise of the projection and are left out
-NEGLIGIBLE = 1e-8
+MIN_SEGMENT = 1e-8
 #: normals of a straight side differ by as much
-ROUNDED = 4 * np.finfo(float).eps
+NORMAL_ROUNDING = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 Basis = Literal["dual", "standard"]
@@ -170,7 +170,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
         overlap = np.eye(2) * weighted.sum(axis=1)[:, None]
     own = slave.node_normal[j]  # (p, 2, 2)
     bent = at.field[:, :, None] - own[:, None]  # ν − n_j
-    bent[np.abs(bent) <= ROUNDED] = 0
+    bent[np.abs(bent) <= NORMAL_ROUNDING] = 0
     D = overlap[..., None] * own[:, :, None]
     D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * bent, N)
     pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
@@ -186,7 +186,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:
     """Find the integration segments, before any filter."""
-    e, m = facing(slave, master)
+    e, m = facing_segments(slave, master)
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
@@ -201,7 +201,7 @@ def overlaps(slave: Surface, master: Surface) -> Overlaps:
         [project(x, n, A + t[:, None] * (B - A)) for t in (low, high)], axis=1
     )
     ends = np.sort(np.clip(ends, -1.0, 1.0), axis=1)
-    kept = (low < high) & (ends[:, 1] - ends[:, 0] > NEGLIGIBLE)
+    kept = (low < high) & (ends[:, 1] - ends[:, 0] > MIN_SEGMENT)
     return Overlaps(e[kept], m[kept], ends[kept])
 
 
@@ -242,7 +242,7 @@ def cast_rays(
 
     cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])  # at the middle
     kept = (cosine <= reach.cosine) & (
-        np.abs(gap).max(axis=1) <= reach.within(slave, master)
+        np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )
     weight = WEIGHTS * (half * np.linalg.norm(edge, axis=1) / 2)[:, None]
     return GaussPoints(*(a[kept] for a in (e, m, xi, beta, field, gap, weight)))

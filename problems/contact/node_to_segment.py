@@ -47,7 +47,9 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
-ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
+VERTEX_TOLERANCE = (
+    1e-9  #: closest points nearer to a segment's end than this are the vertex
+)
 
 
 class ContactRows(NamedTuple):
@@ -76,7 +78,7 @@ def node_to_segment(
     master: Nodes,
     *,
     tangential: bool = False,
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> ContactRows:
     """Linearise the non-penetration of the slave nodes into the master boundary at u.
 
@@ -89,8 +91,8 @@ def node_to_segment(
     slave : (s,) chain of nodes, its body on the left
     master : (v,) chain of nodes, its body on the left
     tangential : whether friction needs tangential rows
-    kept : (s,) first node, in the master chain, of the segment that a slave node keeps;
-        −1 where it is the closest one
+    fixed_segments : (s,) first node, in the master chain, of the segment that a slave
+        node keeps; −1 where it is the closest one
 
     Raises
     ------
@@ -100,7 +102,7 @@ def node_to_segment(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, kept)
+    at = _opposite(x, line, fixed_segments)
     N = np.stack([1 - at.xi, at.xi], axis=1)
     ends = np.stack([at.segment, at.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
@@ -125,7 +127,7 @@ def geometric_stiffness(
     slave: Nodes,
     master: Nodes,
     multipliers: Vector,
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> tuple[NDArray[np.float64], Nodes]:
     """Differentiate the forces Bᵀλ of the slave nodes, λ held: −λ g''(u), per node.
 
@@ -139,7 +141,7 @@ def geometric_stiffness(
 
     Parameters
     ----------
-    points, u, slave, master, kept : as of `node_to_segment`
+    points, u, slave, master, fixed_segments : as of `node_to_segment`
     multipliers : (s,) λ, N/m
 
     Returns
@@ -150,7 +152,7 @@ def geometric_stiffness(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, kept)
+    at = _opposite(x, line, fixed_segments)
     x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
@@ -170,8 +172,8 @@ def geometric_stiffness(
     gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
     gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
     inside = (at.xi > 0) & (at.xi < 1)
-    if kept is not None:
-        inside |= kept >= 0
+    if fixed_segments is not None:
+        inside |= fixed_segments >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
     nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
@@ -181,22 +183,22 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
     """Find the closest points of x (s, 2) on a chain and its outward normals there."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
-    at_first, at_second = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
+    at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
     normal = np.where(at_second[:, None], line.node_normal[second], normal)
     return ClosestPoints(first, xi, normal)
 
 
-def _opposite(x: Points, line: Surface, kept: Nodes | None) -> ClosestPoints:
+def _opposite(x: Points, line: Surface, fixed_segments: Nodes | None) -> ClosestPoints:
     """Find what the slave nodes x (s, 2) stand against: the closest, or what is kept.
 
     On the line of a segment that is kept, ξ may be outside of [0, 1].
     """
     at = closest_points(x, line)
-    if kept is None or not (own := kept >= 0).any():
+    if fixed_segments is None or not (own := fixed_segments >= 0).any():
         return at
-    segment = np.where(own, kept, at.segment)
+    segment = np.where(own, fixed_segments, at.segment)
     start = line.x[segment]
     edge = line.x[segment + 1] - start
     xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)

@@ -13,7 +13,7 @@ from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.problems.contact.bodies import Bodies, ContactSides
 from mortarbench.problems.contact.sides import (
-    ACTIVE,
+    ACTIVE_THRESHOLD,
     active,
     bodies_of,
     contact_sides,
@@ -27,7 +27,7 @@ IN_PLANE = ("sxx", "syy", "sxy")
 IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
-class Inside(NamedTuple):
+class BulkResults(NamedTuple):
     """What is reported of the inside of bodies, away from their contact."""
 
     nodes: int
@@ -48,7 +48,7 @@ def quantities(
     """
     l, owner = bodies.length, bodies.body_of_node
     stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
-    inside = Inside(
+    inside = BulkResults(
         nodes=len(bodies.mesh.points), elements=len(bodies.mesh.cells),
         supports=primal.b.size, energy=primal.objective(s.x) * bodies.force * l,
         max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
@@ -57,7 +57,7 @@ def quantities(
 
 
 def results_of(
-    inside: Inside, bodies: Bodies | ContactSides, primal: QP, s: Solution,
+    inside: BulkResults, bodies: Bodies | ContactSides, primal: QP, s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> dict[str, Any]:  # fmt: skip
     """Report counts, energy, contact forces and stresses.
@@ -66,7 +66,7 @@ def results_of(
     where the master is rigid), −ΣBᵀλ of contact and friction, N/m; absent where several
     pairs may touch, since a sum over them has no meaning: `contacts` has each force.
     max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
-    `pair_results`. With friction those of `frictional`, too.
+    `pair_results`. With friction those of `friction_quantities`, too.
 
     Parameters
     ----------
@@ -91,7 +91,9 @@ def results_of(
             for name, largest in zip(bodies.names, inside.max_von_mises, strict=True)
         },
         "contacts": pair_results(bodies, primal, s, friction),
-    } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
+    } | (
+        friction_quantities(bodies, primal, s, friction) if friction.bound.size else {}
+    )
 
 
 def _contact_force(
@@ -107,7 +109,7 @@ def _contact_force(
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
 
-def frictional(
+def friction_quantities(
     bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
     """Report what friction does.
@@ -154,7 +156,7 @@ def pair_results(
         if pair.master.size:
             force = {master: (0.0 - total).tolist()} | force
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
-        pressed = side.pressed(ACTIVE * largest)
+        pressed = side.pressed(ACTIVE_THRESHOLD * largest)
         found[side.name] = {
             "force": force,
             "largest_pressure": float(side.pressure.max()),

@@ -9,7 +9,9 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_lengths
 
 
-def above_plane(mesh: Mesh, side: Nodes, *, tangential: bool = False) -> ContactRows:
+def rigid_plane_rows(
+    mesh: Mesh, side: Nodes, *, tangential: bool = False
+) -> ContactRows:
     """Keep the nodes of a side above the plane where the last coordinate is zero.
 
     In the plane that is  −u_y ≤ y, exactly; the slip is u_x.

@@ -48,7 +48,7 @@ class Reach:
         if self.distance is not None and not self.distance > 0:
             raise InputError(f"reach: distance={self.distance} m must be positive")
 
-    def within(self, slave: Surface, master: Surface) -> float:
+    def max_distance(self, slave: Surface, master: Surface) -> float:
         """Return the largest distance kept between these sides, m."""
         if self.distance is not None:
             return self.distance
@@ -65,7 +65,7 @@ class Chords(NamedTuple):
 
 
 #: (level, query (p,), sub-chain (p,)) → which of these pairs to follow
-Keep = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
+Criterion = Callable[[Chords, Nodes, Nodes], NDArray[np.bool_]]
 
 
 class Nearest(NamedTuple):
@@ -94,7 +94,7 @@ def nearest(x: Points, line: Surface) -> Nearest:
     return Nearest(segment, _to_chords(x, levels[-1], segment)[0])
 
 
-def facing(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
+def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
     """Find which master segments may lie between the normals at a slave segment's ends.
 
     With f_j(p) = (x_j − p) × n_j, p lies between the lines along the averaged normals
@@ -127,7 +127,9 @@ def facing(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
     return _descend(len(j), _levels(master), keep)
 
 
-def _descend(queries: int, levels: list[Chords], keep: Keep) -> tuple[Nodes, Nodes]:
+def _descend(
+    queries: int, levels: list[Chords], keep: Criterion
+) -> tuple[Nodes, Nodes]:
     """Go from the roots to the leaves with pairs (query, sub-chain), sorted by both."""
     roots = len(levels[0].inverse)
     query = np.repeat(np.arange(queries), roots)
@@ -144,10 +146,10 @@ def _descend(queries: int, levels: list[Chords], keep: Keep) -> tuple[Nodes, Nod
 
 def _levels(line: Surface) -> list[Chords]:
     """Build the tree, from its roots to the segments."""
-    return list(_rising(line))[::-1]
+    return list(_levels_from_leaves(line))[::-1]
 
 
-def _rising(line: Surface) -> Iterator[Chords]:
+def _levels_from_leaves(line: Surface) -> Iterator[Chords]:
     """Build the tree from the segments upwards.
 
     The chords of the parts of a sub-chain end at nodes within some h of its chord, so

@@ -24,7 +24,7 @@ from mortarbench.problems.fem.mesh import (
 )
 
 RIGID = "rigid"  #: name of a master that is no body
-ACTIVE = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
+ACTIVE_THRESHOLD = 1e-6  #: a contact row is active where λ_i > ACTIVE·max λ
 _STATE = f"U{len(SLIDING)}"  #: type of arrays of states
 
 
@@ -95,7 +95,7 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
     slip = np.abs(friction.T @ s.x - friction.start)
     sticks = (friction.bound - np.abs(tangential)) * softness >= slip
     closed = active(normal)[friction.row]
-    sheared = np.abs(tangential) > ACTIVE * np.abs(s.z).max(initial=0.0)
+    sheared = np.abs(tangential) > ACTIVE_THRESHOLD * np.abs(s.z).max(initial=0.0)
     apart = np.where(sheared, SLIDING, "open")
     touching = np.where(sticks, "stick", "slip")
     return np.where(closed, touching, apart).astype(_STATE)
@@ -103,7 +103,7 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
 
 def active(normal: Vector) -> NDArray[np.bool_]:
     """Tell which contact rows (m,) press."""
-    return np.asarray(normal > ACTIVE * normal.max(initial=0.0))
+    return np.asarray(normal > ACTIVE_THRESHOLD * normal.max(initial=0.0))
 
 
 def pair_names(bodies: Bodies | ContactSides) -> list[str]:

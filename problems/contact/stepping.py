@@ -2,7 +2,7 @@
 
 A load step begins where the one before has ended. Its contact rows are linearised at
 that solution, and `relin` − 1 more times at its own; each linearisation is a `Stage`,
-and its QP is posed by whoever holds the bodies: one process undivided ones
+and its QP is linearised by whoever holds the bodies: one process undivided ones
 (`problems.duality.undivided`), ranks their subdomains (`problems.duality.divided`).
 With relin = 1 this is the paper's scheme, of first order in 1/steps.
 
@@ -22,7 +22,11 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from mortarbench.harness import Friction, Solution, Vector
-from mortarbench.problems.contact.friction import FrictionLaw, iterate_of, settled
+from mortarbench.problems.contact.friction import (
+    FrictionLaw,
+    coulomb_fixed_point,
+    select_iterate,
+)
 from mortarbench.problems.fem.mesh import Nodes
 
 
@@ -37,19 +41,19 @@ class State(NamedTuple):
     """The state that a stage begins at, by displacements as its problem takes them."""
 
     u: Vector  #: (w,) where contact is linearised
-    before: Vector  #: (w,) where the slip begins
+    slip_origin: Vector  #: (w,) where the slip begins
     #: (places,) normal force of each slave node, which Coulomb's law begins from
-    pressed: Vector
+    normal_forces: Vector
 
 
-def same(left: State) -> State:
+def continue_slip(left: State) -> State:
     """Begin where the stage before has ended, the slip where that began."""
     return left
 
 
-def slip_anew(left: State) -> State:
+def restart_slip(left: State) -> State:
     """Begin where the stage before has ended, the slip there, too."""
-    return left._replace(before=left.u)
+    return left._replace(slip_origin=left.u)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -61,7 +65,9 @@ class Stage:
     forces: Forces
     fixed: Nodes  #: components that supports hold at zero
     laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
-    begin: Callable[[State], State] = same  #: where, of what the stage before left
+    begin: Callable[[State], State] = (
+        continue_slip  #: where, of what the stage before left
+    )
 
 
 def load_steps(
@@ -80,13 +86,13 @@ def load_steps(
     return tuple(
         Stage(
             step=k, part=k / steps, forces=forces, fixed=fixed, laws=laws,
-            begin=slip_anew if quasi_static and not i else same,
+            begin=restart_slip if quasi_static and not i else continue_slip,
         )
         for k in range(1, steps + 1) for i in range(relin)
     )  # fmt: skip
 
 
-class Posed(Protocol):
+class LinearisedProblem(Protocol):
     """A linearised contact problem, and its dual with any bound of the friction."""
 
     @property
@@ -99,20 +105,20 @@ class Posed(Protocol):
         start : solution with another bound
         """
 
-    def normal(self, s: Solution) -> Vector:
+    def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
 
-    def left(self, s: Solution) -> tuple[Vector, Vector]:
+    def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) and the normal forces (places,) that a solution has."""
 
 
-P = TypeVar("P", bound=Posed)
+P = TypeVar("P", bound=LinearisedProblem)
 
 
-class Problem(NamedTuple, Generic[P]):
+class Iterate(NamedTuple, Generic[P]):
     """A problem of a stage, with the bound of its friction."""
 
-    posed: P
+    problem: P
     friction: Friction
     solution: Callable[[], Solution]  #: of the dual
 
@@ -132,19 +138,19 @@ class LoadPath(Generic[P]):
     """
 
     stages: Sequence[Stage]
-    pose: Callable[[Stage, State], P]
-    rest: State  #: where the first stage begins
-    _done: list[tuple[State, list[Problem[P]]]] = field(
+    linearise: Callable[[Stage, State], P]
+    initial: State  #: where the first stage begins
+    _history: list[tuple[State, list[Iterate[P]]]] = field(
         default_factory=list, init=False
     )
 
-    def problem(self, step: int, iterate: int = 0) -> Problem[P]:
+    def problem(self, step: int, iterate: int = 0) -> Iterate[P]:
         """Pose a load step (1, 2, …), as last linearised.
 
         iterate : which problem of the fixed point of Coulomb's law, 1, 2, …; 0: the
             last one
         """
-        return iterate_of(self.problems(self.last_of(step)), iterate, step)
+        return select_iterate(self.problems(self.last_of(step)), iterate, step)
 
     def iterates(self, step: int) -> int:
         """Count the problems of the fixed point of a step; 1 without Coulomb's law."""
@@ -154,41 +160,41 @@ class LoadPath(Generic[P]):
         """Return the number of the last stage of a load step, from 0 on."""
         return max(i for i, stage in enumerate(self.stages) if stage.step == step)
 
-    def problems(self, i: int) -> list[Problem[P]]:
+    def problems(self, i: int) -> list[Iterate[P]]:
         """Pose stage i (0, 1, …): the problems of its fixed point."""
-        while len(self._done) <= i:
-            stage = self.stages[len(self._done)]
-            state = stage.begin(self._left())
-            posed = self.pose(stage, state)
-            self._done.append((state, _fixed_point(posed, stage)))
-        return self._done[i][1]
+        while len(self._history) <= i:
+            stage = self.stages[len(self._history)]
+            state = stage.begin(self._end_state())
+            linearised = self.linearise(stage, state)
+            self._history.append((state, _fixed_point(linearised, stage)))
+        return self._history[i][1]
 
-    def _left(self) -> State:
-        """Return what the last stage that was posed leaves to the next one."""
-        if not self._done:
-            return self.rest
-        begun, (*_, last) = self._done[-1]
-        u, pressed = last.posed.left(last.solution())
-        return State(u, begun.before, pressed)
+    def _end_state(self) -> State:
+        """Return what the last stage that was linearised leaves to the next one."""
+        if not self._history:
+            return self.initial
+        begun, (*_, last) = self._history[-1]
+        u, normal_forces = last.problem.end_state(last.solution())
+        return State(u, begun.slip_origin, normal_forces)
 
 
-def _fixed_point(posed: P, stage: Stage) -> list[Problem[P]]:
+def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
     """Settle Coulomb's law; without it, the problem is the only one."""
     if not any(law.mu for law in stage.laws):
-        first = posed.friction
-        return [Problem(posed, first, cache(lambda: posed.solve(first)))]
+        first = linearised.friction
+        return [Iterate(linearised, first, cache(lambda: linearised.solve(first)))]
     found = list[Solution]()
 
     def normal(friction: Friction) -> Vector:
-        found.append(posed.solve(friction, found[-1] if found else None))
-        return posed.normal(found[-1])
+        found.append(linearised.solve(friction, found[-1] if found else None))
+        return linearised.normal_multipliers(found[-1])
 
     def known(s: Solution) -> Callable[[], Solution]:
         return lambda: s
 
-    frictions = settled(posed.friction, normal, stage.step)
+    frictions = coulomb_fixed_point(linearised.friction, normal, stage.step)
     return [
-        Problem(posed, friction, known(s))
+        Iterate(linearised, friction, known(s))
         for friction, s in zip(frictions, found, strict=True)
     ]
 

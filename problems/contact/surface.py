@@ -16,7 +16,7 @@ from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
 
 #: a segment this much shorter than the longest of its chain has no direction
-DEGENERATE = 1e-12
+MIN_RELATIVE_LENGTH = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def surface(x: Points, name: str) -> Surface:
     """Compute segments and normals of a chain (v, 2)."""
     edge = np.diff(x, axis=0)
     length = np.sqrt(np.einsum("ex,ex->e", edge, edge))
-    first = np.flatnonzero(length > DEGENERATE * length.max(initial=0.0))
+    first = np.flatnonzero(length > MIN_RELATIVE_LENGTH * length.max(initial=0.0))
     if not len(first):
         raise InputError(
             f"contact {name}: {len(x)} node(s) and no segment of positive length, "
@@ -125,5 +125,5 @@ def unit(vectors: Points, otherwise: Points) -> Points:
     the caller says which normal stands in.
     """
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
-    vanishes = length <= DEGENERATE
+    vanishes = length <= MIN_RELATIVE_LENGTH
     return np.where(vanishes, otherwise, vectors / np.where(vanishes, 1.0, length))

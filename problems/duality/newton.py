@@ -61,9 +61,9 @@ from mortarbench.harness import (
     kkt_residuals,
 )
 from mortarbench.harness.errors import PastEndError
-from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.duality.undivided import REFERENCE, primal_qp
@@ -304,7 +304,7 @@ class NewtonPath:
                     f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
                     f"residual of {best:.1e}: {stuck}"
                 )
-            pressing = lam > ACTIVE * lam.max(initial=0.0)
+            pressing = lam > ACTIVE_THRESHOLD * lam.max(initial=0.0)
             gaps = gaps.keeping(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
@@ -425,7 +425,7 @@ class NewtonPath:
 
     def _inverse(self, K: csc_array) -> GeneralisedInverse:
         tangent = replace(self.bodies, K=K)
-        return clamped(tangent) if self._held else guided(tangent)
+        return factorise_clamped(tangent) if self._held else guided(tangent)
 
     @cached_property
     def _held(self) -> bool:

@@ -61,7 +61,7 @@ from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
-    supports,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
@@ -166,7 +166,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         mesh=mesh, body=body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
         length=length, force=force, f=load.ravel() / force,
-        B_D=supports(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
+        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
     )  # fmt: skip
 
 

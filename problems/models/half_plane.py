@@ -43,7 +43,7 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
@@ -116,7 +116,7 @@ def _pressed(n: int) -> Case:
         return {
             "elements": n,
             "contact_rows": n,
-            "active": int((s.x > ACTIVE * s.x.max(initial=0.0)).sum()),
+            "active": int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum()),
             "energy": float(energy) * _energy_unit(EXACT.P),
             "energy_error": float(energy / exact_energy - 1),
             "multiplier_sum": float(force.sum()),
@@ -190,7 +190,7 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
         }
 
     def slipping(s: Solution) -> NDArray[np.bool_]:
-        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE))
+        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE_THRESHOLD))
 
     curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
     tractions = np.column_stack([curve, EXACT.pressure(curve), -exact.traction(curve)])

@@ -52,7 +52,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
-from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
 from mortarbench.problems.duality.case_forms import beside
 from mortarbench.problems.duality.newton import NewtonPath
@@ -97,7 +97,7 @@ def on_plane(params: Mapping[str, Value]) -> ContactProblem:
 
     return ContactProblem(
         bodies=of, stages=load_steps(1, 1, of.forces, of.fixed),
-        linearise=lambda bodies, _: lambda u: above_plane(
+        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
             bodies.mesh, bodies.pairs[0].slave
         ),
         results=results,
@@ -121,7 +121,7 @@ def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
     bodies = _on_plane(dict(items))[0].assembled
-    rows = above_plane(bodies.mesh, bodies.pairs[0].slave)
+    rows = rigid_plane_rows(bodies.mesh, bodies.pairs[0].slave)
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 
@@ -208,7 +208,7 @@ def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, .
         at_rest = not k and _forgets_pressing(p)
         u = np.zeros_like(left.u) if at_rest else left.u
         slip = u if quasi_static else np.zeros_like(u)
-        return State(u, slip, loads[k][0] / before * left.pressed)
+        return State(u, slip, loads[k][0] / before * left.normal_forces)
 
     kept = np.append(of.fixed, _on_axis(sides, "upper_"))
     first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=kept)

@@ -49,7 +49,7 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
 from mortarbench.problems.duality.torn_dual import torn_dual, torn_quantities
 from mortarbench.problems.fem.inverse import (
@@ -394,7 +394,7 @@ def _reported(
         "dofs": N,
         "equality_rows": held,
         "contact_rows": z.size,
-        "active": int((z > ACTIVE * z.max(initial=0.0)).sum()),
+        "active": int((z > ACTIVE_THRESHOLD * z.max(initial=0.0)).sum()),
         "energy": energy,
         "energy_error": energy / exact_energy(dim, shape) - 1,
         "obstacle_force": force,

@@ -12,7 +12,7 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.bodies import assembled
+from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
 from mortarbench.problems.models.beam_ring import model
@@ -134,7 +134,7 @@ def build(text):
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, flip):
     described(writer(POINTS, *parts(flip)))
-    ours = assembled(described_bodies(Path("a.toml"), "strain"))
+    ours = assemble_stiffness(described_bodies(Path("a.toml"), "strain"))
 
     assert ours.names == ("beam", "ring")
     np.testing.assert_array_equal(ours.mesh.points, RING.mesh.points)
