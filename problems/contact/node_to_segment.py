@@ -47,9 +47,8 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
-VERTEX_TOLERANCE = (
-    1e-9  #: closest points nearer to a segment's end than this are the vertex
-)
+#: closest points nearer to a segment's end than this are the vertex
+VERTEX_TOLERANCE = 1e-9
 
 
 class ContactRows(NamedTuple):

@@ -65,9 +65,8 @@ class Stage:
     forces: Forces
     fixed: Nodes  #: components that supports hold at zero
     laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
-    begin: Callable[[State], State] = (
-        continue_slip  #: where, of what the stage before left
-    )
+    #: where, of what the stage before left
+    begin: Callable[[State], State] = continue_slip
 
 
 def load_steps(

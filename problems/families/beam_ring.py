@@ -26,7 +26,7 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
+MAX_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 
 class BeamRing(ContactFamily):
@@ -66,10 +66,10 @@ class BeamRing(ContactFamily):
         p: Any = params
         nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
-        if nodes > MOST_NODES:
+        if nodes > MAX_NODES:
             raise InputError(
                 f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
-                f"expected at most {MOST_NODES:.2g}"
+                f"expected at most {MAX_NODES:.2g}"
             )
         check_memory(self.name, 2 * nodes)
 

@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.fem.ordering import borders, dissected, node_graph
+from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
 
-LEAF = 8  #: nodes that are cut no more
+LEAF_SIZE = 8  #: nodes that are cut no more
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -65,12 +65,14 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
     ptr, idx = node_graph(*index_arrays(K), K.shape[0] // nodes, nodes)
     ending = np.zeros(nodes, dtype=np.bool_)
     ending[last] = True
-    order, start, children, roots = dissected(ptr, idx, points, ending, LEAF)
+    order, start, children, roots = dissect_components(
+        ptr, idx, points, ending, LEAF_SIZE
+    )
     first, border = borders(ptr, idx, order, start, children)
     return order.astype(np.int64), Fronts(start, first, border, children, roots)
 
 
-def spread(fronts: Fronts, ends: Ints) -> Fronts:
+def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:
     """Replace each position by several, or none: i by ends[i] … ends[i + 1] − 1."""
     count = np.diff(ends)[fronts.border]
     above = np.append(0, np.cumsum(count))

@@ -35,7 +35,7 @@ def eliminate(
     cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
     cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
     # what fronts left, one on another
-    cdef double[::1] store = np.empty(most_waiting(first, children))
+    cdef double[::1] store = np.empty(peak_storage(first, children))
     cdef double *U
     cdef double *S
     for s in range(children.shape[0]):
@@ -77,7 +77,7 @@ def eliminate(
     return True
 
 
-def most_waiting(const int[::1] first, const int[::1] children):
+def peak_storage(const int[::1] first, const int[::1] children):
     """Count the numbers that `eliminate` has to keep at a time."""
     cdef Py_ssize_t s, i, waiting = 0
     cdef int64_t size, top = 0, most = 0
@@ -153,7 +153,7 @@ def substitute(
                 dtrsv(b"L", b"T", b"N", &own, U, &size, xs, &unit)
 
 
-def spread_symmetric(
+def scatter_symmetric(
     const double[:, :] upper, const int[::1] at, double[:, ::1] to
 ):
     """Write a symmetric matrix, of which the upper triangle is given, at rows `at`.

@@ -33,7 +33,7 @@ from sksparse.cholmod import Factor, cholesky
 
 from mortarbench.harness import Matrix, Vector
 from mortarbench.problems.fem.dissection import index_arrays
-from mortarbench.problems.fem.elimination import spread_symmetric
+from mortarbench.problems.fem.elimination import scatter_symmetric
 from mortarbench.problems.fem.kernels import congruence
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.multifrontal import Multifrontal, multifrontal
@@ -70,7 +70,7 @@ class GeneralisedInverse(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Factorised:
+class CholeskyInverse:
     """K⁺ through CHOLMOD's factor; BK⁺Bᵀ by one solve per row, the paper's way."""
 
     factor: Factor
@@ -95,7 +95,7 @@ class Factorised:
 
 
 @dataclass(frozen=True, eq=False)
-class Condensed:
+class CondensedInverse:
     """K⁺ with its block on the components that constraints can touch."""
 
     factor: Multifrontal
@@ -212,7 +212,7 @@ def _inverse(
     if interface is None:
         K_ff = csc_matrix(K[free][:, free])
         factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
-        return Factorised(factor, free, kernel, perf_counter() - start)
+        return CholeskyInverse(factor, free, kernel, perf_counter() - start)
     touched = interface.components
     last = np.concatenate([touched, fixed])
     factor = multifrontal(K, free, interface.points, last)
@@ -221,5 +221,5 @@ def _inverse(
     compliance = np.zeros((touched.size, touched.size))
     for components, U in factor.trailing() if touched.size else ():
         lower, _ = lapack.dpotri(U.T, lower=1)
-        spread_symmetric(lower.T, number[components], compliance)
-    return Condensed(factor, touched, compliance, kernel, perf_counter() - start)
+        scatter_symmetric(lower.T, number[components], compliance)
+    return CondensedInverse(factor, touched, compliance, kernel, perf_counter() - start)

@@ -313,7 +313,7 @@ def prefixed(mesh: Mesh, prefix: str) -> Mesh:
     )
 
 
-def triangular(cells: Nodes) -> NDArray[np.bool_]:
+def is_triangle(cells: Nodes) -> NDArray[np.bool_]:
     """Say which cells (E, 4) are triangles, (E,)."""
     return np.asarray(cells[:, 2] == cells[:, 3])
 

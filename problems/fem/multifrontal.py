@@ -13,7 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Matrix, Vector
-from mortarbench.problems.fem.dissection import Fronts, dissect, index_arrays, spread
+from mortarbench.problems.fem.dissection import (
+    Fronts,
+    dissect,
+    expand_positions,
+    index_arrays,
+)
 from mortarbench.problems.fem.elimination import eliminate, substitute
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -73,7 +78,7 @@ def multifrontal(
     acting = acts.reshape(N, -1)[nodes]
     order = np.arange(n).reshape(N, -1)[nodes][acting]
     ends = np.append(0, np.cumsum(acting.sum(axis=1))).astype(np.int32)
-    fronts = spread(of_nodes, ends)
+    fronts = expand_positions(of_nodes, ends)
 
     position = np.full(n, -1, dtype=np.int32)
     position[order] = np.arange(order.size, dtype=np.int32)

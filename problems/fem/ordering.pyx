@@ -50,7 +50,7 @@ def components(const int[::1] ptr, const int[::1] idx):
     return numbers
 
 
-def dissected(
+def dissect_components(
     const int[::1] ptr, const int[::1] idx, const double[:, :] points, ending, int leaf
 ):
     """Dissect each connected component; see `dissect` and `Fronts`.

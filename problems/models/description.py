@@ -65,7 +65,7 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
+from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh, refine
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
@@ -88,7 +88,7 @@ LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
     "in": 0.0254, "ft": 0.3048,
 }  # fmt: skip
-SOFT = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
+MIN_PLAUSIBLE_E = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
 _KEYS = (
     "mesh",
     "length_unit",
@@ -131,7 +131,7 @@ def read_description(path: Path) -> dict[str, Any]:
     return table
 
 
-def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
+def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     """Read what the TOML file describes.
 
     halvings : times that every edge of the mesh is halved, on straight edges
@@ -146,7 +146,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
     named = read_msh(path.parent / table["mesh"])
     check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
     for _ in range(halvings):
-        named = halved(named)
+        named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
@@ -181,7 +181,7 @@ def remarks(path: Path) -> tuple[str, ...]:
         f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
         f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
         for i, E in enumerate(body["E"] for body in table["bodies"])
-        if E < SOFT
+        if E < MIN_PLAUSIBLE_E
     )
     sides = _sides(table["contacts"])
     two_passes = (

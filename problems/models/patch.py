@@ -123,7 +123,7 @@ def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
     )  # fmt: skip
 
 
-def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
+def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
     """Find the state with a given stretch, which a growing load must come to.
 
     Raises
@@ -142,7 +142,7 @@ def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
     return homogeneous(material, stretch)
 
 
-def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
+def state_under_pressure(material: Hyperelastic, pressure: float) -> Homogeneous:
     """Find the state under a nominal pressure, Pa."""
     least = max(_softest(material), MIN_STRETCH)
     stretch = float(brentq(
@@ -193,8 +193,8 @@ def _uniform(params: Mapping[str, Any]) -> Homogeneous:
     """Find the uniform state of the upper block that its load belongs to."""
     material = hyperelastic(params["material"], Material(E_UPPER, NU))
     if params["stretch"] == 1:
-        return pressed_by(material, PRESSURE)
-    return pressed_to(material, float(params["stretch"]))
+        return state_under_pressure(material, PRESSURE)
+    return state_at_stretch(material, float(params["stretch"]))
 
 
 def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
