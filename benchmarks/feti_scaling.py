@@ -28,7 +28,7 @@ import numpy as np
 from scipy.stats import linregress, t
 
 from mortarbench.harness import Mechanics, certify, no_rows
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
@@ -73,7 +73,7 @@ def one(way, Nr, cells):
         pieces, in_parts = own.decomposed, certifier(own, primal.P)
         dual = feti_dual(pieces, primal)
     else:
-        dual = dualise(primal, floating(bodies))
+        dual = dualise(primal, factorise_floating(bodies))
     lap()
     run = SMALBE().prepare(dual.qp, TOL[way])
     lap()
@@ -82,7 +82,7 @@ def one(way, Nr, cells):
     back = dual.recover(s)
     lap()
     mechanics = Mechanics(
-        primal=primal, back=dual.recover, factorise=lambda: clamped(bodies),
+        primal=primal, back=dual.recover, factorise=lambda: factorise_clamped(bodies),
         in_parts=in_parts,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip

@@ -43,8 +43,8 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.ranges import (
     GLUES,
+    LAW_PARAMETERS,
     LAWS,
-    NEEDED,
     at_least,
     at_most,
     one_of,
@@ -140,7 +140,8 @@ def _checked(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
         value = physical(f"friction {law.kind}: {key}", getattr(law, key))
         if value < 0:
             raise InputError(
-                f"friction {law.kind}: {key} = {value:g}; expected {NEEDED[key]}"
+                f"friction {law.kind}: {key} = {value:g}; expected "
+                + LAW_PARAMETERS[key]
             )
     if law.mu and reference is None:
         raise InputError(

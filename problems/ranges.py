@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
-SHORTEST = 0.1  #: stretch that a body is pressed to
-LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
-MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
+MIN_STRETCH = 0.1  #: stretch that a body is pressed to
+MIN_SIZE, MAX_SIZE = 1e-30, 1e30  #: sizes of physical values, SI
+MAX_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
 COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
 
 
@@ -35,7 +35,7 @@ class Key:
     values: tuple[Value, ...] = ()  #: all that it may have; empty: no such list
     is_size: bool = False  #: positive, and of a usual size in SI units
 
-    def but(self, default: Value) -> Key:
+    def with_default(self, default: Value) -> Key:
         """Return the same key with another default."""
         return replace(self, default=default)
 
@@ -69,7 +69,7 @@ def size(default: float) -> Key:
     return Key(default=default, is_size=True)
 
 
-def declared(**keys: Key) -> Keys:
+def schema(**keys: Key) -> Keys:
     """Declare the keys of a family, in the order of canonical names."""
     return MappingProxyType(keys)
 
@@ -80,47 +80,47 @@ def defaults_of(keys: Keys) -> dict[str, Value]:
 
 
 HALVINGS = key(0, 0, 30)
-STEPS = key(10, 1, MOST_STEPS)
+STEPS = key(10, 1, MAX_STEPS)
 #: the keys that choose the method; node-to-segment takes no notice of basis
-METHODS = declared(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
-PLANES = declared(plane=choice("strain", "stress"))
+METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
+PLANES = schema(plane=choice("strain", "stress"))
 #: how copies of a node are held together, `problems.feti.gluing`
-GLUES = declared(glue=choice("orthonormal", "chain", "redundant"))
+GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
 #: the keys of bodies in subdomains: H/h, 0 for one piece per body, and `GLUES`
-DECOMPOSITION = declared(feti=key(0, 0), **GLUES)
+DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
 #: the laws of friction, each with the key that it needs
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
-NEEDED = {
+LAW_PARAMETERS = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
 }
 #: the keys of friction; -1 is no bound and no mu
-LAW = declared(
+LAW_KEYS = schema(
     friction=choice(*LAWS),
     bound=key(-1.0),
     mu=key(-1.0),
     loading=choice("quasi-static", "static"),
 )
-FRICTION = declared(**LAW, iterate=key(0, 0))
+FRICTION = schema(**LAW_KEYS, iterate=key(0, 0))
 #: the keys of large deformation; newton: 0 is the last iteration
-KINEMATICS = declared(
+KINEMATICS = schema(
     kinematics=choice("linear", "finite"),
     material=choice("neo-hooke", "svk"),
     newton=key(0, 0),
 )
 #: whether second derivatives of the gaps join the tangent
-CONTACT_STIFFNESS = declared(contact_stiffness=choice("none", "geometric"))
+CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
 #: what is not built at finite strain, where a family has the key
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0, "parts": 0, "friction": "none", "plane": "strain", "relin": 1
 }  # fmt: skip
 #: what the name of a case of bodies may set, with the value where its file says nothing
-SETTINGS = declared(
+SETTINGS = schema(
     **METHODS,
     **PLANES,
     steps=STEPS,
-    relin=key(1, 1, MOST_STEPS),
-    **LAW,
+    relin=key(1, 1, MAX_STEPS),
+    **LAW_KEYS,
     kinematics=KINEMATICS["kinematics"],
     material=KINEMATICS["material"],
     **CONTACT_STIFFNESS,
@@ -153,9 +153,10 @@ def positive(family: str, params: Mapping[str, Value], keys: Iterable[str]) -> N
     for key in keys:
         if float(params[key]) <= 0:
             raise InputError(f"{family}: {key}={params[key]} must be positive")
-        if not LEAST <= float(params[key]) <= MOST:
+        if not MIN_SIZE <= float(params[key]) <= MAX_SIZE:
             raise InputError(
-                f"{family}: {key}={params[key]} must be between {LEAST:g} and {MOST:g}"
+                f"{family}: {key}={params[key]} must be between {MIN_SIZE:g} and "
+                f"{MAX_SIZE:g}"
             )
 
 
@@ -164,15 +165,15 @@ def physical(where: str, value: Any) -> float:
 
     Zero, or between 1e-30 and 1e30 in size: Young's modulus of steel is 2e11 Pa.
     """
-    if not is_number(value) or not (value == 0 or LEAST <= abs(value) <= MOST):
+    if not is_number(value) or not (value == 0 or MIN_SIZE <= abs(value) <= MAX_SIZE):
         raise InputError(
-            f"{where} = {shown(value)}; expected a number between {LEAST:g} and "
-            f"{MOST:g} in size, or 0"
+            f"{where} = {shown(value)}; expected a number between {MIN_SIZE:g} and "
+            f"{MAX_SIZE:g} in size, or 0"
         )
     return float(value)
 
 
-def fits(family: str, components: int) -> None:
+def check_memory(family: str, components: int) -> None:
     """Raise InputError for a case that cannot fit into memory, before it is built.
 
     components : of the displacement, or fewer; each takes 1 KiB at the very least (the
@@ -195,8 +196,8 @@ def check_friction(
     elsewhere : whether pairs of sides may have laws of their own
     """
     law = str(params["friction"])
-    for key, what in NEEDED.items():
-        value, default = float(params[key]), LAW[key].default
+    for key, what in LAW_PARAMETERS.items():
+        value, default = float(params[key]), LAW_KEYS[key].default
         if key != LAWS[law] and value != default:
             (user,) = (other for other, needed in LAWS.items() if needed == key)
             raise InputError(
@@ -205,9 +206,9 @@ def check_friction(
             )
         if key == LAWS[law] and value == default and not elsewhere:
             raise InputError(f"{family}: friction={law} needs {key}, {what}")
-        if value != default and not (value == 0 or LEAST <= value <= MOST):
+        if value != default and not (value == 0 or MIN_SIZE <= value <= MAX_SIZE):
             raise InputError(f"{family}: {key}={value:g}; expected {what}")
-    unused = params["loading"] != LAW["loading"].default
+    unused = params["loading"] != LAW_KEYS["loading"].default
     if law == "none" and not elsewhere and unused:
         raise InputError(
             f"{family}: loading={params['loading']} is not used by friction=none; "
@@ -261,7 +262,7 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
-def without_friction(family: str, params: Mapping[str, Value]) -> None:
+def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError where there is friction on sides that halving bends."""
     if params["friction"] != "none":
         raise InputError(
@@ -270,7 +271,7 @@ def without_friction(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
-def one_state(family: str, params: Mapping[str, Value]) -> None:
+def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError at finite strain, whose QPs are linearised at their own states.
 
     The QP of the next finer mesh belongs to another state, so that the distance of the
@@ -283,7 +284,7 @@ def one_state(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
-def minimised(family: str, laws: Iterable[str], meshes: str) -> None:
+def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
     """Raise InputError where a law is Coulomb's, whose solutions minimise nothing.
 
     meshes : keys with values whose answers may be compared instead
@@ -295,7 +296,7 @@ def minimised(family: str, laws: Iterable[str], meshes: str) -> None:
         )
 
 
-def tangential(family: str, params: Mapping[str, Value]) -> None:
+def check_tangential(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak: parts of μP, no sliding."""
     Q, peak = float(params["Q"]), float(params["peak"])
     if not 0 < peak < 1:
@@ -321,12 +322,12 @@ def one_of(
             )
 
 
-def doubled(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
+def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
     """Return the integer `keys`, numbers of cells, twice as large."""
     return {key: 2 * int(params[key]) for key in keys}
 
 
-def fits_dense(family: str, n: int) -> None:
+def check_dense_memory(family: str, n: int) -> None:
     """Raise InputError for a full matrix of n² numbers that cannot fit into memory."""
     needed, limit = 8 * n**2 / 2**20, case_limit_mib()
     if needed > limit:

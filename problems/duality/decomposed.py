@@ -31,7 +31,7 @@ from mortarbench.problems.contact.bodies import (
     elasticity_matrices,
 )
 from mortarbench.problems.contact.friction import forces_at_nodes, friction_of
-from mortarbench.problems.contact.results import Inside, results_of
+from mortarbench.problems.contact.results import BulkResults, results_of
 from mortarbench.problems.contact.stepping import Forces, LoadPath, Stage, State
 from mortarbench.problems.duality.problem import (
     Choice,
@@ -69,7 +69,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 
 @dataclass(frozen=True, eq=False)
 class DecomposedLinearisation:
-    """A linearised contact problem of bodies in subdomains; see `Posed`.
+    """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
     Its methods are called by all ranks, and give them the same.
     """
@@ -93,18 +93,18 @@ class DecomposedLinearisation:
         limits = self.dual.bounds(friction.bound)
         return self.reference(self._qp.with_bounds(*limits), start)
 
-    def normal(self, s: Solution) -> Vector:
+    def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
         dual = self.dual
         z = contact_multipliers(dual.subdomains, dual.halo, s)
         return z[: self.sides.place.size]
 
-    def left(self, s: Solution) -> tuple[Vector, Vector]:
+    def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (w,) at the sides, without dimension, and the normal forces."""
         dual, sides = self.dual, self.sides
         found = local_solution(dual.subdomains, dual.halo, s)
         vars(self).pop("_qp", None)  # explicit blocks are large, and done with
-        forces = forces_at_nodes(self.normal(s), sides.place, sides.places)
+        forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
         return found.at(sides.component), forces
 
 
@@ -156,16 +156,16 @@ def distributed_qp_of(
     last = path.last_of(choice.step)
     before = [one for i in range(last) for one in path.problems(i)]
     before += path.problems(last)[: path.problems(last).index(chosen)]
-    posed, count = chosen.posed, len(path.problems(last))
-    sides = replace(posed.sides, friction=chosen.friction)
+    linearised, count = chosen.problem, len(path.problems(last))
+    sides = replace(linearised.sides, friction=chosen.friction)
 
     def reported(found: LocalSolution) -> dict[str, Any]:
         return _reported(
             problem, DistributedSolution(found, sides, problem.bodies, count)
         )
 
-    dual = posed.dual.with_bound(chosen.friction.bound)
-    first = before[0].posed.dual if before else None
+    dual = linearised.dual.with_bound(chosen.friction.bound)
+    first = before[0].problem.dual if before else None
     return distributed_qp(dual, reported, first, len(before))
 
 
@@ -261,7 +261,9 @@ def linearised(
     return LinearisedSides(
         bodies=bodies, node=node, nodes=layout.nodes, B=csr_array(rows.B),
         c=rows.c / of.length, place=rows.place,
-        friction=friction_of(bodies, rows, stage.laws, at.before, at.pressed),
+        friction=friction_of(
+            bodies, rows, stage.laws, at.slip_origin, at.normal_forces
+        ),
     )  # fmt: skip
 
 
@@ -308,7 +310,7 @@ def _reported(problem: ContactProblem, found: DistributedSolution) -> dict[str, 
     of, own = problem.bodies, found.solution.subdomains
     layout = own.problem.layout
     cells = sum(len(layout.cells(int(s))) for s in own.number)
-    inside = Inside(
+    inside = BulkResults(
         nodes=layout.nodes, supports=own.problem.fixed.size,
         elements=int(own.ranks.total(np.array([float(cells)]))[0]),
         energy=found.solution.energy * of.force * of.length,

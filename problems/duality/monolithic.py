@@ -15,7 +15,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
 from mortarbench.problems.contact.balance import check_friction
-from mortarbench.problems.contact.bodies import Bodies, floating, supports
+from mortarbench.problems.contact.bodies import Bodies, factorise_floating, support_rows
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     forces_at_nodes,
@@ -47,7 +47,7 @@ MAX_REFERENCE_RESIDUAL = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class MonolithicLinearisation:
-    """A linearised contact problem of undivided bodies; see `Posed`."""
+    """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
 
     bodies: Bodies  #: with the load and the supports of its stage
     primal: QP  #: (1) of the paper
@@ -68,15 +68,15 @@ class MonolithicLinearisation:
             )
         return s
 
-    def normal(self, s: Solution) -> Vector:
+    def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows; friction's follow."""
         m, k = self.place.size, self.friction.bound.size
         return s.x[-m - k :][:m]
 
-    def left(self, s: Solution) -> tuple[Vector, Vector]:
+    def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (n,), right on the contact sides, and the normal forces."""
         places = sum(pair.slave.size for pair in self.bodies.pairs)
-        forces = forces_at_nodes(self.normal(s), self.place, places)
+        forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces
 
 
@@ -88,18 +88,18 @@ class MonolithicPath(LoadPath[MonolithicLinearisation]):
 
     def primal(self, k: int) -> QP:
         """Emit the QP of step k (1, 2, …), as last linearised, without friction."""
-        return self.problem(k).posed.primal
+        return self.problem(k).problem.primal
 
     def answer(self, k: int) -> Solution:
         """Return the solution of the primal problem of step k (1, 2, …)."""
         if k not in self._answers:
             last = self.problem(k)
-            self._answers[k] = last.posed.dual().recover(last.solution())
+            self._answers[k] = last.problem.dual().recover(last.solution())
         return self._answers[k]
 
     def solution(self, k: int) -> Vector:
         """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
-        return self.answer(k).x if k else self.rest.u
+        return self.answer(k).x if k else self.initial.u
 
 
 def load_path(
@@ -146,7 +146,7 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
     def factor() -> GeneralisedInverse:
         if held.size == of.fixed.size:
             return of.floating
-        return floating(replace(bodies, B_D=supports(bodies.mesh, held)))
+        return factorise_floating(replace(bodies, B_D=support_rows(bodies.mesh, held)))
 
     is_supported = of.is_supported and all(stage.fixed is of.fixed for stage in stages)
     return _path(
@@ -174,7 +174,7 @@ def _path(
         if names not in known:
             f = np.zeros(bodies.mesh.dofs)
             f[stage.forces.component] = stage.forces.value
-            held = supports(bodies.mesh, stage.fixed)
+            held = support_rows(bodies.mesh, stage.fixed)
             known[names] = replace(bodies, f=f, B_D=held)
         return known[names]
 
@@ -182,7 +182,7 @@ def _path(
         rows = linearise(stage.laws)(at.u * bodies.length)
         own, load = under(stage), id(stage.forces)
         primal = primal_qp(own, rows, stage.part)
-        first = friction_of(own, rows, stage.laws, at.before, at.pressed)
+        first = friction_of(own, rows, stage.laws, at.slip_origin, at.normal_forces)
         if first.bound.size and not any(law.mu for law in stage.laws):
             check_friction(own, rows.B, first, stage.step, stage.part)
 

@@ -13,7 +13,7 @@ the total displacement, so that errors are relative to u and not to an increment
 
 *K* is the tangent Π''(u^j) where that is positive definite on what the supports leave,
 which a Cholesky factorisation tells. Where it is not, the negative eigenvalues of the
-tangents of single cells are raised (`problems.fem.finite_strain.convexified`). The
+tangents of single cells are raised (`problems.fem.finite_strain.convex_tangent`). The
 second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the iteration
 before ("geometric" contact stiffness), may join the tangent; without them the
 convergence is linear where both sides deform. To K is added ρB_DᵀB_D, which changes
@@ -61,19 +61,19 @@ from mortarbench.harness import (
     kkt_residuals,
 )
 from mortarbench.harness.errors import PastEndError
-from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import MAX_REFERENCE_RESIDUAL, primal_qp
 from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.fem.finite_strain import (
     Cells,
-    Evaluated,
+    EnergyDerivatives,
     InvertedCellError,
     assemble,
-    clip,
-    convexified,
+    clip_eigenvalues,
+    convex_tangent,
     evaluate,
 )
 from mortarbench.problems.fem.fixing import fixing_nodes
@@ -140,7 +140,7 @@ class Configuration(NamedTuple):
     u: Vector
     rows: ContactRows
     gap: Vector  #: (m,) without dimensions
-    cells: Evaluated
+    cells: EnergyDerivatives
     energy: float  #: Π
     r: Vector  #: (n,) Π'
 
@@ -310,7 +310,7 @@ class NewtonPath:
                     f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
                     f"residual of {best:.1e}: {stuck}"
                 )
-            pressing = lam > ACTIVE * lam.max(initial=0.0)
+            pressing = lam > ACTIVE_THRESHOLD * lam.max(initial=0.0)
             gaps = gaps.keep_segments(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
@@ -405,7 +405,7 @@ class NewtonPath:
         clipped = 0
         if not found:
             try:
-                _, clipped = convexified(self.cells, tangents, positive)
+                _, clipped = convex_tangent(self.cells, tangents, positive)
             except ArithmeticError as e:
                 raise NoEquilibriumError(str(e)) from None
         return *found[-1], clipped
@@ -425,13 +425,17 @@ class NewtonPath:
         l, F = self.bodies.length, self.bodies.force
         blocks, dofs = curvature(at.u * l, lam[at.rows.place] * F)
         if convex:
-            blocks, _ = clip(blocks)
+            blocks, _ = clip_eigenvalues(blocks)
         i, j = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
         return csc_array((blocks.ravel() * l / F, (i.ravel(), j.ravel())), shape=(n, n))
 
     def _inverse(self, K: csc_array) -> GeneralisedInverse:
         tangent = replace(self.bodies, K=K)
-        return clamped(tangent) if self._is_supported else sliding_inverse(tangent)
+        return (
+            factorise_clamped(tangent)
+            if self._is_supported
+            else sliding_inverse(tangent)
+        )
 
     @cached_property
     def _is_supported(self) -> bool:

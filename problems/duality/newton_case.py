@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from mortarbench.harness import Case, Fields, Reference, Solution, Vector
-from mortarbench.problems.contact.bodies import Bodies, clamped, supported
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    factorise_clamped,
+    factorise_supported,
+)
 from mortarbench.problems.contact.linearise import (
     closest_segments,
     contact_stiffness,
@@ -61,7 +65,7 @@ def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Ga
     def keep_segments(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
         kept = np.where(pressing, closest_segments(bodies, u), -1)
         return Gaps(
-            linearisation(bodies, "nts", None, kept=kept),
+            linearisation(bodies, "nts", None, fixed_segments=kept),
             contact_stiffness(bodies, kept) if geometric else None,
         )
 
@@ -119,8 +123,9 @@ def newton_case(
 
     case = contact_case(
         bodies, primal, form,
-        floating=lambda: sliding_inverse(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies), quantities=collected,
+        floating=lambda: sliding_inverse(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies), quantities=collected,
     )  # fmt: skip
     assert case.mechanics is not None
     back, constant = case.mechanics.back, at.constant * unit

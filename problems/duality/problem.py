@@ -20,11 +20,11 @@ from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
     UnassembledBodies,
-    assembled,
-    clamped,
-    floating,
-    supported,
-    supports,
+    assemble_stiffness,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -166,7 +166,7 @@ class ElasticBodies:
     @cached_property
     def assembled(self) -> Bodies:
         """The bodies in one piece, with their stiffness."""
-        return assembled(self.whole)
+        return assemble_stiffness(self.whole)
 
     @cached_property
     def whole(self) -> UnassembledBodies:
@@ -177,7 +177,7 @@ class ElasticBodies:
         return UnassembledBodies(
             mesh=mesh, body=self.shape.body, names=self.names,
             materials=self.materials, plane=self.plane, length=self.length,
-            force=self.force, f=f, B_D=supports(mesh, self.fixed),
+            force=self.force, f=f, B_D=support_rows(mesh, self.fixed),
             pairs=self.pairs,
         )  # fmt: skip
 
@@ -190,17 +190,17 @@ class ElasticBodies:
     @cached_property
     def floating(self) -> GeneralisedInverse:
         """K⁺ with all rigid motions."""
-        return floating(self.assembled)
+        return factorise_floating(self.assembled)
 
     @cached_property
     def clamped(self) -> GeneralisedInverse:
         """K⁺ without the prescribed components; InputError if these hold too little."""
-        return clamped(self.assembled)
+        return factorise_clamped(self.assembled)
 
     @cached_property
     def supported(self) -> GeneralisedInverse:
-        """K⁺ like `clamped`, also for bodies that contact alone holds."""
-        return supported(self.assembled)
+        """K⁺ like `factorise_clamped`, also for bodies that contact alone holds."""
+        return factorise_supported(self.assembled)
 
 
 def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:

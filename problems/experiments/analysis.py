@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from mortarbench.harness import QP, Fields, Reference, Solution, Status, Vector
-from mortarbench.problems.contact.bodies import Bodies, floating
+from mortarbench.problems.contact.bodies import Bodies, factorise_floating
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.results import fields
@@ -44,7 +44,7 @@ def analyse(
     watch = Stopwatch()
     bodies = bodies_of.__wrapped__(Nr, Nh, radial or 2 * Nh, "strain").assembled
     watch.lap("assembly")
-    inverse = floating(bodies, condense=condense)
+    inverse = factorise_floating(bodies, condense=condense)
     watch.lap("factor")
     rows_of = linearisation(bodies, "nts", "dual")
     solved: list[tuple[QP, Solution]] = []

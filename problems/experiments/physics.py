@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness import Reference, Value
-from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.monolithic import MonolithicPath, load_path
@@ -37,7 +37,7 @@ def stepping(plan: Plan, solve: Reference) -> Rows:
     the solution itself, which is what all the others approach.
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
-    inverse, linearise = clamped(bodies), linearisation(bodies, "nts", "dual")
+    inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
     ways = [(s, r) for r in plan.relin for s in plan.stepping]
     for steps, relin in (*ways, SETTLED):
         path = load_path(bodies, linearise, lambda: inverse, solve, steps, relin)
@@ -66,7 +66,7 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
     length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
-    inverse = clamped(bodies)
+    inverse = factorise_clamped(bodies)
     slave = bodies.pairs[0].slave
     points = bodies.mesh.points[slave]
     angles = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 1.0))

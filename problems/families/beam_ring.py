@@ -13,34 +13,34 @@ from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
     KINEMATICS,
+    MAX_STEPS,
     METHODS,
-    MOST_STEPS,
     PLANES,
     STEPS,
-    declared,
-    fits,
+    check_memory,
     key,
-    without_friction,
+    refuse_friction,
+    schema,
 )
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
+MAX_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
 
 
 class BeamRing(ContactFamily):
     """The paper's benchmark: beam on a half ring, plane elasticity."""
 
     name = "beam-ring"
-    keys = declared(
+    keys = schema(
         Nr=key(10, 1),
         Nh=key(5, 1),
         radial=key(0, 1),
         steps=STEPS,
         step=key(0, 1),
         **METHODS,
-        relin=key(1, 1, MOST_STEPS),
+        relin=key(1, 1, MAX_STEPS),
         **PLANES,
         **FRICTION,
         **DECOMPOSITION,
@@ -66,17 +66,17 @@ class BeamRing(ContactFamily):
         p: Any = params
         nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
-        if nodes > MOST_NODES:
+        if nodes > MAX_NODES:
             raise InputError(
                 f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
-                f"expected at most {MOST_NODES:.2g}"
+                f"expected at most {MAX_NODES:.2g}"
             )
-        fits(self.name, 2 * nodes)
+        check_memory(self.name, 2 * nodes)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; its load steps are linearised anew.
 
         The arcs of the ring are other polygons. Friction on them is refused.
         """
-        without_friction(self.name, params)
+        refuse_friction(self.name, params)
         return super().refined(params)

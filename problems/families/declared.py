@@ -15,8 +15,8 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     defaults_of,
-    doubled,
-    one_state,
+    double,
+    refuse_finite_strain,
 )
 
 if TYPE_CHECKING:
@@ -75,10 +75,10 @@ class DeclaredFamily(Family):
         state.
         """
         if "kinematics" in params:
-            one_state(self.name, params)
+            refuse_finite_strain(self.name, params)
         if "halvings" in params:
             return {**params, "halvings": int(params["halvings"]) + 1}
-        return {**params, **doubled(params, *self.cells)} if self.cells else None
+        return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
         """Return True if bodies are in subdomains, and need no Newton's method."""

@@ -19,14 +19,14 @@ from mortarbench.problems.ranges import (
     GLUES,
     HALVINGS,
     KINEMATICS,
-    LAW,
+    LAW_KEYS,
     SETTINGS,
     check_decomposition,
     check_friction,
     check_kinematics,
-    declared,
     key,
-    minimised,
+    refuse_coulomb,
+    schema,
 )
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class GmshBodies(ContactFamily):
 
     name = "bodies"
     path_suffix = ".toml"
-    keys = declared(
+    keys = schema(
         path=key(""),
         sha256=key(""),
         **SETTINGS,
@@ -87,7 +87,7 @@ class GmshBodies(ContactFamily):
         check_decomposition(self.name, params, key="parts", what=what)
         path = Path(p["path"])
         table = read_description(path)
-        own = any(key in entry for entry in table["contacts"] for key in LAW)
+        own = any(key in entry for entry in table["contacts"] for key in LAW_KEYS)
         check_friction(self.name, p, elsewhere=own)
         with located(str(path)):
             pair_laws(table["contacts"], params)
@@ -100,7 +100,7 @@ class GmshBodies(ContactFamily):
 
         finer = super().refined(params)
         laws = [law.kind for law in laws_of(params)]
-        minimised(self.name, laws, "halvings=0, 1 and 2")
+        refuse_coulomb(self.name, laws, "halvings=0, 1 and 2")
         return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:

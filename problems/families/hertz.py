@@ -15,14 +15,14 @@ from mortarbench.problems.ranges import (
     METHODS,
     PLANES,
     STEPS,
+    check_memory,
+    check_tangential,
     choice,
-    declared,
-    fits,
     key,
     positive,
+    refuse_friction,
+    schema,
     size,
-    tangential,
-    without_friction,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class HertzPlane(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
     name = "hertz-plane"
-    keys = declared(
+    keys = schema(
         n=key(10, 1),
         load=size(10.0),
         **PLANES,
@@ -48,21 +48,21 @@ class HertzPlane(ContactFamily):
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         super().check(params)
-        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
+        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
 
 
 class HertzCylinder(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
     name = "hertz-cylinder"
-    keys = declared(
+    keys = schema(
         n=key(10, 1),
         m=key(8, 1),
         load=size(1.0),
         radius=size(1.0),
         ratio=size(1.0),
-        slave=choice("lower", "upper").but("upper"),
-        contact=METHODS["contact"].but("mortar"),
+        slave=choice("lower", "upper").with_default("upper"),
+        contact=METHODS["contact"].with_default("mortar"),
         basis=METHODS["basis"],
         **PLANES,
         halvings=HALVINGS,
@@ -70,7 +70,7 @@ class HertzCylinder(ContactFamily):
         Q=key(0.0),
         peak=key(0.0),
         programme=choice("normal-first", "proportional"),
-        steps=STEPS.but(20),
+        steps=STEPS.with_default(20),
         **DECOMPOSITION,
     )
     forms = ("primal", "dual")
@@ -83,7 +83,7 @@ class HertzCylinder(ContactFamily):
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range, and used."""
         super().check(params)
-        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
+        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
         sheared = bool(params["Q"] or params["peak"])
         together = params["programme"] == "proportional"
         if sheared:
@@ -93,7 +93,7 @@ class HertzCylinder(ContactFamily):
                         f"{self.name}: {name}={params[name]} with a tangential force; "
                         f"expected {name}={value}, or no Q and no peak"
                     )
-            tangential(self.name, params)
+            check_tangential(self.name, params)
             positive(self.name, params, ("mu",))
         if params["loading"] == "static" and params["Q"] != params["peak"]:
             raise InputError(
@@ -112,5 +112,5 @@ class HertzCylinder(ContactFamily):
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved; friction on arcs is refused."""
-        without_friction(self.name, params)
+        refuse_friction(self.name, params)
         return super().refined(params)

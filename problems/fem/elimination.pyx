@@ -1,9 +1,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 # cython: initializedcheck=False
-"""Compiled loops of the multifrontal method, dense work done by BLAS and LAPACK.
+"""Compiled loops of the multifrontal method, with dense work in BLAS and LAPACK.
 
-`problems.fem.multifrontal` says what it is. U = Lᵀ of a front by rows is L of LAPACK,
-by columns.
+See `problems.fem.multifrontal`. The rows of U = Lᵀ of a front, stored row by row, are
+the columns of L in the column-major order of LAPACK.
 """
 
 from libc.stdint cimport int64_t
@@ -27,15 +27,15 @@ def eliminate(
     const int64_t[::1] offset,
     double[::1] rows,
 ):
-    """Write the rows of U front by front; say whether all pivots were positive."""
+    """Write the rows of U front by front; return False if a pivot is not positive."""
     cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, waiting = 0
     cdef int low, own, left, size, info = 0
     cdef double one = 1.0, minus = -1.0
     cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
     cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
     cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
-    # what fronts left, one on another
-    cdef double[::1] store = np.empty(most_waiting(first, children))
+    # stack of the Schur complements of fronts whose parents are still to come
+    cdef double[::1] store = np.empty(peak_storage(first, children))
     cdef double *U
     cdef double *S
     for s in range(children.shape[0]):
@@ -62,12 +62,13 @@ def eliminate(
             add(&store[top], &to[0], m, own, left, U, S)
         if own:
             dpotrf(b"L", &own, U, &size, &info)
-            if info or not U[(own - 1) * (<Py_ssize_t> size + 1)] > 0:  # NaN is not
+            # not (… > 0): also True for NaN, which dpotrf need not report
+            if info or not U[(own - 1) * (<Py_ssize_t> size + 1)] > 0:
                 return False
         if own and left:
             dtrsm(b"R", b"L", b"T", b"N", &left, &own, &one, U, &size, U + own, &size)
             dsyrk(b"L", b"N", &left, &own, &minus, U + own, &size, &one, S, &left)
-        if children[s]:  # to their place: they are done with
+        if children[s]:  # overwrite the children's complements, which are used up
             for i in range(left):
                 t = i * left + i
                 memmove(&store[top + t], S + t, (left - i) * sizeof(double))
@@ -77,8 +78,8 @@ def eliminate(
     return True
 
 
-def most_waiting(const int[::1] first, const int[::1] children):
-    """Count the numbers that `eliminate` has to keep at a time."""
+def peak_storage(const int[::1] first, const int[::1] children):
+    """Return the largest number of doubles on the stack of `eliminate`."""
     cdef Py_ssize_t s, i, waiting = 0
     cdef int64_t size, top = 0, most = 0
     cdef int64_t[::1] stack = np.empty(children.shape[0], dtype=np.int64)
@@ -99,9 +100,10 @@ cdef void add(
     const double *below, const int *to, Py_ssize_t m, Py_ssize_t own, Py_ssize_t left,
     double *U, double *S,
 ) noexcept nogil:
-    """Add the upper triangle of what a child left at the places `to` of its front.
+    """Add the upper triangle of a child's Schur complement at the places `to` (m,).
 
-    below (m, m), U (own, own + left), S (left, left)
+    below (m, m) complement of the child; U (own, own + left) and S (left, left) of the
+    parent front
     """
     cdef Py_ssize_t i, j
     cdef double *row
@@ -122,7 +124,7 @@ def substitute(
     const double[::1] rows,
     double[:, ::1] x,
 ):
-    """Solve UᵀU x = b in place of b, whose right-hand sides are the rows of x."""
+    """Solve UᵀU x = b in place; the right-hand sides are the rows of x."""
     cdef Py_ssize_t s, t, k, i, fronts = start.shape[0] - 1
     cdef int own, left, size, unit = 1
     cdef double one = 1.0, minus = -1.0, zero = 0.0
@@ -131,7 +133,7 @@ def substitute(
     cdef double *U
     cdef double *xs
     for t in range(2 * fronts):
-        s = min(t, 2 * fronts - 1 - t)  # up the tree and down again
+        s = min(t, 2 * fronts - 1 - t)  # forward up the tree, backward down again
         own, left = start[s + 1] - start[s], first[s + 1] - first[s]
         size = own + left
         if not own:
@@ -153,12 +155,12 @@ def substitute(
                 dtrsv(b"L", b"T", b"N", &own, U, &size, xs, &unit)
 
 
-def spread_symmetric(
+def scatter_symmetric(
     const double[:, :] upper, const int[::1] at, double[:, ::1] to
 ):
-    """Write a symmetric matrix, of which the upper triangle is given, at rows `at`.
+    """Copy a symmetric matrix, stored as upper triangle, to rows and columns `at`.
 
-    Rows and columns whose place is negative are left out.
+    Rows and columns with a negative place are skipped.
     """
     cdef Py_ssize_t i, j
     for i in range(at.shape[0]):

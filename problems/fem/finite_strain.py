@@ -42,14 +42,14 @@ from mortarbench.problems.fem.elasticity import (
 from mortarbench.problems.fem.elements import Floats, determinant
 from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
-from mortarbench.problems.fem.mesh import Mesh, triangular
+from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
 #: Poisson's ratio from which on cells take the mean dilatation
 NEARLY_INCOMPRESSIBLE = 0.4
 #: eigenvalues of a cell's tangent below −ROUNDING times its largest are negative
-ROUNDING = 1e-12
+EIGENVALUE_ROUNDING = 1e-12
 #: what negative ones are raised to, as a part of the cell's largest eigenvalue
-RAISED = 1e-6
+CLIPPED_EIGENVALUE = 1e-6
 
 
 class InvertedCellError(ArithmeticError):
@@ -73,7 +73,7 @@ class Cells:
     pattern: Pattern  #: of K_t
 
 
-class Evaluated(NamedTuple):
+class EnergyDerivatives(NamedTuple):
     """The strain energy of a state, with its derivatives."""
 
     energy: float  #: Π
@@ -122,7 +122,7 @@ def strain_energy(cells: Cells, u: Vector) -> float:
     return total
 
 
-def evaluate(cells: Cells, u: Vector) -> Evaluated:
+def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     """Return the strain energy with its derivatives.
 
     Raises
@@ -158,7 +158,7 @@ def evaluate(cells: Cells, u: Vector) -> Evaluated:
             g = _nodal(theta.first, gradients, volumes)
             part = curvature[:, 0] / volumes.sum(axis=1)
             tangents[own] += part[:, None, None] * (g[:, :, None] * g[:, None, :])
-    return Evaluated(energy, forces, tangents)
+    return EnergyDerivatives(energy, forces, tangents)
 
 
 def assemble(cells: Cells, tangents: Floats) -> csc_array:
@@ -169,7 +169,7 @@ def assemble(cells: Cells, tangents: Floats) -> csc_array:
     return csc_array((data, at.indices, at.indptr), shape=(n, n))
 
 
-def convexified(
+def convex_tangent(
     cells: Cells, tangents: Floats, positive: Callable[[csc_array], bool]
 ) -> tuple[csc_array, int]:
     """Assemble K_t, made positive definite cell by cell where it is not so itself.
@@ -181,7 +181,7 @@ def convexified(
 
     Parameters
     ----------
-    tangents : of the cells, see `Evaluated`
+    tangents : of the cells, see `EnergyDerivatives`
     positive : whether a sum K_t (n, n) is positive definite as the caller needs it: by
         its Cholesky factor, with the supports
 
@@ -198,7 +198,7 @@ def convexified(
     exact = assemble(cells, tangents)
     if positive(exact):
         return exact, 0
-    clipped, changed = clip(_on_corners(cells.mesh, tangents))
+    clipped, changed = clip_eigenvalues(_on_corners(cells.mesh, tangents))
     K = assemble(cells, clipped)
     if not positive(K):
         raise ArithmeticError(
@@ -208,13 +208,13 @@ def convexified(
     return K, changed
 
 
-def clip(tangents: Floats) -> tuple[Floats, int]:
+def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
     """Raise the negative eigenvalues of symmetric matrices (E, k, k); count these."""
     values, vectors = np.linalg.eigh(tangents)
     largest = np.abs(values).max(axis=1, initial=0.0)
-    negative = values < -ROUNDING * largest[:, None]
+    negative = values < -EIGENVALUE_ROUNDING * largest[:, None]
     changed = negative.any(axis=1)
-    raised = np.where(negative, RAISED * largest[:, None], values)[changed]
+    raised = np.where(negative, CLIPPED_EIGENVALUE * largest[:, None], values)[changed]
     vectors = vectors[changed]
     clipped = tangents.copy()
     product = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
@@ -277,7 +277,7 @@ def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:
 
     The sum over cells is the same; the cell's own eigenvalues are those of a triangle.
     """
-    moved, cells = tangents.copy(), triangular(mesh.cells)
+    moved, cells = tangents.copy(), is_triangle(mesh.cells)
     moved[cells, 4:6] += moved[cells, 6:]
     moved[cells, :, 4:6] += moved[cells, :, 6:]
     moved[cells, 6:] = 0

@@ -22,13 +22,14 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import (
     Nodes,
     boundary_facets,
-    triangular,
+    is_triangle,
 )
 
 _COPIES = 32  #: of a file that its parser may hold
-FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
+#: largest deviation from a plane z = const, relative to the extent
+FLATNESS_TOLERANCE = 1e-9
 DIMENSION = {kind: dim for (dim, _), kind in KINDS.items() if dim < 3}  #: that we read
-FAR = 1e100  #: coordinates whose products overflow
+MAX_COORDINATE = 1e100  #: coordinates whose products overflow
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items() if kind in DIMENSION}
 #: kinds of cells that start so are of higher order or solid, by the names of meshio
 _CURVED = ("line", "triangle", "quad")
@@ -70,7 +71,7 @@ def read_msh(path: Path) -> NamedMesh:
             raise InputError(f"{path}: cells of type {block.type}; {_remedy(block)}")
     points = np.asarray(mesh.points, dtype=float)
     extent = np.ptp(points, axis=0).max(initial=0.0)
-    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
+    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLATNESS_TOLERANCE * extent:
         raise InputError(
             f"{path}: not plane; {_SPACE}: expected all nodes at the same z"
         )
@@ -102,7 +103,7 @@ def read_msh(path: Path) -> NamedMesh:
     )  # fmt: skip
 
 
-def halved(mesh: NamedMesh) -> NamedMesh:
+def refine(mesh: NamedMesh) -> NamedMesh:
     """Halve every edge: four triangles or quadrilaterals of each cell.
 
     New nodes lie on the straight edges, so that all bodies keep their shape. A triangle
@@ -110,7 +111,7 @@ def halved(mesh: NamedMesh) -> NamedMesh:
     corners. Bodies stay numbered one after another.
     """
     cells, corners = mesh.cells, mesh.cells.T
-    is_quad = ~triangular(cells)
+    is_quad = ~is_triangle(cells)
     edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1)  # (E, 4, 2)
     ends, middle = np.unique(
         np.sort(edges.reshape(-1, 2), axis=1), axis=0, return_inverse=True
@@ -177,8 +178,14 @@ def _read(path: Path) -> Any:
         tags = mesh.cell_data.get("gmsh:physical", [])
         numbers = _numbers(path.read_bytes())
         tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
-    if points.ndim != 2 or points.shape[1] < 2 or not (abs(points) < FAR).all():
-        raise InputError(f"{path}: coordinates beyond {FAR:g}, or none; expected some")
+    if (
+        points.ndim != 2
+        or points.shape[1] < 2
+        or not (abs(points) < MAX_COORDINATE).all()
+    ):
+        raise InputError(
+            f"{path}: coordinates beyond {MAX_COORDINATE:g}, or none; expected some"
+        )
     if numbers is not None and (numbers < 1).any():  # which meshio counts from the end
         raise InputError(f"{path}: cells of nodes below 1; expected their numbers")
     for block, nodes in zip(mesh.cells, cells, strict=True):
@@ -287,7 +294,7 @@ def _distinct(parts: list[Nodes]) -> Nodes:
 
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
     """Turn clockwise cells over; refuse flat ones and those that are not convex."""
-    x, triangle = points[cells], triangular(cells)[:, None]
+    x, triangle = points[cells], is_triangle(cells)[:, None]
     twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of the diagonals
     turned = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, turned, cells)

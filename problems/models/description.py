@@ -61,21 +61,21 @@ from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
-    supports,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
+from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh, refine
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
+    LAW_PARAMETERS,
     LAWS,
+    MAX_STEPS,
     METHODS,
-    MOST_STEPS,
-    NEEDED,
     PLANES,
     SETTINGS,
-    fits,
+    check_memory,
     physical,
 )
 
@@ -88,7 +88,7 @@ LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
     "in": 0.0254, "ft": 0.3048,
 }  # fmt: skip
-SOFT = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
+MIN_PLAUSIBLE_E = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
 _KEYS = (
     "mesh",
     "length_unit",
@@ -122,7 +122,7 @@ def read_description(path: Path) -> dict[str, Any]:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
             default = SETTINGS[key].default
-            checked.at_least_one(key, table.get(key, default), MOST_STEPS)
+            checked.at_least_one(key, table.get(key, default), MAX_STEPS)
         chosen = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
         _check_choices(table, chosen)
         for entry in checked.filled_list("contacts", table["contacts"]):
@@ -131,7 +131,7 @@ def read_description(path: Path) -> dict[str, Any]:
     return table
 
 
-def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
+def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     """Read what the TOML file describes.
 
     halvings : times that every edge of the mesh is halved, on straight edges
@@ -144,9 +144,9 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
     """
     table = read_description(path)
     named = read_msh(path.parent / table["mesh"])
-    fits(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
+    check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
     for _ in range(halvings):
-        named = halved(named)
+        named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
@@ -166,7 +166,7 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         mesh=mesh, body=body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
         length=length, force=force, f=load.ravel() / force,
-        B_D=supports(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
+        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
     )  # fmt: skip
 
 
@@ -181,7 +181,7 @@ def remarks(path: Path) -> tuple[str, ...]:
         f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
         f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
         for i, E in enumerate(body["E"] for body in table["bodies"])
-        if E < SOFT
+        if E < MIN_PLAUSIBLE_E
     )
     sides = _sides(table["contacts"])
     two_passes = (
@@ -291,7 +291,7 @@ def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
 def _friction(entry: Mapping[str, Any]) -> None:
     """Check the values of what an entry says of friction."""
     _check_choices(entry, ("friction", "loading"))
-    for key, what in NEEDED.items():
+    for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
             raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
 
@@ -316,19 +316,21 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
     _friction(entry)
     law = entry.get("friction", params["friction"])
     needed = LAWS[law]
-    for key in NEEDED:
+    for key in LAW_PARAMETERS:
         if key in entry and key != needed:
             raise InputError(f"{key} is not used by friction {law!r}; expected none")
     given = {"friction": law, "bound": 0.0, "mu": 0.0}
     if needed:
         given[needed] = entry.get(needed, params[needed])
         if given[needed] < 0:
-            raise InputError(f"friction {law!r} needs {needed}, {NEEDED[needed]}")
+            raise InputError(
+                f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}"
+            )
     return law_of(given)
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    checked.only_keys(entry, ("slave", "master", "friction", *NEEDED))
+    checked.only_keys(entry, ("slave", "master", "friction", *LAW_PARAMETERS))
     _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
     for side in _SIDES:

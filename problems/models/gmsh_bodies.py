@@ -30,13 +30,15 @@ from mortarbench.problems.duality.problem import (
     keyed_linearisation,
 )
 from mortarbench.problems.models.description import (
-    described_bodies,
     pair_laws,
+    read_bodies,
     read_description,
 )
 
-STRAIGHT = 1e-6  #: angle between edges of a straight side, which coordinates round
-ARC = np.pi / 4  #: between chords of an arc, at most; larger angles are drawn corners
+#: angle between edges of a straight side, which coordinates round
+MAX_STRAIGHT_ANGLE = 1e-6
+#: between chords of an arc, at most; larger angles are drawn corners
+MAX_ARC_ANGLE = np.pi / 4
 
 
 def problem(params: Mapping[str, Value]) -> ContactProblem:
@@ -115,7 +117,7 @@ def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
     """State the bodies of a description; the digest tells contents apart."""
     del sha256
-    return elastic_bodies_of(described_bodies(Path(path), plane, halvings))
+    return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:
@@ -126,7 +128,7 @@ def has_arcs(params: Mapping[str, Value]) -> bool:
         edges = np.diff(of.shape.mesh.points[side], axis=0)
         angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
         turns = np.abs(np.diff(angles))
-        if ((turns > STRAIGHT) & (turns < ARC)).any():
+        if ((turns > MAX_STRAIGHT_ANGLE) & (turns < MAX_ARC_ANGLE)).any():
             return True
     return False
 

@@ -21,7 +21,7 @@ import numpy as np
 from mortarbench.harness import QP, Friction, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
@@ -66,7 +66,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
-        linearise=lambda bodies, _: lambda u: above_plane(
+        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
             bodies.mesh, bodies.pairs[0].slave, tangential=True
         ),
         results=lambda found: {

@@ -43,14 +43,14 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
-from mortarbench.problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
+from mortarbench.problems.models.hertz import CURVE_POINTS, MATERIAL, RADIUS, UNIT_LOAD
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
 MU = 0.3
 LOAD = 10 * UNIT_LOAD  #: P, N/m
 SIDE = "half plane on half plane"
-REACH = 1.5  #: half width of what may touch, in a, of law=hertz
+MESH_HALF_WIDTH = 1.5  #: half width of what may touch, in a, of law=hertz
 
 #: two cylinders of the radius and the material of the families of Hertz
 EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
@@ -98,7 +98,7 @@ class Elements:
 
 
 def _pressed(n: int) -> Case:
-    elements = Elements(n, REACH)
+    elements = Elements(n, MESH_HALF_WIDTH)
     qp = _dual(elements.F, elements.middle**2, 1.0, np.zeros(n), np.full(n, np.inf))
     x, width = EXACT.a * elements.middle, EXACT.a * elements.h
     approach = displacement(((1.0, 1.0),))
@@ -116,7 +116,7 @@ def _pressed(n: int) -> Case:
         return {
             "elements": n,
             "contact_rows": n,
-            "active": int((s.x > ACTIVE * s.x.max(initial=0.0)).sum()),
+            "active": int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum()),
             "energy": float(energy) * _energy_unit(EXACT.P),
             "energy_error": float(energy / exact_energy - 1),
             "multiplier_sum": float(force.sum()),
@@ -129,8 +129,8 @@ def _pressed(n: int) -> Case:
             "half_width_error": float(half_width / EXACT.a - 1),
         }
 
-    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
-    exact = np.column_stack([curve, EXACT.pressure(curve), np.zeros(CURVE)])
+    curve = EXACT.a * np.linspace(-MESH_HALF_WIDTH, MESH_HALF_WIDTH, CURVE_POINTS)
+    exact = np.column_stack([curve, EXACT.pressure(curve), np.zeros(CURVE_POINTS)])
 
     def fields(s: Solution) -> Fields:
         p = s.x * EXACT.P / width
@@ -190,9 +190,9 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
         }
 
     def slipping(s: Solution) -> NDArray[np.bool_]:
-        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE))
+        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE_THRESHOLD))
 
-    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
+    curve = EXACT.a * np.linspace(-MESH_HALF_WIDTH, MESH_HALF_WIDTH, CURVE_POINTS)
     tractions = np.column_stack([curve, EXACT.pressure(curve), -exact.traction(curve)])
 
     def fields(s: Solution) -> Fields:

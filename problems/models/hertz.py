@@ -52,7 +52,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
-from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
 from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import NewtonPath
@@ -82,8 +82,8 @@ MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: of the key `load`, N/m
 
 GROWTH = 1.15  #: of neighbouring cells away from the contact
-UNIFORM = 1.5  #: half width of the evenly meshed part of the arc, in a
-CURVE = 601  #: points of exact tractions in pictures, over that part
+UNIFORM_HALF_WIDTH = 1.5  #: half width of the evenly meshed part of the arc, in a
+CURVE_POINTS = 601  #: points of exact tractions in pictures, over that part
 
 
 @cached_problem
@@ -97,7 +97,7 @@ def on_plane(params: Mapping[str, Value]) -> ContactProblem:
 
     return ContactProblem(
         bodies=of, stages=load_steps(1, 1, of.forces, of.fixed),
-        linearise=lambda bodies, _: lambda u: above_plane(
+        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
             bodies.mesh, bodies.pairs[0].slave
         ),
         results=results,
@@ -121,7 +121,7 @@ def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
     bodies = _on_plane(dict(items))[0].assembled
-    rows = above_plane(bodies.mesh, bodies.pairs[0].slave)
+    rows = rigid_plane_rows(bodies.mesh, bodies.pairs[0].slave)
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 
@@ -131,7 +131,7 @@ def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
     exact = LineContact(
         p["load"] * UNIT_LOAD, RADIUS, 1 / _compliance(MATERIAL, p["plane"])
     )
-    a = min(exact.a, RADIUS)  # as of `two_halves`
+    a = min(exact.a, RADIUS)  # as of `half_cylinders`
     shape = HalfDiscs((_half_cylinder(RADIUS, a / p["n"], a, p["halvings"]),))
     sides = shape.sides
     return ElasticBodies(
@@ -142,7 +142,7 @@ def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
     ), exact  # fmt: skip
 
 
-class Halves(NamedTuple):
+class HalfCylinders(NamedTuple):
     """Half cylinders that meet at (0, 0), and Hertz's solution."""
 
     discs: tuple[HalfDisc, ...]
@@ -193,7 +193,7 @@ def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, .
     and Q would do work on it.
     """
     p: Any = params
-    discs, sides = two_halves(p).discs, of.shape.sides
+    discs, sides = half_cylinders(p).discs, of.shape.sides
     pressing = [_pressed(discs, "upper_flat", 1.0), _pressed(discs, "lower_flat", -1.0)]
     loads = _loads(p)
     quasi_static = p["loading"] == "quasi-static"
@@ -208,7 +208,7 @@ def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, .
         at_rest = not k and _forgets_pressing(p)
         u = np.zeros_like(left.u) if at_rest else left.u
         slip = u if quasi_static else np.zeros_like(u)
-        return State(u, slip, loads[k][0] / before * left.pressed)
+        return State(u, slip, loads[k][0] / before * left.normal_forces)
 
     kept = np.append(of.fixed, _on_axis(sides, "upper_"))
     first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=kept)
@@ -221,7 +221,7 @@ def _programme(params: Mapping[str, Value], of: ElasticBodies) -> tuple[Stage, .
     )  # fmt: skip
 
 
-def two_halves(params: Mapping[str, Value]) -> Halves:
+def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
     """Divide the cylinders, n cells per a on the upper one and m on the lower.
 
     Where Hertz's a exceeds a radius, as with a body too soft for his theory, cells are
@@ -239,7 +239,7 @@ def two_halves(params: Mapping[str, Value]) -> Halves:
     a, halvings = min(exact.a, RADIUS, radius), p["halvings"]
     upper = _half_cylinder(RADIUS, a / p["n"], a, halvings).prefixed("upper_")
     lower = _half_cylinder(-radius, a / p["m"], a, halvings).prefixed("lower_")
-    return Halves((upper, lower), (MATERIAL, below), exact)
+    return HalfCylinders((upper, lower), (MATERIAL, below), exact)
 
 
 def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
@@ -249,7 +249,7 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineConta
     no symmetry is bent.
     """
     p: Any = params
-    halves = two_halves(params)
+    halves = half_cylinders(params)
     discs, exact, shape = halves.discs, halves.exact, HalfDiscs(halves.discs)
     sides, flat = shape.sides, shape.sides["lower_flat"]
     forces = [_pressed(discs, "upper_flat", 1.0)]
@@ -325,13 +325,18 @@ def _half_cylinder(centre: float, h: float, a: float, halvings: int) -> HalfDisc
     then all are halved.
     """
     radius, towards = abs(centre), -np.copysign(np.pi / 2, centre)
-    arc = halved(graded(h, UNIFORM * a, radius * np.pi / 2), halvings) / radius
+    arc = (
+        insert_midpoints(
+            graded_points(h, UNIFORM_HALF_WIDTH * a, radius * np.pi / 2), halvings
+        )
+        / radius
+    )
     angles = towards + np.concatenate([-arc[:0:-1], arc])
-    radii = radius - halved(graded(h, 0.0, radius), halvings)[:-1]
+    radii = radius - insert_midpoints(graded_points(h, 0.0, radius), halvings)[:-1]
     return HalfDisc((0.0, centre), angles, radii)
 
 
-def graded(h: float, uniform: float, total: float) -> Vector:
+def graded_points(h: float, uniform: float, total: float) -> Vector:
     """Divide [0, total]: cells of size h up to `uniform`, then growing by GROWTH.
 
     Where cells of size h reach the end, all are as long, and at most h.
@@ -345,7 +350,7 @@ def graded(h: float, uniform: float, total: float) -> Vector:
     return np.append(even, even[-1] + rest * np.cumsum(sizes) / sizes.sum())
 
 
-def halved(x: Vector, times: int) -> Vector:
+def insert_midpoints(x: Vector, times: int) -> Vector:
     """Insert the midpoints of an increasing sequence, so many times."""
     places = np.arange(x.size)
     return np.interp(np.linspace(0, x.size - 1, (x.size - 1) * 2**times + 1), places, x)
@@ -458,7 +463,7 @@ def _curve(
     Its tangent (−n_y, n_x) is along x on the upper cylinder, whose traction is −q, and
     against it on the lower one: either way the shear is −q.
     """
-    x = exact.a * np.linspace(-UNIFORM, UNIFORM, CURVE)
+    x = exact.a * np.linspace(-UNIFORM_HALF_WIDTH, UNIFORM_HALF_WIDTH, CURVE_POINTS)
     return np.column_stack([x, exact.pressure(x), -shear(x)])
 
 

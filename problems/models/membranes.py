@@ -55,7 +55,7 @@ from mortarbench.problems.feti.subdomains import (
 from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
-LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
+LOADS = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
 
 
 def membranes(form: str, params: Mapping[str, Value]) -> Case:
@@ -145,9 +145,9 @@ class Membranes:
         """Return the forces on some nodes (k,)."""
         body, within = np.divmod(node, (self.side + 1) ** 2)
         row, column = np.divmod(within, self.side + 1)
-        f = np.array([value for value, _ in LOADED])
-        heights = np.stack([shares(self.side, *y) for _, y in LOADED])
-        along = shares(self.side, 0.0, 1.0)
+        f = np.array([value for value, _ in LOADS])
+        heights = np.stack([hat_integrals(self.side, *y) for _, y in LOADS])
+        along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
     def in_subdomains(self, rows: str) -> DecomposedProblem:
@@ -242,7 +242,7 @@ def _touching(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
     return csr_array((data, pairs.ravel(), ends), shape=(len(pairs), nodes))
 
 
-def shares(n: int, lower: float, upper: float) -> Vector:
+def hat_integrals(n: int, lower: float, upper: float) -> Vector:
     """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
     begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
     rising = (end**2 - begin**2) / 2

@@ -49,7 +49,7 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
 from mortarbench.problems.duality.feti_dual import decomposition_quantities, feti_dual
 from mortarbench.problems.fem.inverse import (
@@ -73,9 +73,9 @@ from mortarbench.problems.models.membranes import membrane_class
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
-TANGENT = 0.9  #: r at which the hemisphere gives way to its tangent, m
-LIFT_OFF = 0.697965148223374  #: a, m
-SLOPE = LIFT_OFF**2 / np.sqrt(1 - LIFT_OFF**2)  #: A, m
+TANGENT_RADIUS = 0.9  #: r at which the hemisphere gives way to its tangent, m
+CONTACT_RADIUS = 0.697965148223374  #: a, m
+SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
 
 
 def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
@@ -89,7 +89,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     rows, start, in_parts = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}
     if form == "primal":
-        new = with_bounds(rows)
+        new = bound_form(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
         pieces, in_parts = own.decomposed, certifier(own, rows.P)
@@ -285,7 +285,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     return Problem(shape, x, n**dim, w, qp)
 
 
-def with_bounds(rows: QP) -> Transformed:
+def bound_form(rows: QP) -> Transformed:
     """Take out the prescribed components, and write −v ≤ −ψ as bounds v ≥ ψ."""
     free = rows.G.indices
     n, m = rows.q.size, free.size
@@ -327,16 +327,16 @@ def obstacle_height(x: Vector, shape: str) -> Vector:
     if shape == "flat":
         return np.zeros(len(x))
     r = np.linalg.norm(x, axis=1)
-    ball = np.sqrt(1 - np.minimum(r, TANGENT) ** 2)
-    return np.asarray(ball - TANGENT / ball * np.maximum(r - TANGENT, 0))
+    ball = np.sqrt(1 - np.minimum(r, TANGENT_RADIUS) ** 2)
+    return np.asarray(ball - TANGENT_RADIUS / ball * np.maximum(r - TANGENT_RADIUS, 0))
 
 
 def exact_height(x: Vector, shape: str = "flat") -> Vector:
     """Return the exact u at positions (N, dim), m."""
     if shape == "hemisphere":
         r = np.linalg.norm(x, axis=1)
-        beyond = SLOPE * np.log(2 / np.maximum(r, LIFT_OFF))
-        return np.where(r <= LIFT_OFF, obstacle_height(x, shape), beyond)
+        beyond = SLOPE * np.log(2 / np.maximum(r, CONTACT_RADIUS))
+        return np.where(r <= CONTACT_RADIUS, obstacle_height(x, shape), beyond)
     r = np.maximum(np.linalg.norm(x, axis=1), 1.0)
     if x.shape[1] == 1:
         return np.asarray((r - 1) ** 2)
@@ -358,8 +358,10 @@ def exact_energy(dim: int, shape: str = "flat") -> float:
     at, weights = leggauss(20)  # enough for all digits of what is so smooth
     rho = HALF[shape] / np.cos(np.pi / 8 * (1 + at))
     if shape == "hemisphere":
-        ball = -np.pi / 2 * (LIFT_OFF**2 + np.log(1 - LIFT_OFF**2))
-        return float(ball + np.pi * weights @ (SLOPE**2 / 2 * np.log(rho / LIFT_OFF)))
+        ball = -np.pi / 2 * (CONTACT_RADIUS**2 + np.log(1 - CONTACT_RADIUS**2))
+        return float(
+            ball + np.pi * weights @ (SLOPE**2 / 2 * np.log(rho / CONTACT_RADIUS))
+        )
     along_ray = 3 / 8 * (rho**4 - 1) - (rho**2 - 1) / 2 + (0.5 - rho**2) * np.log(rho)
     return float(np.pi * weights @ along_ray)
 
@@ -394,7 +396,7 @@ def _reported(
         "dofs": N,
         "equality_rows": held,
         "contact_rows": z.size,
-        "active": int((z > ACTIVE * z.max(initial=0.0)).sum()),
+        "active": int((z > ACTIVE_THRESHOLD * z.max(initial=0.0)).sum()),
         "energy": energy,
         "energy_error": energy / exact_energy(dim, shape) - 1,
         "obstacle_force": force,

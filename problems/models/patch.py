@@ -63,7 +63,7 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import gauss_stress
-from mortarbench.problems.ranges import SHORTEST
+from mortarbench.problems.ranges import MIN_STRETCH
 
 LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
 NAMES = ("lower", "upper")
@@ -123,7 +123,7 @@ def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
     )  # fmt: skip
 
 
-def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
+def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
     """Find the state with a given stretch, which a growing load must come to.
 
     Raises
@@ -142,9 +142,9 @@ def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
     return homogeneous(material, stretch)
 
 
-def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
+def state_under_pressure(material: Hyperelastic, pressure: float) -> Homogeneous:
     """Find the state under a nominal pressure, Pa."""
-    least = max(_softest(material), SHORTEST)
+    least = max(_softest(material), MIN_STRETCH)
     stretch = float(brentq(
         lambda stretch: homogeneous(material, stretch).nominal + pressure, least, 1.0,
         xtol=1e-15,
@@ -154,10 +154,12 @@ def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
 
 def _softest(material: Hyperelastic) -> float:
     """Return the stretch at which the pressure is largest; 0 where there is none."""
-    if homogeneous(material, SHORTEST).stiffness > 0:
+    if homogeneous(material, MIN_STRETCH).stiffness > 0:
         return 0.0
     return float(
-        brentq(lambda stretch: homogeneous(material, stretch).stiffness, SHORTEST, 1.0)
+        brentq(
+            lambda stretch: homogeneous(material, stretch).stiffness, MIN_STRETCH, 1.0
+        )
     )
 
 
@@ -191,8 +193,8 @@ def _uniform(params: Mapping[str, Any]) -> Homogeneous:
     """Find the uniform state of the upper block that its load belongs to."""
     material = hyperelastic(params["material"], Material(E_UPPER, NU))
     if params["stretch"] == 1:
-        return pressed_by(material, PRESSURE)
-    return pressed_to(material, float(params["stretch"]))
+        return state_under_pressure(material, PRESSURE)
+    return state_at_stretch(material, float(params["stretch"]))
 
 
 def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:

@@ -66,7 +66,7 @@ def own_subdomains(name, ranks):
             qp_choice("dual", case.params),
         )
         path = decomposed_path(problem, choice, ranks, reference_over_ranks)
-        return path.problem(choice.step, choice.iterate).posed.dual.subdomains
+        return path.problem(choice.step, choice.iterate).problem.dual.subdomains
     problem = parts_of(name)
     return LocalSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 

@@ -16,9 +16,9 @@ from mortarbench.harness import Case
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
@@ -151,7 +151,8 @@ def _case(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, "dual",
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
+        floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip

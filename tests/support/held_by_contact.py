@@ -19,9 +19,9 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
@@ -63,8 +63,9 @@ def disc_between_plates(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
+        floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
 

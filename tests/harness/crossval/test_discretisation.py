@@ -26,7 +26,7 @@ from mortarbench.harness.names import assemble, completed, parse
 from mortarbench.harness.plugin import as_family
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.models.hertz import halved
+from mortarbench.problems.models.hertz import insert_midpoints
 from mortarbench.problems.models.obstacle import (
     exact_energy,
     exact_height,
@@ -163,9 +163,9 @@ def test_halving_removes_the_error_of_a_whole_cylinder_with_the_rate_of_its_elem
 
 def test_halved_cells_keep_every_node():
     x = np.array([0.0, 1, 3, 7])
-    assert halved(x, 0).tolist() == x.tolist()
-    assert halved(x, 2)[::4].tolist() == x.tolist()
-    assert halved(x, 1)[1::2].tolist() == [0.5, 2, 5]
+    assert insert_midpoints(x, 0).tolist() == x.tolist()
+    assert insert_midpoints(x, 2)[::4].tolist() == x.tolist()
+    assert insert_midpoints(x, 1)[1::2].tolist() == [0.5, 2, 5]
 
 
 def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):

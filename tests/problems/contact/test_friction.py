@@ -12,11 +12,11 @@ from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
+    coulomb_fixed_point,
     forces_at_nodes,
     friction_of,
-    iterate_of,
     law_of,
-    settled,
+    select_iterate,
 )
 
 FORCE = 6.0  #: normal force without friction
@@ -38,7 +38,7 @@ def lifted(by):
 @pytest.mark.parametrize("cohesion", [0.0, 0.25])
 def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(cohesion):
     """g = c + μ(6 − g)  with μ = ½: g = (c + 3)/1.5."""
-    found = settled(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
+    found = coulomb_fixed_point(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
 
     assert found[-1].bound == pytest.approx((cohesion + 3) / 1.5, rel=1e-10)
     assert found[-1].unsettled == 0
@@ -50,14 +50,14 @@ def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(co
 
 
 def test_a_bound_of_zero_is_as_far_from_the_law_as_the_law_demands():
-    first, *others = settled(friction(0.5), lifted(0.0), step=1)
+    first, *others = coulomb_fixed_point(friction(0.5), lifted(0.0), step=1)
 
     assert first.unsettled == 3.0
     assert [float(one.bound[0]) for one in others] == [3.0]
 
 
 def test_a_law_that_asks_for_nothing_is_settled_at_once():
-    (only,) = settled(friction(0.0), lifted(1.0), step=1)
+    (only,) = coulomb_fixed_point(friction(0.0), lifted(1.0), step=1)
 
     assert (only.bound, only.unsettled) == (0, 0)
 
@@ -71,7 +71,7 @@ def test_bounds_that_go_apart_are_refused_with_the_nearest_and_the_last():
         return FORCE - one.bound
 
     with pytest.raises(InputError, match="load step 7 does not settle") as e:
-        settled(friction(1.01, 3.0), normal, step=7)
+        coulomb_fixed_point(friction(1.01, 3.0), normal, step=7)
 
     assert "\n" not in str(e.value)
     assert 31 <= len(calls) <= 33
@@ -90,7 +90,7 @@ def test_bounds_that_creep_end_at_a_thousand():
         return one.bound * (1 + 1e-3 * 0.999 ** len(calls))
 
     with pytest.raises(InputError, match="after 1000 Tresca problems"):
-        settled(friction(1.0, 1.0), normal, step=1)
+        coulomb_fixed_point(friction(1.0, 1.0), normal, step=1)
 
     assert len(calls) == 1000
 
@@ -104,20 +104,20 @@ def test_a_bound_that_holds_no_equilibrium_is_named():
     with pytest.raises(
         InputError, match=r"step 3: no equilibrium.* the 2\. bound"
     ) as e:
-        settled(friction(0.5, 1.0), normal, step=3)
+        coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
     assert str(e.value).endswith("no optimal point")
 
 
 def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
     problems = ["first", "second", "third"]
 
-    assert [iterate_of(problems, i, 1) for i in (0, 1, 2, 3)] == [
+    assert [select_iterate(problems, i, 1) for i in (0, 1, 2, 3)] == [
         "third", "first", "second", "third",
     ]  # fmt: skip
     with pytest.raises(
         PastEndError, match="iterate=4: the fixed point of step 5 has 3"
     ):
-        iterate_of(problems, 4, 5)
+        select_iterate(problems, 4, 5)
 
 
 def test_nodes_are_pressed_and_never_pulled():

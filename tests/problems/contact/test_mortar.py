@@ -258,7 +258,7 @@ def test_the_search_loses_no_overlap(seed, monkeypatch):
                  master + 0.02 * rng.standard_normal(master.shape))  # fmt: skip
     found = overlaps(s, m)
     pairs = np.divmod(np.arange(70 * 63), 63)
-    monkeypatch.setattr(module, "facing", lambda s, m: pairs)
+    monkeypatch.setattr(module, "facing_segments", lambda s, m: pairs)
 
     assert len(found.slave) > 100
     for one, other in zip(found, overlaps(s, m), strict=True):

@@ -5,7 +5,7 @@ import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import segment_search as search
-from mortarbench.problems.contact.segment_search import Reach, facing, nearest
+from mortarbench.problems.contact.segment_search import Reach, facing_segments, nearest
 from mortarbench.problems.contact.surface import surface
 
 
@@ -107,14 +107,14 @@ def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
     first = np.maximum(side(first, begins), side(first, ends)) >= 0
     second = np.minimum(side(last, begins), side(last, ends)) <= 0
 
-    assert np.array_equal(facing(slave, master), np.nonzero(first & second))
+    assert np.array_equal(facing_segments(slave, master), np.nonzero(first & second))
 
 
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_few_master_segments_face_a_slave_segment(segments):
     slave, master = surface(arc(segments), "s"), surface(bent_beam(segments), "m")
 
-    assert len(facing(slave, master)[0]) <= 6 * segments
+    assert len(facing_segments(slave, master)[0]) <= 6 * segments
 
 
 @pytest.mark.parametrize(
@@ -131,6 +131,6 @@ def test_by_default_the_larger_side_bounds_the_distance():
     small, large = surface(arc(4, 0.1), "s"), surface(arc(4, 2.0), "m")
 
     expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
-    assert Reach().within(small, large) == pytest.approx(expected)
-    assert Reach().within(large, small) == pytest.approx(expected)
-    assert Reach(distance=0.25).within(small, large) == 0.25
+    assert Reach().max_distance(small, large) == pytest.approx(expected)
+    assert Reach().max_distance(large, small) == pytest.approx(expected)
+    assert Reach(distance=0.25).max_distance(small, large) == 0.25

@@ -7,7 +7,7 @@ import pytest
 
 from mortarbench.harness import kkt_residuals
 from mortarbench.harness.mechanics import NO_FRICTION
-from mortarbench.problems.contact.bodies import floating
+from mortarbench.problems.contact.bodies import factorise_floating
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dualise
@@ -48,7 +48,7 @@ def assembled(qp):
 def test_the_solution_is_that_of_the_whole(rows, law):
     primal, friction = posed(law)
     _, torn_apart = dual_of(primal, friction, rows)
-    whole = dualise(primal, floating(BODIES), friction=friction)
+    whole = dualise(primal, factorise_floating(BODIES), friction=friction)
     s = reference_solution(assembled(torn_apart.qp))
     found, expected = (
         torn_apart.recover(s), whole.recover(reference_solution(whole.qp)),

@@ -579,7 +579,7 @@ def test_a_tangent_that_cannot_be_made_convex_ends_the_load(monkeypatch):
     def fails(cells, tangents, positive):
         raise ArithmeticError("never")
 
-    monkeypatch.setattr(newton, "convexified", fails)
+    monkeypatch.setattr(newton, "convex_tangent", fails)
     with pytest.raises(newton.NoEquilibriumError, match="never"):
         path._convex(at, np.zeros(path._places), None)
 

@@ -7,7 +7,7 @@ import pytest
 
 from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.suite.suite import load_suite
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
 from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
@@ -126,7 +126,9 @@ def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
     rows = node_to_segment(bodies.mesh.points, np.zeros(848), *bodies.pairs[0])
     primal = primal_qp(bodies, rows)
     way = dualise if transform == "dual" else dual_bounds
-    inverse = floating(bodies) if transform == "dual" else clamped(bodies)
+    inverse = (
+        factorise_floating(bodies) if transform == "dual" else factorise_clamped(bodies)
+    )
     new = way(primal, inverse)
 
     back = new.recover(SMALBE().prepare(new.qp, 1e-11)())

@@ -14,7 +14,12 @@ from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.hyperelastic import hyperelastic
-from mortarbench.problems.models.patch import E_UPPER, NU, homogeneous, pressed_by
+from mortarbench.problems.models.patch import (
+    E_UPPER,
+    NU,
+    homogeneous,
+    state_under_pressure,
+)
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.adapters.osqp_ import OSQP
 from mortarbench.solvers.adapters.piqp_ import PIQP
@@ -81,7 +86,7 @@ def test_so_are_those_of_st_venant_and_kirchhoff(stretch):
 
 def test_the_pressure_of_the_family_is_a_nominal_stress():
     got = quantities("contact-patch", stretch=1.0)
-    exact = pressed_by(hyperelastic("neo-hooke", Material(E_UPPER, NU)), 1e6)
+    exact = state_under_pressure(hyperelastic("neo-hooke", Material(E_UPPER, NU)), 1e6)
 
     assert got["nominal_stress"] == pytest.approx(-1e6, rel=1e-9)
     assert got["stretches"] == pytest.approx([exact.lateral, exact.stretch], abs=1e-9)

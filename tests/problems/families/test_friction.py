@@ -10,7 +10,7 @@ from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.balance import check_balance
-from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped
+from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise_clamped
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import (
@@ -330,8 +330,8 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
     path = load_path(
-        bodies, lambda u: rows, lambda: clamped(bodies), reference_solution, 1,
-        laws=laws,
+        bodies, lambda u: rows, lambda: factorise_clamped(bodies),
+        reference_solution, 1, laws=laws,
     )  # fmt: skip
 
     told = r"step 1 does not settle: after 3. Tresca problems .* is [789]\.\de-01, and"

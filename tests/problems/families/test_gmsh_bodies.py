@@ -12,11 +12,11 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.bodies import assembled
+from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
 from mortarbench.problems.models.beam_ring import model
-from mortarbench.problems.models.description import described_bodies
+from mortarbench.problems.models.description import read_bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
@@ -134,7 +134,7 @@ def build(text):
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, flip):
     described(writer(POINTS, *parts(flip)))
-    ours = assembled(described_bodies(Path("a.toml"), "strain"))
+    ours = assemble_stiffness(read_bodies(Path("a.toml"), "strain"))
 
     assert ours.names == ("beam", "ring")
     np.testing.assert_array_equal(ours.mesh.points, RING.mesh.points)
@@ -268,7 +268,7 @@ def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
     lengths = nodal_lengths(RING.mesh.points[top])
     for load, total in (("traction = [3e6, -5e6]", 2.0), ("force = [6e6, -1e7]", 2.0)):
         described(toml=TOML.replace(point, f'boundary = "top"\n{load}'))
-        bodies = described_bodies(Path("a.toml"), "strain")
+        bodies = read_bodies(Path("a.toml"), "strain")
         f = bodies.f.reshape(-1, 2) * 1e8
 
         assert lengths.sum() == pytest.approx(total)
@@ -278,7 +278,7 @@ def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
 
 def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
     described(toml=TOML.replace("units = { length = 2.0, force = 1e8 }\n", ""))
-    bodies = described_bodies(Path("a.toml"), "strain")
+    bodies = read_bodies(Path("a.toml"), "strain")
 
     assert bodies.length == pytest.approx(2.0)
     assert bodies.force == 1e8
@@ -505,7 +505,7 @@ def test_nodes_of_no_cell_are_left_out(described):
     shift = {k: v + 1 for k, v in quads.items()}, {k: v + 1 for k, v in curves.items()}
     more = np.vstack([[[1.0, 0.0, 0.0]], POINTS])  # the centre of the ring
     described(msh22(more, *shift, {"corner": np.array([[CORNER + 1]])}))
-    bodies = described_bodies(Path("a.toml"), "strain")
+    bodies = read_bodies(Path("a.toml"), "strain")
 
     np.testing.assert_array_equal(bodies.mesh.points, RING.mesh.points)
     np.testing.assert_array_equal(bodies.f, RING.f)
@@ -877,7 +877,7 @@ def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described
         with pytest.raises(
             InputError, match=f"{what}; three dimensions are not supported yet"
         ):
-            described_bodies(Path("a.toml"), "strain")
+            read_bodies(Path("a.toml"), "strain")
 
 
 def test_contact_forces_of_several_pairs_are_told_pair_by_pair(tmp_path):

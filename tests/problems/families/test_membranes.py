@@ -11,7 +11,7 @@ from mortarbench.harness import InputError, Solution, Status, kkt_residuals
 from mortarbench.harness.files.matfile import read_mat, save_mat
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.laplacian import grid_stiffness
-from mortarbench.problems.models.membranes import shares
+from mortarbench.problems.models.membranes import hat_integrals
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -69,7 +69,7 @@ def test_the_stiffness_is_exact_for_what_the_elements_hold():
 def test_the_load_integrates_polynomials_of_the_first_degree(n):
     """Also where the edge of the strip is inside of a cell."""
     y = np.linspace(0, 1, n + 1)
-    share = shares(n, 0.75, 1.0)
+    share = hat_integrals(n, 0.75, 1.0)
 
     assert share.sum() == pytest.approx(0.25)
     assert share @ y == pytest.approx((1 - 0.75**2) / 2)

@@ -6,7 +6,7 @@ import pytest
 from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.problems.families.obstacle import Obstacle
 from mortarbench.problems.models.obstacle import (
-    LIFT_OFF,
+    CONTACT_RADIUS,
     exact_energy,
     exact_height,
     obstacle_height,
@@ -147,10 +147,10 @@ def test_over_the_hemisphere_the_exact_height_is_harmonic_and_leaves_it_smoothly
     ) / h**2  # fmt: skip
     r = np.linalg.norm(x, axis=1)
     lift = exact_height(x, "hemisphere") - obstacle_height(x, "hemisphere")
-    near = abs(r - LIFT_OFF) < 0.02
+    near = abs(r - CONTACT_RADIUS) < 0.02
 
-    assert laplacian[r > LIFT_OFF + h] == pytest.approx(0, abs=1e-5)
-    assert (laplacian[r < LIFT_OFF - h] < -1).all()
+    assert laplacian[r > CONTACT_RADIUS + h] == pytest.approx(0, abs=1e-5)
+    assert (laplacian[r < CONTACT_RADIUS - h] < -1).all()
     assert (lift >= 0).all()
     assert lift[near].max() <= 3 * 0.02**2
     assert exact_height(np.array([[2.0, 0.0]]), "hemisphere") == pytest.approx(0)

@@ -13,8 +13,8 @@ from mortarbench.problems.fem.finite_strain import (
     assemble,
     cauchy_stress,
     cells_of,
-    clip,
-    convexified,
+    clip_eigenvalues,
+    convex_tangent,
     deformation_gradients,
     evaluate,
     strain_energy,
@@ -272,14 +272,16 @@ def test_clipping_leaves_convex_matrices_and_raises_negative_eigenvalues():
     ])  # fmt: skip
     symmetric = (Q * spectra[:, None, :]) @ np.swapaxes(Q, 1, 2)
 
-    clipped, changed = clip((symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    clipped, changed = clip_eigenvalues((symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
 
     assert changed == 2
     found = np.linalg.eigvalsh(clipped)
     assert np.allclose(found, np.sort(np.maximum(spectra, 0)), atol=1e-5)
     assert found.min() > -1e-14
     assert (clipped == np.swapaxes(clipped, 1, 2)).all()
-    in_other_units, _ = clip(1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    in_other_units, _ = clip_eigenvalues(
+        1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2
+    )
     assert np.abs(in_other_units / 1e6 - clipped).max() < 1e-13
 
 
@@ -300,7 +302,7 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     for stretch in (0.9, 1.1):
         u = (mesh.points * [stretch - 1, 0]).ravel()
         tangents = evaluate(c, u).tangents
-        K, changed[stretch] = convexified(c, tangents, positive)
+        K, changed[stretch] = convex_tangent(c, tangents, positive)
         exact[stretch] = abs(K - assemble(c, tangents)).max() == 0
         assert positive(K)
 
@@ -314,7 +316,7 @@ def test_convex_cells_stay_what_they_are_triangles_too():
     tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
     asked = iter([False, True])
 
-    K, changed = convexified(c, tangents, lambda K: next(asked))
+    K, changed = convex_tangent(c, tangents, lambda K: next(asked))
 
     assert changed == 0
     assert abs(K - assemble(c, tangents)).max() < 1e-14
@@ -326,4 +328,4 @@ def test_a_body_that_nothing_holds_is_refused():
     tangents = evaluate(c, np.zeros(mesh.dofs)).tangents
 
     with pytest.raises(ArithmeticError, match="expected supports that hold every body"):
-        convexified(c, tangents, lambda K: False)
+        convex_tangent(c, tangents, lambda K: False)

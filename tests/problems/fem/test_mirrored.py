@@ -7,7 +7,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import diags_array
 
-from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped, floating
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    assemble,
+    factorise_clamped,
+    factorise_floating,
+)
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
@@ -57,8 +62,8 @@ def sign(bodies):
 @cache
 def load_path(bodies, contact, basis, relin=1):
     return monolithic_path(
-        bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
-        reference_solution, STEPS, relin,
+        bodies, linearisation(bodies, contact, basis),
+        lambda: factorise_clamped(bodies), reference_solution, STEPS, relin,
     )  # fmt: skip
 
 
@@ -67,8 +72,9 @@ def results(bodies, contact, basis, form):
     """Solve the QP of the last step in `form`: u in m, and what it means in SI."""
     primal = load_path(bodies, contact, basis).primal(STEPS)
     case = contact_case(
-        bodies, primal, form, floating=lambda: floating(bodies),
-        clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
+        bodies, primal, form, floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_clamped(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
     s = SMALBE().prepare(case.qp, 1e-12)()

@@ -20,8 +20,8 @@ from mortarbench.problems.fem.mesh import (
     boundary_facets,
     dofs_of,
     half_ring,
+    is_triangle,
     rectangle,
-    triangular,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover
 from mortarbench.problems.models.patch import PRESSURE, model
@@ -42,7 +42,7 @@ def test_the_stiffness_is_that_of_linear_triangles_of_another_code(quads):
     expected = linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(other)
     K = stiffness(mesh, elasticity_matrix(STEEL, "strain"))
 
-    assert triangular(mesh.cells).all()
+    assert is_triangle(mesh.cells).all()
     assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
     assert abs(K @ rigid_modes(mesh.points)).max() <= 1e-12 * abs(K).max()
 
