@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
     from mortarbench.harness.mechanics import CellBlock, Mechanics
     from mortarbench.harness.qp import QP, Vector
     from mortarbench.harness.solution import Solution
@@ -260,7 +260,7 @@ class Family(ABC):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
+    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
         """Say how ranks make their shares of what `build` would emit, complete params.
 
         All ranks call what is returned, with a reference that solves shares of a QP on

@@ -148,18 +148,18 @@ class Ranks:
             table.update(dict.fromkeys(table, 0))
 
 
-def alone() -> Ranks:
+def single_process() -> Ranks:
     """Return the ranks of a single process, which needs no MPI."""
-    return Ranks(cast("Comm", _Alone()))
+    return Ranks(cast("Comm", _SingleProcess()))
 
 
-class _Alone:
+class _SingleProcess:
     """The communicator of a single process: there is nobody else to hear from."""
 
     size = 1
     rank = 0
 
-    def Dup(self) -> _Alone:
+    def Dup(self) -> _SingleProcess:
         """Return a communicator of the same process."""
         return self
 
@@ -237,7 +237,7 @@ class DistributedVector(np.ndarray):
         if method == "__call__":
             if "out" in how:
                 how["out"] = tuple(_slice(out) for out in how["out"])
-            return _again(self.ranks, getattr(ufunc, method)(*plain, **how))
+            return _rewrap(self.ranks, getattr(ufunc, method)(*plain, **how))
         if method == "reduce" and ufunc in _REDUCTIONS:
             return _REDUCTIONS[ufunc](self.ranks, ufunc.reduce(*plain, **how))
         raise TypeError(f"{ufunc.__name__}.{method} of a distributed vector")
@@ -251,7 +251,7 @@ class DistributedVector(np.ndarray):
         if function is np.count_nonzero:
             return int(self.ranks.total(np.array([np.count_nonzero(plain[0])]))[0])
         if function in _COMPONENTWISE:
-            return _again(self.ranks, function(*plain, **kwargs))
+            return _rewrap(self.ranks, function(*plain, **kwargs))
         raise TypeError(f"{function.__name__} of a distributed vector")
 
 
@@ -266,9 +266,9 @@ def _slice(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, DistributedVector) else value
 
 
-def _again(ranks: Ranks, found: Any) -> Any:
+def _rewrap(ranks: Ranks, found: Any) -> Any:
     if isinstance(found, tuple):
-        return tuple(_again(ranks, f) for f in found)
+        return tuple(_rewrap(ranks, f) for f in found)
     return distributed(found, ranks) if np.ndim(found) == 1 else found
 
 
@@ -340,11 +340,11 @@ class Share(NamedTuple):
     whole: Callable[[Solution], Solution | None]
 
 
-#: begins the digest of a QP that no process has whole: `Emitted.digest`
-EMITTED = "emitted-"
+#: begins the digest of a QP that no process has whole: `DistributedQP.digest`
+DISTRIBUTED_DIGEST = "emitted-"
 
 
-class Answered(NamedTuple):
+class Evaluation(NamedTuple):
     """What ranks make of a solution together; all of them call what they call."""
 
     #: what `harness.verify.over_ranks` takes to certify it; None: that needs the whole
@@ -353,7 +353,7 @@ class Answered(NamedTuple):
     quantities: Callable[[], Mapping[str, Any]] | None
 
 
-class Emitted(NamedTuple):
+class DistributedQP(NamedTuple):
     """A QP that ranks have made together, each its share; no process has it whole."""
 
     variables: int  #: of the whole
@@ -363,10 +363,10 @@ class Emitted(NamedTuple):
     share: Callable[[], Share]
     #: names the numbers of the QP; called by all ranks. Not as
     #: `harness.files.qpfile.qp_digest`, which takes the whole, and therefore marked by
-    #: `EMITTED`
+    #: `DISTRIBUTED_DIGEST`
     digest: Callable[[], str]
     #: of this rank's slice of a solution, what it means; called by all ranks
-    answer: Callable[[Solution], Answered]
+    answer: Callable[[Solution], Evaluation]
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -378,7 +378,7 @@ class Emitted(NamedTuple):
 
 
 #: has all ranks emit a case, family, params and form, where its family can
-Emit = Callable[[Mapping[str, Any], Ranks], Emitted]
+Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 
 
 @runtime_checkable

@@ -46,8 +46,8 @@ from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import (
     Distributable,
+    DistributedQP,
     Emit,
-    Emitted,
     Ranks,
     Share,
 )
@@ -212,7 +212,7 @@ def follow(
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
-    emitted: Emitted | None = None
+    emitted: DistributedQP | None = None
     solution: Solution | None = None
     while (order := _next_order(ranks)) is not None:
         try:
@@ -289,7 +289,7 @@ class OnRanks:
         self._solver = self.__wrapped__ = solver  # its file is that of failures
         self._ranks = ranks
         self._emit = emit
-        self._emitted: Emitted | None = None
+        self._emitted: DistributedQP | None = None
         self._unemitted: Exception | None = None
         self._copies = copies
         self._path = Path()
@@ -404,7 +404,7 @@ class OnRanks:
 
 def _emitted(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
-) -> tuple[Emitted, dict[str, Any]]:
+) -> tuple[DistributedQP, dict[str, Any]]:
     """Emit on all ranks, and tell of it what `OnRanks.shares` does.
 
     Raises

@@ -14,7 +14,11 @@ import numpy as np
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.failures import agreed
-from mortarbench.harness.distributed.vectors import DistributedColumns, Emitted, Ranks
+from mortarbench.harness.distributed.vectors import (
+    DistributedColumns,
+    DistributedQP,
+    Ranks,
+)
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
 from mortarbench.harness.qp import QP, no_rows
@@ -172,7 +176,9 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     return told
 
 
-def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str, Any]:
+def evaluated_by_ranks(
+    emitted: DistributedQP, s: Solution, ranks: Ranks
+) -> dict[str, Any]:
     """Evaluate an answer on all ranks together; each has its slice of the solution.
 
     By a share of its own, without what the solver has made of the first one. All ranks
@@ -215,7 +221,7 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
 
 
 def _values_by_ranks(
-    emitted: Emitted, s: Solution, ranks: Ranks
+    emitted: DistributedQP, s: Solution, ranks: Ranks
 ) -> dict[str, float] | None:
     """Evaluate objective and residuals; None where they are not finite.
 

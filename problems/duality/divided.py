@@ -24,7 +24,7 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.vectors import Emitted, Ranks
+from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
@@ -137,7 +137,7 @@ def layout_of(bodies: ElasticBodies, size: int) -> Subdivision:
 
 def emitted_by(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
-) -> Emitted:
+) -> DistributedQP:
     """Emit this rank's share of the dual that is chosen; called by all ranks.
 
     Raises

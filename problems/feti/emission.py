@@ -22,10 +22,10 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from mortarbench.harness import QP, InputError, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.vectors import (
-    EMITTED,
+    DISTRIBUTED_DIGEST,
     DistributedColumns,
+    DistributedQP,
     DistributedVector,
-    Emitted,
     Ranks,
     Share,
     distributed,
@@ -147,7 +147,7 @@ def emitted(
     results: Results | None,
     first: OwnDual | None = None,
     others: int = 0,
-) -> Emitted:
+) -> DistributedQP:
     """Describe this rank's share of the dual; called by all ranks.
 
     The digest of a problem that others come before is that of the first of these, with
@@ -165,10 +165,10 @@ def emitted(
 
     def digest() -> str:
         names = others * [_digest(first.own)] if first else [_digest(own)]
-        return EMITTED + hex_digest(map(str.encode, names), 16)
+        return DISTRIBUTED_DIGEST + hex_digest(map(str.encode, names), 16)
 
     limits = dual.bounds(own.problem.contact.bound)
-    return Emitted(
+    return DistributedQP(
         variables=own.rows.total, equality_rows=own.coarse,
         bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in limits),
         share=dual.share, digest=digest,

@@ -14,7 +14,7 @@ from scipy.linalg import block_diag, null_space
 from scipy.sparse import csc_array, csr_array, hstack
 
 from mortarbench.harness import Solution, Vector
-from mortarbench.harness.distributed.vectors import Answered
+from mortarbench.harness.distributed.vectors import Evaluation
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
     Contact,
@@ -102,7 +102,7 @@ def answers(
     halo: Halo,
     torn: Mapping[str, Any],
     reported: Results | None,
-) -> Callable[[Solution], Answered]:
+) -> Callable[[Solution], Evaluation]:
     """Make what says what an answer means, on each rank for its own.
 
     Parameters
@@ -113,14 +113,14 @@ def answers(
     """
     problem = own.problem
 
-    def answer(s: Solution) -> Answered:
+    def answer(s: Solution) -> Evaluation:
         found, results = own_solution(own, halo, s), None
         if reported is not None:
 
             def results() -> Mapping[str, Any]:
                 return {**reported(found), **torn}
 
-        return Answered((found.bodies, found.u, found.z[_carrying(problem)]), results)
+        return Evaluation((found.bodies, found.u, found.z[_carrying(problem)]), results)
 
     return answer
 

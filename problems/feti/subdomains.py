@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import Ranks, alone
+from mortarbench.harness.distributed.vectors import Ranks, single_process
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import balanced
 from mortarbench.problems.feti.subdivision import (
@@ -573,4 +573,4 @@ def _equalities(problem: ProblemInParts) -> int:
 def on_one_process(problem: ProblemInParts) -> OwnSubdomains:
     """Hold all subdomains on a single process."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
-    return OwnSubdomains(problem, alone(), every)
+    return OwnSubdomains(problem, single_process(), every)

@@ -11,8 +11,8 @@ from mortarbench.harness.distributed import vectors
 from mortarbench.harness.distributed.vectors import (
     PARTS,
     DistributedColumns,
+    DistributedQP,
     DistributedVector,
-    Emitted,
     Ranks,
     distributed,
 )
@@ -217,7 +217,7 @@ def test_what_is_neither_by_components_nor_a_reduction_is_refused():
 
 
 def test_sizes_of_an_emitted_qp_are_those_of_the_whole():
-    emitted = Emitted(
+    emitted = DistributedQP(
         variables=7, equality_rows=3, bounds=2, share=None, digest=None, answer=None
     )
     assert emitted.sizes == {

@@ -11,9 +11,9 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Case, Solution, Status, Verdict
 from mortarbench.harness.distributed.vectors import (
-    Answered,
     DistributedColumns,
-    Emitted,
+    DistributedQP,
+    Evaluation,
     Ranks,
     Share,
     distributed,
@@ -191,7 +191,7 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
         assert (fields, note) == ({}, "no energy_bound: no admissible pair")
 
 
-class Alone:
+class SerialComm:
     """A communicator of one process."""
 
     size, rank = 1, 0
@@ -209,7 +209,7 @@ class Alone:
 
 def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
     """Evaluate a point of the QP above, with the bound ¼ in place of the row."""
-    ranks = Ranks(Alone())
+    ranks = Ranks(SerialComm())
 
     def slices(v):
         return distributed(np.array(v, dtype=float), ranks)
@@ -222,8 +222,8 @@ def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
         )  # fmt: skip
         return Share(qp, lambda s: s)
 
-    answered = Answered(certifiable, quantities)
-    emitted = Emitted(2, 1, 3, share, lambda: "", lambda s: answered)
+    answered = Evaluation(certifiable, quantities)
+    emitted = DistributedQP(2, 1, 3, share, lambda: "", lambda s: answered)
     s = replace(POINT, x=slices(x), z=QP_.h[:0], z_box=slices([0.5, 0]))
     return evaluated_by_ranks(emitted, s, ranks)
 
