@@ -191,7 +191,7 @@ class Record(Measurement):
         """True if the solver claims a solution, or rightly that there is none."""
         return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
-    def but(self, **changes: Any) -> Self:
+    def replace(self, **changes: Any) -> Self:
         """Copy with some fields changed."""
         return replace(self, **changes)
 

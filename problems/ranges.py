@@ -35,7 +35,7 @@ class Key:
     values: tuple[Value, ...] = ()  #: all that it may have; empty: no such list
     is_size: bool = False  #: positive, and of a usual size in SI units
 
-    def but(self, default: Value) -> Key:
+    def replace(self, default: Value) -> Key:
         """Return the same key with another default."""
         return replace(self, default=default)
 

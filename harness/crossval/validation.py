@@ -287,7 +287,7 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 def _apart(r: Record) -> Record:
     """Call a solver that drove a sequence by another name than one that began cold."""
-    return r if r.mode == "cold" else r.but(solver=f"{r.solver} ({r.mode})")
+    return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
 
 
 def _listed(r: Record, text: str) -> Listed:

@@ -102,7 +102,7 @@ def judged(
     prove : finds the optimum of `qp` where residuals cannot decide
     found : residuals and objective, where ranks have evaluated them together
     """
-    record = record.but(
+    record = record.replace(
         sizes=qp.sizes,
         claimed=s.status.value,
         message=s.message,
@@ -111,7 +111,7 @@ def judged(
         reported=s.reported,
     )
     if s.status is Status.DECLINED:
-        return record.but(verdict=Verdict.DECLINED)
+        return record.replace(verdict=Verdict.DECLINED)
     if found is not None:
         residuals = Residuals(*(found[name] for name in Residuals._fields))
         objective = found["objective"]
@@ -132,7 +132,7 @@ def judged(
     if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
     decided_by = "residuals" if error is None else "reference"
-    return record.but(
+    return record.replace(
         verdict=verdict(
             s.status, residuals, tol, error=error, infeasible=margin is not None
         ),
@@ -273,7 +273,7 @@ def note_of(what: str, e: Exception) -> str:
 
 def noted(record: Record, *notes: str) -> Record:
     """Add notes to the message of a record."""
-    return record.but(message="; ".join(filter(None, [record.message, *notes])))
+    return record.replace(message="; ".join(filter(None, [record.message, *notes])))
 
 
 def plain(data: Any) -> Any:

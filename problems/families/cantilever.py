@@ -28,7 +28,7 @@ class Cantilever(DeclaredFamily):
         ny=key(10, 1),
         nu=key(0.3),
         material=KINEMATICS["material"],
-        steps=STEPS.but(1),
+        steps=STEPS.replace(1),
         step=key(0, 1),
         newton=KINEMATICS["newton"],
     )

@@ -61,8 +61,8 @@ class HertzCylinder(ContactFamily):
         load=size(1.0),
         radius=size(1.0),
         ratio=size(1.0),
-        slave=choice("lower", "upper").but("upper"),
-        contact=METHODS["contact"].but("mortar"),
+        slave=choice("lower", "upper").replace("upper"),
+        contact=METHODS["contact"].replace("mortar"),
         basis=METHODS["basis"],
         **PLANES,
         halvings=HALVINGS,
@@ -70,7 +70,7 @@ class HertzCylinder(ContactFamily):
         Q=key(0.0),
         peak=key(0.0),
         programme=choice("normal-first", "proportional"),
-        steps=STEPS.but(20),
+        steps=STEPS.replace(20),
         **DECOMPOSITION,
     )
     forms = ("primal", "dual")

@@ -25,7 +25,7 @@ class Obstacle(DeclaredFamily):
 
     name = "obstacle"
     keys = declared(
-        dim=choice(1, 2).but(2),
+        dim=choice(1, 2).replace(2),
         n=key(20, 2),
         shape=choice("flat", "hemisphere"),
         **DECOMPOSITION,

@@ -34,9 +34,9 @@ class ContactPatch(ContactFamily):
     keys = declared(
         lower=key(6, 1),
         upper=key(4, 1),
-        slave=choice("lower", "upper").but("upper"),
+        slave=choice("lower", "upper").replace("upper"),
         ratio=size(1.0),
-        contact=METHODS["contact"].but("mortar"),
+        contact=METHODS["contact"].replace("mortar"),
         basis=METHODS["basis"],
         **PLANES,
         **FRICTION,

@@ -35,7 +35,7 @@ class Plate(DeclaredFamily):
         height=key(0.0),
         pattern=choice("uniform", "checkerboard", "column"),
         jump=size(1.0),
-        load=choice("point", "edge", "nodal").but("edge"),
+        load=choice("point", "edge", "nodal").replace("edge"),
         **PLANES,
         supports=choice("rows", "eliminated"),
         **GLUES,

@@ -59,13 +59,13 @@ def write(folder, answers, tol=1e-8):
         for label, text, answer in answers:
             record = record_of(text, label, tol)
             if isinstance(answer, Verdict):
-                journal.append(record.but(verdict=answer, message="as it ended"))
+                journal.append(record.replace(verdict=answer, message="as it ended"))
                 continue
             case = cases.setdefault(text, built(text))
-            record = record.but(qp=qp_digest(case.qp, serialised=True))
+            record = record.replace(qp=qp_digest(case.qp, serialised=True))
             record = judged(record, case.qp, answer)
             if np.isfinite(answer.x).all():
-                record = record.but(vectors=save_solution(folder, answer))
+                record = record.replace(vectors=save_solution(folder, answer))
             journal.append(record)
     return folder
 
@@ -270,7 +270,7 @@ class Dense:
 
 
 def given(case, label, s, tol=1e-8):
-    record = record_of(f"{BEAM}/primal", label, tol).but(claimed=s.status.value)
+    record = record_of(f"{BEAM}/primal", label, tol).replace(claimed=s.status.value)
     return Given(record=record, label=label, repeats=1, case=case, solution=s)
 
 
@@ -310,7 +310,7 @@ def test_a_certificate_that_the_reference_contradicts_is_our_fault(
         for path in (tmp_path / "journal").iterdir():
             path.unlink()
         with Journal(tmp_path, "here") as journal:
-            journal.append(record.but(energy_bound=bound))
+            journal.append(record.replace(energy_bound=bound))
 
         found, verdict = verdict_on(cli, tmp_path)
 
@@ -578,8 +578,8 @@ def test_cases_that_cannot_be_built_as_they_were_are_listed(truths, tmp_path, cl
     with Journal(tmp_path, "here") as journal:
         for r in read_journal(tmp_path):
             if r.family == "beam-ring":
-                other = r.but(solver="other", run_id="other", qp="0" * 16)
-                journal.append(other.but(case=f"{BEAM}/step=1/dual-bounds",
+                other = r.replace(solver="other", run_id="other", qp="0" * 16)
+                journal.append(other.replace(case=f"{BEAM}/step=1/dual-bounds",
                                          params={**r.params, "step": 1}))  # fmt: skip
 
     code, verdict = verdict_on(cli, tmp_path)
@@ -720,8 +720,10 @@ def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
     exact = reference_solution(built(text).qp)
     folder = write(tmp_path / "out", [("exact", text, exact)])
     with Journal(folder, "there") as journal:
-        old = record_of(text, "old").but(params={"size": 3}, case="obstacle/size=3/x")
-        journal.append(old.but(verdict=Verdict.FAILED))
+        old = record_of(text, "old").replace(
+            params={"size": 3}, case="obstacle/size=3/x"
+        )
+        journal.append(old.replace(verdict=Verdict.FAILED))
 
     assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
         "obstacle/dim=1/n=12"
