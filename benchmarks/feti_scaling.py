@@ -80,7 +80,7 @@ def one(way, Nr, cells):
     back = dual.recover(s)
     lap()
     mechanics = Mechanics(
-        primal=primal, back=dual.recover, factorise=lambda: clamped(bodies),
+        primal=primal, to_primal=dual.recover, factorise=lambda: clamped(bodies),
         in_parts=in_parts,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip

@@ -277,7 +277,7 @@ class Mechanics:
     #: P = K, q = −f, A has one unit entry per prescribed component, b = 0, G = B, h = c
     primal: QP
     #: of the emitted QP → x = u, y of the supports, z of contact and friction rows
-    back: Callable[[Solution], Solution]
+    to_primal: Callable[[Solution], Solution]
     factorise: Callable[[], Inverse]  #: called once, if at all
     mesh_size: float  #: of the contact side, in the lengths of `primal`
     #: rigid motions of single bodies (n, r), supports or not: to balance forces with
@@ -304,7 +304,7 @@ class Mechanics:
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:
-        """Return λ (m,) of `rows` from a solution that `back` gives."""
+        """Return λ (m,) of `rows` from a solution that `to_primal` gives."""
         contact = self.primal.h.size
         return np.append(s.z[:contact], s.z[contact:][self.friction.bound > 0])
 
@@ -375,16 +375,16 @@ class Mechanics:
             largest=_largest(felt), KR=KR,
         )  # fmt: skip
 
-    def still(self, v: Extended) -> Extended:
+    def without_rigid_motion(self, v: Extended) -> Extended:
         """Take the rigid motions out of `v` (n,):  v − R Rᵀv."""
         if not self.kernel.shape[1]:  # sparse matrices take long over nothing
             return v
         return np.asarray(v - self.kernel @ (self.kernel.T @ v))
 
-    def relaxed(self, force: Extended) -> Extended:
+    def apply_inverse(self, force: Extended) -> Extended:
         """Apply  P K⁺P,  P = I − RRᵀ,  to a force (n,)."""
-        bent = self.inverse(self.still(force).astype(np.float64))
-        return self.still(bent.astype(Real))
+        bent = self.inverse(self.without_rigid_motion(force).astype(np.float64))
+        return self.without_rigid_motion(bent.astype(Real))
 
     def norm(self, v: Extended) -> float:
         """Return the energy norm ‖v‖_K; a seminorm where bodies can move rigidly.
@@ -392,7 +392,7 @@ class Mechanics:
         There, the motion is taken out first: KR = 0 but for the rounding of K, which a
         motion that is large beside the deformation would show.
         """
-        v = self.still(v)
+        v = self.without_rigid_motion(v)
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 

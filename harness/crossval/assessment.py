@@ -68,7 +68,7 @@ def energy_allowed(tol: float) -> float:
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
 ) -> tuple[Assessment, Deviation]:
-    """Measure `s`, a finite point as ``mechanics.back`` gives it, against the solution.
+    """Measure `s`, a finite point from ``mechanics.to_primal``, against the solution.
 
     Where that is zero, against what the load would do without contact.
     """

@@ -82,7 +82,7 @@ def ground_truth_of(
 
     def assessed(g: Given) -> tuple[Assessment, Deviation]:
         assert g.case.mechanics is not None
-        at = g.case.mechanics.back(g.solution)
+        at = g.case.mechanics.to_primal(g.solution)
         return assess(mechanics, point, at, g.record.asked_tol)
 
     exact = mechanics.exact
@@ -115,7 +115,9 @@ def _best_certified(
     for g in given:
         try:
             assert g.case.mechanics is not None
-            found.append((certify(mechanics, g.case.mechanics.back(g.solution)), g))
+            found.append(
+                (certify(mechanics, g.case.mechanics.to_primal(g.solution)), g)
+            )
         except UncertifiableError:
             continue
     if not found:

@@ -309,7 +309,9 @@ def _suspects(problem: Problem, given: Sequence[Given]) -> dict[str, Vector]:
     """Return the multipliers of refuted answers by run_id."""
     refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
     return {
-        g.record.run_id: g.case.mechanics.multipliers(g.case.mechanics.back(g.solution))
+        g.record.run_id: g.case.mechanics.multipliers(
+            g.case.mechanics.to_primal(g.solution)
+        )
         for g in given
         if g.record.run_id in refuted and g.case.mechanics is not None
     }

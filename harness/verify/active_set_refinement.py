@@ -41,8 +41,8 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
     for _ in range(3):
         r = force - K @ u
         r[held] = 0
-        r = mechanics.still(r)
-        step = mechanics.relaxed(r)
+        r = mechanics.without_rigid_motion(r)
+        step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
     return u - step, left

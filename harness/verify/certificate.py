@@ -78,7 +78,7 @@ from mortarbench.harness.verify.substructured import (
     Undivided,
     length,
     neighbour,
-    still,
+    without_rigid_motion,
 )
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
@@ -161,7 +161,7 @@ class Certificate:
 
 @np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
-    """Bound the error of `s`, as ``mechanics.back`` gives it.
+    """Bound the error of `s`, as ``mechanics.to_primal`` gives it.
 
     The pair is the answer's own, mended as little as possible. Where most of g is work,
     as with an interior point, whose multipliers and gaps are all positive, a pair with
@@ -316,7 +316,7 @@ def proven(
     work = float(works.sum())
     at_u = split.residual(u)
     near = neighbour(split, at_u.rho + split.pulled(lam))
-    drift = still(split, claimed - u)
+    drift = without_rigid_motion(split, claimed - u)
     moved = split.spread(drift)
     K_moved = split.product(moved)
     u_u, u_d, d_d, moved_moved, moved_d = split.total(*(

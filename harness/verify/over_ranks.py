@@ -63,7 +63,7 @@ from mortarbench.harness.verify.substructured import (
     length,
     sample,
     scaled_rows,
-    still,
+    without_rigid_motion,
 )
 
 
@@ -437,7 +437,7 @@ class _OnRanks:
         return np.asarray(self.rigid.all @ alpha)
 
     def residual(self, u: Extended) -> Residual:
-        deformed = still(self, u)
+        deformed = without_rigid_motion(self, u)
         v = self.spread(deformed)
         Kv = self.product(v)
         rho = self.joined(Kv - self._own.f)

@@ -150,7 +150,7 @@ class Neighbour(NamedTuple):
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
-def still(split: Split, v: Extended) -> Extended:
+def without_rigid_motion(split: Split, v: Extended) -> Extended:
     """Take the rigid motions out of v (n,)."""
     alpha = split.along(v)
     return v - split.motion(alpha) if alpha.size else v
@@ -181,7 +181,7 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
 
 def length(split: Split, force: Extended) -> float:
     """Return the dual norm of forces (n,), by d of what balances of them."""
-    d = split.solve(still(split, force)).astype(Real)
+    d = split.solve(without_rigid_motion(split, force)).astype(Real)
     square = split.total(float(d @ split.product(d)))[0]
     return float(np.sqrt(max(square, 0.0)))
 
@@ -292,18 +292,18 @@ class Undivided(_Stored):
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
         K = csc_array(self.mechanics.primal.P)
-        v = self.mechanics.still(v)
+        v = self.mechanics.without_rigid_motion(v)
         Kv = times_columns(K.data, K.indices, K.indptr, v, v.size)
-        return self.mechanics.still(Kv)
+        return self.mechanics.without_rigid_motion(Kv)
 
     def solve(self, rho: Extended) -> Vector:
         """Return K⁺ρ."""
-        return np.asarray(self.mechanics.relaxed(rho), dtype=np.float64)
+        return np.asarray(self.mechanics.apply_inverse(rho), dtype=np.float64)
 
     def noise(self, u: Extended) -> Extended:
         """Return a sample of the rounding of Ku without rigid motion."""
         K = csc_array(self.mechanics.primal.P).power(2)
-        deformed = still(self, u)
+        deformed = without_rigid_motion(self, u)
         variances = K @ deformed.astype(np.float64) ** 2
         return self.free(sample(variances, deformed, np.arange(u.size), Real))
 

@@ -168,7 +168,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     mechanics, loaded = case.mechanics, LATE in sys.modules
 
     def certificate() -> Certificate:
-        return certify(mechanics, mechanics.back(s))
+        return certify(mechanics, mechanics.to_primal(s))
 
     told = _certified(certificate)
     if not loaded and LATE in sys.modules:  # and that is no part of the time

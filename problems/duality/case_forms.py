@@ -176,7 +176,7 @@ def contact_case(
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=primal, back=new.recover, factorise=supported,
+            primal=primal, to_primal=new.recover, factorise=supported,
             mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
             scale=energy, grid=Grid(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,

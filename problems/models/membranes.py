@@ -85,7 +85,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=pair.qp, back=new.recover, factorise=pair.factorise,
+            primal=pair.qp, to_primal=new.recover, factorise=pair.factorise,
             mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
             in_parts=in_parts,

@@ -111,7 +111,7 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         constant=new.constant + datum,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=rows, back=new.recover, factorise=problem.factorise,
+            primal=rows, to_primal=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
             in_parts=in_parts,
             constant=datum, grid=Grid(

@@ -109,7 +109,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         constant=new.constant * LOAD * LENGTH,
         matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
-            primal=plate.primal, back=new.recover, factorise=plate.factorise,
+            primal=plate.primal, to_primal=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
             rigid=rigid_modes(mesh.points), names=("plate",),
             scale=LOAD * LENGTH, grid=Grid(

@@ -126,7 +126,7 @@ class ExactSolution:
         return self.length(self.u)
 
     def answer(self) -> Solution:
-        """Return u and λ in doubles, as `Mechanics.back` would give them."""
+        """Return u and λ in doubles, as `Mechanics.to_primal` would give them."""
         m = self.mechanics
         u, lam = (np.array([_float(x) for x in v]) for v in (self.u, self.multipliers))
         contact = m.primal.h.size

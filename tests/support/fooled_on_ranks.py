@@ -121,7 +121,7 @@ class BoundSearch:
             motion, contact = m.exact.motion(u), m.exact.contact
             inside = (motion[contact] <= 0).all() and not u[m.exact.held].any()
             lengths = [m.norm(v - truth.u) for v in (u, claimed.astype(Real))]
-            still = *lengths, bool(inside), m.still(u - truth.u)
+            still = *lengths, bool(inside), m.without_rigid_motion(u - truth.u)
         of_u, of_answer, inside, off = self.ranks.comm.bcast(still)
         jump = own.parts.spread.astype(Real) @ off[own.components] - found.off
         torn = own.among.total(float(jump @ own.parts.product(jump)))[0]

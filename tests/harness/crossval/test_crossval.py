@@ -208,7 +208,7 @@ def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
 
 def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
     case, s = truths[2, "dual-bounds"]
-    back, nothing = case.mechanics.back, replace(s, x=np.zeros_like(s.x))
+    back, nothing = case.mechanics.to_primal, replace(s, x=np.zeros_like(s.x))
     point = reference_point(case.mechanics, reference_solution)
 
     exact, _ = assess(case.mechanics, point, back(s), 1e-8)
@@ -232,7 +232,7 @@ def test_a_multiplier_that_pulls_is_found_with_its_row(form, truths, tmp_path, c
     code, verdict = verdict_on(cli, write(tmp_path, answers))
 
     assert (code, culprits(verdict)) == (1, {"pulls"})
-    pulling = case.mechanics.back(wrong).z < 0
+    pulling = case.mechanics.to_primal(wrong).z < 0
     assert verdict["disagreements"][0]["pulls"] == np.flatnonzero(pulling).tolist()
 
 
@@ -284,7 +284,7 @@ def duplicate():
         lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
     )  # fmt: skip
     mechanics = Mechanics(
-        primal=primal, back=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
+        primal=primal, to_primal=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
         rigid=np.zeros((2, 0)),
     )  # fmt: skip
     return Case(qp=primal, recover=lambda s: s.x, quantities=lambda s: {},
@@ -358,7 +358,7 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     monkeypatch.setattr(
         "mortarbench.harness.crossval.comparison.ground_truth_of", doubtful
     )
-    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
     s = pushed((1.5, 0.0))
     answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
     silent = replace(s, iterations=3, status=Status.FAILED)
@@ -657,7 +657,7 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
             raise ZeroDivisionError("no way back")
         return s
 
-    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
     answers = [given(case, k, pushed(z)) for k, z in
                {"a": (1.5, 0.0), "lost": (0.0, 1.5)}.items()]  # fmt: skip
 

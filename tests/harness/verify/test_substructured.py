@@ -26,7 +26,7 @@ from mortarbench.harness.verify.over_ranks import (
     certify_over_ranks,
 )
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import neighbour, still
+from mortarbench.harness.verify.substructured import neighbour, without_rigid_motion
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.feti.own_bodies import own_bodies
@@ -82,7 +82,7 @@ class Known:
     own: OwnBodies
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.back` would give it."""
+        """The solution as `Mechanics.to_primal` would give it."""
         m, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + m.rows.T @ lam)
@@ -185,7 +185,7 @@ def test_bounds_are_about_those_of_the_whole(name: str) -> None:
         for label in ("clarabel", "piqp"):
             case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
             assert case.mechanics is not None
-            s = case.mechanics.back(SOLVERS[label].prepare(case.qp, tol)())
+            s = case.mechanics.to_primal(SOLVERS[label].prepare(case.qp, tol)())
             one, other = (certify(m, s) for m in (case.mechanics, problem.mechanics))
             assert holds(problem, s, other)
             if one.bound > NOISE:
@@ -213,7 +213,7 @@ def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
         for label in ("smalbe", "feti"):
             if SOLVERS[label].declines(case.qp):
                 continue
-            s = case.mechanics.back(SOLVERS[label].prepare(case.qp, tol)())
+            s = case.mechanics.to_primal(SOLVERS[label].prepare(case.qp, tol)())
             found = certify(case.mechanics, s)
             points = found.u, s.x.astype(Real)
             error = max(whole.norm(v - exact.u) for v in points) / exact.norm
@@ -263,7 +263,9 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     u[mechanics.exact.held] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
     together = split.averaged(split.spread(u) + 100 * apart)
-    left = still(split, together - u)  # contact alone holds a body of the patch
+    left = without_rigid_motion(
+        split, together - u
+    )  # contact alone holds a body of the patch
 
     assert np.abs(left).max() < 1e-9
 

@@ -180,7 +180,9 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
     monkeypatch.setattr(
         "mortarbench.harness.verify.verdicts.perf_counter", lambda: next(looks)
     )
-    fields, note = certified(case(mechanics=SimpleNamespace(back=lambda s: s)), POINT)
+    fields, note = certified(
+        case(mechanics=SimpleNamespace(to_primal=lambda s: s)), POINT
+    )
 
     assert fields.pop("certify_seconds") == 2.0
     if is_bounded:

@@ -38,7 +38,7 @@ def built(name):
 @cache
 def in_one_piece(name):
     whole = built(f"{name}/dual")
-    u = whole.mechanics.back(reference_solution(whole.qp)).x
+    u = whole.mechanics.to_primal(reference_solution(whole.qp)).x
     return u, whole.mechanics.primal.P
 
 
@@ -46,7 +46,7 @@ def check(name, cut, glue):
     u, K = in_one_piece(name)
     case = built(f"{name}/{cut}/glue={glue}/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
-    error = case.mechanics.back(s).x - u
+    error = case.mechanics.to_primal(s).x - u
     bound = certified(case, s)[0]["energy_bound"]
     relative = np.sqrt(max(error @ (K @ error), 0.0) / (u @ (K @ u)))
 
@@ -96,7 +96,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
     """One with the form that eliminates them."""
     u, _ = in_one_piece(name)
     eliminated = built(f"{name}/dual-bounds")
-    exact = eliminated.mechanics.back(reference_solution(eliminated.qp)).x
+    exact = eliminated.mechanics.to_primal(reference_solution(eliminated.qp)).x
 
     assert u == pytest.approx(exact, abs=1e-12)
 
