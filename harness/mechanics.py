@@ -24,7 +24,7 @@ Real = np.longdouble
 Extended = NDArray[np.longdouble]
 #: up to which part of its terms what a rigid motion does to the gaps, or a load along
 #: it, is taken for the rounding of coordinates, normals and tractions
-UNFELT = 1e-10
+MOTION_ROUNDING = 1e-10
 
 
 class Inverse(Protocol):
@@ -174,8 +174,10 @@ class Exact(NamedTuple):
     c: Extended  #: (m,)
     lower: Extended  #: (m,) 0 of contact, −g of friction
     upper: Extended  #: (m,) ∞ of contact, g of friction
-    held: NDArray[np.int64]  #: prescribed components
-    loose: Extended  #: (m,) estimate of the compliance of each row, B_i diag(K)⁻¹B_iᵀ
+    fixed: NDArray[np.int64]  #: prescribed components
+    compliance: (
+        Extended  #: (m,) estimate of the compliance of each row, B_i diag(K)⁻¹B_iᵀ
+    )
 
     @property
     def contact(self) -> NDArray[np.bool_]:
@@ -324,15 +326,15 @@ class Mechanics:
         diagonal, B = self.primal.P.diagonal(), self.rows
         c = contact_rows(self.primal, self._carrying)[1]
         bound, contact = self._carrying.bound.astype(Real), self.primal.h.size
-        held = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
+        fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
-        softness[held] = 0
+        softness[fixed] = 0
         return Exact(
             f=-self.primal.q.astype(Real), B=B.astype(Real),
-            c=c.astype(Real), held=held,
+            c=c.astype(Real), fixed=fixed,
             lower=np.append(np.zeros(contact, dtype=Real), -bound),
             upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
-            loose=(B.multiply(B) @ softness).astype(Real),
+            compliance=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 
     @cached_property
@@ -369,7 +371,7 @@ class Mechanics:
         KR = np.zeros(felt.shape, dtype=Real)
         if p:
             KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
-            KR[exact.held] = 0
+            KR[exact.fixed] = 0
         return RigidMotions(
             felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
             largest=_largest(felt), KR=KR,
@@ -437,5 +439,5 @@ def felt_first(B: Matrix, R: NDArray[np.float64]) -> tuple[NDArray[np.float64], 
     per = 1 / np.where(length > 0, length, np.inf)
     G, terms = per[:, None] * (B @ R), per[:, None] * (abs(B) @ np.abs(R))
     _, sizes, turn = np.linalg.svd(G, full_matrices=len(per) < r)
-    felt = int((sizes > UNFELT * terms.max(initial=0.0)).sum())
+    felt = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
     return turn.T, felt

@@ -82,12 +82,12 @@ def assess(
     rubbed = exact.friction_work(u) - exact.friction_work(truth.u)
     energy = float(slope @ off + 0.5 * (off @ (K @ off)) + rubbed.sum())
     length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
-    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
+    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.compliance)
     closed, strict = _closed(exact, lam, gap, small)
     true_gap = -exact.motion(truth.u)
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
     contradicted = (closed != true_closed) & strict & true_strict & contact
-    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.loose
+    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.compliance
     assessment = Assessment(
         error=_over(mechanics.norm(off), length),
         equilibrium_error=_over(mechanics.norm(off_rest), length),
@@ -154,7 +154,7 @@ def _closed(
     exact: Exact, lam: Extended, gap: Extended, small: Extended
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Tell which rows are closed, and which of the answers to that are strict."""
-    force = lam * exact.loose
+    force = lam * exact.compliance
     return force > gap, np.maximum(force, gap) > small
 
 

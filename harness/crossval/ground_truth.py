@@ -87,7 +87,7 @@ def ground_truth_of(
 
     exact = mechanics.exact
     contact = exact.contact
-    closed = (point.multipliers * exact.loose > -exact.motion(point.u))[contact]
+    closed = (point.multipliers * exact.compliance > -exact.motion(point.u))[contact]
     kernel = mechanics.inverse.kernel
     P = mechanics.primal.P
     return GroundTruth(name, point.bound, int(closed.sum()), assessed, P, kernel, why)

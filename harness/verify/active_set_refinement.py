@@ -36,11 +36,11 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
     Returns u, without rigid motion, and the energy norm of what one refinement left
     undone, √(rᵀK⁺r) with the residual r, in extended precision.
     """
-    K, held = mechanics.stiffness, mechanics.exact.held
+    K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
     for _ in range(3):
         r = force - K @ u
-        r[held] = 0
+        r[fixed] = 0
         r = mechanics.without_rigid_motion(r)
         step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
@@ -67,7 +67,7 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> States:
     method.
     """
     room = multipliers - exact.lower, exact.upper - multipliers
-    return predicted(room, exact.loose, exact.motion(u))
+    return predicted(room, exact.compliance, exact.motion(u))
 
 
 def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:

@@ -24,7 +24,7 @@ from scipy.sparse import (
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from mortarbench.harness.mechanics import (
-    UNFELT,
+    MOTION_ROUNDING,
     Exact,
     Extended,
     Mechanics,
@@ -36,8 +36,8 @@ from mortarbench.harness.qp import Vector
 ROUNDS = 20  #: of growing the set of rows
 DENSE = 2000  #: rows up to which F_VV is formed
 #: of the best held motion: how little forces, at the power ½, hold a loose one
-LOOSE = 1e-5
-ROUNDED = 1e-12  #: of its terms, that a load along a loose or free motion may be
+SUPPORT_THRESHOLD = 1e-5
+LOAD_ROUNDING = 1e-12  #: of its terms, that a load along a loose or free motion may be
 _EPS = Real(np.finfo(Real).eps)
 
 
@@ -57,7 +57,7 @@ def admissible(
     if moving.free.shape[1]:
         u = u - moving.free @ (moving.free.T @ u)
     rows = _Rows(exact.B, exact.c, exact.contact)
-    found = _inside(rows, u, closed, partial(_nearest, mechanics))
+    found = _feasible_near(rows, u, closed, partial(_nearest, mechanics))
     return None if found is None else found.u
 
 
@@ -69,17 +69,17 @@ class _Rows(NamedTuple):
     contact: NDArray[np.bool_]  #: (m,)
 
 
-class Inside(NamedTuple):
+class FeasiblePoint(NamedTuple):
     """A displacement that no row excludes."""
 
     u: Extended
     theta: Any = Real(1)  #: of the whole displacement, where it had to be shrunk
 
 
-def _inside(
+def _feasible_near(
     rows: _Rows, u: Extended, closed: NDArray[np.bool_],
     nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
-) -> Inside | None:  # fmt: skip
+) -> FeasiblePoint | None:  # fmt: skip
     """Move u inside, with equality on V.
 
     V are the closed rows, the violated ones, and those that get violated meanwhile. It
@@ -90,30 +90,32 @@ def _inside(
     nearest : of the rows V, the map from excesses t (v,) to the δ with B_V δ = −t
     """
     B, c, contact = rows
-    held = np.zeros_like(closed)
+    enforced = np.zeros_like(closed)
     moved, step = u, None
     for _ in range(ROUNDS):
         gap = c - B @ moved
         size = np.abs(moved).max(initial=Real(0))  # of what is added up to get there
         reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
-        inside = _EPS * (reach + 16 * np.abs(c))
-        wanted = held | closed | (contact & (gap < 0))
-        if not wanted.any():
-            return Inside(u)
-        if (wanted != held).any():
-            held = wanted
-            step = nearest(held)
-        elif (gap[contact | held] >= 0).all() and (gap[held] <= 4 * inside[held]).all():
-            return Inside(moved)
+        margin = _EPS * (reach + 16 * np.abs(c))
+        required = enforced | closed | (contact & (gap < 0))
+        if not required.any():
+            return FeasiblePoint(u)
+        if (required != enforced).any():
+            enforced = required
+            step = nearest(enforced)
+        elif (gap[contact | enforced] >= 0).all() and (
+            gap[enforced] <= 4 * margin[enforced]
+        ).all():
+            return FeasiblePoint(moved)
         assert step is not None
-        moved = moved + step((inside - gap)[held].astype(np.float64))
+        moved = moved + step((margin - gap)[enforced].astype(np.float64))
         if not np.isfinite(moved).all():
             return _shrunk(rows, u)
     gap = (c - B @ moved)[contact]
-    return Inside(moved) if (gap >= 0).all() else _shrunk(rows, u)
+    return FeasiblePoint(moved) if (gap >= 0).all() else _shrunk(rows, u)
 
 
-def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
+def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
     """Return θu with the largest θ that is admissible for sure."""
     B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
@@ -123,9 +125,9 @@ def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
     for _ in range(8):  # the product may be rounded outwards
         if not (B @ (theta * u) > c).any():
-            return Inside(np.asarray(theta * u), theta)
+            return FeasiblePoint(np.asarray(theta * u), theta)
         theta = theta * (1 - 8 * _EPS)
-    return Inside(np.zeros_like(u), Real(0))
+    return FeasiblePoint(np.zeros_like(u), Real(0))
 
 
 def _nearest(
@@ -146,11 +148,11 @@ def _nearest(
     return step
 
 
-def inside_at_rows(
+def feasible_at_rows(
     exact: Exact, R: NDArray[np.float64], softness: Vector, u: Extended,
     closed: NDArray[np.bool_],
-) -> Inside | None:  # fmt: skip
-    """Move only what rows touch inside, as `_inside` does.
+) -> FeasiblePoint | None:  # fmt: skip
+    """Move only what rows touch inside, as `_feasible_near` does.
 
     Parameters
     ----------
@@ -168,7 +170,7 @@ def inside_at_rows(
     B = csr_array(hstack([exact.B, none.astype(Real)]))
     nearest = partial(_nearest_at_rows, exact.B.astype(np.float64), R, softness)
     start = np.concatenate([u, np.zeros(R.shape[1], dtype=Real)])
-    return _inside(_Rows(B, exact.c, exact.contact), start, closed, nearest)
+    return _feasible_near(_Rows(B, exact.c, exact.contact), start, closed, nearest)
 
 
 def _nearest_at_rows(
@@ -214,8 +216,8 @@ def closing(
         return lambda t, e: (t, 0 * e)
     exact, motions = mechanics.exact, mechanics.motions
     V = np.flatnonzero(rows)
-    loose = exact.loose[V].astype(np.float64)
-    scale = 1 / np.sqrt(np.where(loose > 0, loose, 1.0))
+    compliance = exact.compliance[V].astype(np.float64)
+    scale = 1 / np.sqrt(np.where(compliance > 0, compliance, 1.0))
     B_V = csr_array(diags_array(scale) @ mechanics.rows[V])
     R = motions.felt.toarray().astype(np.float64)
     turn, p = felt_first(B_V, R)
@@ -300,7 +302,7 @@ def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     most : what that sum would be if each motion were its largest entry everywhere
 
     """
-    return bool((np.abs(along) > UNFELT * terms + ROUNDED * most).any())
+    return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
 
 
 def driven(pushed: Extended, names: Sequence[str]) -> str:
@@ -325,17 +327,17 @@ def relative(multipliers: Extended) -> Extended:
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
 
-def held_and_loose(
+def supported_and_floating(
     G: Extended, w: Extended
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Split motions (p,) by whether rows with the weights w, of at most 1, hold them.
 
-    Returns orthonormal bases (p, h) and (p, p − h); ‖√w Gν‖ is at most LOOSE times its
-    maximum in the second.
+    Returns orthonormal bases (p, h) and (p, p − h); in the second, ‖√w Gν‖ is at most
+    SUPPORT_THRESHOLD times its maximum.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
-    h = int((sizes > LOOSE * sizes.max(initial=0.0)).sum())
+    h = int((sizes > SUPPORT_THRESHOLD * sizes.max(initial=0.0)).sum())
     return turn[:h].T, turn[h:].T
 
 
@@ -359,9 +361,9 @@ class Balance(NamedTuple):
         It is within its bounds: λ̂ ≥ 0 of contact, |λ̂| ≤ g of friction. Nearest relative
         to the distance from these, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, wᵢ ≈ λᵢ of contact: what
         balances the load must not act across wide gaps or against a slip, where it
-        would do work. Along motions that λ does not hold, see `held_and_loose`, the
-        load has to vanish up to its rounding, or else all rows have to help, in the end
-        each as much as any other.
+        would do work. Along motions that λ does not support
+        (`supported_and_floating`), the load has to vanish up to its rounding; otherwise
+        all rows contribute, in the last attempt with equal weights.
 
         Raises
         ------
@@ -390,9 +392,9 @@ class Balance(NamedTuple):
         λ̂ is λ + WGν cut off at its bounds, where ν minimises a convex function of as
         many variables as there are motions.
         """
-        held, loose = held_and_loose(self.G, w)
+        supported, floating = supported_and_floating(self.G, w)
         on = w > 0
-        basis = held @ _whitening((np.sqrt(w)[:, None] * self.G) @ held)
+        basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
 
         def merged(lam: Extended) -> Extended:
             whole = multipliers.copy()
@@ -409,9 +411,9 @@ class Balance(NamedTuple):
         if found is None:
             return None
         lam = merged(found)
-        missing = np.abs(loose.T @ (self.load - self.G.T @ lam))
-        total = np.abs(loose).T @ self._terms(lam)
-        return lam if (missing <= ROUNDED * total).all() else None
+        missing = np.abs(floating.T @ (self.load - self.G.T @ lam))
+        total = np.abs(floating).T @ self._terms(lam)
+        return lam if (missing <= LOAD_ROUNDING * total).all() else None
 
     def _terms(self, lam: Extended) -> Extended:
         return np.asarray(self.load_terms + self.G_terms.T @ np.abs(lam))

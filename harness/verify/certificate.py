@@ -69,8 +69,8 @@ from mortarbench.harness.verify.admissible import (
     UncertifiableError,
     admissible,
     balanced,
-    held_and_loose,
     relative,
+    supported_and_floating,
 )
 from mortarbench.harness.verify.substructured import (
     Rounding,
@@ -229,7 +229,7 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
     """Yield what the answer's own pair proves and, if that is mostly work, others."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
-    u[exact.held] = 0
+    u[exact.fixed] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
     states = suggested(exact, u, multipliers)
@@ -325,7 +325,7 @@ def proven(
             (moved, K_moved), (moved, near.Kd),
         )
     ))  # fmt: skip
-    held, _ = held_and_loose(G, relative(exact.interior(lam)))
+    supported, _ = supported_and_floating(G, relative(exact.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
     if u_u < 4 * d_d:  # û may be zero, for which θ = 0, and far from the answer
@@ -334,10 +334,10 @@ def proven(
     apart, left = _root(d_d), near.left + length(split, noise)
     total, nearest = apart + left, max(apart - left, 0.0)
     square = total * total + 2 * work
-    known = split.rounding(held)
-    reach = _reach(split, exact, G, held, lam, -motion, square)
-    unbalanced = np.abs(held.T @ near.unbalanced[:p])
-    scattered = np.abs(held.T) @ split.scattered(noise)[:p]
+    known = split.rounding(supported)
+    reach = _reach(split, exact, G, supported, lam, -motion, square)
+    unbalanced = np.abs(supported.T @ near.unbalanced[:p])
+    scattered = np.abs(supported.T) @ split.scattered(noise)[:p]
     pull = (unbalanced + scattered).astype(np.float64)
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
@@ -348,11 +348,11 @@ def proven(
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
-    further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
+    further = np.abs(supported.T @ split.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
     if off is not None:  # K_T does not feel bodies that move with their supports
-        turned = np.abs(held.T @ split.along(off[0])[:p]).astype(np.float64)
+        turned = np.abs(supported.T @ split.along(off[0])[:p]).astype(np.float64)
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
@@ -410,8 +410,8 @@ class _Reach(NamedTuple):
 
 
 def _reach(
-    split: Split, exact: Exact, G: Extended, held: NDArray[np.float64], lam: Extended,
-    gaps: Extended, square: float,
+    split: Split, exact: Exact, G: Extended, supported: NDArray[np.float64],
+    lam: Extended, gaps: Extended, square: float,
 ) -> _Reach:  # fmt: skip
     """Bound the rigid part γ of û − u* by what contact allows.
 
@@ -421,10 +421,10 @@ def _reach(
     not hold are left aside as those that contact does not feel: what rounding makes of
     K along them is not part of the problem.
     """
-    if not held.shape[1]:
+    if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
     tiny = np.finfo(float).tiny
-    phi, motions = np.sqrt(exact.loose.astype(np.float64)), G.astype(np.float64)
+    phi, motions = np.sqrt(exact.compliance.astype(np.float64)), G.astype(np.float64)
     down, up = lam > exact.lower, lam < exact.upper
     below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
     above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
@@ -434,8 +434,8 @@ def _reach(
     cost = opened + np.sqrt(square) * soft + square * pressed + tiny
     columns = (np.vstack([-motions[up], motions[down]]) / cost[:, None]).T
     size = np.abs(columns).max()
-    found = np.zeros((3, held.shape[1]))
-    for k, motion in enumerate(held.T):
+    found = np.zeros((3, supported.shape[1]))
+    for k, motion in enumerate(supported.T):
         for target in (motion, -motion):
             y = _combination(columns / size, target) / size / cost
             forces = np.zeros_like(lam)

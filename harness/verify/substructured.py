@@ -103,8 +103,8 @@ class Split(Protocol):
     def total(self, *numbers: float) -> list[float]:
         """Add numbers over all subdomains."""
 
-    def rounding(self, held: NDArray[np.float64]) -> Rounding:
-        """Return what E does along the motions `held` (p, h), felt by contact."""
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
+        """Return what E does along the motions `supported` (p, h), felt by contact."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Ew (n,) and |wᵀEw| for w, not zero at supports, without motion R."""
@@ -231,7 +231,7 @@ class _Stored(ABC):
 
     def free(self, v: Extended) -> Extended:
         """Put v (n,) to zero where a support holds, in place."""
-        v[self.mechanics.exact.held] = 0
+        v[self.mechanics.exact.fixed] = 0
         return v
 
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
@@ -307,15 +307,17 @@ class Undivided(_Stored):
         variances = K @ deformed.astype(np.float64) ** 2
         return self.free(sample(variances, deformed, np.arange(u.size), Real))
 
-    def rounding(self, held: NDArray[np.float64]) -> Rounding:
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
         """Return ER, which is KR but for what P takes out of it."""
         motions = self.mechanics.motions
-        along = np.abs(held.T @ np.asarray(motions.felt.T @ motions.KR) @ held)
-        strain = [length(self, motions.KR @ k) for k in held.T]
+        along = np.abs(
+            supported.T @ np.asarray(motions.felt.T @ motions.KR) @ supported
+        )
+        strain = [length(self, motions.KR @ k) for k in supported.T]
         return Rounding(np.array(strain), along.astype(np.float64))
 
 
-class Among(Protocol):
+class Reduction(Protocol):
     """How what some subdomains have is added to what others have elsewhere.
 
     Components are those that these subdomains have copies of, (n,); coarse unknowns are
@@ -328,46 +330,50 @@ class Among(Protocol):
     def gathered(self, alpha: Vector) -> Vector:
         """Put coefficients of own rigid motions together with all others: (r,)."""
 
-    def own(self, alpha: Vector) -> Vector:
+    def local_part(self, alpha: Vector) -> Vector:
         """Take the coefficients of own rigid motions out of all (r,)."""
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
         """Return  M − Sᵀ diag(scale) S  (r, r), with M and S added up over all.
 
-        S : (t, own) its rows are of the components `at`
+        S : (t, local) its rows are of the components `at`
         """
 
 
 class Sharing:
-    """Shares forces ρ among subdomains, balanced in each; factorised once.
+    """Shares forces ρ reduction subdomains, balanced in each; factorised once.
 
     Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
 
     def __init__(
-        self, parts: Substructures, held: NDArray[np.int64], loose: Any, among: Among
+        self,
+        parts: Substructures,
+        fixed: NDArray[np.int64],
+        floating: Any,
+        reduction: Reduction,
     ) -> None:
         """Set up the coarse problem.
 
         Parameters
         ----------
-        held : components that supports hold
-        loose : (r, q) coefficients of R_T of the motions that no support holds
-        among : sums over subdomains that are elsewhere
+        fixed : prescribed components
+        floating : (r, q) coefficients of R_T of the motions that no support holds
+        reduction : sums over subdomains that are elsewhere
 
         """
-        self._parts, self._among, self._loose = parts, among, loose
+        self._parts, self._reduction, self._floating = parts, reduction, floating
         squares = csr_array(parts.spread)
         squares.data = squares.data**2
         self._squares = squares
-        total = among.completed(squares.T @ parts.weight)
+        total = reduction.completed(squares.T @ parts.weight)
         #: (N,) shares D of copies in their components, which add up to one: TᵀDT = 1
         self.part = parts.weight / (squares @ total)
-        jointly = among.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
-        jointly[held] = True
+        jointly = reduction.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
+        jointly[fixed] = True
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
         inverse = 1 / total
-        inverse[held] = 0
+        inverse[fixed] = 0
         T, R = csr_array(parts.spread[rows]), csr_array(parts.kernel[rows])
         touched = np.zeros(total.size, dtype=bool)
         touched[T.indices] = True
@@ -383,21 +389,23 @@ class Sharing:
 
     @cached_property
     def _coarse(self) -> Callable[[Vector], Vector]:
-        coarse = self._among.coarse(self._RWR, self._TWR, self._inverse, self._at)
-        return _coarse_solve(coarse, self._loose)
+        coarse = self._reduction.coarse(self._RWR, self._TWR, self._inverse, self._at)
+        return _coarse_solve(coarse, self._floating)
 
     def variances(self, v: Extended) -> Vector:
         """Return (K∘K)(u∘u) (n,), with the squares of v = Tu in every subdomain."""
         squares = self._parts.squared_product(v.astype(np.float64) ** 2)
-        return np.asarray(self._among.completed(self._squares.T @ squares))
+        return np.asarray(self._reduction.completed(self._squares.T @ squares))
 
     def __call__(self, rho: Vector) -> Vector:
         """Return b (N,) with Tᵀb = ρ (n,) on the components that nothing holds."""
-        parts, among = self._parts, self._among
+        parts, reduction = self._parts, self._reduction
         b = self.part * (parts.spread @ rho)
         for _ in range(2):  # the second time for the digits that the first one lost
-            mu = among.own(self._coarse(among.gathered(parts.kernel.T @ b)))
-            jumps = self._inverse * among.completed(self._TWR @ mu, self._at)
+            mu = reduction.local_part(
+                self._coarse(reduction.gathered(parts.kernel.T @ b))
+            )
+            jumps = self._inverse * reduction.completed(self._TWR @ mu, self._at)
             b[self._rows] -= self._WR @ mu - self._w * (self._T @ jumps)
         return np.asarray(b)
 
@@ -407,10 +415,12 @@ class Sharing:
         α with RᵀZ(v − Rα) = 0, as forces are balanced; copies that a support holds
         differ from zero.
         """
-        x, among = v[self._rows].astype(np.float64), self._among
-        pulls = among.completed(self._T.T @ (self._w * x), self._at)
+        x, reduction = v[self._rows].astype(np.float64), self._reduction
+        pulls = reduction.completed(self._T.T @ (self._w * x), self._at)
         apart = x - self._T @ (self._inverse * pulls)
-        alpha = among.own(self._coarse(among.gathered(self._WR.T @ apart)))
+        alpha = reduction.local_part(
+            self._coarse(reduction.gathered(self._WR.T @ apart))
+        )
         return np.asarray(v - self._parts.kernel @ alpha)
 
 

@@ -18,8 +18,8 @@ from mortarbench.harness.distributed.vectors import Evaluation
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
     Contact,
-    OwnBodies,
-    Unheld,
+    FloatingBodies,
+    LocalBodies,
     certify_over_ranks,
 )
 from mortarbench.problems.fem.mesh import Nodes
@@ -40,29 +40,29 @@ class OwnSolution:
     """
 
     subdomains: OwnSubdomains
-    bodies: OwnBodies
+    bodies: LocalBodies
     u: Vector  #: (n,) at `bodies.components`, the same of copies on several ranks
     z: Vector  #: (m,) multipliers of all rows of contact and friction, on every rank
 
     def at(self, component: Nodes) -> Vector:
         """Tell all ranks the displacement at components (w,) of the whole."""
-        return np.asarray(self.bodies.among.traced(self.u, component))
+        return np.asarray(self.bodies.reduction.traced(self.u, component))
 
     def diagonal(self, component: Nodes) -> Vector:
         """Tell all ranks the diagonal of K at components (w,) of the whole."""
-        among = self.bodies.among
-        places, here = among.places(component)
+        reduction = self.bodies.reduction
+        places, here = reduction.places(component)
         known = np.unique(places[here])
         found = np.zeros(self.u.size)
         found[known] = self.bodies.parts.diagonal(known)
-        return np.asarray(among.traced(among.completed(found), component))
+        return np.asarray(reduction.traced(reduction.completed(found), component))
 
     @cached_property
     def energy(self) -> float:
         """½uᵀKu − fᵀu of the whole."""
         v = self.bodies.parts.spread @ self.u
         work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
-        return self.bodies.among.total(float(work))[0]
+        return self.bodies.reduction.total(float(work))[0]
 
 
 #: of what ranks have found → physical results, SI, the same on all ranks
@@ -82,7 +82,7 @@ def own_solution(own: OwnSubdomains, halo: Halo, s: Solution) -> OwnSolution:
     v = np.zeros(T.shape[0])
     v[own.kept] = own.domains.inverse(own.f - own.rows.B.T @ touched)
     v[own.kept] -= own.domains.kernel @ alpha
-    u = bodies.among.completed(T.T @ v) / times
+    u = bodies.reduction.completed(T.T @ v) / times
     z = contact_multipliers(own, halo, s)
     return OwnSolution(subdomains=own, bodies=bodies, u=u, z=z)
 
@@ -136,12 +136,12 @@ def certified_by(
     return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
 
 
-def own_bodies(own: OwnSubdomains) -> OwnBodies:
+def own_bodies(own: OwnSubdomains) -> LocalBodies:
     """Gather what certificates need of this rank's subdomains."""
     return _bodies(own.floating)[0]
 
 
-def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
+def _bodies(own: OwnSubdomains) -> tuple[LocalBodies, Vector]:
     """Gather what this rank has, and count the copies (n,) of its components.
 
     own : its subdomains float
@@ -151,17 +151,17 @@ def _bodies(own: OwnSubdomains) -> tuple[OwnBodies, Vector]:
     times = np.empty(components.size)
     times[place] = own.times
     parts = LocalProblems(own.torn_bodies, problem.components)
-    return OwnBodies(
+    return LocalBodies(
         ranks=own.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=times.size) < times,
         coarse=own.own_motions,
         motions=own.coarse, f=own.f,
-        held=np.flatnonzero(np.isin(components, problem.held)),
+        fixed=np.flatnonzero(np.isin(components, problem.held)),
         contact=Contact(
             rows=csr_array(contact.rows[kept]), c=contact.c[kept],
             bound=contact.bound[contact.bound > 0],
         ),
-        unheld=_unheld(own),
+        floating=_floating(own),
     ), times  # fmt: skip
 
 
@@ -220,7 +220,7 @@ class _Extent(NamedTuple):
         return found / self.size
 
 
-def _unheld(own: OwnSubdomains) -> Unheld:
+def _floating(own: OwnSubdomains) -> FloatingBodies:
     """Gather the rigid motions of the bodies that supports leave any."""
     #: of each own node, in turn, a copy among the own torn nodes
     copy = np.unique(own.nodes.number, return_index=True)[1]
@@ -228,7 +228,9 @@ def _unheld(own: OwnSubdomains) -> Unheld:
     components = d * copy.size
     motions, left, names = [csr_array((components, 0))], list[Any](), list[str]()
     if not (unheld := unheld_bodies(problem)):
-        return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
+        return FloatingBodies(
+            motions=motions[0], combinations=np.zeros((0, 0)), names=()
+        )
     points = np.concatenate([*of.points(own.number)])
     body = of.body[own.number][own.nodes.subdomain]
     held, axis = np.divmod(problem.held, d)
@@ -248,8 +250,10 @@ def _unheld(own: OwnSubdomains) -> Unheld:
         )
         motions.append(one @ csr_array(found))
         names.append(problem.names[b])
-    return Unheld(
-        motions=csr_array(hstack(motions)), left=block_diag(*left), names=tuple(names)
+    return FloatingBodies(
+        motions=csr_array(hstack(motions)),
+        combinations=block_diag(*left),
+        names=tuple(names),
     )
 
 

@@ -172,7 +172,7 @@ def _given(
     """Solve with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
-    free, closed = np.setdiff1d(np.arange(len(K)), exact.held), states == CLOSED
+    free, closed = np.setdiff1d(np.arange(len(K)), exact.fixed), states == CLOSED
     lam = np.where(
         states == LOWER, exact.lower, np.where(states == UPPER, exact.upper, 0)
     )

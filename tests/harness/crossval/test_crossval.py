@@ -117,7 +117,7 @@ def disturbed(case, s, size):
     point = reference_point(case.mechanics, reference_solution)
     if case.qp.h.size:
         v = rng.standard_normal(s.x.size)
-        v[case.mechanics.exact.held] = 0
+        v[case.mechanics.exact.fixed] = 0
     else:
         v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
         if case.qp.b.size:  # what the rigid motions do not feel

@@ -21,7 +21,7 @@ from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
-    OwnBodies,
+    LocalBodies,
     _OnRanks,
     certify_over_ranks,
 )
@@ -79,7 +79,7 @@ class Known:
 
     mechanics: Mechanics
     exact: ReferencePoint
-    own: OwnBodies
+    own: LocalBodies
 
     def solution(self) -> Solution:
         """The solution as `Mechanics.to_primal` would give it."""
@@ -133,7 +133,7 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
         and worst <= ROUNDED * within + slack
         and (lam >= exact.lower).all() and (lam <= exact.upper).all()
         and (motion[exact.contact] <= 0).all()
-        and (found.u[exact.held] == 0).all()
+        and (found.u[exact.fixed] == 0).all()
     )  # fmt: skip
 
 
@@ -238,10 +238,10 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     mechanics, parts = problem.mechanics, problem.own.parts
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
-    u[mechanics.exact.held] = 0
+    u[mechanics.exact.fixed] = 0
     split = _OnRanks(problem.own)
     near = neighbour(split, split.residual(u).rho + split.pulled(exact.multipliers))
-    held = mechanics.exact.held
+    held = mechanics.exact.fixed
     b = parts.product(near.d)
     whole = mechanics.stiffness @ u - mechanics.exact.f
     whole = whole + mechanics.exact.B.T @ exact.multipliers
@@ -260,7 +260,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     mechanics, parts = problem.mechanics, problem.own.parts
     split = _OnRanks(problem.own)
     u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
-    u[mechanics.exact.held] = 0
+    u[mechanics.exact.fixed] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
     together = split.averaged(split.spread(u) + 100 * apart)
     left = without_rigid_motion(

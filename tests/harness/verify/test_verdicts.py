@@ -64,7 +64,7 @@ def fault(_):
 
 
 class Broken:
-    back = staticmethod(fault)
+    to_primal = staticmethod(fault)
 
 
 def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
