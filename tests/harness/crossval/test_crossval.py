@@ -11,9 +11,9 @@ from scipy.sparse import csc_array
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, Case, Mechanics, Solution, Status, no_rows
 from mortarbench.harness.crossval.assessment import assess, distances, energy_allowed
-from mortarbench.harness.crossval.comparison import brief, compared
+from mortarbench.harness.crossval.comparison import brief, compare_answers
 from mortarbench.harness.crossval.discretisation import read_discretisation
-from mortarbench.harness.crossval.ground_truth import Given, ground_truth_of
+from mortarbench.harness.crossval.ground_truth import StoredAnswer, ground_truth_of
 from mortarbench.harness.files.qpfile import qp_digest, save_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.names import parse
@@ -269,9 +269,9 @@ class Dense:
         return np.asarray(B @ (B @ self.inverse).T)
 
 
-def given(case, label, s, tol=1e-8):
+def stored_answer(case, label, s, tol=1e-8):
     record = record_of(f"{BEAM}/primal", label, tol).replace(claimed=s.status.value)
-    return Given(record=record, label=label, repeats=1, case=case, solution=s)
+    return StoredAnswer(record=record, label=label, repeats=1, case=case, solution=s)
 
 
 @pytest.fixture
@@ -321,9 +321,9 @@ def test_a_certificate_that_the_reference_contradicts_is_our_fault(
 
 def test_different_multipliers_of_one_contact_force_agree(duplicate):
     shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
-    answers = [given(duplicate, k, pushed(z)) for k, z in shares.items()]
+    answers = [stored_answer(duplicate, k, pushed(z)) for k, z in shares.items()]
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert found.truth == "reference"
     assert len(found.pairs) == 3
@@ -360,10 +360,15 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     )
     case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
     s = pushed((1.5, 0.0))
-    answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
+    answers = [
+        stored_answer(case, "a", s),
+        stored_answer(case, "b", replace(s, iterations=3)),
+    ]
     silent = replace(s, iterations=3, status=Status.FAILED)
 
-    found = compared("wall", [*answers, given(case, "c", silent)], finds_nothing, None)
+    found = compare_answers(
+        "wall", [*answers, stored_answer(case, "c", silent)], finds_nothing, None
+    )
 
     assert not any(a.refuted for a in found.answers)
     assert [(p.a, p.b) for p in found.unresolved] == [(0, 1)]
@@ -372,10 +377,12 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
 
 def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
     good, bad = pushed((1.5, 0.0)), pushed((1.5, 0.0), (0.45, 0.9))
-    answers = [given(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))]
-    answers.append(given(duplicate, "good", good))
+    answers = [
+        stored_answer(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))
+    ]
+    answers.append(stored_answer(duplicate, "good", good))
 
-    found = compared("wall", answers, finds_nothing, None)
+    found = compare_answers("wall", answers, finds_nothing, None)
 
     assert found.truth == "good on primal"
     assert "it found nothing" in found.note
@@ -546,10 +553,10 @@ def test_mechanics_that_fail_leave_the_residuals(duplicate):
         raise ZeroDivisionError("no factor")
 
     mechanics = replace(duplicate.mechanics, factorise=factorise)
-    answers = [given(replace(duplicate, mechanics=mechanics), k, pushed(z))
+    answers = [stored_answer(replace(duplicate, mechanics=mechanics), k, pushed(z))
                for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert found.truth == ""
     assert "no factor" in found.note
@@ -658,10 +665,10 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
         return s
 
     case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
-    answers = [given(case, k, pushed(z)) for k, z in
+    answers = [stored_answer(case, k, pushed(z)) for k, z in
                {"a": (1.5, 0.0), "lost": (0.0, 1.5)}.items()]  # fmt: skip
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert [a.assessment is None for a in found.answers] == [False, True]
     assert "no way back" in found.answers[1].remarks[0]
