@@ -35,12 +35,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness.distributed.failures import (
-    ALONE_SECONDS,
+    PEER_TIMEOUT,
     RECORD,
     RankFailedError,
     abort,
-    agreed,
     in_a_line,
+    run_collectively,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.distributed.network import network
@@ -121,14 +121,14 @@ class _Ends:
     def first(self, mpiexec: int) -> str:
         """Wait until mpiexec has ended, and describe the end of the first rank.
 
-        The others have `ALONE_SECONDS` to end after it, whatever its exit code. Empty
+        The others have `PEER_TIMEOUT` to end after it, whatever its exit code. Empty
         where mpiexec was the first to end.
         """
         mpi, deadline = os.pidfd_open(mpiexec), np.inf
         self._events.register(mpi, EPOLLIN)
         has_ended = False
         while not has_ended and (left := deadline - time.monotonic()) > 0:
-            ready = [fd for fd, _ in self._events.poll(min(left, ALONE_SECONDS))]
+            ready = [fd for fd, _ in self._events.poll(min(left, PEER_TIMEOUT))]
             has_ended = mpi in ready
             for fd in ready:
                 if fd in self._rank_of:
@@ -139,7 +139,7 @@ class _Ends:
                 if fd == mpi:  # ranks that end now, end because it has
                     self._note("")
             if self._first is not None and deadline == np.inf:
-                deadline = time.monotonic() + ALONE_SECONDS
+                deadline = time.monotonic() + PEER_TIMEOUT
         if self._first is None or isinstance(self._first, str):
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
@@ -241,7 +241,7 @@ def follow(
             elif run is not None and share is not None:
                 solution, _ = _solved(run, share, ranks)
         except BaseException as e:
-            if _ordered(ranks, ALONE_SECONDS):
+            if _ordered(ranks, PEER_TIMEOUT):
                 continue  # rank 0 has failed alike, and says so
             abort(ranks, e)
 
@@ -415,9 +415,11 @@ def _emitted(
     """
     start = time.perf_counter()
     try:
-        made = agreed(ranks, lambda: emit(case, ranks))  # by then the slowest is done
+        made = run_collectively(
+            ranks, lambda: emit(case, ranks)
+        )  # by then the slowest is done
         seconds = time.perf_counter() - start
-        digest = agreed(ranks, made.digest)
+        digest = run_collectively(ranks, made.digest)
         told = {"sizes": made.sizes, "digest": digest, "build_seconds": seconds}
         return made, told
     except InputError:

@@ -1,18 +1,17 @@
-"""The certificate of torn bodies by the ranks that hold them: no process has the whole.
+"""Certificate of decomposed bodies, computed by the ranks that store the subdomains.
 
-As `harness.verify.substructured`, with what other ranks have added where a sum says so.
-Each rank has the components that its subdomains touch. Copies of a component on several
-ranks get the same value on all of them. The rows of contact and friction, which are no
-longer than the sides, are on every rank, and so is the coarse problem.
+The mathematics is that of `harness.verify.substructured`; sums are completed by MPI
+reductions. Each rank stores the components that its subdomains touch, and copies of a
+component on several ranks have equal values. The rows of contact and friction, which
+are as many as there are nodes on the sides, and the coarse problem are replicated.
 
-Where contact alone holds a body, its rigid motions R are a few columns of which each
-rank has the rows of its components; products with Rᵀ are sums over all components, in
-extended precision. That is all that λ̂ needs to balance the load (`harness.verify.
-admissible.Balance`): the load along R, and the motion of the rows, which every rank
-has.
+If contact alone supports a body, its rigid motions R are a few distributed columns, and
+products with Rᵀ are reductions in extended precision. The balance of λ̂ with the load
+(`harness.verify.admissible.Balance`) needs only the load along R, and the motion of the
+contact rows, which is replicated.
 
-K is the sum TᵀK_T T over subdomains here, since nobody has another one: what rounding
-makes of it is no part of the problem.
+K is defined as the sum TᵀK_T T over subdomains, since it is not assembled: the rounding
+of an assembled K is not part of the problem.
 """
 
 from __future__ import annotations
@@ -69,92 +68,91 @@ from mortarbench.harness.verify.substructured import (
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Contact:
-    """All rows of contact, then of friction with a bound above zero; on every rank."""
+    """Rows of contact, then of friction with a positive bound; replicated."""
 
-    rows: csr_array  #: (m, n) columns are components of the whole
+    rows: csr_array  #: (m, n) with global components as columns
     c: Vector  #: (m,)
     bound: Vector  #: (k,) of the last rows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FloatingBodies:
-    """The rigid motions of bodies that supports do not hold, as one rank has them.
+    """Local rows of the rigid motions of bodies that supports do not fix.
 
-    Columns are orthonormal to double precision, in the sum over the components of all
-    ranks.
+    Columns are orthonormal to double precision, with the inner product over the
+    components of all ranks.
     """
 
-    motions: csr_array  #: (n, k) of single bodies, supports or not, in turn
-    combinations: NDArray[
-        np.float64
-    ]  #: (k, r) combinations that move nothing that is held
+    motions: csr_array  #: (n, k) of each body in turn, regardless of supports
+    #: (k, r) combinations that do not move prescribed components
+    combinations: NDArray[np.float64]
     names: tuple[str, ...]  #: of these bodies
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LocalBodies:
-    """What one rank has of torn bodies."""
+    """The part of decomposed bodies that one rank stores."""
 
     ranks: Ranks
     parts: Substructures  #: its subdomains; T has a column for each of its components
-    components: NDArray[np.int64]  #: (n,) of the whole, ascending
-    shared: NDArray[np.bool_]  #: (n,) whether other ranks have copies, too
-    coarse: NDArray[np.int64]  #: (r,) of each column of R, reduction those of all ranks
-    motions: int  #: of all subdomains of all ranks
-    f: Vector  #: (N,) the load of a component is the sum of those of its copies
-    fixed: NDArray[np.int64]  #: (h,) places in `components` of those prescribed
+    components: NDArray[np.int64]  #: (n,) their global numbers, ascending
+    shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
+    coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
+    motions: int  #: number of columns of R on all ranks
+    f: Vector  #: (N,) load; that of a component is the sum over its copies
+    fixed: NDArray[np.int64]  #: (h,) positions in `components` of the prescribed ones
     contact: Contact
     floating: FloatingBodies
-    #: (n, n) of a single process that has assembled it: what rounding makes of it is a
-    #: part of the problem then, where an answer moves bodies with their supports
+    #: (n, n) K as assembled by a single process; None on several. Its rounding is then
+    #: part of the problem if an answer moves bodies together with their supports
     stored: csr_array | None = None
 
     @cached_property
     def reduction(self) -> MPIReduction:
-        """How sums are completed."""
+        """Sums over all ranks."""
         return MPIReduction(self)
 
 
 class MPIReduction:
-    """Adds what other ranks have; see `harness.verify.substructured.Reduction`."""
+    """Sums over MPI ranks; see `harness.verify.substructured.Reduction`."""
 
     def __init__(self, local: LocalBodies) -> None:
         self._local, comm = local, local.ranks.comm
         mine = local.components[local.shared]
-        known = np.unique(np.concatenate(comm.allgather(mine)))
-        self._size = known.size
-        #: of each component, its place reduction all shared ones
+        interface = np.unique(np.concatenate(comm.allgather(mine)))
+        self._size = interface.size
+        #: (n,) position of each component among all shared ones, -1 for inner ones
         self._place = np.full(local.components.size, -1)
-        self._place[local.shared] = np.searchsorted(known, mine)
-        first = np.full(known.size, comm.size)
+        self._place[local.shared] = np.searchsorted(interface, mine)
+        first = np.full(interface.size, comm.size)
         first[self._place[local.shared]] = comm.rank
         lowest = np.min(comm.allgather(first), axis=0)
-        #: whether this is the first rank that has a component
-        self.counts = np.ones(local.components.size, dtype=bool)
-        self.counts[local.shared] = lowest[self._place[local.shared]] == comm.rank
+        #: (n,) mask of the components that count here: no lower rank stores them
+        self.is_owner = np.ones(local.components.size, dtype=bool)
+        self.is_owner[local.shared] = lowest[self._place[local.shared]] == comm.rank
 
     def summed(self, x: NDArray[Any]) -> NDArray[Any]:
-        """Add arrays in the order of the ranks: all get the same digits."""
+        """Sum arrays in the order of the ranks; all ranks get the same digits."""
         parts = np.empty((self._local.ranks.size, *x.shape), dtype=x.dtype)
         self._local.ranks.comm.Allgather(x, parts)
         return np.asarray(parts.sum(axis=0))
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add what other ranks have of the components `at` (t,), or of all (n,)."""
+        """Add what other ranks contribute to components `at` (t,), or to all (n,)."""
         place = self._place if at is None else self._place[at]
         here = place >= 0
         exchanged = np.zeros(self._size, dtype=v.dtype)
         exchanged[place[here]] = v[here]
-        found = v.copy()
-        found[here] = self.summed(exchanged)[place[here]]
-        return found
+        complete = v.copy()
+        complete[here] = self.summed(exchanged)[place[here]]
+        return complete
 
     def along(self, M: Any, v: NDArray[Any]) -> NDArray[Any]:
-        """Return Mᵀv of the whole (k,), of columns M (n, k), sparse, and v (n,)."""
-        return self.summed(np.asarray(M.T @ np.where(self.counts, v, 0)))
+        """Return the global Mᵀv (k,) for sparse columns M (n, k) and v (n,)."""
+        return self.summed(np.asarray(M.T @ np.where(self.is_owner, v, 0)))
 
     def total(self, *numbers: float) -> list[float]:
-        """Add numbers over all ranks."""
+        """Sum numbers over all ranks."""
         return [float(x) for x in self._local.ranks.total(np.array(numbers))]
 
     def gathered(self, alpha: Vector) -> Vector:
@@ -164,16 +162,16 @@ class MPIReduction:
         return self.summed(whole)
 
     def local_part(self, alpha: Vector) -> Vector:
-        """Take the coefficients of local rigid motions."""
+        """Return the coefficients of the local rigid motions."""
         return np.asarray(alpha[self._local.coarse])
 
-    def traced(self, v: NDArray[Any], at: NDArray[np.int64]) -> Any:
-        """Tell all ranks the values of v (n,) at components `at` (w,) of the whole."""
+    def values_at(self, v: NDArray[Any], at: NDArray[np.int64]) -> Any:
+        """Return the values of v (n,) at global components `at` (w,), on all ranks."""
         places, here = self.places(at)
-        counted = self.counts[places[here]]
-        found = np.zeros(at.size, dtype=v.dtype)
-        found[np.flatnonzero(here)[counted]] = v[places[here][counted]]
-        return self.summed(found)
+        owned = self.is_owner[places[here]]  # each component from one rank only
+        values = np.zeros(at.size, dtype=v.dtype)
+        values[np.flatnonzero(here)[owned]] = v[places[here][owned]]
+        return self.summed(values)
 
     def places(
         self, at: NDArray[np.int64]
@@ -184,15 +182,16 @@ class MPIReduction:
         return places, local[places] == at
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S,  with M and S added up over all ranks."""
+        """Return  M − Sᵀ diag(scale) S  (r, r),  with M and S summed over all ranks."""
         r, comm = self._local.motions, self._local.ranks.comm
         place = self._place[at]
-        alone, jointly = place < 0, place >= 0
-        local = csr_array(S[alone])
-        mine = coo_array(M - local.T @ scaled_rows(local, scale[alone]))
+        # components of a single rank enter its own matrix; only shared ones are sent
+        inner, jointly = place < 0, place >= 0
+        S_inner = csr_array(S[inner])
+        mine = coo_array(M - S_inner.T @ scaled_rows(S_inner, scale[inner]))
         numbers = self._local.coarse
         row, column = numbers[mine.row], numbers[mine.col]
-        told = csr_array((mine.data, (row, column)), shape=(r, r))
+        local_part = csr_array((mine.data, (row, column)), shape=(r, r))
         rows = coo_array(S[jointly])
         across = csr_array(
             (rows.data, (place[jointly][rows.row], numbers[rows.col])),
@@ -201,29 +200,30 @@ class MPIReduction:
         weight = np.zeros(self._size)
         weight[place[jointly]] = scale[jointly]
         parts, crossing, weights = zip(
-            *comm.allgather((told, across, weight)), strict=True
+            *comm.allgather((local_part, across, weight)), strict=True
         )
         S_all = csr_array(sum(crossing[1:], start=crossing[0]))
         whole = sum(parts[1:], start=parts[0])
         return csr_array(whole - S_all.T @ scaled_rows(S_all, np.max(weights, axis=0)))
 
 
-@np.errstate(all="ignore")  # as `harness.verify.certificate.certify`
+@np.errstate(all="ignore")  # a point may hold 1e300, as in `certify`
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
     """Bound the error of an answer; called by all ranks, which get the same bound.
 
-    Pairs are those of `harness.verify.certificate.certify`, without exchanged rows.
+    The pairs tried are those of `harness.verify.certificate.certify`, without an
+    exchange of rows.
 
     Parameters
     ----------
-    claimed : (n,) displacement of local components, the same of copies on several ranks
-    multipliers : (m,) of all rows, on every rank
+    claimed : (n,) displacement of the local components
+    multipliers : (m,) of all rows, replicated
 
     Returns
     -------
-    of which `u` and `off` are those of local components and subdomains
+    a certificate whose `u` and `off` are those of local components and subdomains
 
     Raises
     ------
@@ -239,50 +239,50 @@ def certify_over_ranks(
     split = _OnRanks(local)
     at, exact, rigid, softness = split.at, split.exact, split.rigid, split.softness
     u = rigid.without_free(local, u)
-    trace = local.reduction.traced(u, at)
+    trace = local.reduction.values_at(u, at)
     raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
     states = suggested(exact, trace, raw)
-    tidied = at_bounds(exact, states, raw), states == CLOSED
+    complementary = at_bounds(exact, states, raw), states == CLOSED
     none = np.zeros(raw.size, dtype=bool)
 
-    def proved(
+    def attempt(
         u: Extended, trace: Extended, lam: Extended, closed: NDArray[np.bool_]
     ) -> Certificate | str:
         try:
-            mended, feasible, forces = _mended(
+            at_rows, feasible, forces = _admissible_pair(
                 local, exact, rigid, (at, softness, trace), u, lam, closed
             )
             return proven(
                 split, exact, rigid.balance.G, claimed=claimed, u=feasible,
-                at_rows=mended, multipliers=forces,
+                at_rows=at_rows, multipliers=forces,
             )  # fmt: skip
         except UncertifiableError as e:
             return str(e)
 
     def certificates() -> Iterator[Certificate | str]:
-        for lam, closed in (tidied, (raw, none)):
-            found = proved(u, trace, lam, closed)
-            yield found
-            if is_sharp(found):
+        for lam, closed in (complementary, (raw, none)):
+            certificate = attempt(u, trace, lam, closed)
+            yield certificate
+            if is_sharp(certificate):
                 return
 
     def at_rest() -> Certificate | str:
-        return proved(0 * u, 0 * trace, 0 * raw, none)
+        return attempt(0 * u, 0 * trace, 0 * raw, none)
 
     return sharpest(certificates(), at_rest)
 
 
-def _mended(
+def _admissible_pair(
     local: LocalBodies, exact: Exact, rigid: _RigidMotions,
     trace: tuple[NDArray[np.int64], Vector, Extended],
     u: Extended, lam: Extended, closed: NDArray[np.bool_],
 ) -> tuple[Extended, Extended, Extended]:  # fmt: skip
-    """Find û at the components of the rows (w,) and at local ones (n,), and λ̂.
+    """Return û at the components of the rows (w,) and at local ones (n,), and λ̂.
 
     Raises
     ------
     UncertifiableError
-        When they cannot be mended.
+        When there is no admissible pair near the answer.
 
     """
     at, softness, start = trace
@@ -298,17 +298,17 @@ def _mended(
 
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
-    """Return the rows on the components they touch (w,), and 1/Kᵢᵢ there, (w,)."""
+    """Return the rows restricted to the components they touch (w,), and 1/Kᵢᵢ (w,)."""
     contact, k = local.contact, local.contact.bound.size
     B, contacts = csr_array(contact.rows[:, at]), contact.c.size - k
     places, here = local.reduction.places(at)
     diagonal = np.zeros(local.components.size)
-    known = np.unique(places[here])
-    diagonal[known] = local.parts.diagonal(known)
-    diagonal = local.reduction.traced(local.reduction.completed(diagonal), at)
+    present = np.unique(places[here])
+    diagonal[present] = local.parts.diagonal(present)
+    diagonal = local.reduction.values_at(local.reduction.completed(diagonal), at)
     free = np.ones(local.components.size)
     free[local.fixed] = 0
-    is_free = local.reduction.traced(free, at) > 0
+    is_free = local.reduction.values_at(free, at) > 0
     softness = np.where(is_free & (diagonal > 0), 1 / diagonal, 0)
     bound = contact.bound.astype(Real)
     return Exact(
@@ -322,23 +322,22 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _RigidMotions:
-    """The rigid motions that supports leave, and what contact must do about them.
+    """Rigid motions that the supports leave, and the balance of the load along them.
 
-    As `harness.mechanics.RigidMotions`, columns are orthonormal in extended precision,
-    in the sum over the components of all ranks. K of subdomains is exactly zero along
-    them.
+    Columns are orthonormal in extended precision, with the inner product over the
+    components of all ranks. The K of subdomains is exactly zero along them.
     """
 
-    #: (n, r) sparse, of local components. Contact rows open or close along the first p,
-    #: which are *felt*; along the others, *free*, no gap changes but for rounding
+    #: (n, r) sparse, at local components. Contact rows open or close along the first p
+    #: motions (felt by contact); along the others (free), gaps change by rounding only
     all: Any
-    at_rows: NDArray[np.float64]  #: (w, p) felt ones, of the components that rows touch
-    together: NDArray[np.float64]  #: (motions, r) coefficients of R of all subdomains
-    balance: Balance  #: of the load along felt ones
-    driven: str = ""  #: which load along free ones nothing can balance, if there is one
+    at_rows: NDArray[np.float64]  #: (w, p) felt motions at the components of the rows
+    together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
+    balance: Balance  #: of the load along felt motions
+    driven: str = ""  #: the load along free motions that nothing balances, if any
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:
-        """Take the free motions out of v (n,)."""
+        """Subtract the free motions from v (n,)."""
         p, r = self.at_rows.shape[1], self.all.shape[1]
         if p == r:
             return v
@@ -357,7 +356,10 @@ class _RigidMotions:
 def _rigid_motions(
     local: LocalBodies, exact: Exact, at: NDArray[np.int64]
 ) -> _RigidMotions:
-    """Split the rigid motions by whether rows feel them at the components `at` (w,)."""
+    """Split the rigid motions into those that the contact rows feel, and free ones.
+
+    at : (w,) global components that the rows touch
+    """
     reduction, parts, floating = local.reduction, local.parts, local.floating
 
     if not floating.combinations.shape[1]:
@@ -367,22 +369,22 @@ def _rigid_motions(
             Balance(*np.zeros((2, rows, 0)), *np.zeros((3, 0)), *np.zeros((2, rows))),
         )  # fmt: skip
 
-    def seen(R: Any) -> NDArray[Any]:
-        """Tell all ranks columns (n, k) at these components: (w, k)."""
+    def at_components(R: Any) -> NDArray[Any]:
+        """Return columns (n, k) at these components on all ranks: (w, k)."""
         columns = (R[:, [k]].toarray().ravel() for k in range(R.shape[1]))
-        return np.stack([reduction.traced(column, at) for column in columns], axis=1)
+        return np.stack([reduction.values_at(column, at) for column in columns], axis=1)
 
     free = np.ones(local.components.size)
     free[local.fixed] = 0
     R = csr_array(
         diags_array(free) @ floating.motions @ csr_array(floating.combinations)
     )
-    turn, p = felt_first(local.contact.rows[:, at], seen(R))
+    turn, p = felt_first(local.contact.rows[:, at], at_components(R))
     R = _orthonormal(local, csr_array(R @ csr_array(turn)))
-    largest, R_at = _largest(local, R), seen(R)
+    largest, R_at = _largest(local, R), at_components(R)
     f = reduction.completed(parts.spread.T @ local.f.astype(Real))
     size, along = np.abs(f), reduction.along(R, f)
-    total = reduction.summed(size[reduction.counts].sum(keepdims=True))
+    total = reduction.summed(size[reduction.is_owner].sum(keepdims=True))
     why, terms = "", reduction.along(abs(R), size)
     if is_driven(along[p:], terms[p:], total * largest[p:]):
         along_free = np.append(np.zeros(p), along[p:])
@@ -403,29 +405,32 @@ def _rigid_motions(
 
 
 def _orthonormal(local: LocalBodies, R: csr_array) -> Any:
-    """Orthonormalise columns (n, r) that are so to double precision; sparse."""
+    """Orthonormalise sparse columns (n, r) that are orthonormal to double precision.
+
+    One step of R(3I − RᵀR)/2 squares their error.
+    """
     R = csr_array(R.astype(Real))
-    counted = R[local.reduction.counts]
-    gram = local.reduction.summed((counted.T @ counted).toarray())
+    owned = R[local.reduction.is_owner]
+    gram = local.reduction.summed((owned.T @ owned).toarray())
     return csr_array(R + R @ csr_array(0.5 * (np.eye(R.shape[1]) - gram)))
 
 
 def _largest(local: LocalBodies, R: Any) -> Extended:
-    """Return the largest size in each column (k,) on all ranks."""
+    """Return the largest absolute entry of each column (k,) over all ranks."""
     found = abs(csc_array(R))
     sizes = found.max(axis=0).toarray().ravel() if found.nnz else np.zeros(R.shape[1])
     return np.asarray(np.max(local.ranks.comm.allgather(sizes), axis=0))
 
 
 class _OnRanks:
-    """The bodies of all ranks; see `harness.verify.substructured.Split`.
+    """Bodies distributed over ranks; see `harness.verify.substructured.Split`.
 
-    No rank has the assembled K. The residual is that of TᵀK_T T, where subdomains have
-    exact kernels, and E is estimated by samples of the rounding of doubles.
+    K is not assembled. The residual is that of TᵀK_T T, with the exact kernels of the
+    subdomains, and E is estimated by samples of the rounding of doubles.
     """
 
     def __init__(self, local: LocalBodies) -> None:
-        """Prepare what several pairs need."""
+        """Compute the data that all pairs share."""
         self._local = local
         #: (w,) components that the rows touch
         self.at = np.unique(local.contact.rows.indices).astype(np.int64)
@@ -496,7 +501,7 @@ class _OnRanks:
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
         if self._local.stored is not None:
-            # bodies that w moves far with their supports leave Kw as sums that cancel
+            # where w moves bodies together with their supports, the terms of Kw cancel
             v = self.spread(w)
             Kw, Kv = cancelling(self._local.stored, w[:, None])[:, 0], self.product(v)
             off = Kw - self.joined(Kv)

@@ -30,7 +30,7 @@ from mortarbench.harness.verify.active_set_refinement import (
     predicted,
     unconstrained_guess,
 )
-from mortarbench.harness.verify.admissible import DENSE
+from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
@@ -121,7 +121,7 @@ def _identified(mechanics: Mechanics, solve: Reference) -> States:
     f, B = -mechanics.primal.q, mechanics.rows
     lb, ub = (v.astype(np.float64) for v in (exact.lower, exact.upper))
     m = exact.c.size
-    if not m or (m > DENSE and not R.shape[1]):
+    if not m or (m > MAX_DENSE_ROWS and not R.shape[1]):
         return unconstrained_guess(mechanics)
     qp = QP(
         P=inverse.congruence(B), q=exact.c.astype(np.float64) - B @ inverse(f),

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.failures import agreed
+from mortarbench.harness.distributed.failures import run_collectively
 from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
     DistributedQP,
@@ -197,22 +197,24 @@ def evaluated_by_ranks(
         "notes": list[str](),
     }  # fmt: skip
     try:
-        found["values"] = agreed(ranks, lambda: _values_by_ranks(emitted, s, ranks))
+        found["values"] = run_collectively(
+            ranks, lambda: _values_by_ranks(emitted, s, ranks)
+        )
         if found["values"] is None:
             return found
-        answered = agreed(ranks, lambda: emitted.answer(s))
+        answered = run_collectively(ranks, lambda: emitted.answer(s))
     except Exception as e:
         return {**found, "notes": [note_of("evaluation by ranks", e)]}
     if (certifiable := answered.certifiable) is not None:
         found["bounds"], note = _certified(
-            lambda: agreed(ranks, lambda: certify_over_ranks(*certifiable))
+            lambda: run_collectively(ranks, lambda: certify_over_ranks(*certifiable))
         )
         found["notes"] += filter(None, [note])
     if (results := answered.quantities) is not None:
         start = perf_counter()
         try:
             with np.errstate(all="ignore"):
-                found["quantities"] = plain(agreed(ranks, results))
+                found["quantities"] = plain(run_collectively(ranks, results))
             found["recover_seconds"] = perf_counter() - start
         except Exception as e:
             found["quantities"] = {}

@@ -453,5 +453,5 @@ def _largest_von_mises(
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
         most = von_mises(stress, materials[b].nu, plane).max()
         largest[b] = max(largest[b], most)
-    everyones = found.bodies.ranks.everyones(largest)
+    everyones = found.bodies.ranks.gather_all(largest)
     return [float(most) for most in everyones.max(axis=0)]

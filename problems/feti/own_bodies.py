@@ -46,7 +46,7 @@ class OwnSolution:
 
     def at(self, component: Nodes) -> Vector:
         """Tell all ranks the displacement at components (w,) of the whole."""
-        return np.asarray(self.bodies.reduction.traced(self.u, component))
+        return np.asarray(self.bodies.reduction.values_at(self.u, component))
 
     def diagonal(self, component: Nodes) -> Vector:
         """Tell all ranks the diagonal of K at components (w,) of the whole."""
@@ -55,7 +55,7 @@ class OwnSolution:
         known = np.unique(places[here])
         found = np.zeros(self.u.size)
         found[known] = self.bodies.parts.diagonal(known)
-        return np.asarray(reduction.traced(reduction.completed(found), component))
+        return np.asarray(reduction.values_at(reduction.completed(found), component))
 
     @cached_property
     def energy(self) -> float:

@@ -113,7 +113,7 @@ cdef class Reduction:
             memcpy(numbers(own), terms, k * sizeof(double))
         if least:
             numbers(own)[k] = least[0]
-        everyones = self.ranks.everyones(own)
+        everyones = self.ranks.gather_all(own)
         of_rank = numbers(everyones)
         for i in range(k):
             terms[i] = 0.0

@@ -71,7 +71,7 @@ def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypa
     u = 1e-3 * rng.standard_normal(mechanics.exact.f.size).astype(Real)
     none = np.zeros(mechanics.exact.c.size, dtype=bool)
     by_factor = admissible(mechanics, u, none)
-    monkeypatch.setattr(module, "DENSE", 2)
+    monkeypatch.setattr(module, "MAX_DENSE_ROWS", 2)
     by_iterations = admissible(mechanics, u, none)
 
     far = mechanics.norm(by_factor - u)
