@@ -61,14 +61,14 @@ def one(way, Nr, cells):
     u = np.zeros(bodies.mesh.dofs)
     primal = primal_qp(bodies, node_to_segment(bodies.mesh.points, u, *bodies.pairs[0]))
     lap()
-    pieces = in_parts = None
+    pieces = certify_by_subdomains = None
     if way == "feti":
         of = bodies_of(Nr, Nr // 2, Nr, "strain")
         (stage,) = load_steps(1, 1, of.forces, of.fixed)
         contact = Contact(primal.G, primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
         own = on_one_process(described(of, layout, "orthonormal", stage, contact))
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
+        pieces, certify_by_subdomains = own.torn_bodies, certified_by(own, primal.P)
         dual = torn_dual(pieces, primal)
     else:
         dual = dualise(primal, floating(bodies))
@@ -81,7 +81,7 @@ def one(way, Nr, cells):
     lap()
     mechanics = Mechanics(
         primal=primal, to_primal=dual.recover, factorise=lambda: clamped(bodies),
-        in_parts=in_parts,
+        certify_by_subdomains=certify_by_subdomains,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound

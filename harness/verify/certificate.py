@@ -187,8 +187,10 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    if mechanics.in_parts is not None:
-        certificate: Certificate = mechanics.in_parts(s.x, mechanics.multipliers(s))
+    if mechanics.certify_by_subdomains is not None:
+        certificate: Certificate = mechanics.certify_by_subdomains(
+            s.x, mechanics.multipliers(s)
+        )
         return certificate
     split = Undivided(mechanics)
     best = sharpest(_certificates(split, s), lambda: _at_rest(split, s))

@@ -143,11 +143,11 @@ def contact_case(
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, in_parts, subdomains = None, None, None
+    seconds, certify_by_subdomains, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
         own = on_one_process(parts)
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
+        pieces, certify_by_subdomains = own.torn_bodies, certified_by(own, primal.P)
         new = torn_dual(pieces, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
@@ -182,7 +182,7 @@ def contact_case(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction, in_parts=in_parts,
+            friction=friction, certify_by_subdomains=certify_by_subdomains,
         ),
         unsettled=friction.unsettled,
     )  # fmt: skip

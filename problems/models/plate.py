@@ -116,7 +116,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            in_parts=(
+            certify_by_subdomains=(
                 certified_by(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),

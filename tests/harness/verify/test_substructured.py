@@ -116,7 +116,9 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
     own = own_bodies(subdomains)
     mechanics = replace(
-        whole, factorise=never, in_parts=lambda u, z: certify_over_ranks(own, u, z)
+        whole,
+        factorise=never,
+        certify_by_subdomains=lambda u, z: certify_over_ranks(own, u, z),
     )
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution), own)
