@@ -62,7 +62,7 @@ def one(way, Nr, cells):
     u = np.zeros(bodies.mesh.dofs)
     primal = primal_qp(bodies, node_to_segment(bodies.mesh.points, u, *bodies.pairs[0]))
     lap()
-    pieces = in_parts = parts = None
+    pieces = certify_by_subdomains = parts = None
     if way == "feti":
         of = bodies_of(Nr, Nr // 2, Nr, "strain")
         (stage,) = load_steps(1, 1, of.forces, of.fixed)
@@ -70,7 +70,7 @@ def one(way, Nr, cells):
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
         own = on_one_process(parts)
-        pieces, in_parts = own.decomposed, certifier(own, primal.P)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, primal.P)
         dual = feti_dual(pieces, primal)
     else:
         dual = dualise(primal, factorise_floating(bodies))
@@ -83,7 +83,7 @@ def one(way, Nr, cells):
     lap()
     mechanics = Mechanics(
         primal=primal, back=dual.recover, factorise=lambda: factorise_clamped(bodies),
-        in_parts=in_parts,
+        certify_by_subdomains=certify_by_subdomains,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound

@@ -195,12 +195,12 @@ class _Book:
         record = result.record
         if result.part:
             number = self.schedule.number_of_part(record.block, result.part)
-            record = record.but(block=number)
+            record = record.replace(block=number)
         self.was_deleted = not self.held.is_there()
         if result.point is not None:
-            record = record.but(vectors=save(self.out, result.point))
+            record = record.replace(vectors=save(self.out, result.point))
         if result.fields is not None:
-            record = record.but(fields=save(self.out, result.fields))
+            record = record.replace(fields=save(self.out, result.fields))
         self.journal.append(record)
         self.schedule.note(record)
         self._count(record, record)

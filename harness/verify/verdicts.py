@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.failures import agreed
-from mortarbench.harness.distributed.vectors import DistributedColumns, Emitted, Ranks
+from mortarbench.harness.distributed.failures import run_collectively
+from mortarbench.harness.distributed.vectors import (
+    DistributedColumns,
+    DistributedQP,
+    Ranks,
+)
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
 from mortarbench.harness.qp import QP, no_rows
@@ -98,7 +102,7 @@ def judged(
     prove : finds the optimum of `qp` where residuals cannot decide
     found : residuals and objective, where ranks have evaluated them together
     """
-    record = record.but(
+    record = record.replace(
         sizes=qp.sizes,
         claimed=s.status.value,
         message=s.message,
@@ -107,7 +111,7 @@ def judged(
         reported=s.reported,
     )
     if s.status is Status.DECLINED:
-        return record.but(verdict=Verdict.DECLINED)
+        return record.replace(verdict=Verdict.DECLINED)
     if found is not None:
         residuals = Residuals(*(found[name] for name in Residuals._fields))
         objective = found["objective"]
@@ -128,7 +132,7 @@ def judged(
     if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
     decided_by = "residuals" if error is None else "reference"
-    return record.but(
+    return record.replace(
         verdict=verdict(
             s.status, residuals, tol, error=error, infeasible=margin is not None
         ),
@@ -164,7 +168,7 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     mechanics, loaded = case.mechanics, LATE in sys.modules
 
     def certificate() -> Certificate:
-        return certify(mechanics, mechanics.back(s))
+        return certify(mechanics, mechanics.to_primal(s))
 
     told = _certified(certificate)
     if not loaded and LATE in sys.modules:  # and that is no part of the time
@@ -172,7 +176,9 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     return told
 
 
-def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str, Any]:
+def evaluated_by_ranks(
+    emitted: DistributedQP, s: Solution, ranks: Ranks
+) -> dict[str, Any]:
     """Evaluate an answer on all ranks together; each has its slice of the solution.
 
     By a share of its own, without what the solver has made of the first one. All ranks
@@ -191,22 +197,24 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
         "notes": list[str](),
     }  # fmt: skip
     try:
-        found["values"] = agreed(ranks, lambda: _values_by_ranks(emitted, s, ranks))
+        found["values"] = run_collectively(
+            ranks, lambda: _values_by_ranks(emitted, s, ranks)
+        )
         if found["values"] is None:
             return found
-        answered = agreed(ranks, lambda: emitted.answer(s))
+        answered = run_collectively(ranks, lambda: emitted.answer(s))
     except Exception as e:
         return {**found, "notes": [note_of("evaluation by ranks", e)]}
     if (certifiable := answered.certifiable) is not None:
         found["bounds"], note = _certified(
-            lambda: agreed(ranks, lambda: certify_over_ranks(*certifiable))
+            lambda: run_collectively(ranks, lambda: certify_over_ranks(*certifiable))
         )
         found["notes"] += filter(None, [note])
     if (results := answered.quantities) is not None:
         start = perf_counter()
         try:
             with np.errstate(all="ignore"):
-                found["quantities"] = plain(agreed(ranks, results))
+                found["quantities"] = plain(run_collectively(ranks, results))
             found["recover_seconds"] = perf_counter() - start
         except Exception as e:
             found["quantities"] = {}
@@ -215,7 +223,7 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
 
 
 def _values_by_ranks(
-    emitted: Emitted, s: Solution, ranks: Ranks
+    emitted: DistributedQP, s: Solution, ranks: Ranks
 ) -> dict[str, float] | None:
     """Evaluate objective and residuals; None where they are not finite.
 
@@ -267,7 +275,7 @@ def note_of(what: str, e: Exception) -> str:
 
 def noted(record: Record, *notes: str) -> Record:
     """Add notes to the message of a record."""
-    return record.but(message="; ".join(filter(None, [record.message, *notes])))
+    return record.replace(message="; ".join(filter(None, [record.message, *notes])))
 
 
 def plain(data: Any) -> Any:

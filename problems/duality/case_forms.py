@@ -149,11 +149,11 @@ def contact_case(
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, in_parts, subdomains = None, None, None
+    seconds, certify_by_subdomains, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
         own = on_one_process(parts)
-        pieces, in_parts = own.decomposed, certifier(own, primal.P)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, primal.P)
         new = feti_dual(pieces, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
@@ -182,13 +182,13 @@ def contact_case(
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=primal, back=new.recover, factorise=supported,
+            primal=primal, to_primal=new.recover, factorise=supported,
             mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
             scale=energy, grid=Grid(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction, in_parts=in_parts,
+            friction=friction, certify_by_subdomains=certify_by_subdomains,
         ),
         unsettled=friction.unsettled,
     )  # fmt: skip

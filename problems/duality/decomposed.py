@@ -24,7 +24,7 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.harness.distributed.vectors import Emitted, Ranks
+from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
@@ -141,7 +141,7 @@ def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
 
 def distributed_qp_of(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
-) -> Emitted:
+) -> DistributedQP:
     """Emit this rank's share of the dual that is chosen; called by all ranks.
 
     Raises
@@ -465,5 +465,5 @@ def _largest_von_mises(
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
         most = von_mises(stress, materials[b].nu, plane).max()
         largest[b] = max(largest[b], most)
-    everyones = found.bodies.ranks.everyones(largest)
+    everyones = found.bodies.ranks.gather_all(largest)
     return [float(most) for most in everyones.max(axis=0)]

@@ -128,7 +128,7 @@ def newton_case(
         supported=lambda: factorise_supported(bodies), quantities=collected,
     )  # fmt: skip
     assert case.mechanics is not None
-    back, constant = case.mechanics.back, at.constant * unit
+    back, constant = case.mechanics.to_primal, at.constant * unit
 
     def drawn(s: Solution) -> Fields:
         s = back(s)

@@ -21,7 +21,7 @@ from mortarbench.problems.ranges import (
 
 if TYPE_CHECKING:
     from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
-    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
     from mortarbench.problems.duality.problem import ContactProblem
 
 
@@ -87,7 +87,7 @@ class DeclaredFamily(Family):
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
+    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
         """Return what has each rank make its share; None where one process must."""
         if form != "dual" or not self.is_divided(params):
             return None
@@ -95,7 +95,7 @@ class DeclaredFamily(Family):
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> Emitted:
+    ) -> DistributedQP:
         """Emit this rank's share of the dual; called by all ranks."""
         from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
@@ -149,7 +149,7 @@ class ContactFamily(DeclaredFamily):
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> Emitted:
+    ) -> DistributedQP:
         """Emit this rank's share of the dual; called by all ranks."""
         from mortarbench.problems.duality.decomposed import distributed_qp_of
         from mortarbench.problems.duality.problem import qp_choice

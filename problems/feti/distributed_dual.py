@@ -22,10 +22,10 @@ from scipy.sparse import coo_array, csc_array, csr_array
 from mortarbench.harness import QP, InputError, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.vectors import (
-    EMITTED,
+    DISTRIBUTED_DIGEST,
     DistributedColumns,
+    DistributedQP,
     DistributedVector,
-    Emitted,
     Ranks,
     Share,
     distributed,
@@ -154,7 +154,7 @@ def distributed_qp(
     results: Results | None,
     first: LocalDual | None = None,
     others: int = 0,
-) -> Emitted:
+) -> DistributedQP:
     """Return the dual QP as distributed over ranks; called by all of them.
 
     If solutions of previous problems enter the QP, they depend on the number of ranks
@@ -175,10 +175,10 @@ def distributed_qp(
 
     def digest() -> str:
         names = others * [_digest(first.subdomains)] if first else [_digest(local)]
-        return EMITTED + hex_digest(map(str.encode, names), 16)
+        return DISTRIBUTED_DIGEST + hex_digest(map(str.encode, names), 16)
 
     bounds = dual.bounds(local.problem.contact.bound)
-    return Emitted(
+    return DistributedQP(
         variables=local.rows.total, equality_rows=local.coarse_size,
         bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
         share=dual.share, digest=digest,

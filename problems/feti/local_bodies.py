@@ -14,12 +14,12 @@ from scipy.linalg import block_diag, null_space
 from scipy.sparse import csc_array, csr_array, hstack
 
 from mortarbench.harness import Solution, Vector
-from mortarbench.harness.distributed.vectors import Answered
+from mortarbench.harness.distributed.vectors import Evaluation
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
     Contact,
-    OwnBodies,
-    Unheld,
+    FloatingBodies,
+    LocalBodies,
     certify_over_ranks,
 )
 from mortarbench.problems.fem.mesh import Nodes
@@ -40,29 +40,29 @@ class LocalSolution:
     """
 
     subdomains: LocalSubdomains
-    bodies: OwnBodies
+    bodies: LocalBodies
     u: Vector  #: (n,) at `bodies.components`; equal on all ranks that share a component
     z: Vector  #: (m,) multipliers of all rows of contact and friction
 
     def at(self, component: Nodes) -> Vector:
         """Return the displacement at global components (w,)."""
-        return np.asarray(self.bodies.among.traced(self.u, component))
+        return np.asarray(self.bodies.reduction.values_at(self.u, component))
 
     def diagonal(self, component: Nodes) -> Vector:
         """Return the diagonal of K at global components (w,)."""
-        among = self.bodies.among
-        places, here = among.places(component)
+        reduction = self.bodies.reduction
+        places, here = reduction.places(component)
         local = np.unique(places[here])
         values = np.zeros(self.u.size)
         values[local] = self.bodies.parts.diagonal(local)
-        return np.asarray(among.traced(among.completed(values), component))
+        return np.asarray(reduction.values_at(reduction.completed(values), component))
 
     @cached_property
     def energy(self) -> float:
         """½uᵀKu − fᵀu, summed over all ranks."""
         v = self.bodies.parts.spread @ self.u
         work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
-        return self.bodies.among.total(float(work))[0]
+        return self.bodies.reduction.total(float(work))[0]
 
 
 #: solution → physical results in SI units, the same on all ranks
@@ -82,7 +82,7 @@ def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolu
     v = np.zeros(T.shape[0])
     v[local.free] = local.domains.inverse(local.f - local.rows.B.T @ multipliers)
     v[local.free] -= local.domains.kernel @ alpha
-    u = bodies.among.completed(T.T @ v) / multiplicity
+    u = bodies.reduction.completed(T.T @ v) / multiplicity
     z = contact_multipliers(local, halo, s)
     return LocalSolution(subdomains=local, bodies=bodies, u=u, z=z)
 
@@ -102,7 +102,7 @@ def evaluation(
     halo: Halo,
     decomposition: Mapping[str, Any],
     reported: Results | None,
-) -> Callable[[Solution], Answered]:
+) -> Callable[[Solution], Evaluation]:
     """Return a function that evaluates physical results for the local subdomains.
 
     Parameters
@@ -113,14 +113,14 @@ def evaluation(
     """
     problem = local.problem
 
-    def answer(s: Solution) -> Answered:
+    def answer(s: Solution) -> Evaluation:
         solution, results = local_solution(local, halo, s), None
         if reported is not None:
 
             def results() -> Mapping[str, Any]:
                 return {**reported(solution), **decomposition}
 
-        return Answered(
+        return Evaluation(
             (solution.bodies, solution.u, solution.z[_force_rows(problem)]), results
         )
 
@@ -138,12 +138,12 @@ def certifier(
     return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
 
 
-def local_bodies(local: LocalSubdomains) -> OwnBodies:
+def local_bodies(local: LocalSubdomains) -> LocalBodies:
     """Return the local data of certificates; supports are rows."""
     return _local_bodies(local.floating)[0]
 
 
-def _local_bodies(local: LocalSubdomains) -> tuple[OwnBodies, Vector]:
+def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
     """Return the local data of certificates, and the multiplicities (n,).
 
     local : subdomains that all float
@@ -153,17 +153,17 @@ def _local_bodies(local: LocalSubdomains) -> tuple[OwnBodies, Vector]:
     multiplicity = np.empty(components.size)
     multiplicity[place] = local.multiplicity
     parts = LocalProblems(local.decomposed, problem.components)
-    return OwnBodies(
+    return LocalBodies(
         ranks=local.ranks, parts=parts, components=components,
         shared=np.bincount(place, minlength=multiplicity.size) < multiplicity,
         coarse=local.local_motions,
         motions=local.coarse_size, f=local.f,
-        held=np.flatnonzero(np.isin(components, problem.fixed)),
+        fixed=np.flatnonzero(np.isin(components, problem.fixed)),
         contact=Contact(
             rows=csr_array(contact.rows[active]), c=contact.c[active],
             bound=contact.bound[contact.bound > 0],
         ),
-        unheld=_floating_bodies(local),
+        floating=_floating_bodies(local),
     ), multiplicity  # fmt: skip
 
 
@@ -222,7 +222,7 @@ class _Extent(NamedTuple):
         return motions / self.size
 
 
-def _floating_bodies(local: LocalSubdomains) -> Unheld:
+def _floating_bodies(local: LocalSubdomains) -> FloatingBodies:
     """Return the rigid motions of all floating bodies at the local components."""
     #: one copy of each local node among the local torn nodes
     copy = np.unique(local.nodes.number, return_index=True)[1]
@@ -230,7 +230,9 @@ def _floating_bodies(local: LocalSubdomains) -> Unheld:
     components = d * copy.size
     motions, remaining, names = [csr_array((components, 0))], list[Any](), list[str]()
     if not (numbers := floating_bodies(problem)):
-        return Unheld(motions=motions[0], left=np.zeros((0, 0)), names=())
+        return FloatingBodies(
+            motions=motions[0], combinations=np.zeros((0, 0)), names=()
+        )
     points = np.concatenate([*layout.points(local.number)])
     body = layout.body[local.number][local.nodes.subdomain]
     fixed, axis = np.divmod(problem.fixed, d)
@@ -254,9 +256,9 @@ def _floating_bodies(local: LocalSubdomains) -> Unheld:
         )
         motions.append(embedding @ csr_array(modes))
         names.append(problem.names[b])
-    return Unheld(
+    return FloatingBodies(
         motions=csr_array(hstack(motions)),
-        left=block_diag(*remaining),
+        combinations=block_diag(*remaining),
         names=tuple(names),
     )
 

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import Ranks, alone
+from mortarbench.harness.distributed.vectors import Ranks, single_process
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import balanced_partition
 from mortarbench.problems.feti.subdivision import (
@@ -616,4 +616,4 @@ def _equality_count(problem: DecomposedProblem) -> int:
 def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
     """Return all subdomains on this process, as if it was the only rank."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
-    return LocalSubdomains(problem, alone(), every)
+    return LocalSubdomains(problem, single_process(), every)

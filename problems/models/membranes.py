@@ -64,13 +64,13 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, in_parts = None, None
+    seconds, certify_by_subdomains = None, None
     if form == "primal":
         new = primal_form(pair.qp)
     else:
         start = perf_counter()
         own = on_one_process(pair.in_subdomains(p["glue"]))
-        pieces, in_parts = own.decomposed, certifier(own, pair.qp.P)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
         new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
         matrices = feti_matrices(pieces, new.qp)
@@ -85,10 +85,10 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=pair.qp, back=new.recover, factorise=pair.factorise,
+            primal=pair.qp, to_primal=new.recover, factorise=pair.factorise,
             mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
-            in_parts=in_parts,
+            certify_by_subdomains=certify_by_subdomains,
         ),
     )  # fmt: skip
 

@@ -86,13 +86,13 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
             f"feti with form {form} is not built; expected form dual, or no feti"
         )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start, in_parts = problem.qp, perf_counter(), None
+    rows, start, certify_by_subdomains = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}
     if form == "primal":
         new = bound_form(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
-        pieces, in_parts = own.decomposed, certifier(own, rows.P)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, rows.P)
         new = feti_dual(pieces, rows)
         decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "dual":
@@ -111,9 +111,9 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         constant=new.constant + datum,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=rows, back=new.recover, factorise=problem.factorise,
+            primal=rows, to_primal=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
-            in_parts=in_parts,
+            certify_by_subdomains=certify_by_subdomains,
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,

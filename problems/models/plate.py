@@ -109,14 +109,14 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         constant=new.constant * LOAD * LENGTH,
         matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
-            primal=plate.primal, back=new.recover, factorise=plate.factorise,
+            primal=plate.primal, to_primal=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
             rigid=rigid_modes(mesh.points), names=("plate",),
             scale=LOAD * LENGTH, grid=Grid(
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            in_parts=(
+            certify_by_subdomains=(
                 certifier(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),

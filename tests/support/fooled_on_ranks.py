@@ -119,12 +119,12 @@ class BoundSearch:
                 u[components] = part
             m = self.mechanics
             motion, contact = m.exact.motion(u), m.exact.contact
-            inside = (motion[contact] <= 0).all() and not u[m.exact.held].any()
+            inside = (motion[contact] <= 0).all() and not u[m.exact.fixed].any()
             lengths = [m.norm(v - truth.u) for v in (u, claimed.astype(Real))]
-            still = *lengths, bool(inside), m.still(u - truth.u)
+            still = *lengths, bool(inside), m.without_rigid_motion(u - truth.u)
         of_u, of_answer, inside, off = self.ranks.comm.bcast(still)
         jump = own.parts.spread.astype(Real) @ off[own.components] - found.off
-        torn = own.among.total(float(jump @ own.parts.product(jump)))[0]
+        torn = own.reduction.total(float(jump @ own.parts.product(jump)))[0]
         return of_u, of_answer, float(np.hypot(of_u, np.sqrt(max(torn, 0)))), inside
 
     def tried(self, s):

@@ -182,7 +182,7 @@ def stored_solution(
     """
     primal = mechanics.primal
     K, B = primal.P.toarray(), primal.G.toarray()
-    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.held)
+    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.fixed)
     rows = B[closed][:, free]
     loose = _loose(rows, mechanics.inverse.kernel[free])
     rows = np.vstack([rows, loose.T])

@@ -15,10 +15,10 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.crossval.discretisation import (
     FILE,
-    MOST_UNKNOWNS,
+    MAX_UNKNOWNS,
     Level,
     discretisation_errors,
-    estimated,
+    estimate_error,
     read_discretisation,
 )
 from mortarbench.harness.crossval.mesh_refinement import prolongation
@@ -180,14 +180,14 @@ def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):
 
 @pytest.mark.parametrize("rate", [1.0, 1.5, 2.0])
 def test_the_rate_and_the_error_of_a_sequence_that_has_them_are_found(rate):
-    found = estimated("box", converging(0.6, rate, 3))
+    found = estimate_error("box", converging(0.6, rate, 3))
 
     assert found.rate == pytest.approx(rate)
     assert found.error == pytest.approx(0.6 / 2)
 
 
 def test_two_meshes_tell_their_difference_only():
-    found = estimated("box", levels(0.3), note="the next one would be too large")
+    found = estimate_error("box", levels(0.3), note="the next one would be too large")
 
     assert (found.kind, found.rate) == ("change", None)
     assert found.note == "the next one would be too large"
@@ -195,7 +195,7 @@ def test_two_meshes_tell_their_difference_only():
 
 
 def test_what_hardly_falls_is_not_extrapolated():
-    found = estimated("box", levels(0.3, 0.29))
+    found = estimate_error("box", levels(0.3, 0.29))
 
     assert found.kind == "change"
     assert "slowly" in found.note
@@ -203,7 +203,7 @@ def test_what_hardly_falls_is_not_extrapolated():
 
 def test_what_grows_is_not_said_to_fall():
     """The second halving changes 2^1.45 = 2.73 times as much as the first."""
-    found = estimated("box", levels(0.1, 0.1 * 2**1.45))
+    found = estimate_error("box", levels(0.1, 0.1 * 2**1.45))
 
     assert (found.kind, found.error) == ("change", found.change)
     assert "does not fall" in found.note
@@ -212,7 +212,7 @@ def test_what_grows_is_not_said_to_fall():
 
 
 def test_what_the_reference_does_not_know_is_no_discretisation_error():
-    found = estimated("box", levels(1e-3, bound=1e-2))
+    found = estimate_error("box", levels(1e-3, bound=1e-2))
 
     assert found.kind == "rounding"
     assert found.error >= 1e-2
@@ -270,7 +270,7 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
     assert {d.kind for d in (*found, *large, *late)} == {"unknown"}
     assert "it is Monday" in found[0].note
     assert "bare offers no refined mesh" in found[1].note
-    assert f"{MOST_UNKNOWNS:,}" in large[0].note
+    assert f"{MAX_UNKNOWNS:,}" in large[0].note
     assert "time" in late[0].note
     assert late[0].levels == large[0].levels == ()
 

@@ -265,7 +265,7 @@ def test_a_malformed_answer_is_a_failure_with_a_short_message(qp, wrong, message
 def test_a_history_that_would_fill_the_disk_is_dropped_and_the_answer_kept(
     qp, monkeypatch
 ):
-    monkeypatch.setattr(answers, "MOST_HISTORY", 100)
+    monkeypatch.setattr(answers, "MAX_HISTORY_BYTES", 100)
 
     class Verbose(type(PLUGIN.solvers["honest"])):
         def act(self, qp):

@@ -79,7 +79,7 @@ def test_shear_that_tresca_grants_without_contact_is_counted_apart():
     states = ("open", "stick", "slip", "sliding_without_contact")
     assert sum(found[name] for name in states) == friction.bound.size
 
-    z = case.mechanics.back(s).z
+    z = case.mechanics.to_primal(s).z
     shear, pressed = np.abs(z[rows:]), z[:rows] > 1e-6 * z[:rows].max()
     apart = ~pressed[friction.row] & (shear > 1e-6 * np.abs(z).max())
     assert found["sliding_without_contact"] == apart.sum() > 0
@@ -136,7 +136,7 @@ def test_every_form_is_the_same_problem(law, contact):
 @pytest.mark.parametrize("law", ["tresca/bound=5e7", "coulomb/mu=0.3"])
 def test_friction_opposes_the_slip_and_only_at_its_bound(law):
     case, s, found = solved(f"{SMALL}/friction={law}/dual")
-    friction, back = case.mechanics.friction, case.mechanics.back(s)
+    friction, back = case.mechanics.friction, case.mechanics.to_primal(s)
     force = back.z[case.mechanics.primal.h.size :]
     slip = friction.T @ back.x - friction.start
     slips = abs(slip) > 1e-9 * abs(slip).max()

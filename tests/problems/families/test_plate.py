@@ -86,7 +86,7 @@ def test_the_dual_has_the_displacement_of_the_plate(name):
     s = FETI().prepare(case.qp, 1e-9)()
     primal = case.mechanics.primal
     u = case.mechanics.inverse(-primal.q)
-    back = case.mechanics.back(s)
+    back = case.mechanics.to_primal(s)
     K_norm = np.sqrt(u @ (primal.P @ u))
     off = back.x - u
     assert np.sqrt(off @ (primal.P @ off)) <= 1e-7 * K_norm

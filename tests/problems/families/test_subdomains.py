@@ -38,7 +38,7 @@ def built(name):
 @cache
 def in_one_piece(name):
     whole = built(f"{name}/dual")
-    u = whole.mechanics.back(reference_solution(whole.qp)).x
+    u = whole.mechanics.to_primal(reference_solution(whole.qp)).x
     return u, whole.mechanics.primal.P
 
 
@@ -46,7 +46,7 @@ def check(name, cut, glue):
     u, K = in_one_piece(name)
     case = built(f"{name}/{cut}/glue={glue}/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
-    error = case.mechanics.back(s).x - u
+    error = case.mechanics.to_primal(s).x - u
     bound = certified(case, s)[0]["energy_bound"]
     relative = np.sqrt(max(error @ (K @ error), 0.0) / (u @ (K @ u)))
 
@@ -69,7 +69,7 @@ def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
         raise AssertionError("a factor of the whole")
 
     monkeypatch.setattr(problem, "factorise_clamped", refused)
-    monkeypatch.setattr(problem, "floating", refused)
+    monkeypatch.setattr(problem, "factorise_floating", refused)
     case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
     assert certified(case, s)[0]["energy_bound"] <= 1e-5
@@ -96,7 +96,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
     """One with the form that eliminates them."""
     u, _ = in_one_piece(name)
     eliminated = built(f"{name}/dual-bounds")
-    exact = eliminated.mechanics.back(reference_solution(eliminated.qp)).x
+    exact = eliminated.mechanics.to_primal(reference_solution(eliminated.qp)).x
 
     assert u == pytest.approx(exact, abs=1e-12)
 

@@ -229,7 +229,7 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
 @pytest.mark.parametrize("fill", [0, 10**6])
 def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkeypatch):
     """Either way the sum of the ranks' parts of B W Bᵀ is inverted."""
-    monkeypatch.setattr(factor, "FILL", fill)
+    monkeypatch.setattr(factor, "MAX_FILL", fill)
     F, qp = dual_of(torn)
     x = np.random.default_rng(6).standard_normal(qp.q.size)
     known = F.preconditioner("dirichlet", "stiffness")(x)

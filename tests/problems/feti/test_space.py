@@ -70,13 +70,13 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
 
 def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
     own = torn(box(), np.zeros(0, dtype=np.int64))
-    unheld = local_bodies(own).unheld
-    R = unheld.motions.toarray()
+    floating = local_bodies(own).floating
+    R = floating.motions.toarray()
 
     assert floating_bodies(own.problem)
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
     assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
-    assert_allclose(unheld.left, np.eye(6))
+    assert_allclose(floating.combinations, np.eye(6))
 
 
 #: motions that a face across x leaves that is held along some axes
@@ -89,13 +89,13 @@ def test_a_face_that_is_held_along_axes_leaves_the_other_motions(axes):
     face = np.flatnonzero(mesh.points[:, 0] == 0)
     fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])
     own = torn(mesh, fixed)
-    unheld = local_bodies(own).unheld
+    floating = local_bodies(own).floating
     left = LEFT[axes]
 
     assert (not floating_bodies(own.problem)) == (left == 0)
-    assert unheld.left.shape[1] == left
+    assert floating.combinations.shape[1] == left
     if left:
-        R = unheld.motions @ unheld.left
+        R = floating.motions @ floating.combinations
         assert_allclose(R.T @ R, np.eye(left), atol=1e-14)
         assert abs(R[fixed]).max() <= 1e-15
         assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
