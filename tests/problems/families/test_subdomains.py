@@ -68,8 +68,8 @@ def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
     def refused(*_: object) -> None:
         raise AssertionError("a factor of the whole")
 
-    monkeypatch.setattr(problem, "clamped", refused)
-    monkeypatch.setattr(problem, "floating", refused)
+    monkeypatch.setattr(problem, "factorise_clamped", refused)
+    monkeypatch.setattr(problem, "factorise_floating", refused)
     case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
     assert certified(case, s)[0]["energy_bound"] <= 1e-5
