@@ -33,11 +33,11 @@ class HalfPlane(DeclaredFamily):
     model = "half_plane.half_planes"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Let the tangential force never have been larger than it is."""
+        """Return all keys; peak defaults to Q, loading without unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the law has these forces, and they do not slide."""
+        """Raise InputError unless the law allows Q and peak, without sliding."""
         super().check(params)
         check_dense_memory(self.name, int(params["n"]))
         if params["law"] == "cattaneo":
