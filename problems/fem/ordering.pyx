@@ -212,13 +212,13 @@ def borders(
     cdef int[::1] first = firsts, stack = np.empty(fronts, dtype=np.int32)
     cdef int[::1] position = np.empty(nodes, dtype=np.int32)
     cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
-    found = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
-    cdef int[::1] unsorted = found
+    entries = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
+    cdef int[::1] unsorted = entries
     for p in range(nodes):
         position[order[p]] = p
     for s in range(fronts):
         if end + nodes > unsorted.shape[0]:
-            found = unsorted = np.resize(found, 2 * found.size)
+            entries = unsorted = np.resize(entries, 2 * entries.size)
         for i in range(children[s]):
             waiting -= 1
             child = stack[waiting]
@@ -238,7 +238,7 @@ def borders(
         waiting += 1
 
     # two counting sorts, by position and then by front: borders ascend at linear cost
-    cdef int[::1] at = np.append(0, np.bincount(found[:end], minlength=nodes)).cumsum(
+    cdef int[::1] at = np.append(0, np.bincount(entries[:end], minlength=nodes)).cumsum(
         dtype=np.int32
     )
     cdef int[::1] of_front = np.empty(end, dtype=np.int32), filled = firsts.copy()

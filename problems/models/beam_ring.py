@@ -61,7 +61,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             p["steps"], p["relin"], elastic.forces, elastic.fixed, (law_of(p),),
             quasi_static=p["loading"] == "quasi-static",
         ),
-        results=lambda found: {"tip": (found.at(tip) * LENGTH).tolist()},
+        results=lambda answer: {"tip": (answer.at(tip) * LENGTH).tolist()},
     )  # fmt: skip
 
 

@@ -69,8 +69,8 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         linearise=lambda bodies, _: lambda u: rigid_plane_rows(
             bodies.mesh, bodies.pairs[0].slave, tangential=True
         ),
-        results=lambda found: {
-            **along_the_side(*found.sides), "tresca_problems": found.problems,
+        results=lambda answer: {
+            **along_the_side(*answer.sides), "tresca_problems": answer.problems,
         },
     )  # fmt: skip
 

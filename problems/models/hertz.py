@@ -91,8 +91,8 @@ def on_plane(params: Mapping[str, Value]) -> ContactProblem:
     """Return the linear problem of a cylinder on a rigid plane."""
     elastic, exact = _on_plane(params)
 
-    def results(found: Found) -> dict[str, Any]:
-        bodies, primal, s, _ = found.sides
+    def results(answer: Found) -> dict[str, Any]:
+        bodies, primal, s, _ = answer.sides
         return pressure_quantities(bodies, primal, exact, s)
 
     return ContactProblem(
@@ -163,13 +163,13 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         rows = linearisation(bodies, p["contact"], p["basis"], laws)
         return lambda u: rows(np.zeros_like(u))
 
-    def results(found: Found) -> dict[str, Any]:
-        bodies, primal, s, friction = found.sides
+    def results(answer: Found) -> dict[str, Any]:
+        bodies, primal, s, friction = answer.sides
         values = pressure_quantities(bodies, primal, exact, s)
         if shear is not None:
             values |= shear_quantities(bodies, primal, exact, s, friction, p, shear)
         if p["friction"] == "coulomb":
-            values["tresca_problems"] = found.problems
+            values["tresca_problems"] = answer.problems
         return values
 
     stages = load_steps(1, 1, elastic.forces, elastic.fixed, laws)

@@ -179,14 +179,14 @@ class Membranes:
 
         Energy and force are divided by the tension.
         """
-        return self._reported(s.z, self.qp.objective(s.x), float(s.x.min()))
+        return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
 
-    def results(self, found: OwnSolution) -> dict[str, Any]:
+    def results(self, answer: OwnSolution) -> dict[str, Any]:
         """Return the results of `quantities` from all ranks; collective."""
-        lowest = found.bodies.ranks.extreme(float(found.u.min()), np.min)
-        return self._reported(found.z, found.energy, lowest)
+        lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
+        return self._quantities(answer.z, answer.energy, lowest)
 
-    def _reported(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
+    def _quantities(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
         nodes = 2 * (self.side + 1) ** 2
         return {
             "nodes": nodes,

@@ -161,11 +161,11 @@ def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
     """Return the function that evaluates `obstacle_quantities` on ranks."""
     del dual
     p: Any = params
-    return partial(_found_by_ranks, _grid(p["n"], p["shape"]), p["shape"])
+    return partial(_rank_quantities, _grid(p["n"], p["shape"]), p["shape"])
 
 
-def _found_by_ranks(
-    grid: StructuredGrid, shape: str, found: OwnSolution
+def _rank_quantities(
+    grid: StructuredGrid, shape: str, answer: OwnSolution
 ) -> Mapping[str, Any]:
     """Return `obstacle_quantities` from the solutions of all ranks; collective.
 
@@ -175,14 +175,14 @@ def _found_by_ranks(
     n = grid.divisions[0]
     w, q = exact_height(grid.position(boundary), shape), -_load(grid, shape, boundary)
     load = LOAD[shape] * _hat_integrals(n, 2 * HALF[shape] / n, boundary)
-    node = found.bodies.components
+    node = answer.bodies.components
     x, at_boundary = grid.position(node), np.isin(node, boundary)
-    u = np.where(at_boundary, exact_height(x, shape), found.u)
+    u = np.where(at_boundary, exact_height(x, shape), answer.u)
     error = float(np.abs(u - exact_height(x, shape)).max())
-    return _reported(
-        shape, (2, grid.nodes, n**2, boundary.size), found.z,
-        found.energy + float(w @ (q + load) / 2),
-        found.bodies.ranks.extreme(error, np.max),
+    return _quantities(
+        shape, (2, grid.nodes, n**2, boundary.size), answer.z,
+        answer.energy + float(w @ (q + load) / 2),
+        answer.bodies.ranks.extreme(error, np.max),
     )  # fmt: skip
 
 
@@ -373,13 +373,13 @@ def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
     """
     N, dim = problem.x.shape
     error = problem.lift + s.x - exact_height(problem.x, problem.shape)
-    return _reported(
+    return _quantities(
         problem.shape, (dim, N, problem.cells, problem.qp.b.size), s.z,
         problem.energy(s.x), float(np.abs(error).max()),
     )  # fmt: skip
 
 
-def _reported(
+def _quantities(
     shape: str, sizes: tuple[int, int, int, int], z: Vector, energy: float, error: float
 ) -> dict[str, Any]:
     """Return the dictionary of `obstacle_quantities`.

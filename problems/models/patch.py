@@ -79,14 +79,14 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     elastic = bodies(p)
     D = elasticity_matrices(elastic.materials, elastic.plane)
 
-    def error(found: Found) -> dict[str, Any]:
+    def error(answer: Found) -> dict[str, Any]:
         """Return the largest |σ_y + p|/p over all Gauss points."""
         largest = 0.0
-        for part in found.meshes():
+        for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)
             deviation = np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE
             largest = max(largest, float(deviation))
-        return {"stress_error": found.largest(largest)}
+        return {"stress_error": answer.largest(largest)}
 
     return ContactProblem(
         bodies=elastic, linearise=by_keys(p), results=error,

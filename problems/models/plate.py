@@ -223,22 +223,22 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
 
 def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
     """Return the function that evaluates `quantities` on ranks."""
-    return partial(_found_by_ranks, _grid(params), _stiffness(params)[0], dual)
+    return partial(_rank_quantities, _grid(params), _stiffness(params)[0], dual)
 
 
-def _found_by_ranks(
-    grid: StructuredGrid, moduli: Vector, dual: OwnDual, found: OwnSolution
+def _rank_quantities(
+    grid: StructuredGrid, moduli: Vector, dual: OwnDual, answer: OwnSolution
 ) -> dict[str, Any]:
     """Return `quantities` and condition numbers from all ranks; collective."""
-    own = found.subdomains
+    own = answer.subdomains
     tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]), 2)
     values = {
         "nodes": grid.nodes,
         "elements": int(np.prod(grid.divisions)),
         "dofs": 2 * grid.nodes,
         "equality_rows": own.problem.held.size,
-        "energy": found.energy * LOAD * LENGTH,
-        "tip": (found.at(tip) * LENGTH).tolist(),
+        "energy": answer.energy * LOAD * LENGTH,
+        "tip": (answer.at(tip) * LENGTH).tolist(),
     }
     return values | conditions(_spectra(moduli, dual))
 
