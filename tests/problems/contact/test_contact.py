@@ -1,4 +1,4 @@
-"""Node-to-segment rows against geometry done by hand."""
+"""Node-to-segment rows, compared with hand-computed geometry."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What holds for every pair of sides, in random shapes and motions."""
+"""Properties of contact rows for random shapes and motions of two sides."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ def numbers(shape, low, high):
 
 @st.composite
 def sides(draw):
-    """Wavy slave above a wavy master that may be longer, shorter or penetrated."""
+    """Wavy slave above a wavy master, which may be longer, shorter or penetrated."""
     s, m = draw(st.integers(2, 9)), draw(st.integers(2, 9))
     left, width = draw(st.floats(-0.4, 0.4)), draw(st.floats(0.5, 1.5))
     distance = draw(st.floats(-0.1, 0.4))

@@ -26,12 +26,12 @@ MESHES = {
 
 
 def definite(mesh):
-    """A stiffness on an elastic foundation."""
+    """Return a stiffness matrix on an elastic foundation."""
     return csc_array(stiffness(mesh, D) + 7.0 * eye_array(mesh.dofs))
 
 
 def dense(factor):
-    """The whole Lᵀ."""
+    """Return the whole Lᵀ."""
     f, U = factor.fronts, np.zeros((factor.order.size, factor.order.size))
     for s in range(len(f.children)):
         own = np.arange(f.start[s], f.start[s + 1])
