@@ -136,7 +136,7 @@ def test_the_order_of_the_slave_nodes_only_orders_the_rows(side, seed):
 
 @quick
 @given(side=sides())
-def test_the_gap_is_what_the_inequality_leaves_at_the_linearisation_point(side):
+def test_the_gap_is_the_slack_of_the_row_at_the_linearisation_point(side):
     """c − B u is the signed distance where the closest point is inside a segment."""
     points, u, slave, master = side
     B, c, *_ = node_to_segment(*side)

@@ -36,7 +36,7 @@ def lifted(by):
 
 
 @pytest.mark.parametrize("cohesion", [0.0, 0.25])
-def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(cohesion):
+def test_the_fixed_point_satisfies_coulombs_law(cohesion):
     """g = c + μ(6 − g)  with μ = ½: g = (c + 3)/1.5."""
     iterates = coulomb_fixed_point(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
 
@@ -56,13 +56,13 @@ def test_a_bound_of_zero_is_as_far_from_the_law_as_the_law_demands():
     assert [float(one.bound[0]) for one in others] == [3.0]
 
 
-def test_a_law_that_asks_for_nothing_is_settled_at_once():
+def test_a_coefficient_of_zero_converges_at_once():
     (only,) = coulomb_fixed_point(friction(0.0), lifted(1.0), step=1)
 
     assert (only.bound, only.unsettled) == (0, 0)
 
 
-def test_bounds_that_go_apart_are_refused_with_the_nearest_and_the_last():
+def test_divergence_is_refused_with_the_smallest_and_the_last_residual():
     """μ = 1.01: iterates alternate, at distances that grow by the factor 1.01."""
     calls = []
 
@@ -81,7 +81,7 @@ def test_bounds_that_go_apart_are_refused_with_the_nearest_and_the_last():
     assert f"is {off[-1]:.1e}, and was {off.min():.1e} at best" in str(e.value)
 
 
-def test_bounds_that_creep_end_at_a_thousand():
+def test_slow_convergence_ends_after_a_thousand_problems():
     """The distance to the limit shrinks by a thousandth per iterate."""
     calls = []
 
@@ -126,7 +126,7 @@ def test_nodes_are_pressed_and_never_pulled():
     assert force.tolist() == [0, 3, 0, 0, 2]
 
 
-def test_a_law_reads_what_is_its_own():
+def test_a_law_reads_only_its_own_parameter():
     keys = {"bound": 5.0, "mu": 0.3}
 
     assert law_of({"friction": "none", **keys}) == FrictionLaw()
@@ -155,7 +155,7 @@ def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_fo
     assert discrete.start.tolist() == [7, 8, 9]
 
 
-def test_without_rows_there_is_no_friction():
+def test_without_rows_friction_is_empty():
     rows = SimpleNamespace(row=np.zeros(0, dtype=np.int64))
 
     assert friction_of(None, rows, (), np.zeros(0), np.zeros(0)) is NO_FRICTION

@@ -68,7 +68,7 @@ def arcs(n, master_share=0.9):
 # exact numbers --------------------------------------------------------------------
 
 
-def test_normals_of_a_known_polyline():
+def test_normals_of_a_polyline_by_hand():
     normal = surface(np.array([[0.0, 0], [4, 3], [7, 7]]), "slave").node_normal
 
     expected = [[3 / 5, -4 / 5], [np.sqrt(0.5), -np.sqrt(0.5)], [4 / 5, -3 / 5]]
@@ -156,7 +156,7 @@ def test_the_constraint_is_on_the_total_displacement(basis):
 @pytest.mark.parametrize(
     "right", [0.5, 0.2, 0.05, 1e-6], ids=lambda r: f"to {r} of the last"
 )
-def test_the_dual_basis_is_biorthogonal_on_what_is_covered(right):
+def test_the_dual_basis_is_biorthogonal_on_the_covered_part(right):
     """∫Φ_j N_k = δ_jk ∫N_k per segment, the last of four covered in part."""
     slave = flat(4, 0.0, rightwards=True, right=4.0)
     s, m = sides(slave, flat(7, -0.1, rightwards=False, left=-1.0, right=3 + right))
@@ -393,7 +393,7 @@ def test_sides_beside_each_other_have_no_row(basis):
 
 
 @pytest.mark.parametrize("basis", BASES)
-def test_a_side_that_runs_the_wrong_way_faces_nothing(basis):
+def test_a_reversed_side_has_no_contact_rows(basis):
     slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
 
     assert rows(slave[::-1], master, basis=basis).B.shape == (0, 28)

@@ -122,7 +122,7 @@ def test_few_master_segments_face_a_slave_segment(segments):
     [({"cosine": -1.5}, "cosine=-1.5"), ({"cosine": float("nan")}, "cosine=nan"),
      ({"distance": 0.0}, "distance=0.0"), ({"distance": float("nan")}, "distance=nan")],
 )  # fmt: skip
-def test_a_reach_that_means_nothing_is_refused(wrong, message):
+def test_an_invalid_reach_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
         Reach(**wrong)
 

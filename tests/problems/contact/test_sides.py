@@ -76,7 +76,7 @@ def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
         assert (force > 1e-6 * force.max()).sum() > expected.sum()
 
 
-def test_hertz_is_found_along_the_side():
+def test_the_pressure_along_the_side_is_that_of_hertz():
     case = HertzPlane().build("primal", HertzPlane().defaults, reference_solution)
     s = Clarabel().prepare(case.qp, 1e-10)()
     values = case.quantities(s)
@@ -87,7 +87,7 @@ def test_hertz_is_found_along_the_side():
     assert pair["half_width"] == pytest.approx(0.68078e-3, abs=0.68078e-3 / 10)
 
 
-def test_a_node_that_faces_nothing_has_no_gap_and_no_pressure():
+def test_a_node_without_a_row_has_no_gap_and_no_pressure():
     """Blocks displaced by half their width: half of the slave side faces no master."""
     bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
     bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
@@ -108,7 +108,7 @@ def test_a_node_that_faces_nothing_has_no_gap_and_no_pressure():
     assert side.pressure[x < 0.9].min() > 0
 
 
-def test_pairs_that_share_a_slave_side_are_told_apart():
+def test_rows_of_pairs_with_a_common_slave_side_are_distinguished():
     bodies = model({**ContactPatch().defaults, "lower": 6, "upper": 4})
     (pair,) = bodies.pairs
     left, right = pair.master[:3], pair.master[2:]

@@ -137,7 +137,7 @@ def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
     assert abs(back.y).max() > 0.1  # the clamps carry the load
 
 
-def test_steps_are_the_same_in_whatever_order_they_are_asked_for():
+def test_load_steps_do_not_depend_on_the_order_of_requests():
     def gaps(step, params):
         return FAMILY.build("primal", params, reference_solution).qp.h
 

@@ -21,7 +21,7 @@ from mortarbench.problems.models.cantilever import beam, elastica
     ("load", "deflection", "shortening"),
     [(1, 0.30172077, 0.05643324), (10, 0.81060902, 0.55499560)],
 )
-def test_the_elastica_has_the_known_digits(load, deflection, shortening):
+def test_the_elastica_has_published_digits(load, deflection, shortening):
     assert elastica(load) == pytest.approx((deflection, shortening), abs=6e-9)
 
 

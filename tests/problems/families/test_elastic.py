@@ -46,7 +46,7 @@ def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
      (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
      (FrictionLaw("coulomb", mu=0.3), "expected reference=")],
 )  # fmt: skip
-def test_laws_that_are_none_are_refused_in_one_line(law, message):
+def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:
         one_step(model(PATCH.complete({})), "dual", friction=law)
 
@@ -91,6 +91,6 @@ def test_bodies_in_parts_are_those_in_one_piece(glue):
      ("dual", {"parts": 1}, "parts=1 of 2 bodies"),
      ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
 )  # fmt: skip
-def test_parts_that_there_cannot_be_are_refused(form, keys, message):
+def test_impossible_parts_are_refused(form, keys, message):
     with pytest.raises(InputError, match=message):
         one_step(model(PATCH.complete({})), form, **keys)

@@ -202,7 +202,7 @@ def test_the_keys_leave_the_names_and_problems_of_linear_elasticity_as_they_are(
         ("contact-patch/kinematics=finite/stretch=1.2/dual", "can only be pressed"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_together_is_refused_in_one_line(name, message):
+def test_inconsistent_keys_are_refused_in_one_line(name, message):
     with pytest.raises(InputError, match=message) as e:
         parse(name, problems.PROBLEMS)
     assert "\n" not in str(e.value)
@@ -214,7 +214,7 @@ def test_a_material_that_softens_is_refused_where_it_does():
         built("contact-patch", stretch=0.5, material="svk")
 
 
-def test_there_is_no_refined_case_at_finite_strain():
+def test_refinement_at_finite_strain_is_refused():
     for family, own in CASES.values():
         keys = {**own, "kinematics": "finite"}
         with pytest.raises(InputError, match="expected kinematics=linear"):

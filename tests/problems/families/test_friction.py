@@ -61,7 +61,7 @@ def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force,
     assert values["friction_residual"] <= 1e-10
 
 
-def test_a_bound_that_nothing_reaches_glues_the_flanks_as_well():
+def test_an_unreachable_bound_makes_open_rows_stick_as_well():
     """The other code's limit g → ∞ with all rows of the arc."""
     _, _, values = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
 
@@ -102,7 +102,7 @@ def test_coulomb_grants_no_shear_without_contact():
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 @pytest.mark.parametrize("law", ["tresca/bound=0", "coulomb/mu=0"])
-def test_a_bound_of_zero_is_no_friction(law, contact, form):
+def test_a_bound_of_zero_yields_the_frictionless_problem(law, contact, form):
     name = f"{SMALL}/contact={contact}"
     _, _, rough = solved(f"{name}/friction={law}/{form}")
     _, _, smooth = solved(f"{name}/{form}")
@@ -163,7 +163,7 @@ def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
 
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
-def test_tangential_rows_are_blind_to_what_both_sides_do_together(contact):
+def test_tangential_rows_vanish_on_common_motions_of_both_sides(contact):
     bodies = model(PROBLEMS["contact-patch"].defaults)
     law = (FrictionLaw("tresca", bound=1.0),)
     rows = linearisation(bodies, contact, "dual", law)(np.zeros(bodies.mesh.dofs))
@@ -236,7 +236,7 @@ def test_loads_are_balanced_where_friction_may_hold_them():
 
 
 @pytest.mark.parametrize("push", [0.2, -0.1])
-def test_below_the_limit_it_stays_whatever_the_law_allows(push):
+def test_below_the_limit_forces_do_not_depend_on_the_law(push):
     """Statics determines the forces, whatever the law."""
     normal = (1 + 0.1 * push) / np.hypot(1, 0.1) * WEIGHT
     for law in (COULOMB, FrictionLaw("tresca", bound=0.5 * WEIGHT)):

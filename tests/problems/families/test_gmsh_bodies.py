@@ -304,9 +304,7 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
     ],
 )
 @pytest.mark.parametrize("form", ["primal", "dual"])
-def test_a_load_that_nothing_balances_is_named_before_solving(
-    described, load, message, form
-):
+def test_an_unbalanced_load_is_refused_before_solving(described, load, message, form):
     text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
     with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
         build(f"{text}/steps=1/{form}")
@@ -370,7 +368,7 @@ def test_a_contact_that_is_described_twice_is_refused(described):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
-def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
+def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
     """Its top is on rollers: K is singular, but rounding lets it be factorised."""
     there = ROOT / "suites" / "crossval"
     shutil.copy(there / "punch.msh", tmp_path)
@@ -788,7 +786,7 @@ def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described
             read_bodies(Path("a.toml"), "strain")
 
 
-def test_contact_forces_of_several_pairs_are_told_pair_by_pair(tmp_path):
+def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
     """2 MN/m pass through a disc: each of its two contacts bears all of it."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
     values = case.quantities(reference_solution(case.qp))

@@ -96,7 +96,7 @@ def test_the_fixed_point_begins_without_friction_and_contracts():
     assert (np.divide(residuals[2:9], residuals[1:8]) < 0.7).all()
 
 
-def test_without_friction_nothing_slips_back():
+def test_without_friction_there_is_no_tangential_force():
     got = solved(8, mu=0.0)[0].quantities(solved(8, mu=0.0)[1])
 
     assert got["tangential_sum"] == 0

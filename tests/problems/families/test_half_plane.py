@@ -154,7 +154,7 @@ def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
     assert got["dissipation"] > 0
 
 
-def test_friction_dissipates_what_the_force_did_less_what_is_stored():
+def test_dissipation_is_the_work_of_the_force_less_the_stored_energy():
     """∫Q dδ of the closed curve Q(δ) from −peak to peak and back: 2·dissipation."""
     Q = np.linspace(-0.8, 0.8, 201)
     unit = MU * EXACT.P * 2 * MU * EXACT.P / (np.pi * EXACT.E_star)
@@ -182,7 +182,7 @@ def test_an_interior_point_method_finds_the_same():
      ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),
      ("n=1", "n=1 must be at least 2"), ("n=90000000", "a full matrix of 90000000")],
 )  # fmt: skip
-def test_what_the_law_does_not_use_or_lacks_is_refused_in_one_line(name, message):
+def test_unused_and_missing_keys_of_the_law_are_refused_in_one_line(name, message):
     with pytest.raises(InputError, match="half-plane: ") as e:
         parse(f"half-plane/{name}/dual", PROBLEMS)
 

@@ -159,7 +159,7 @@ def test_the_difference_from_hertz_falls_with_the_load():
 
 
 @pytest.mark.parametrize("n", [20, 40])
-def test_what_is_left_on_fine_meshes_is_finite_size(n):
+def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
     got = result(PLANE, n=n)
 
     assert got["pressure_l2_error"] <= 0.01

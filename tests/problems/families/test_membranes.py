@@ -53,7 +53,7 @@ def test_sizes_are_those_of_the_table(size):
     assert values["explicit_subdomains"] == values["subdomains"]
 
 
-def test_the_stiffness_is_exact_for_what_the_elements_hold():
+def test_the_stiffness_is_exact_for_functions_of_the_element_space():
     """∫|∇u|² of u = 1, x, y and xy on the unit square: 0, 1, 1 and 2/3."""
     n = 5
     x = np.tile(np.linspace(0, 1, n + 1), n + 1)

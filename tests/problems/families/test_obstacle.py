@@ -127,7 +127,7 @@ def test_the_membrane_keeps_the_symmetry_of_the_square():
         assert image == pytest.approx(u, abs=1e-10)
 
 
-def test_the_boundary_is_held_at_the_exact_height():
+def test_the_boundary_has_the_exact_height():
     problem = obstacle_problem(2, 8)
     at_boundary = abs(problem.x).max(axis=1) == 1.5
     case, s = solved(SMALBE(), "primal", 2, 8)

@@ -70,7 +70,7 @@ def test_node_to_segment_passes_on_matching_meshes():
     ("mesh", "slave", "percent"),
     [((6, 4), "upper", 27.8), ((6, 4), "lower", 8.9), ((24, 20), "upper", 9.8)],
 )
-def test_node_to_segment_fails_by_what_another_code_found(mesh, slave, percent):
+def test_node_to_segment_has_the_errors_of_an_independent_code(mesh, slave, percent):
     """The expected errors are those of a prototype with other supports."""
     lower, upper = mesh
     got = 100 * error(contact="nts", slave=slave, lower=lower, upper=upper)

@@ -58,7 +58,7 @@ def test_condition_numbers_are_those_of_a_prototype(keys, multipliers, numbers):
         (1e4, "kappa_dirichlet_stiffness", 2350.7),
     ],
 )
-def test_jumps_cost_what_they_cost_a_prototype(jump, name, value):
+def test_condition_numbers_with_jumps_are_those_of_a_prototype(jump, name, value):
     values = reported(pattern="checkerboard", jump=jump)
     assert values[name] == pytest.approx(value, rel=3e-5)
 

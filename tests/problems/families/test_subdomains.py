@@ -114,7 +114,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
         ),
     ],
 )
-def test_what_is_not_built_is_refused_by_name(press, name, message):
+def test_unsupported_combinations_are_refused_by_name(press, name, message):
     with pytest.raises(InputError, match=message):
         built(name)
 

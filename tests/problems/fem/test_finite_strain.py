@@ -42,7 +42,7 @@ def stretched(material, lateral_free):
         (0.6, 1.2144261693, -0.7146352056, -0.5884550446),
     ],
 )
-def test_neo_hooke_between_frictionless_plates_has_the_known_digits(
+def test_neo_hooke_between_frictionless_plates_has_published_digits(
     stretch, lateral, nominal, cauchy
 ):
     material = hyperelastic("neo-hooke", SOFT)
@@ -226,7 +226,7 @@ def test_in_homogeneous_states_both_elements_agree_with_the_material(name):
     assert np.allclose(computed[:, 2], stress[0, 1], rtol=1e-11)
 
 
-def test_neo_hooke_out_of_the_plane_is_what_a_cube_needs_that_cannot_move():
+def test_neo_hooke_stress_out_of_the_plane_is_that_of_a_confined_cube():
     """σ_z = ΛlnJ/J: μ(B₃₃ − 1) vanishes as F₃₃ = 1."""
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     material = hyperelastic("neo-hooke", SOFT)
@@ -310,7 +310,7 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     assert changed == {0.9: 40, 1.1: 0}
 
 
-def test_convex_cells_stay_what_they_are_triangles_too():
+def test_convex_cells_are_unchanged_also_triangles():
     """Without strain, no cell is changed, even if K_t counts as indefinite."""
     c = cells("neo-hooke", 0.3)
     tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
@@ -322,7 +322,7 @@ def test_convex_cells_stay_what_they_are_triangles_too():
     assert abs(K - assemble(c, tangents)).max() < 1e-14
 
 
-def test_a_body_that_nothing_holds_is_refused():
+def test_a_floating_body_is_refused():
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     c = cells_of(mesh, [hyperelastic("svk", SOFT)], np.zeros(4, dtype=np.int64))
     tangents = evaluate(c, np.zeros(mesh.dofs)).tangents

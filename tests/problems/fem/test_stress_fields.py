@@ -94,7 +94,7 @@ def cube(fixed=NO_NODES):
     )  # fmt: skip
 
 
-def test_all_six_stresses_of_a_body_in_space_are_known():
+def test_all_six_stresses_of_a_body_in_space_are_exact():
     bodies, gradient = cube(), np.arange(9).reshape(3, 3) * 1e-3
     e = (gradient + gradient.T) / 2
     lame = STEEL.E * STEEL.nu / ((1 + STEEL.nu) * (1 - 2 * STEEL.nu))
