@@ -164,7 +164,7 @@ def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
             )
     if law.mu and reference is None:
         raise InputError(
-            "friction coulomb needs solutions; expected reference=, as build is given"
+            "friction coulomb needs a reference solve; expected reference= of build"
         )
     return law
 

@@ -180,7 +180,7 @@ def physical(where: str, value: Any) -> float:
     if not is_number(value) or not (value == 0 or MIN_SIZE <= abs(value) <= MAX_SIZE):
         raise InputError(
             f"{where} = {shown(value)}; expected a number between {MIN_SIZE:g} and "
-            f"{MAX_SIZE:g} in size, or 0"
+            f"{MAX_SIZE:g} in magnitude, or 0"
         )
     return float(value)
 
@@ -194,9 +194,9 @@ def check_memory(family: str, components: int) -> None:
     needed, limit = components * COMPONENT_MIB, case_limit_mib()
     if needed > limit:
         raise InputError(
-            f"{family}: {components:.2g} components of the displacement take "
-            f"{needed:.2g} MiB of memory at least; expected a mesh that fits into "
-            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to what there is"
+            f"{family}: {components:.2g} displacement components take at "
+            f"least {needed:.2g} MiB of memory; expected a mesh that fits into "
+            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to the memory available"
         )
 
 
@@ -278,8 +278,8 @@ def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError for friction on arcs, whose polygons refinement changes."""
     if params["friction"] != "none":
         raise InputError(
-            f"{family}: friction={params['friction']} on curved sides, whose slip is "
-            "another on finer meshes; expected friction=tresca on flat sides"
+            f"{family}: friction={params['friction']} on curved sides, whose slip "
+            "depends on the mesh; expected friction=tresca on flat sides"
         )
 
 
@@ -304,8 +304,8 @@ def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
     """
     if "coulomb" in laws:
         raise InputError(
-            f"{family}: friction=coulomb minimises no energy on any mesh, so that "
-            f"there is no error in its norm; compare answers with {meshes}"
+            f"{family}: friction=coulomb has no energy to minimise, so that no error "
+            f"in its norm exists; compare answers with {meshes}"
         )
 
 
@@ -347,5 +347,5 @@ def check_dense_memory(family: str, n: int) -> None:
         raise InputError(
             f"{family}: a full matrix of {n} rows takes {needed:.2g} MiB of memory; "
             f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
-            "what there is"
+            "the memory available"
         )

@@ -125,9 +125,9 @@ def coulomb_fixed_point(
             forces = normal(friction)
         except ArithmeticError as e:
             raise InputError(
-                f"load step {step}: no equilibrium was found with the "
-                f"{len(iterates) + 1}. bound of Coulomb's law: friction cannot hold "
-                f"the load; expected supports or friction that hold the bodies: {e}"
+                f"load step {step}: no equilibrium was found with bound "
+                f"{len(iterates) + 1} of Coulomb's law: friction cannot hold the "
+                f"load; expected supports or friction that hold the bodies: {e}"
             ) from None
         residuals.append(friction.residual(forces))
         if residuals[-1] <= FIXED_POINT_TOLERANCE:
@@ -137,8 +137,8 @@ def coulomb_fixed_point(
             break
         friction = replace(friction, bound=friction.demanded(forces))
     raise InputError(
-        f"the friction of load step {step} does not settle: after {len(iterates)} "
-        f"Tresca problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
+        f"Coulomb's law does not converge in load step {step}: after {len(iterates)} "
+        f"Tresca problems, ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
         f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
     )
 

@@ -111,7 +111,7 @@ class GmshBodies(ContactFamily):
             return ""
         return (
             "of the bodies as they are meshed; chords of an arc stay corners: for "
-            "pressures, mesh anew"
+            "pressures, generate a finer mesh"
         )
 
     def build(
@@ -136,6 +136,6 @@ class GmshBodies(ContactFamily):
         except (LinAlgError, CholmodNotPositiveDefiniteError):
             raise InputError(
                 f"{path}: the stiffness has no Cholesky factor in double precision; "
-                "expected cells whose sides, and bodies whose E, differ by less"
+                "expected smaller ratios of the sides of cells, and of the moduli E"
             ) from None
         return replace(case, remarks=remarks(Path(path)))

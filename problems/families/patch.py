@@ -64,7 +64,7 @@ class ContactPatch(ContactFamily):
         if not MIN_STRETCH <= stretch < 1:
             raise InputError(
                 f"{self.name}: stretch={stretch:g} must be at least {MIN_STRETCH:g} "
-                "and below 1: blocks on each other can only be pressed"
+                "and below 1: stacked blocks can only be compressed"
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:

@@ -208,7 +208,7 @@ def convex_tangent(
     if not positive(K):
         raise ArithmeticError(
             f"the tangent is not positive definite with {changed} of {len(tangents)} "
-            "cells made convex; expected supports that hold every body"
+            "cells modified; expected supports that hold every body"
         )
     return K, changed
 

@@ -189,18 +189,25 @@ def _read(path: Path) -> Any:
         or not (abs(points) < MAX_COORDINATE).all()
     ):
         raise InputError(
-            f"{path}: coordinates beyond {MAX_COORDINATE:g}, or none; expected some"
+            f"{path}: coordinates beyond {MAX_COORDINATE:g}, or none; expected nodes "
+            "with finite coordinates"
         )
     # node numbers start at 1; meshio would take −1 as an index from the end
     if numbers is not None and (numbers < 1).any():
-        raise InputError(f"{path}: cells of nodes below 1; expected their numbers")
+        raise InputError(f"{path}: cells with node numbers below 1; expected 1 or more")
     for block, nodes in zip(mesh.cells, cells, strict=True):
         corners = CORNERS.get(block.type, nodes.shape[-1])
         if nodes.ndim != 2 or nodes.shape[1] != corners:
-            raise InputError(f"{path}: {block.type} cells of {nodes.shape[-1]} nodes")
+            raise InputError(
+                f"{path}: {block.type} cells with {nodes.shape[-1]} nodes; expected "
+                f"{corners}"
+            )
         # meshio numbers nodes that the file does not define as −1
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
-            raise InputError(f"{path}: cells of nodes that are not in the file")
+            raise InputError(
+                f"{path}: cells with nodes that are not in the file; expected nodes "
+                "of its section $Nodes"
+            )
     if tags and not tagged:
         raise InputError(f"{path}: not every cell has a tag; expected one for each")
     return mesh
@@ -308,8 +315,8 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
     if (flat := twice_area == 0).any():
         x, y = points[cells[flat.argmax()]].mean(axis=0)
         raise InputError(
-            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected corners "
-            "that are apart, in their order around it"
+            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected "
+            "distinct corners, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
     corners = cross(np.roll(edges, 1, axis=1), edges)

@@ -253,7 +253,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
         lengths = np.linalg.norm(np.diff(named.points[edges], axis=1)[:, 0], axis=1)
         np.add.at(weights, edges, lengths[:, None] / 2)
     elif kinds == ["traction"]:
-        raise InputError("a point takes a force, no traction")
+        raise InputError("traction acts on a point; expected a boundary, or force")
     else:
         weights[nodes] = 1.0
     if kinds == ["force"]:
@@ -381,7 +381,7 @@ def _units(
         checked.only_keys(units, ("length", "force"))
         total = float(np.linalg.norm(load, axis=1).sum())
         if total == 0:
-            raise InputError("the loads sum up to nothing; expected a load")
+            raise InputError("all loads are zero; expected a load")
         extent = float(np.ptp(named.points, axis=0).max())
         return (
             physical("length", checked.positive("length", units.get("length", extent))),

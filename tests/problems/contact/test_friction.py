@@ -70,12 +70,12 @@ def test_divergence_is_refused_with_the_smallest_and_the_last_residual():
         calls.append(float(one.bound[0]))
         return FORCE - one.bound
 
-    with pytest.raises(InputError, match="load step 7 does not settle") as e:
+    with pytest.raises(InputError, match="does not converge in load step 7") as e:
         coulomb_fixed_point(friction(1.01, 3.0), normal, step=7)
 
     assert "\n" not in str(e.value)
     assert 31 <= len(calls) <= 33
-    assert f"after {len(calls)} Tresca problems" in str(e.value)
+    assert f"after {len(calls)} Tresca problems," in str(e.value)
     demanded = 1.01 * (FORCE - np.array(calls))
     off = abs(np.array(calls) - demanded) / calls
     assert f"is {off[-1]:.1e}, and was {off.min():.1e} at best" in str(e.value)
@@ -89,7 +89,7 @@ def test_slow_convergence_ends_after_a_thousand_problems():
         calls.append(one)
         return one.bound * (1 + 1e-3 * 0.999 ** len(calls))
 
-    with pytest.raises(InputError, match="after 1000 Tresca problems"):
+    with pytest.raises(InputError, match="after 1000 Tresca problems,"):
         coulomb_fixed_point(friction(1.0, 1.0), normal, step=1)
 
     assert len(calls) == 1000
@@ -101,9 +101,7 @@ def test_a_bound_that_holds_no_equilibrium_is_named():
             raise ArithmeticError("no optimal point")
         return FORCE - one.bound
 
-    with pytest.raises(
-        InputError, match=r"step 3: no equilibrium.* the 2\. bound"
-    ) as e:
+    with pytest.raises(InputError, match=r"step 3: no equilibrium.* bound 2 of") as e:
         coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
     assert str(e.value).endswith("no optimal point")
 

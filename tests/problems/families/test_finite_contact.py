@@ -199,7 +199,7 @@ def test_the_keys_leave_the_names_and_problems_of_linear_elasticity_as_they_are(
         ("beam-ring/kinematics=large/dual", "kinematics='large' is unknown"),
         ("hertz-plane/kinematics=finite/newton=-1/dual", "newton=-1 must be at least"),
         ("contact-patch/stretch=0.8/dual", "stretch=0.8 is not used by"),
-        ("contact-patch/kinematics=finite/stretch=1.2/dual", "can only be pressed"),
+        ("contact-patch/kinematics=finite/stretch=1.2/dual", "can only be compressed"),
     ],
 )  # fmt: skip
 def test_inconsistent_keys_are_refused_in_one_line(name, message):
