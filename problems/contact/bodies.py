@@ -190,8 +190,8 @@ def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedI
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
-    touched = np.union1d(bodies.interface, bodies.B_D.indices)
-    interface = Interface(touched, bodies.mesh.points) if condense else None
+    constrained = np.union1d(bodies.interface, bodies.B_D.indices)
+    interface = Interface(constrained, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 

@@ -161,25 +161,25 @@ def mortar(
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
     """Integrate D, M, the weighted gaps and the covered lengths."""
-    at = cast_rays(slave, master, overlaps(slave, master), reach)
-    N = _shape(at.xi)
-    phi = _dual(at) if basis == "dual" else N
+    gauss = cast_rays(slave, master, overlaps(slave, master), reach)
+    N = _shape(gauss.xi)
+    phi = _dual(gauss) if basis == "dual" else N
     s, v = len(slave.x), len(master.x)
-    j, k = slave.facets[at.slave], master.facets[at.master]  # (p, 2) nodes
-    weighted = phi * at.weight[..., None]  # (p, 3, 2)
+    j, k = slave.facets[gauss.slave], master.facets[gauss.master]  # (p, 2) nodes
+    weighted = phi * gauss.weight[..., None]  # (p, 3, 2)
     overlap = np.einsum("pgj,pgk->pjk", weighted, N)
     if basis == "dual":  # summed over a slave segment, ∫Φ_jN_k = δ_jk ∫Φ_j exactly
         overlap = np.eye(2) * weighted.sum(axis=1)[:, None]
     # ∫Φ_j N_k ν = n_j ∫Φ_j N_k + ∫Φ_j N_k (ν − n_j)
     n_j = slave.node_normal[j]  # (p, 2, 2)
-    deviation = at.field[:, :, None] - n_j[:, None]
+    deviation = gauss.field[:, :, None] - n_j[:, None]
     deviation[np.abs(deviation) <= NORMAL_ROUNDING] = 0
     D = overlap[..., None] * n_j[:, :, None]
     D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * deviation, N)
-    pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
-    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * at.beta - 1))
-    measure = at.weight * np.linalg.norm(at.field, axis=-1)
-    gap = np.einsum("pgj,pg->pj", phi, measure * at.gap)
+    pull = weighted[..., None] * gauss.field[:, :, None]  # (p, 3, 2, 2)
+    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * gauss.beta - 1))
+    measure = gauss.weight * np.linalg.norm(gauss.field, axis=-1)
+    gap = np.einsum("pgj,pg->pj", phi, measure * gauss.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
     return Mortar(
         _sum(D, j, j, (s, s)), _sum(M, j, k, (s, v)),
@@ -255,17 +255,17 @@ def cast_rays(
     return GaussPoints(*(a[near] for a in (e, m, xi, beta, field, gap, weight)))
 
 
-def _dual(at: GaussPoints) -> NDArray[np.float64]:
+def _dual(gauss: GaussPoints) -> NDArray[np.float64]:
     """Evaluate the dual basis Φ_1, Φ_2 on each slave segment, (p, 3, 2)."""
-    w = at.weight
-    total = np.bincount(at.slave, w.sum(axis=1))
+    w = gauss.weight
+    total = np.bincount(gauss.slave, w.sum(axis=1))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        sums = np.bincount(at.slave, (w * values).sum(axis=1))
-        return (sums[at.slave] / total[at.slave])[:, None]
+        sums = np.bincount(gauss.slave, (w * values).sum(axis=1))
+        return (sums[gauss.slave] / total[gauss.slave])[:, None]
 
-    centre = mean(at.xi)
-    offset = at.xi - centre
+    centre = mean(gauss.xi)
+    offset = gauss.xi - centre
     offset = offset - mean(offset)  # correct the rounding of ξ̄: v may be tiny
     N = _shape(centre)
     slope = 2 * N[..., 0] * N[..., 1] / mean(offset**2) * offset
@@ -293,8 +293,8 @@ def _sum(
     dim = vectors.shape[-1]
     i = np.repeat(rows, 2 * dim, axis=1)
     j = np.tile(dofs_of(nodes, dim).reshape(-1, 2 * dim), (1, 2))
-    at = (i.ravel(), j.ravel())
-    return csr_array(coo_array((vectors.ravel(), at), (shape[0], dim * shape[1])))
+    indices = (i.ravel(), j.ravel())
+    return csr_array(coo_array((vectors.ravel(), indices), (shape[0], dim * shape[1])))
 
 
 def _rows(
@@ -308,9 +308,9 @@ def _rows(
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
     row = np.concatenate([D.row, M.row])
     slave, master = (dofs_of(side, dim) for side in sides)
-    at = (row, np.concatenate([slave[D.col], master[M.col]]))
+    indices = (row, np.concatenate([slave[D.col], master[M.col]]))
     values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
-    B = csr_array(coo_array((values, at), (len(j), N * dim)))
+    B = csr_array(coo_array((values, indices), (len(j), N * dim)))
     B.eliminate_zeros()
     return B
 

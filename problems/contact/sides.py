@@ -52,27 +52,27 @@ def contact_sides(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
         # 0.0 − x: zeros without a sign
-        pressing = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
+        contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)
-        shearing = np.zeros_like(pressing)
+        shearing = np.zeros_like(contact_force)
         if own.any():
             force = friction.T[own].T @ tangential[own]
             shearing -= as_vectors(force, dim)[pair.slave] * F
         side = current_surface(points, u, pair.slave, "slave")
         length = surface(points[pair.slave], "slave").areas
-        normal = np.einsum("sx,sx->s", pressing, side.node_normal)
+        normal = np.einsum("sx,sx->s", contact_force, side.node_normal)
         gap, push = np.full((2, len(pair.slave)), np.nan)
         place, direction = slave_places(B[rows], pair.slave, dim)
         gap[place] = slack[rows]
-        push[place] = np.einsum("rx,rx->r", pressing[place], -direction)
+        push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
         push = np.nan_to_num(push)
         nodal_state = np.full(len(pair.slave), "open", dtype=state.dtype)
         nodal_state[place[friction.row[own] - rows.start]] = state[own]
         sides.append(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
-                force=pressing + shearing, pressure=(0.0 - normal) / length, gap=gap,
-                push=push,
+                force=contact_force + shearing, pressure=(0.0 - normal) / length,
+                gap=gap, push=push,
                 shear=np.einsum("sx,sx->s", shearing, side.tangents[:, 0]) / length
                 if own.any() else None,
                 friction=nodal_state if own.any() else None,

@@ -68,20 +68,20 @@ def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
     return np.asarray(factor * D[np.ix_(components, components)])
 
 
-def shape_gradients(corners: Floats, at: Vector) -> tuple[Floats, Vector]:
+def shape_gradients(corners: Floats, xi: Vector) -> tuple[Floats, Vector]:
     """Differentiate the shape functions of cells with respect to x.
 
     Parameters
     ----------
     corners : (E, n, dim) corner positions of the cells
-    at : (dim,) point of the reference cell
+    xi : (dim,) point of the reference cell
 
     Returns
     -------
     (E, n, dim) gradients ∂N_a/∂x and (E,) Jacobian determinants
 
     """
-    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(at)
+    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(xi)
     J = np.einsum("ar,eax->erx", reference, corners)  # ∂x/∂ξ
     gradients: Floats = np.einsum("erx,ar->eax", inverse_transpose(J), reference)
     return gradients, determinant(J)

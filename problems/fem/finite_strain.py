@@ -116,12 +116,12 @@ def strain_energy(cells: Cells, u: Vector) -> float:
     if (determinant(F) <= 0).any():
         return np.inf
     total = 0.0
-    for material, own in _by_material(cells):
-        theta = material.dilatation(F[own]).value
+    for material, index in _by_material(cells):
+        theta = material.dilatation(F[index]).value
         if mean_dilatation(material):
-            theta = _average(theta, cells.volumes[own])
-        W = material.shear(F[own]).value + material.volumetric(theta)[0]
-        total += float((cells.volumes[own] * W).sum())
+            theta = _average(theta, cells.volumes[index])
+        W = material.shear(F[index]).value + material.volumetric(theta)[0]
+        total += float((cells.volumes[index] * W).sum())
     return total
 
 
@@ -141,26 +141,26 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
         raise InvertedCellError(worst, float(J[worst]))
     energy, forces = 0.0, np.zeros(u.size)
     tangents = np.empty((len(J), 8, 8))
-    for material, own in _by_material(cells):
-        volumes, gradients = cells.volumes[own], cells.gradients[own]
-        w, theta = material.shear(F[own]), material.dilatation(F[own])
+    for material, index in _by_material(cells):
+        volumes, gradients = cells.volumes[index], cells.gradients[index]
+        w, theta = material.shear(F[index]), material.dilatation(F[index])
         mean = mean_dilatation(material)
         measure = _average(theta.value, volumes) if mean else theta.value
         U, slope, curvature = material.volumetric(measure)
         energy += float((volumes * (w.value + U)).sum())
         P = w.first + slope[..., None, None] * theta.first
         nodal = _nodal(P, gradients, volumes)
-        forces += np.bincount(cells.dofs[own].ravel(), nodal.ravel(), u.size)
+        forces += np.bincount(cells.dofs[index].ravel(), nodal.ravel(), u.size)
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
             A += np.einsum(
                 "eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first
             )  # fmt: skip
-        tangents[own] = cell_tangents(gradients, volumes, A)
+        tangents[index] = cell_tangents(gradients, volumes, A)
         if mean:
             g = _nodal(theta.first, gradients, volumes)
             part = curvature[:, 0] / volumes.sum(axis=1)
-            tangents[own] += part[:, None, None] * (g[:, :, None] * g[:, None, :])
+            tangents[index] += part[:, None, None] * (g[:, :, None] * g[:, None, :])
     return EnergyDerivatives(energy, forces, tangents)
 
 
@@ -234,17 +234,17 @@ def cauchy_stress(cells: Cells, u: Vector) -> Floats:
     centre = _deformed(cells, u, gradients[:, None])[:, 0]
     inside = deformation_gradients(cells, u)
     stress = np.empty((len(centre), 4))
-    for material, own in _by_material(cells):
-        F, theta = centre[own], material.dilatation(centre[own])
+    for material, index in _by_material(cells):
+        F, theta = centre[index], material.dilatation(centre[index])
         measure = theta.value
         if mean_dilatation(material):
-            at_points = material.dilatation(inside[own]).value
-            measure = _average(at_points, cells.volumes[own])[:, 0]
+            at_points = material.dilatation(inside[index]).value
+            measure = _average(at_points, cells.volumes[index])[:, 0]
         slope = material.volumetric(measure)[1]
         P = material.shear(F).first + slope[:, None, None] * theta.first
         J = determinant(F)
         sigma = P @ np.swapaxes(F, 1, 2) / J[:, None, None]
-        stress[own] = np.column_stack([
+        stress[index] = np.column_stack([
             sigma[:, 0, 0], sigma[:, 1, 1], sigma[:, 0, 1],
             slope * material.thickness_rate(F) / J,
         ])  # fmt: skip

@@ -33,8 +33,8 @@ def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.f
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, q, v) at the Gauss points, Pa; see `centre_stress`."""
-    at = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
-    return np.stack(at, axis=1)
+    stresses = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
+    return np.stack(stresses, axis=1)
 
 
 def _stress_at(
