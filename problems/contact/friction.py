@@ -135,7 +135,7 @@ def coulomb_fixed_point(
         iterates.append(replace(friction, unsettled=residuals[-1]))
         if len(iterates) - int(np.argmin(residuals)) > MAX_STAGNATION:
             break
-        friction = replace(friction, bound=friction.demanded(forces))
+        friction = replace(friction, bound=friction.demanded(forces))  # g ← mu·λ_n
     raise InputError(
         f"Coulomb's law does not converge in load step {step}: after {len(iterates)} "
         f"Tresca problems, ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
@@ -170,5 +170,6 @@ def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
 
     """
     force = np.zeros(places)
+    # solutions to a tolerance may have multipliers below zero, bounds must not
     force[place] = np.maximum(normal, 0.0)
     return force

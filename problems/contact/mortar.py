@@ -176,6 +176,7 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
     deviation[np.abs(deviation) <= NORMAL_ROUNDING] = 0
     D = overlap[..., None] * n_j[:, :, None]
     D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * deviation, N)
+    # M with the same ν and weights as D, so that the forces of a row balance
     pull = weighted[..., None] * gauss.field[:, :, None]  # (p, 3, 2, 2)
     M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * gauss.beta - 1))
     measure = gauss.weight * np.linalg.norm(gauss.field, axis=-1)
@@ -193,16 +194,19 @@ def overlaps(slave: Surface, master: Surface) -> Overlaps:
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
+    # the part [low, high] of the master segment AB between the lines along the normals
     low, high = np.zeros(len(e)), np.ones(len(e))
     for side, (x_j, n_j) in zip((1.0, -1.0), zip(x, n, strict=True), strict=True):
         f_A, f_B = side * cross(x_j - A, n_j), side * cross(x_j - B, n_j)  # ≥ 0 inside
-        splits = (f_A < 0) != (f_B < 0)
+        splits = (f_A < 0) != (f_B < 0)  # the line crosses AB, at `place`
         place = f_A / np.where(splits, f_A - f_B, 1.0)
+        # a segment that is outside as a whole becomes empty: low = 1, high = 0
         low = np.where(f_A < 0, np.where(splits, np.maximum(low, place), 1.0), low)
         high = np.where(f_B < 0, np.where(splits, np.minimum(high, place), 0.0), high)
     ends = np.stack(
         [project(x, n, A + t[:, None] * (B - A)) for t in (low, high)], axis=1
     )
+    # both sides run anticlockwise around their bodies, so that ξ decreases along AB
     ends = np.sort(np.clip(ends, -1.0, 1.0), axis=1)
     valid = (low < high) & (ends[:, 1] - ends[:, 0] > MIN_SEGMENT)
     return Overlaps(e[valid], m[valid], ends[valid])
@@ -240,7 +244,7 @@ def cast_rays(
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
     field += N[..., 1:] * slave.node_normal[k][:, None]
-    n = unit(field, slave.normal[e][:, None])
+    n = unit(field, slave.normal[e][:, None])  # opposite end normals: ν may vanish
 
     A, B = master.start[m][:, None], master.end[m][:, None]
     f_A, f_B = cross(x - A, n), cross(x - B, n)  # opposite signs: the ray hits AB
@@ -251,6 +255,7 @@ def cast_rays(
     near = (cosine <= reach.cosine) & (
         np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )
+    # dx = half·|edge|/2 dt on t ∈ [−1, 1]
     weight = WEIGHTS * (half * np.linalg.norm(edge, axis=1) / 2)[:, None]
     return GaussPoints(*(a[near] for a in (e, m, xi, beta, field, gap, weight)))
 

@@ -55,8 +55,8 @@ VERTEX_TOLERANCE = 1e-9
 class ContactRows(NamedTuple):
     """Linear inequalities B u ≤ c on the total displacement u, and the slip T u."""
 
-    B: csr_array  #: (m_I, n) dimensionless
-    c: Vector  #: (m_I,) m
+    B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
+    c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
     share: Vector  #: (m_I,) length ∫N_j of the slave side that belongs to the row, m
@@ -112,6 +112,7 @@ def node_to_segment(
     node = np.column_stack([slave, master[ends]])
     weight = np.column_stack([-np.ones(len(slave)), N])
     B = rows_along(node, weight, closest.normal, points.size)
+    # friction has the weights of its contact row along the tangents
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
         directions = tangents(closest.normal)
@@ -187,6 +188,7 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
     """Return the closest points of x (s, 2) on a chain, with outward normals."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
+    # snap to vertices, whose normal is the average: rounding must not select a segment
     at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])

@@ -51,7 +51,7 @@ def contact_sides(
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        # 0.0 − x: zeros without a sign
+        # 0.0 − x instead of −x: no negative zeros in reports
         contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)
         shearing = np.zeros_like(contact_force)
@@ -62,6 +62,7 @@ def contact_sides(
         length = surface(points[pair.slave], "slave").areas
         normal = np.einsum("sx,sx->s", contact_force, side.node_normal)
         gap, push = np.full((2, len(pair.slave)), np.nan)
+        # nodes without a row keep the gap NaN
         place, direction = slave_places(B[rows], pair.slave, dim)
         gap[place] = slack[rows]
         push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)

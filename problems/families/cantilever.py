@@ -47,6 +47,7 @@ class Cantilever(DeclaredFamily):
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; the default nx makes cells half as long as thick."""
         params: dict[str, Any] = {**self.defaults, **given}
+        # limited before rounding: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)
         derived = {"nx": round(cells), "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}

@@ -140,7 +140,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
     if not J[worst] > 0:  # also NaN
         raise InvertedCellError(worst, float(J[worst]))
     energy, forces = 0.0, np.zeros(u.size)
-    tangents = np.empty((len(J), 8, 8))
+    tangents = np.empty((len(J), 8, 8))  # plane strain: four nodes, two components
     for material, index in _by_material(cells):
         volumes, gradients = cells.volumes[index], cells.gradients[index]
         w, theta = material.shear(F[index]), material.dilatation(F[index])
@@ -151,6 +151,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
         P = w.first + slope[..., None, None] * theta.first
         nodal = _nodal(P, gradients, volumes)
         forces += np.bincount(cells.dofs[index].ravel(), nodal.ravel(), u.size)
+        # ∂²(w + U′θ)/∂F² at fixed U′; the rest is U″ θ′⊗θ′, or U″/V ggᵀ of the mean
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
             A += np.einsum(
@@ -200,6 +201,7 @@ def convex_tangent(
         When even the modified K_t is not positive definite.
 
     """
+    # cells may be indefinite while their sum is not: modify only if necessary
     exact = assemble(cells, tangents)
     if positive(exact):
         return exact, 0
@@ -223,6 +225,7 @@ def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
     vectors = vectors[changed]
     clipped = tangents.copy()
     product = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    # symmetric to the last digit
     clipped[changed] = (product + np.swapaxes(product, 1, 2)) / 2
     return clipped, int(changed.sum())
 

@@ -86,11 +86,13 @@ def bodies(Nr: int, Nh: int, radial: int, plane: Plane) -> ElasticBodies:
     """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells."""
     shape = StructuredGrids(_grids(Nr, Nh, radial))
     sides = shape.sides
+    # m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
     clamped = [dofs_of(sides[b], 2) for b in ("left", "left_foot", "right_foot")]
     return ElasticBodies(
         shape=shape, names=NAMES, materials=(BEAM, RING), plane=plane, length=LENGTH,
         force=LOAD, fixed=np.concatenate(clamped),
         forces=Forces(_tip(sides)[1:], np.array([-1.0])),
+        # as in the paper: the ring is the slave, the beam the master
         pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
 

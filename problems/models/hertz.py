@@ -279,6 +279,7 @@ def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPai
 def _shear_forces(points: NDArray[np.float64], Q: float) -> Vector:
     """Return the forces (2k,) of Q at the nodes of a flat side, (x, y) node by node."""
     share, (x, y) = nodal_lengths(points), points.T
+    # vertical forces ∝ x balance the moment of Q about the origin
     forces = Q * share / share.sum(), Q * y[0] * share * x / (share @ x**2)
     return np.column_stack(forces).ravel()
 
@@ -311,7 +312,7 @@ def _loads(params: Mapping[str, Value]) -> list[tuple[float, float]]:
     if p["loading"] == "static":
         return [(1.0, p["Q"])]
     if p["programme"] == "proportional":
-        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a grows evenly
+        parts = (np.arange(1, p["steps"] + 1) / p["steps"]) ** 2  # a ∝ √P grows evenly
         return [(part, part * p["Q"]) for part in parts]
     return [(1.0, Q) for Q in dict.fromkeys((p["peak"], p["Q"]))]
 
