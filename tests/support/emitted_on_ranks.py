@@ -61,9 +61,12 @@ def own_subdomains(name, ranks):
     """Hold what ranks hold, whose shares are those of the first problem of a path."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
-        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
+        problem, choice = (
+            case.family.contact_problem(case.params),
+            chosen("dual", case.params),
+        )
         path = torn_path(problem, choice, ranks, reference_over_ranks)
-        return path.problem(choice.step, choice.iterate).posed.dual.own
+        return path.problem(choice.step, choice.iterate).problem.dual.own
     problem = parts_of(name)
     return OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 
