@@ -139,7 +139,7 @@ class ContactFamily(DeclaredFamily):
     problem: ClassVar[str]
     model = ""
 
-    def stated(self, params: Mapping[str, Value]) -> ContactProblem:
+    def contact_problem(self, params: Mapping[str, Value]) -> ContactProblem:
         """Return the contact problem of complete keys."""
         problem: ContactProblem = _model(self.problem)(params)
         return problem
@@ -156,7 +156,7 @@ class ContactFamily(DeclaredFamily):
         from mortarbench.problems.duality.problem import chosen
 
         choice = chosen(form, params)
-        return case_of(self.stated(params), form, choice, reference)
+        return case_of(self.contact_problem(params), form, choice, reference)
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
@@ -167,7 +167,7 @@ class ContactFamily(DeclaredFamily):
 
         self.check(params)
         choice = chosen("dual", params)
-        return emitted_by(ranks, self.stated(params), choice, reference)
+        return emitted_by(ranks, self.contact_problem(params), choice, reference)
 
 
 def _model(place: str) -> Callable[..., Any]:

@@ -30,7 +30,7 @@ class HalfPlane(DeclaredFamily):
         peak=key(0.0),
     )
     forms = ("dual",)
-    model = "half_plane.half_planes"
+    model = "half_plane.half_plane_case"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
         """Return all keys; peak defaults to Q, loading without unloading."""

@@ -42,7 +42,7 @@ class HertzPlane(ContactFamily):
         **KINEMATICS,
     )
     forms = ("primal", "dual")
-    problem = "hertz.on_plane"
+    problem = "hertz.plane_problem"
     model = "hertz.newton_step"
 
     def check(self, params: Mapping[str, Value]) -> None:

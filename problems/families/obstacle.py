@@ -31,7 +31,7 @@ class Obstacle(DeclaredFamily):
         **DECOMPOSITION,
     )
     forms = CONTACT_FORMS
-    model = "obstacle.over_obstacle"
+    model = "obstacle.obstacle_case"
     subdomains = "obstacle"
     cells = ("n",)
 

@@ -70,12 +70,12 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             bodies.mesh, bodies.pairs[0].slave, tangential=True
         ),
         results=lambda answer: {
-            **along_the_side(*answer.sides), "tresca_problems": answer.problems,
+            **published_quantities(*answer.sides), "tresca_problems": answer.problems,
         },
     )  # fmt: skip
 
 
-def along_the_side(
+def published_quantities(
     bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
     """Return the published quantities, interpolated linearly between nodes.

@@ -57,7 +57,7 @@ MESH_HALF_WIDTH = 1.5  #: half width of the potential contact of law=hertz, in a
 EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
 
 
-def half_planes(params: Mapping[str, Value]) -> Case:
+def half_plane_case(params: Mapping[str, Value]) -> Case:
     """Return the QP of complete keys, in its only form, dual."""
     p: Any = params
     if p["law"] == "hertz":

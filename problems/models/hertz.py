@@ -87,9 +87,9 @@ CURVE_POINTS = 601  #: points of the exact tractions in pictures, on the uniform
 
 
 @remembered
-def on_plane(params: Mapping[str, Value]) -> ContactProblem:
+def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
     """Return the linear problem of a cylinder on a rigid plane."""
-    elastic, exact = _on_plane(params)
+    elastic, exact = _cylinder_on_plane(params)
 
     def results(answer: Found) -> dict[str, Any]:
         bodies, primal, s, _ = answer.sides
@@ -107,7 +107,7 @@ def on_plane(params: Mapping[str, Value]) -> ContactProblem:
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
     """Return a Newton QP of a cylinder on a plane at finite strain; gaps are linear."""
-    exact = _on_plane(params)[1]
+    exact = _cylinder_on_plane(params)[1]
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     case = newton_case(
         path, form, 1, int(params["newton"]),
@@ -120,12 +120,14 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
-    bodies = _on_plane(dict(items))[0].assembled
+    bodies = _cylinder_on_plane(dict(items))[0].assembled
     rows = rigid_plane_rows(bodies.mesh, bodies.pairs[0].slave)
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 
-def _on_plane(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineContact]:
+def _cylinder_on_plane(
+    params: Mapping[str, Value],
+) -> tuple[ElasticBodies, LineContact]:
     """Return the cylinder on a rigid plane, n cells per a, and Hertz's solution."""
     p: Any = params
     exact = LineContact(

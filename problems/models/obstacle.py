@@ -78,7 +78,7 @@ CONTACT_RADIUS = 0.697965148223374  #: a, root of a²(ln 2 − ln a) = 1 − a²
 SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
 
 
-def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
+def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
     """Return the QP in one form."""
     p: Any = params
     if p["feti"] and form != "dual":

@@ -61,7 +61,10 @@ def parts_of(name: str) -> ProblemInParts:
     """Describe the dual of a case; what comes before it is solved."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
-        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
+        problem, choice = (
+            case.family.contact_problem(case.params),
+            chosen("dual", case.params),
+        )
         path = whole_path(problem, reference_solution)
         whole, friction, _ = path.problem(choice.step, choice.iterate)
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
