@@ -94,6 +94,7 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
+    # T diag(K)⁻¹ Tᵀ of each row; components without stiffness count as of stiffness 1
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
     slip = np.abs(friction.T @ s.x - friction.start)
     sticks = (friction.bound - np.abs(tangential)) * softness >= slip
@@ -130,6 +131,7 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Return the slice of rows of B (m, n) that belongs to each pair."""
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
+    # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
     outside = []
     for pair in bodies.pairs:
@@ -138,6 +140,7 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
         outside.append(touches @ other > 0)
     slices, first = [], 0
     for k in range(len(bodies.pairs)):
+        # the rows of pair k end before the first row with a node beyond its two sides
         beyond = np.flatnonzero(outside[k][first:])
         end = first + int(beyond[0]) if beyond.size else m
         slices.append(slice(first, end))

@@ -154,6 +154,7 @@ def rigid_motions(points: Floats) -> Floats:
     line, 3 in the plane and 6 in space.
     """
     N, dim = points.shape
+    # about the centroid, rotations are orthogonal to translations
     offset = points - points.mean(axis=0)
     planes = list(combinations(range(dim), 2))
     motions = np.zeros((N, dim, dim + len(planes)))

@@ -236,7 +236,8 @@ def _parse(path: Path) -> Any:
     lines = [line.split() for line in entities.split(b"\n") if line.split()]
     points = int(lines[0][0])
     for i, fields in enumerate(lines[1:]):
-        at = 4 if i < points else 7  # tag, position or box, number of physical tags
+        # after tag and position or box: the number of physical tags
+        at = 4 if i < points else 7
         if fields[at] == b"0":
             fields[at : at + 1] = [b"1", b"0"]
     text = b"\n".join([b"", *(b" ".join(fields) for fields in lines), b""])
@@ -319,6 +320,7 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
             "distinct corners, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
+    # at every corner of a convex cell, the boundary bends to the left
     corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
         x, y = points[cells[bad.argmax()]].mean(axis=0)

@@ -110,7 +110,7 @@ class NeoHooke(Hyperelastic):
             log_J = np.log(determinant(F))
         return Derivatives(
             mu * ((F**2).sum((-2, -1)) / 2 - 1 - log_J),
-            mu * (F - back),
+            mu * (F - back),  # ∂ ln J/∂F = F⁻ᵀ
             mu * (np.einsum("ik,jl->ijkl", _I, _I)
                   + np.einsum("...il,...kj->...ijkl", back, back)),
         )  # fmt: skip
@@ -136,6 +136,7 @@ class NeoHooke(Hyperelastic):
 
     def thickness_rate(self, F: Floats) -> Floats:
         """Return J."""
+        # det F = F₃₃ J₂ with the determinant J₂ in the plane
         return determinant(F)
 
 
@@ -155,7 +156,7 @@ class StVenantKirchhoff(Hyperelastic):
 
     def dilatation(self, F: Floats) -> Derivatives:
         """Return θ = tr E."""
-        theta = (F**2).sum((-2, -1)) / 2 - 1
+        theta = (F**2).sum((-2, -1)) / 2 - 1  # tr E = ½ F:F − 1 in the plane
         identity = np.einsum("ik,jl->ijkl", _I, _I)
         return Derivatives(
             theta, F, np.broadcast_to(identity, (*theta.shape, 2, 2, 2, 2))
@@ -168,6 +169,7 @@ class StVenantKirchhoff(Hyperelastic):
 
     def thickness_rate(self, F: Floats) -> Floats:
         """Return 1."""
+        # tr E = … + ½(F₃₃² − 1)
         return np.ones(F.shape[:-2])
 
 

@@ -82,6 +82,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         count = np.bincount(b, minlength=N)
         polynomial[count > 0] /= count[count > 0, None, None]
         has_value = has_value | (count > 0)
+    # the constant term is the value at the node about which it is expanded
     result = polynomial[:, 0]
     isolated = ~has_value  # one layer of cells: take the mean of the adjacent cells
     result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]

@@ -92,6 +92,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     def results(at: Iteration, s: Solution) -> dict[str, Any]:
         """Compare the mean displacement of the end face, m, with the elastica."""
         end = at.tangent.mesh.boundaries["right"]
+        # mean over the face by ∫N_j
         share = nodal_lengths(at.tangent.mesh.points[end])
         u = share @ as_vectors(s.x, 2)[end] / share.sum() * LENGTH
         return {
@@ -108,6 +109,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 def beam(slenderness: float, load: float, cells: tuple[int, int], nu: float) -> Bodies:
     """Assemble the beam of nx × ny cells, clamped on the left, under its full load."""
     t = LENGTH / slenderness
+    # P = load·EI/L² with EI = E t³/(12(1 − ν²))
     P = load * E * t**3 / (12 * (1 - nu**2)) / LENGTH**2
     mesh = rectangle((0.0, -t / 2), (LENGTH, t), cells)
     end = mesh.boundaries["right"]

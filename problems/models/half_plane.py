@@ -112,6 +112,7 @@ def _hertz_case(n: int) -> Case:
         """
         force = s.x * EXACT.P
         p, hertz = force / width, EXACT.pressure(x)
+        # ∫px² = Pa²/4, with the moment of a constant pressure on each element
         half_width = np.sqrt(4 * force @ (x**2 + width**2 / 12) / EXACT.P)
         energy = 0.5 * s.x @ (qp.P @ s.x) + s.y[0]
         return {

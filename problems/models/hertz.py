@@ -190,8 +190,8 @@ def _programme(
 
     In the first stage, supports on the axis fix the upper cylinder; under P they have
     no reactions. Without friction, two cylinders roll on each other almost freely, as
-    only the polygonal shape of their arcs resists. Slip of the next stage would then be
-    measured from an arbitrary rolled state, on which Q does work.
+    only the polygonal shape of their arcs resists. Slip of the next stage would be
+    measured from that arbitrary state, and Q would do work on the rolling.
     """
     p: Any = params
     discs, sides = half_cylinders(p).discs, elastic.shape.sides

@@ -73,11 +73,11 @@ class TangentialContact:
 
         The pairs of the loading come before those of the unloading.
         """
-        stuck = 1 - self.peak  # (c/a)²
+        stuck = 1 - self.peak  # (c/a)² = 1 − Q*/μP, and the force of its semicircle
         loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
         if self.Q == self.peak:
             return loading
-        stuck = 1 - (self.peak - self.Q) / 2
+        stuck = 1 - (self.peak - self.Q) / 2  # (c′/a)²
         return (*loading, (-2.0, 1.0), (2 * stuck, np.sqrt(stuck)))
 
     @property
@@ -102,6 +102,7 @@ class TangentialContact:
         traction of the loading is taken to be exact. A moment that no c yields gives
         the nearest c.
         """
+        # a semicircle of force w and half width c has the moment ∫x² = wc²/4
         *others, (w, c) = self.semicircles
         rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in others)
         return float(self.normal.a * np.clip(rest * c**2 / w, 0, 1) ** 0.25)

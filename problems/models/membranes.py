@@ -238,6 +238,7 @@ def membrane_kind(part: Part, h: float = 1.0) -> Kind:
 
 def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
     """Return the rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
+    # both sides ascending by node, hence by y: the grids match
     pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
     ends = 2 * np.arange(len(pairs) + 1)
     data = np.tile([1.0, -1.0], len(pairs))
@@ -247,5 +248,6 @@ def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
 def hat_integrals(n: int, lower: float, upper: float) -> Vector:
     """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
     begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
+    # of each cell, ∫ of its rising and of its falling hat function
     rising = (end**2 - begin**2) / 2
     return np.asarray((np.append(end - begin - rising, 0) + np.append(0, rising)) / n)

@@ -272,6 +272,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     if dim == 2:
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
+    # half a cell of tolerance against rounding of the coordinates
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)

@@ -209,6 +209,7 @@ def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
     column, row = (x.astype(np.int64) for x in layout.block[1:])
+    # no contact rows, but the interface of problems with contact
     none = np.zeros(0)
     return ProblemInParts(
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
