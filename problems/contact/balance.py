@@ -66,7 +66,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
 
     """
     R, centres, size = _motions(bodies)
-    allowed = _kernel(bodies.B_D @ R)
+    allowed = _kernel(bodies.B_D @ R)  # Z = R·allowed
     if not allowed.shape[1]:  # the supports fix every body
         return
     load, closing = R.T @ bodies.f, csr_array(B) @ R
@@ -86,6 +86,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         raise InputError(
             _message([bodies.names[first]], f"its load in {' and '.join(axes)}")
         )
+    # the residual of least squares is a motion that closes no gap and gains energy
     motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
     if np.linalg.norm(motion) <= threshold:
         return

@@ -69,7 +69,7 @@ class UnassembledBodies:
     plane: Plane | None  #: None in space
     length: float  #: l, unit of length, m
     force: float  #: F₀, unit of force, N/m
-    f: Vector  #: (n,) full load
+    f: Vector  #: (n,) full load of eq. (1)
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
     pairs: tuple[ContactPair, ...]  #: sides that may touch
 
@@ -133,7 +133,7 @@ class UnassembledBodies:
 class Bodies(UnassembledBodies):
     """Bodies with their stiffness matrix, non-dimensional: K' = K·l/F₀, u' = u/l."""
 
-    K: csc_array  #: (n, n)
+    K: csc_array  #: (n, n) stiffness matrix of eq. (1)
 
 
 def assemble(
@@ -190,8 +190,8 @@ def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedI
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
-    touched = np.union1d(bodies.interface, bodies.B_D.indices)
-    interface = Interface(touched, bodies.mesh.points) if condense else None
+    constrained = np.union1d(bodies.interface, bodies.B_D.indices)
+    interface = Interface(constrained, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 

@@ -125,9 +125,9 @@ def coulomb_fixed_point(
             forces = normal(friction)
         except ArithmeticError as e:
             raise InputError(
-                f"load step {step}: no equilibrium was found with the "
-                f"{len(iterates) + 1}. bound of Coulomb's law: friction cannot hold "
-                f"the load; expected supports or friction that hold the bodies: {e}"
+                f"load step {step}: no equilibrium was found with bound "
+                f"{len(iterates) + 1} of Coulomb's law: friction cannot hold the "
+                f"load; expected supports or friction that hold the bodies: {e}"
             ) from None
         residuals.append(friction.residual(forces))
         if residuals[-1] <= FIXED_POINT_TOLERANCE:
@@ -135,10 +135,10 @@ def coulomb_fixed_point(
         iterates.append(replace(friction, unsettled=residuals[-1]))
         if len(iterates) - int(np.argmin(residuals)) > MAX_STAGNATION:
             break
-        friction = replace(friction, bound=friction.demanded(forces))
+        friction = replace(friction, bound=friction.demanded(forces))  # g ← mu·λ_n
     raise InputError(
-        f"the friction of load step {step} does not settle: after {len(iterates)} "
-        f"Tresca problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
+        f"Coulomb's law does not converge in load step {step}: after {len(iterates)} "
+        f"Tresca problems, ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
         f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
     )
 
@@ -170,5 +170,6 @@ def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
 
     """
     force = np.zeros(places)
+    # solutions to a tolerance may have multipliers below zero, bounds must not
     force[place] = np.maximum(normal, 0.0)
     return force

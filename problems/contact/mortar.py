@@ -161,25 +161,26 @@ def mortar(
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
     """Integrate D, M, the weighted gaps and the covered lengths."""
-    at = cast_rays(slave, master, overlaps(slave, master), reach)
-    N = _shape(at.xi)
-    phi = _dual(at) if basis == "dual" else N
+    gauss = cast_rays(slave, master, overlaps(slave, master), reach)
+    N = _shape(gauss.xi)
+    phi = _dual(gauss) if basis == "dual" else N
     s, v = len(slave.x), len(master.x)
-    j, k = slave.facets[at.slave], master.facets[at.master]  # (p, 2) nodes
-    weighted = phi * at.weight[..., None]  # (p, 3, 2)
+    j, k = slave.facets[gauss.slave], master.facets[gauss.master]  # (p, 2) nodes
+    weighted = phi * gauss.weight[..., None]  # (p, 3, 2)
     overlap = np.einsum("pgj,pgk->pjk", weighted, N)
     if basis == "dual":  # summed over a slave segment, ∫Φ_jN_k = δ_jk ∫Φ_j exactly
         overlap = np.eye(2) * weighted.sum(axis=1)[:, None]
     # ∫Φ_j N_k ν = n_j ∫Φ_j N_k + ∫Φ_j N_k (ν − n_j)
     n_j = slave.node_normal[j]  # (p, 2, 2)
-    deviation = at.field[:, :, None] - n_j[:, None]
+    deviation = gauss.field[:, :, None] - n_j[:, None]
     deviation[np.abs(deviation) <= NORMAL_ROUNDING] = 0
     D = overlap[..., None] * n_j[:, :, None]
     D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * deviation, N)
-    pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
-    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * at.beta - 1))
-    measure = at.weight * np.linalg.norm(at.field, axis=-1)
-    gap = np.einsum("pgj,pg->pj", phi, measure * at.gap)
+    # M with the same ν and weights as D, so that the forces of a row balance
+    pull = weighted[..., None] * gauss.field[:, :, None]  # (p, 3, 2, 2)
+    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * gauss.beta - 1))
+    measure = gauss.weight * np.linalg.norm(gauss.field, axis=-1)
+    gap = np.einsum("pgj,pg->pj", phi, measure * gauss.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
     return Mortar(
         _sum(D, j, j, (s, s)), _sum(M, j, k, (s, v)),
@@ -193,16 +194,19 @@ def overlaps(slave: Surface, master: Surface) -> Overlaps:
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
+    # the part [low, high] of the master segment AB between the lines along the normals
     low, high = np.zeros(len(e)), np.ones(len(e))
     for side, (x_j, n_j) in zip((1.0, -1.0), zip(x, n, strict=True), strict=True):
         f_A, f_B = side * cross(x_j - A, n_j), side * cross(x_j - B, n_j)  # ≥ 0 inside
-        splits = (f_A < 0) != (f_B < 0)
+        splits = (f_A < 0) != (f_B < 0)  # the line crosses AB, at `place`
         place = f_A / np.where(splits, f_A - f_B, 1.0)
+        # a segment that is outside as a whole becomes empty: low = 1, high = 0
         low = np.where(f_A < 0, np.where(splits, np.maximum(low, place), 1.0), low)
         high = np.where(f_B < 0, np.where(splits, np.minimum(high, place), 0.0), high)
     ends = np.stack(
         [project(x, n, A + t[:, None] * (B - A)) for t in (low, high)], axis=1
     )
+    # both sides run anticlockwise around their bodies, so that ξ decreases along AB
     ends = np.sort(np.clip(ends, -1.0, 1.0), axis=1)
     valid = (low < high) & (ends[:, 1] - ends[:, 0] > MIN_SEGMENT)
     return Overlaps(e[valid], m[valid], ends[valid])
@@ -240,7 +244,7 @@ def cast_rays(
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
     field += N[..., 1:] * slave.node_normal[k][:, None]
-    n = unit(field, slave.normal[e][:, None])
+    n = unit(field, slave.normal[e][:, None])  # opposite end normals: ν may vanish
 
     A, B = master.start[m][:, None], master.end[m][:, None]
     f_A, f_B = cross(x - A, n), cross(x - B, n)  # opposite signs: the ray hits AB
@@ -251,21 +255,22 @@ def cast_rays(
     near = (cosine <= reach.cosine) & (
         np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )
+    # dx = half·|edge|/2 dt on t ∈ [−1, 1]
     weight = WEIGHTS * (half * np.linalg.norm(edge, axis=1) / 2)[:, None]
     return GaussPoints(*(a[near] for a in (e, m, xi, beta, field, gap, weight)))
 
 
-def _dual(at: GaussPoints) -> NDArray[np.float64]:
+def _dual(gauss: GaussPoints) -> NDArray[np.float64]:
     """Evaluate the dual basis Φ_1, Φ_2 on each slave segment, (p, 3, 2)."""
-    w = at.weight
-    total = np.bincount(at.slave, w.sum(axis=1))
+    w = gauss.weight
+    total = np.bincount(gauss.slave, w.sum(axis=1))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        sums = np.bincount(at.slave, (w * values).sum(axis=1))
-        return (sums[at.slave] / total[at.slave])[:, None]
+        sums = np.bincount(gauss.slave, (w * values).sum(axis=1))
+        return (sums[gauss.slave] / total[gauss.slave])[:, None]
 
-    centre = mean(at.xi)
-    offset = at.xi - centre
+    centre = mean(gauss.xi)
+    offset = gauss.xi - centre
     offset = offset - mean(offset)  # correct the rounding of ξ̄: v may be tiny
     N = _shape(centre)
     slope = 2 * N[..., 0] * N[..., 1] / mean(offset**2) * offset
@@ -293,8 +298,8 @@ def _sum(
     dim = vectors.shape[-1]
     i = np.repeat(rows, 2 * dim, axis=1)
     j = np.tile(dofs_of(nodes, dim).reshape(-1, 2 * dim), (1, 2))
-    at = (i.ravel(), j.ravel())
-    return csr_array(coo_array((vectors.ravel(), at), (shape[0], dim * shape[1])))
+    indices = (i.ravel(), j.ravel())
+    return csr_array(coo_array((vectors.ravel(), indices), (shape[0], dim * shape[1])))
 
 
 def _rows(
@@ -308,9 +313,9 @@ def _rows(
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
     row = np.concatenate([D.row, M.row])
     slave, master = (dofs_of(side, dim) for side in sides)
-    at = (row, np.concatenate([slave[D.col], master[M.col]]))
+    indices = (row, np.concatenate([slave[D.col], master[M.col]]))
     values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
-    B = csr_array(coo_array((values, at), (len(j), N * dim)))
+    B = csr_array(coo_array((values, indices), (len(j), N * dim)))
     B.eliminate_zeros()
     return B
 

@@ -55,8 +55,8 @@ VERTEX_TOLERANCE = 1e-9
 class ContactRows(NamedTuple):
     """Linear inequalities B u ≤ c on the total displacement u, and the slip T u."""
 
-    B: csr_array  #: (m_I, n) dimensionless
-    c: Vector  #: (m_I,) m
+    B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
+    c: Vector  #: (m_I,) c_M of eq. (5), m
     T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
     row: Nodes  #: (k,) contact row of each tangential row
     share: Vector  #: (m_I,) length ∫N_j of the slave side that belongs to the row, m
@@ -102,19 +102,20 @@ def node_to_segment(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _projections(x, line, fixed_segments)
-    N = np.stack([1 - at.xi, at.xi], axis=1)
-    ends = np.stack([at.segment, at.segment + 1], axis=1)
+    closest = _projections(x, line, fixed_segments)
+    N = np.stack([1 - closest.xi, closest.xi], axis=1)
+    ends = np.stack([closest.segment, closest.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
-    gap = np.einsum("sx,sx->s", x - foot, at.normal)
+    gap = np.einsum("sx,sx->s", x - foot, closest.normal)
 
     # (m, 3) stencil of each row: the slave node and both ends of the segment
     node = np.column_stack([slave, master[ends]])
     weight = np.column_stack([-np.ones(len(slave)), N])
-    B = rows_along(node, weight, at.normal, points.size)
+    B = rows_along(node, weight, closest.normal, points.size)
+    # friction has the weights of its contact row along the tangents
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
-        directions = tangents(at.normal)
+        directions = tangents(closest.normal)
         row = np.repeat(np.arange(slave.size), directions.shape[1])
         along = directions.reshape(-1, points.shape[1])
         T = rows_along(node[row], weight[row], along, points.size)
@@ -153,8 +154,8 @@ def geometric_stiffness(
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _projections(x, line, fixed_segments)
-    x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
+    closest = _projections(x, line, fixed_segments)
+    x_1, x_2 = line.x[closest.segment], line.x[closest.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
     t, area = e / L[:, None], cross(d, e)
@@ -173,11 +174,13 @@ def geometric_stiffness(
     mixed, (L, area) = outer(area_1, length_1), (v[:, None, None] for v in (L, area))
     gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
     gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
-    inside = (at.xi > 0) & (at.xi < 1)
+    inside = (closest.xi > 0) & (closest.xi < 1)
     if fixed_segments is not None:
         inside |= fixed_segments >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
-    nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
+    nodes = np.column_stack(
+        [slave, master[closest.segment], master[closest.segment + 1]]
+    )
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
@@ -185,6 +188,7 @@ def closest_points(x: Points, line: Surface) -> ClosestPoints:
     """Return the closest points of x (s, 2) on a chain, with outward normals."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
+    # snap to vertices, whose normal is the average: rounding must not select a segment
     at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
@@ -199,10 +203,10 @@ def _projections(
 
     On the line of a fixed segment, ξ may be outside of [0, 1].
     """
-    at = closest_points(x, line)
+    closest = closest_points(x, line)
     if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():
-        return at
-    segment = np.where(is_fixed, fixed_segments, at.segment)
+        return closest
+    segment = np.where(is_fixed, fixed_segments, closest.segment)
     start = line.x[segment]
     edge = line.x[segment + 1] - start
     xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
@@ -210,8 +214,8 @@ def _projections(
     across = -tangents(edge)[:, 0] / length
     return ClosestPoints(
         segment,
-        np.where(is_fixed, xi, at.xi),
-        np.where(is_fixed[:, None], across, at.normal),
+        np.where(is_fixed, xi, closest.xi),
+        np.where(is_fixed[:, None], across, closest.normal),
     )
 
 

@@ -33,7 +33,7 @@ class BulkResults(NamedTuple):
     nodes: int
     elements: int
     supports: int  #: number of prescribed components
-    energy: float  #: ½uᵀKu − fᵀu, J/m
+    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m
     #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
     max_von_mises: Sequence[float]
 
@@ -105,6 +105,7 @@ def _contact_force(
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
+    # contact forces act on both bodies: sum those on one of them, or they cancel
     loaded = owner == owner[(master if master.size else slave)[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
@@ -154,7 +155,7 @@ def pair_results(
         total = side.force.sum(axis=0)
         force = {slave: total.tolist()}
         if pair.master.size:
-            force = {master: (0.0 - total).tolist()} | force
+            force = {master: (0.0 - total).tolist()} | force  # 0.0 − x: no −0
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
         pressed = side.pressed(ACTIVE_THRESHOLD * largest)
         results[side.name] = {
@@ -200,7 +201,10 @@ def contact_forces(
     s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> NDArray[np.float64]:
-    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m."""
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m.
+
+    The sign is that of f − Bᵀλ in eq. (6) of the paper.
+    """
     B, _ = contact_rows(primal, friction)
     return as_vectors(-(B.T @ s.z) * bodies.force, bodies.mesh.dim)
 

@@ -123,6 +123,7 @@ def facing_segments(slave: Surface, master: Surface) -> tuple[Nodes, Nodes]:
             one = offset[nodes] + np.einsum("px,px->p", start, along)
             return one, one + np.einsum("px,px->p", edge, along)
 
+        # |n| = 1: f_j on a sub-chain is within δ of its values on the chord
         above = np.maximum(*ends(j[query])) >= -level.deviation[node]
         below = np.minimum(*ends(k[query])) <= level.deviation[node]
         followed: NDArray[np.bool_] = above & below
@@ -135,6 +136,7 @@ def _descend(
     queries: int, levels: list[Chords], keep: Criterion
 ) -> tuple[Nodes, Nodes]:
     """Descend from the roots; return pairs (query, leaf) sorted by both."""
+    # a vectorised descent of all queries at once, level by level
     roots = len(levels[0].inverse)
     query = np.repeat(np.arange(queries), roots)
     node = np.tile(np.arange(roots), queries)

@@ -51,28 +51,29 @@ def contact_sides(
     for name, pair, rows in zip(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
-        # 0.0 − x: zeros without a sign
-        pressing = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
+        # 0.0 − x instead of −x: no negative zeros in reports
+        contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)
-        shearing = np.zeros_like(pressing)
+        shearing = np.zeros_like(contact_force)
         if own.any():
             force = friction.T[own].T @ tangential[own]
             shearing -= as_vectors(force, dim)[pair.slave] * F
         side = current_surface(points, u, pair.slave, "slave")
         length = surface(points[pair.slave], "slave").areas
-        normal = np.einsum("sx,sx->s", pressing, side.node_normal)
+        normal = np.einsum("sx,sx->s", contact_force, side.node_normal)
         gap, push = np.full((2, len(pair.slave)), np.nan)
+        # nodes without a row keep the gap NaN
         place, direction = slave_places(B[rows], pair.slave, dim)
         gap[place] = slack[rows]
-        push[place] = np.einsum("rx,rx->r", pressing[place], -direction)
+        push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
         push = np.nan_to_num(push)
         nodal_state = np.full(len(pair.slave), "open", dtype=state.dtype)
         nodal_state[place[friction.row[own] - rows.start]] = state[own]
         sides.append(
             ContactSide(
                 name=name, nodes=pair.slave, length=length,
-                force=pressing + shearing, pressure=(0.0 - normal) / length, gap=gap,
-                push=push,
+                force=contact_force + shearing, pressure=(0.0 - normal) / length,
+                gap=gap, push=push,
                 shear=np.einsum("sx,sx->s", shearing, side.tangents[:, 0]) / length
                 if own.any() else None,
                 friction=nodal_state if own.any() else None,
@@ -93,6 +94,7 @@ def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
+    # T diag(K)⁻¹ Tᵀ of each row; components without stiffness count as of stiffness 1
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
     slip = np.abs(friction.T @ s.x - friction.start)
     sticks = (friction.bound - np.abs(tangential)) * softness >= slip
@@ -129,6 +131,7 @@ def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, st
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     """Return the slice of rows of B (m, n) that belongs to each pair."""
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
+    # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
     outside = []
     for pair in bodies.pairs:
@@ -137,6 +140,7 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
         outside.append(touches @ other > 0)
     slices, first = [], 0
     for k in range(len(bodies.pairs)):
+        # the rows of pair k end before the first row with a node beyond its two sides
         beyond = np.flatnonzero(outside[k][first:])
         end = first + int(beyond[0]) if beyond.size else m
         slices.append(slice(first, end))

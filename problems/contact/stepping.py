@@ -103,6 +103,7 @@ def load_steps(
     return tuple(
         Stage(
             step=k, part=k / steps, forces=forces, fixed=fixed, laws=laws,
+            # relinearisations of a step keep its slip origin
             begin=restart_slip if quasi_static and not i else continue_slip,
         )
         for k in range(1, steps + 1) for i in range(relin)
@@ -202,6 +203,7 @@ def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
     solutions = list[Solution]()
 
     def normal(friction: Friction) -> Vector:
+        # the bound changes little between iterates: start from the last solution
         start = solutions[-1] if solutions else None
         solutions.append(linearised.solve(friction, start))
         return linearised.normal_multipliers(solutions[-1])

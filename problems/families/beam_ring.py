@@ -26,7 +26,7 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
+MAX_NODES = 50_000_000  #: the entries of K are indexed by 32-bit integers
 
 
 class BeamRing(ContactFamily):
@@ -55,7 +55,7 @@ class BeamRing(ContactFamily):
     singular = "the work of a point load grows without bound as its cell shrinks"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the keys left out; radial defaults to 2·Nh, step to steps."""
+        """Return all keys; radial defaults to 2·Nh, step to steps."""
         params: dict[str, Any] = {**self.defaults, **given}
         derived = {"radial": 2 * params["Nh"], "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}
@@ -74,9 +74,10 @@ class BeamRing(ContactFamily):
         check_memory(self.name, 2 * nodes)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; its load steps are linearised anew.
+        """Return the case with every cell halved, which runs its own load steps.
 
-        The arcs of the ring are other polygons. Friction on them is refused.
+        The arcs of the ring are then approximated by other polygons, on which friction
+        is refused.
         """
         refuse_friction(self.name, params)
         return super().refined(params)

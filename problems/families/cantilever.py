@@ -19,9 +19,11 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MIN_SLENDERNESS = 2.0  #: smallest length of the beam over its thickness
-MIN_LOAD, MAX_LOAD = 1e-3, 1e3  #: PL²/EI; the elastica loses digits beyond
-MAX_NU = 0.4999  #: beyond, the factor of the tangent has few digits left
+MIN_SLENDERNESS = 2.0  #: smallest ratio of length to thickness
+#: PL²/EI; outside these limits, the formula of the elastica loses digits
+MIN_LOAD, MAX_LOAD = 1e-3, 1e3
+#: closer to ½, the Cholesky factor of the tangent loses nearly all digits
+MAX_NU = 0.4999
 
 
 class Cantilever(DeclaredFamily):
@@ -43,8 +45,9 @@ class Cantilever(DeclaredFamily):
     model = "cantilever.newton_step"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the keys left out; nx makes cells half as long as thick."""
+        """Return all keys; the default nx makes cells half as long as thick."""
         params: dict[str, Any] = {**self.defaults, **given}
+        # limited before rounding: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)
         derived = {"nx": round(cells), "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}

@@ -29,7 +29,7 @@ class Greco(ContactFamily):
     problem = "greco.problem"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are cells and a coefficient of friction."""
+        """Raise InputError unless every key is in its range, and mu not negative."""
         super().check(params)
         check_memory(self.name, int(params["n"]) ** 2)
         if not 0 <= float(params["mu"]) <= MAX_SIZE:

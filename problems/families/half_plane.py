@@ -30,14 +30,14 @@ class HalfPlane(DeclaredFamily):
         peak=key(0.0),
     )
     forms = ("dual",)
-    model = "half_plane.half_planes"
+    model = "half_plane.half_plane_case"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Let the tangential force never have been larger than it is."""
+        """Return all keys; peak defaults to Q, loading without unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the law has these forces, and they do not slide."""
+        """Raise InputError unless the law allows Q and peak, without sliding."""
         super().check(params)
         check_dense_memory(self.name, int(params["n"]))
         if params["law"] == "cattaneo":

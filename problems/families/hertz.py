@@ -42,7 +42,7 @@ class HertzPlane(ContactFamily):
         **KINEMATICS,
     )
     forms = ("primal", "dual")
-    problem = "hertz.on_plane"
+    problem = "hertz.plane_problem"
     model = "hertz.newton_step"
 
     def check(self, params: Mapping[str, Value]) -> None:
@@ -77,16 +77,16 @@ class HertzCylinder(ContactFamily):
     problem = "hertz.problem"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Let the tangential force never have been larger than it is."""
+        """Return all keys; peak defaults to Q, loading without unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range, and used."""
+        """Raise InputError unless every key is in its range and has an effect."""
         super().check(params)
         check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
-        sheared = bool(params["Q"] or params["peak"])
-        together = params["programme"] == "proportional"
-        if sheared:
+        has_shear = bool(params["Q"] or params["peak"])
+        proportional = params["programme"] == "proportional"
+        if has_shear:
             for name, value in (("friction", "coulomb"), ("ratio", 1.0)):
                 if params[name] != value:
                     raise InputError(
@@ -100,17 +100,17 @@ class HertzCylinder(ContactFamily):
                 f"{self.name}: peak={params['peak']} is not used by loading=static; "
                 "expected loading=quasi-static, which unloads"
             )
-        if together and not (sheared and params["Q"] == params["peak"]):
+        if proportional and not (has_shear and params["Q"] == params["peak"]):
             raise InputError(
                 f"{self.name}: programme=proportional needs Q, and no peak above it"
             )
-        if params["steps"] != self.defaults["steps"] and not together:
+        if params["steps"] != self.defaults["steps"] and not proportional:
             raise InputError(
                 f"{self.name}: steps={params['steps']} is not used by "
                 f"programme={params['programme']}; expected programme=proportional"
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; friction on arcs is refused."""
+        """Return the case with every cell halved; raise InputError with friction."""
         refuse_friction(self.name, params)
         return super().refined(params)

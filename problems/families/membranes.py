@@ -1,4 +1,4 @@
-"""Two membranes torn into subdomains; see `problems.models.membranes`."""
+"""The family of two membranes in subdomains; see `problems.models.membranes`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Membranes(DeclaredFamily):
-    """Two membranes in contact along an edge, the right one floating."""
+    """Two membranes in contact along an edge; the right one floats."""
 
     name = "membranes"
     keys = schema(S=key(2, 1), n=key(8, 1), **GLUES)
@@ -29,5 +29,5 @@ class Membranes(DeclaredFamily):
         check_memory(self.name, 2 * (side + 1) ** 2)
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True: there are always subdomains."""
+        """Return True: the membranes are always decomposed."""
         return True

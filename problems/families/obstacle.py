@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Obstacle(DeclaredFamily):
-    """A string or membrane over an obstacle, with known exact solution."""
+    """A string or membrane over an obstacle, with an exact solution."""
 
     name = "obstacle"
     keys = schema(
@@ -31,7 +31,7 @@ class Obstacle(DeclaredFamily):
         **DECOMPOSITION,
     )
     forms = CONTACT_FORMS
-    model = "obstacle.over_obstacle"
+    model = "obstacle.obstacle_case"
     subdomains = "obstacle"
     cells = ("n",)
 
@@ -43,5 +43,5 @@ class Obstacle(DeclaredFamily):
         check_memory(self.name, int(params["n"]) ** int(params["dim"]))
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True for a membrane in subdomains."""
+        """Return True for a decomposed membrane; one process assembles strings."""
         return params["dim"] == 2 and super().is_divided(params)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class ContactPatch(ContactFamily):
-    """Contact patch test: two blocks on each other under uniform pressure."""
+    """Contact patch test: two stacked blocks under uniform pressure."""
 
     name = "contact-patch"
     keys = schema(
@@ -50,10 +50,7 @@ class ContactPatch(ContactFamily):
     cells = ("lower", "upper")
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range.
-
-        A stretch must be one that pressure can bring about.
-        """
+        """Raise InputError unless every key is in its range, and stretch below 1."""
         super().check(params)
         check_memory(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
         stretch = float(params["stretch"])
@@ -67,13 +64,13 @@ class ContactPatch(ContactFamily):
         if not MIN_STRETCH <= stretch < 1:
             raise InputError(
                 f"{self.name}: stretch={stretch:g} must be at least {MIN_STRETCH:g} "
-                "and below 1: blocks on each other can only be pressed"
+                "and below 1: stacked blocks can only be compressed"
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; the odd row of cells is not.
+        """Return the case with every cell halved; raise InputError with Coulomb's law.
 
-        Coulomb's law is refused: its solutions minimise nothing.
+        The number of rows of cells, rounded up to n/2, may not double for odd n.
         """
         finer = double(params, *self.cells)
         meshes = "/".join(f"{name}={n}" for name, n in finer.items())

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class Plate(DeclaredFamily):
-    """A clamped plate in subdomains, with jumps of E: linear, to measure FETI on."""
+    """A clamped plate in subdomains, with jumps of E: a linear problem for FETI."""
 
     name = "plate"
     keys = schema(
@@ -63,5 +63,5 @@ class Plate(DeclaredFamily):
             )
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True: there are always subdomains."""
+        """Return True: the plate is always decomposed."""
         return True

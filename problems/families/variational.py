@@ -22,13 +22,13 @@ class String(DeclaredFamily):
     model = "variational.string"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are three points or more."""
+        """Raise InputError unless there are at least three points."""
         super().check(params)
         check_memory(self.name, int(params["n"]))
 
 
 class JournalBearing(DeclaredFamily):
-    """The pressure in a journal bearing, not negative: MINPACK-2."""
+    """The non-negative pressure in a journal bearing: MINPACK-2."""
 
     name = "journal-bearing"
     keys = schema(n=key(50, 2), eccentricity=size(0.1))
@@ -36,7 +36,7 @@ class JournalBearing(DeclaredFamily):
     model = "variational.journal_bearing"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the shaft turns inside of the bearing."""
+        """Raise InputError unless the eccentricity is below 1, where surfaces touch."""
         super().check(params)
         if float(params["eccentricity"]) >= 1:
             raise InputError(
@@ -54,6 +54,6 @@ class Torsion(DeclaredFamily):
     model = "variational.torsion"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are two nodes a side and a twist."""
+        """Raise InputError unless there are two nodes per side and a positive twist."""
         super().check(params)
         check_memory(self.name, int(params["n"]) ** 2)

@@ -55,7 +55,7 @@ INLINED double adjugate(int dim, const double J[DIM][DIM], double adj[DIM][DIM])
    x (n, dim) corners, D (v, v) with v = dim(dim + 1)/2 components of strain,
    Ke (dim, dim, n, n), indexed by components, then by nodes */
 INLINED void cell_stiffness(
-    int n, int dim, int pairs, const element *of, const double *x, const double *D,
+    int n, int dim, int pairs, const element *elem, const double *x, const double *D,
     double *Ke
 ) {
     const int v = dim * (dim + 1) / 2;
@@ -64,15 +64,15 @@ INLINED void cell_stiffness(
     for (int e = 0; e < dim * pairs; e++)
         for (int m = 0; m < dim; m++)
             span[e * dim + m] =
-                x[of->edges[2 * e + 1] * dim + m] - x[of->edges[2 * e] * dim + m];
+                x[elem->edges[2 * e + 1] * dim + m] - x[elem->edges[2 * e] * dim + m];
     for (int i = 0; i < dim * dim * n * n; i++)
         Ke[i] = 0;
-    for (int q = 0; q < of->points; q++) {
-        const double *reference = of->gradients + q * dim * n;
+    for (int q = 0; q < elem->points; q++) {
+        const double *reference = elem->gradients + q * dim * n;
         /* J = ∂x/∂ξ by differences of corners: Σ x_a ∂N_a/∂ξ would cancel digits */
         for (int k = 0; k < dim; k++)
             for (int m = 0; m < dim; m++) {
-                const int *last = of->edges + 2 * k * pairs + 1;
+                const int *last = elem->edges + 2 * k * pairs + 1;
                 double sum = reference[k * n + last[0]] * span[k * pairs * dim + m];
                 for (int e = 1; e < pairs; e++)
                     sum += reference[k * n + last[2 * e]]
@@ -80,7 +80,7 @@ INLINED void cell_stiffness(
                 J[k][m] = sum;
             }
         /* grad lacks its factor 1/det; it enters twice: w det (1/det)² = w/det */
-        const double weight = of->weights[q] / adjugate(dim, J, adj);
+        const double weight = elem->weights[q] / adjugate(dim, J, adj);
         for (int m = 0; m < dim; m++)
             for (int a = 0; a < n; a++) {
                 double sum = adj[m][0] * reference[a];
@@ -131,7 +131,7 @@ INLINED void scatter(
 }
 
 INLINED void sum_cells(
-    int n, int dim, int pairs, const element *of, const double *points, ptrdiff_t E,
+    int n, int dim, int pairs, const element *elem, const double *points, ptrdiff_t E,
     const int *cells, const double *D, const int *material, const int *ptr,
     const int *slot, double *data
 ) {
@@ -142,21 +142,21 @@ INLINED void sum_cells(
         for (int i = 0; i < n; i++)
             for (int m = 0; m < dim; m++)
                 x[i * dim + m] = points[(ptrdiff_t)nodes[i] * dim + m];
-        cell_stiffness(n, dim, pairs, of, x, D + material[e] * v * v, Ke);
+        cell_stiffness(n, dim, pairs, elem, x, D + material[e] * v * v, Ke);
         scatter(n, dim, Ke, n, dim * n * n, 1, n * n, nodes, ptr, slot + e * n * n, data);
     }
 }
 
 /* Sum the stiffness of E cells (E, n); points (N, dim), D (materials, v, v). */
 CLONED static void sum_stiffness(
-    int n, int dim, const element *of, const double *points, ptrdiff_t E,
+    int n, int dim, const element *elem, const double *points, ptrdiff_t E,
     const int *cells, const double *D, const int *material, const int *ptr,
     const int *slot, double *data
 ) {
-    if (n == 4 && dim == 2 && of->pairs == 2)
-        sum_cells(4, 2, 2, of, points, E, cells, D, material, ptr, slot, data);
+    if (n == 4 && dim == 2 && elem->pairs == 2)
+        sum_cells(4, 2, 2, elem, points, E, cells, D, material, ptr, slot, data);
     else
-        sum_cells(n, dim, of->pairs, of, points, E, cells, D, material, ptr, slot, data);
+        sum_cells(n, dim, elem->pairs, elem, points, E, cells, D, material, ptr, slot, data);
 }
 
 /* Sum blocks (E, n·dim, n·dim), indexed by nodes, then by components. */

@@ -68,20 +68,20 @@ def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
     return np.asarray(factor * D[np.ix_(components, components)])
 
 
-def shape_gradients(corners: Floats, at: Vector) -> tuple[Floats, Vector]:
+def shape_gradients(corners: Floats, xi: Vector) -> tuple[Floats, Vector]:
     """Differentiate the shape functions of cells with respect to x.
 
     Parameters
     ----------
     corners : (E, n, dim) corner positions of the cells
-    at : (dim,) point of the reference cell
+    xi : (dim,) point of the reference cell
 
     Returns
     -------
     (E, n, dim) gradients ∂N_a/∂x and (E,) Jacobian determinants
 
     """
-    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(at)
+    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(xi)
     J = np.einsum("ar,eax->erx", reference, corners)  # ∂x/∂ξ
     gradients: Floats = np.einsum("erx,ar->eax", inverse_transpose(J), reference)
     return gradients, determinant(J)
@@ -154,6 +154,7 @@ def rigid_motions(points: Floats) -> Floats:
     line, 3 in the plane and 6 in space.
     """
     N, dim = points.shape
+    # about the centroid, rotations are orthogonal to translations
     offset = points - points.mean(axis=0)
     planes = list(combinations(range(dim), 2))
     motions = np.zeros((N, dim, dim + len(planes)))

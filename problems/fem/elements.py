@@ -44,16 +44,16 @@ class Element:
         """Weights of the Gauss points, (q,)."""
         return np.ones(len(self.corners))
 
-    def gradients(self, at: Vector) -> Floats:
-        """Return ∂N_a/∂ξ (n, dim) at a point (dim,) of the reference cell."""
-        factors = 1 + self.corners * at
+    def gradients(self, xi: Vector) -> Floats:
+        """Return ∂N_a/∂ξ (n, dim) at the point ξ (dim,) of the reference cell."""
+        factors = 1 + self.corners * xi
         others = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(self.dim)]
         return np.asarray(self.corners * np.stack(others, axis=-1) / 2**self.dim)
 
     @cached_property
     def table(self) -> Floats:
         """∂N_a/∂ξ_k at all Gauss points, (q, dim, n)."""
-        return np.stack([self.gradients(at).T for at in self.points]).copy()
+        return np.stack([self.gradients(xi).T for xi in self.points]).copy()
 
     @cached_property
     def edges(self) -> NDArray[np.int32]:
@@ -82,7 +82,9 @@ HEXAHEDRON = Element(
     ]),
 )  # fmt: skip
 #: elements by dimension and number of columns of a table of cells
-ELEMENTS = {(of.dim, len(of.corners)): of for of in (QUAD, HEXAHEDRON)}
+ELEMENTS = {
+    (element.dim, len(element.corners)): element for element in (QUAD, HEXAHEDRON)
+}
 
 
 def determinant(A: Floats) -> Floats:

@@ -87,7 +87,7 @@ class CholeskyInverse:
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
         """Return BK⁺Bᵀ by a block solve for all rows of B."""
-        F = B @ self(B.T.toarray())
+        F = B @ self(B.T.toarray())  # eq. (3)
         return np.asarray((F + F.T) / 2)
 
     def at_constraints(self, b: Vector) -> Vector:
@@ -162,7 +162,7 @@ def floating_inverse(
     starred, fixed, start = [], [], 0
     for R, rows in zip(kernels, fixing, strict=True):
         Q = np.zeros_like(R)
-        Q[rows] = np.linalg.qr(R[rows])[0]
+        Q[rows] = np.linalg.qr(R[rows])[0]  # R*, orthonormal
         starred.append(csr_array(Q))
         fixed.append(start + rows)
         start += len(R)
@@ -196,6 +196,7 @@ def supported_inverse(
         return _inverse(csc_array(K), free, kernel, interface)
     kernel[fixed] = 0  # exactly: null_space leaves rounding
     kernel = np.linalg.qr(kernel)[0]
+    # pivoting picks components on which the motions are well conditioned
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     return _inverse(csc_array(K), np.setdiff1d(free, pins), kernel, interface)
 

@@ -94,7 +94,7 @@ cdef extern from "cells.h" nogil:
         const int *edges
 
     void sum_stiffness(
-        int n, int dim, const element *of, const double *points, Py_ssize_t E,
+        int n, int dim, const element *elem, const double *points, Py_ssize_t E,
         const int *cells, const double *D, const int *material, const int *ptr,
         const int *slot, double *data
     )
@@ -109,7 +109,7 @@ cdef extern from "cells.h" nogil:
 
 
 def add_stiffness(
-    of,
+    elem,
     const double[:, ::1] points,
     const int[:, ::1] cells,
     const double[:, :, ::1] D,
@@ -119,13 +119,13 @@ def add_stiffness(
 ):
     """Sum ∫ BᵀDB over the cells into the values of the dof pattern.
 
-    of : element; points : (N, dim); cells : (E, n); D : (materials, v, v) in Voigt's
+    elem : element; points : (N, dim); cells : (E, n); D : (materials, v, v) in Voigt's
     notation; material : (E,) material of each cell
     """
     cdef int n = cells.shape[1], dim = points.shape[1]
-    cdef const double[:, :, ::1] gradients = of.table
-    cdef const double[::1] weights = of.weights
-    cdef const int[:, :, ::1] edges = of.edges
+    cdef const double[:, :, ::1] gradients = elem.table
+    cdef const double[::1] weights = elem.weights
+    cdef const int[:, :, ::1] edges = elem.edges
     cdef element data
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
     cdef double[::1] sums = values

@@ -32,6 +32,7 @@ def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
 def _along(n: int, h: float) -> tuple[csc_array, csc_array]:
     """Return ∫N_a′N_b′ and ∫N_aN_b of n linear elements in a row."""
     inside = np.ones(n)
+    # number of cells at each node
     ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]
     K = diags_array([-inside, ends, -inside], offsets=[-1, 0, 1]) / h
     M = diags_array([inside, 2 * ends, inside], offsets=[-1, 0, 1]) * (h / 6)

@@ -184,6 +184,7 @@ class HalfDisc:
         angles, rings : ranges of cells; corners are indices into the nodes returned
         """
         a, r = self.angles.size, self.radii.size
+        # the innermost ring consists of triangles with the centre as common corner
         has_centre = rings.stop == r
         i = np.arange(angles.start, angles.stop + 1)
         j = np.arange(rings.start, rings.stop + (not has_centre))
@@ -347,7 +348,8 @@ def boundary_facets(cells: Nodes, dim: int) -> Nodes:
     is_facet = (nodes[:, 1:] != nodes[:, :-1]).all(axis=1)
     facets, nodes = facets[is_facet], nodes[is_facet]
     key, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
-    for k in range(dim):  # the dim lowest nodes identify a facet
+    # the dim lowest nodes identify a facet
+    for k in range(dim):
         key = key * count + nodes[:, k]
     _, first, times = np.unique(key, return_index=True, return_counts=True)
     return np.asarray(facets[first[times == 1]])

@@ -29,7 +29,7 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Multifrontal:
-    """Factor K_oo = LLᵀ, stored as U = Lᵀ of each front, own rows × (own + border)."""
+    """Factor K_oo = LLᵀ, stored by fronts as U = Lᵀ, pivots × (pivots + border)."""
 
     order: Nodes  #: o, components in elimination order
     fronts: Fronts  #: of positions in `order`
@@ -47,10 +47,10 @@ class Multifrontal:
         """Return the unknowns eliminated last, per connected part, and U on them."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
-            own = slice(f.start[s], f.start[s + 1])
+            positions = slice(f.start[s], f.start[s + 1])
             rows = self.rows[self.offset[s] : self.offset[s + 1]]
-            size = own.stop - own.start
-            blocks.append((self.order[own], rows.reshape(size, size)))
+            size = positions.stop - positions.start
+            blocks.append((self.order[positions], rows.reshape(size, size)))
         return blocks
 
 
@@ -84,8 +84,8 @@ def multifrontal(
 
     position = np.full(n, -1, dtype=np.int32)
     position[order] = np.arange(order.size, dtype=np.int32)
-    own, border = np.diff(fronts.start), np.diff(fronts.first)
-    offset = np.append(0, np.cumsum(own.astype(np.int64) * (own + border)))
+    pivots, border = np.diff(fronts.start), np.diff(fronts.first)
+    offset = np.append(0, np.cumsum(pivots.astype(np.int64) * (pivots + border)))
     rows = np.zeros(offset[-1])
     definite = eliminate(
         *index_arrays(K), K.data, order, position, fronts.start, fronts.first,

@@ -35,15 +35,15 @@ def components(const int[::1] ptr, const int[::1] idx):
     cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
     cdef int count = 0
     numbers = np.full(nodes, -1, dtype=np.int32)
-    cdef int[::1] number = numbers, reached = np.empty(nodes, dtype=np.int32)
+    cdef int[::1] number = numbers, queue = np.empty(nodes, dtype=np.int32)
     for seed in range(nodes):
         if number[seed] >= 0:
             continue
-        number[seed], reached[0], at, end = count, seed, 0, 1
+        number[seed], queue[0], at, end = count, seed, 0, 1
         while at < end:
-            for t in range(ptr[reached[at]], ptr[reached[at] + 1]):
+            for t in range(ptr[queue[at]], ptr[queue[at] + 1]):
                 if number[idx[t]] < 0:
-                    number[idx[t]], reached[end] = count, idx[t]
+                    number[idx[t]], queue[end] = count, idx[t]
                     end += 1
             at += 1
         count += 1
@@ -65,24 +65,24 @@ def dissect_components(
     cdef const int64_t[::1] end = ends
 
     # a part of n nodes is bisected at most n − 1 times, which bounds the fronts
-    cdef Py_ssize_t nodes = points.shape[0], waiting, low, high, middle, separator
+    cdef Py_ssize_t nodes = points.shape[0], depth, low, high, middle, separator
     cdef Py_ssize_t c, begin, fronts = 0
     lengths, branches = np.zeros((2, 3 * nodes), dtype=np.int32)
     roots = np.zeros(3 * nodes, dtype=np.bool_)
     cdef int[::1] length = lengths, children = branches
-    cdef int[:, ::1] todo = np.empty((2 * nodes, 2), dtype=np.int32)
+    cdef int[:, ::1] stack = np.empty((2 * nodes, 2), dtype=np.int32)
     cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # in the last bisection
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
     cdef double[:, ::1] along = np.empty((2, nodes))
     cdef int cut = 0
     for c in range(end.shape[0] // 2):
         # in reversed postorder: separator, second half, first half
-        begin, waiting = fronts, 0
+        begin, depth = fronts, 0
         if end[2 * c] < end[2 * c + 1]:
-            todo[0, 0], todo[0, 1], waiting = end[2 * c], end[2 * c + 1], 1
-        while waiting:
-            waiting -= 1
-            low, high = todo[waiting, 0], todo[waiting, 1]
+            stack[0, 0], stack[0, 1], depth = end[2 * c], end[2 * c + 1], 1
+        while depth:
+            depth -= 1
+            low, high = stack[depth, 0], stack[depth, 1]
             middle = separator = high
             if high - low > leaf:
                 cut += 2
@@ -94,9 +94,9 @@ def dissect_components(
                 separator += low
             if middle != low and middle != high:
                 length[fronts], children[fronts] = high - separator, 2
-                todo[waiting, 0], todo[waiting, 1] = low, middle
-                todo[waiting + 1, 0], todo[waiting + 1, 1] = middle, separator
-                waiting += 2
+                stack[depth, 0], stack[depth, 1] = low, middle
+                stack[depth + 1, 0], stack[depth + 1, 1] = middle, separator
+                depth += 2
             else:  # a leaf, or nodes that all have the same coordinate
                 length[fronts], children[fronts] = high - low, 0
             fronts += 1
@@ -206,22 +206,22 @@ def borders(
 
     Returns first (F + 1,) and border, see `Fronts`.
     """
-    cdef Py_ssize_t s, t, i, p, child, end = 0, waiting = 0
+    cdef Py_ssize_t s, t, i, p, child, end = 0, depth = 0
     cdef Py_ssize_t nodes = order.shape[0], fronts = children.shape[0]
     firsts = np.zeros(fronts + 1, dtype=np.int32)
     cdef int[::1] first = firsts, stack = np.empty(fronts, dtype=np.int32)
     cdef int[::1] position = np.empty(nodes, dtype=np.int32)
     cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
-    found = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
-    cdef int[::1] unsorted = found
+    entries = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
+    cdef int[::1] unsorted = entries
     for p in range(nodes):
         position[order[p]] = p
     for s in range(fronts):
         if end + nodes > unsorted.shape[0]:
-            found = unsorted = np.resize(found, 2 * found.size)
+            entries = unsorted = np.resize(entries, 2 * entries.size)
         for i in range(children[s]):
-            waiting -= 1
-            child = stack[waiting]
+            depth -= 1
+            child = stack[depth]
             for t in range(first[child], first[child + 1]):
                 p = unsorted[t]
                 if p >= start[s + 1] and seen[p] != s:
@@ -234,11 +234,11 @@ def borders(
                     seen[p], unsorted[end] = s, p
                     end += 1
         first[s + 1] = end
-        stack[waiting] = s
-        waiting += 1
+        stack[depth] = s
+        depth += 1
 
     # two counting sorts, by position and then by front: borders ascend at linear cost
-    cdef int[::1] at = np.append(0, np.bincount(found[:end], minlength=nodes)).cumsum(
+    cdef int[::1] at = np.append(0, np.bincount(entries[:end], minlength=nodes)).cumsum(
         dtype=np.int32
     )
     cdef int[::1] of_front = np.empty(end, dtype=np.int32), filled = firsts.copy()

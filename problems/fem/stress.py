@@ -33,8 +33,8 @@ def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.f
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, q, v) at the Gauss points, Pa; see `centre_stress`."""
-    at = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
-    return np.stack(at, axis=1)
+    stresses = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
+    return np.stack(stresses, axis=1)
 
 
 def _stress_at(
@@ -82,6 +82,7 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         count = np.bincount(b, minlength=N)
         polynomial[count > 0] /= count[count > 0, None, None]
         has_value = has_value | (count > 0)
+    # the constant term is the value at the node about which it is expanded
     result = polynomial[:, 0]
     isolated = ~has_value  # one layer of cells: take the mean of the adjacent cells
     result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]

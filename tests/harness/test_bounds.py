@@ -290,7 +290,7 @@ def test_minus_zero_is_zero():
 def test_how_much_memory_a_case_may_take_can_be_raised(monkeypatch):
     monkeypatch.setenv(CASE_VARIABLE, "0.5")
     with pytest.raises(
-        InputError, match="or MORTARBENCH_CASE_MIB set to what there is"
+        InputError, match="or MORTARBENCH_CASE_MIB set to the memory available"
     ):
         parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
     monkeypatch.setenv(CASE_VARIABLE, "1000")

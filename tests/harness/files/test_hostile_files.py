@@ -545,8 +545,8 @@ def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path)
         (b"$Nodes\n6", b"$Nodes\n999999999999", "not a .msh|would take"),
         (b"6 2 1 0", b"2000000000 2 1 0", "not a .msh|would take"),
         (b"2 5 4", b"2 5 77", "not a .msh|not in the file"),
-        (b"1 2 5 4", b"1 2 5 0", "nodes below 1"),
-        (b"1 2 5 4", b"1 2 5 -1", "nodes below 1"),
+        (b"1 2 5 4", b"1 2 5 0", "node numbers below 1"),
+        (b"1 2 5 4", b"1 2 5 -1", "node numbers below 1"),
         (b"6 2 1 0", b"6 inf 1 0", "coordinates beyond"),
         (b"6 2 1 0", b"6 1e308 1 0", "coordinates beyond"),
         (b"6 2 1 0", b"6 nan 1 0", "coordinates beyond"),
@@ -571,7 +571,7 @@ def test_a_hostile_mesh_is_refused(tmp_path, cheaply, old, new, message):
 def test_nodes_below_one_are_refused_in_format_4_too(tmp_path, node):
     (tmp_path / "a.msh").write_bytes(MSH_41.replace(b"2 1 2 5 4", b"2 1 2 5 " + node))
 
-    with pytest.raises(InputError, match=r"nodes below 1|not a \.msh"):
+    with pytest.raises(InputError, match=r"node numbers below 1|not a \.msh"):
         read_msh(tmp_path / "a.msh")
 
 

@@ -1,4 +1,4 @@
-"""Bodies from gmsh files: the paper's benchmark, described by a user, is the same."""
+"""Bodies from gmsh files, compared with the family of the paper's benchmark."""
 
 import re
 import shutil
@@ -64,7 +64,7 @@ def edges(chain):
 
 
 def parts(flip=False):
-    """Cells under their names as gmsh has them: unordered, of any orientation."""
+    """Return cells by name as gmsh writes them: unordered, of any orientation."""
     sides, rng = RING.mesh.boundaries, np.random.default_rng(577215)
     curves = {name: edges(sides[name]) for name in ("left", "outer", "bottom", "top")}
     curves["feet"] = np.vstack([edges(sides["left_foot"]), edges(sides["right_foot"])])
@@ -81,7 +81,7 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1, one entity for each physical group, or for cells without one."""
+    """Write ASCII 4.1 with one entity per physical group, or per set of other cells."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
@@ -114,7 +114,7 @@ POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
 
 @pytest.fixture
 def described(tmp_path, monkeypatch):
-    """Write mesh and TOML into the working directory; the name of the family's case."""
+    """Write mesh and TOML into the working directory; return the name of the case."""
     monkeypatch.chdir(tmp_path)
 
     def write(mesh=None, toml=TOML):
@@ -156,8 +156,8 @@ def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
         name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
         for name, cells in quads.items()
     }
-    given = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
-    (tmp_path / "m.msh").write_text(msh22(POINTS, given, curves, spots, quad_type=2))
+    elements = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
+    (tmp_path / "m.msh").write_text(msh22(POINTS, elements, curves, spots, quad_type=2))
     read = read_msh(tmp_path / "m.msh")
 
     for name, expected in triangles.items():
@@ -391,21 +391,19 @@ def test_more_shear_than_friction_bears_is_refused_in_every_step(sheared_blocks)
 
 
 @pytest.mark.parametrize(
-    ("load", "told"),
+    ("load", "message"),
     [
         ("force = [0, -1e8]", "body 'beam': nothing balances the moment of its load"),
         (f'{TOP}\n[[loads]]\nboundary = "left"\nforce = [-1e3, 0]', "beam"),
     ],
 )
 @pytest.mark.parametrize("form", ["primal", "dual"])
-def test_a_load_that_nothing_balances_is_named_before_solving(
-    described, load, told, form
-):
+def test_an_unbalanced_load_is_refused_before_solving(described, load, message, form):
     text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
     with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
         build(f"{text}/steps=1/{form}")
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -464,8 +462,8 @@ def test_a_contact_that_is_described_twice_is_refused(described):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
-def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
-    """Its top is on rollers; the factor of the singular K exists all the same."""
+def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
+    """Its top is on rollers: K is singular, but rounding lets it be factorised."""
     there = ROOT / "suites" / "crossval"
     shutil.copy(there / "punch.msh", tmp_path)
     toml = (there / "punch.toml").read_text()
@@ -538,7 +536,7 @@ def test_nodes_of_no_cell_are_left_out(described):
          "a.toml: loads[0]: point: unknown physical point 'tip'; known: corner"),
         ("force = [0, -1e8]", "force = [0]", "a.toml: loads[0]: force = [0]; expected"),
         ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
-        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: the loads sum up to"),
+        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: all loads are zero"),
         ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
         ("force = [0, -1e8]", "forces = [0, -1e8]",
          "a.toml: loads[0]: unknown key 'forces'; did you mean 'force'? known: "),
@@ -546,7 +544,8 @@ def test_nodes_of_no_cell_are_left_out(described):
          "a.toml: loads[0]: unknown key 'pint'; did you mean 'point'? known: "),
         ('boundary = "feet"', 'boundry = "feet"',
          "a.toml: supports[1]: unknown key 'boundry'; did you mean 'boundary'? known"),
-        ("force = [0, -1e8]", "traction = [0, -1e8]", "a.toml: loads[0]: a point"),
+        ("force = [0, -1e8]", "traction = [0, -1e8]",
+         "a.toml: loads[0]: traction acts on a point"),
         ('slave = "outer"', 'slave = "outre"',
          "a.toml: contacts[0]: slave: unknown physical curve 'outre'; did you mean 'o"),
         ('slave = "outer"', 'slave = "feet"',
@@ -573,7 +572,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 
 
 @pytest.mark.parametrize(
-    ("load", "supports", "told"),
+    ("load", "supports", "message"),
     [
         ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
         ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
@@ -584,14 +583,16 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
          '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
     ],
 )  # fmt: skip
-def test_a_load_that_its_supports_take_up_is_refused(described, load, supports, told):
-    """Every component of it is prescribed to be zero: no body feels it."""
+def test_a_load_that_its_supports_take_up_is_refused(
+    described, load, supports, message
+):
+    """All displacements at the load are prescribed as zero: it has no effect."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")
 
     assert str(e.value) == (
-        f"a.toml: loads[0] {told} fix holds there: it has no effect; load another "
+        f"a.toml: loads[0] {message} fix holds there: it has no effect; load another "
         "side, or hold other components"
     )
 
@@ -655,10 +656,10 @@ def bent(points):
     ],
 )  # fmt: skip
 def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
-    made = contents(*square())
-    kinds = {"quad_type": made[4]} if len(made) > 4 else {}
+    content = contents(*square())
+    kinds = {"quad_type": content[4]} if len(content) > 4 else {}
     with pytest.raises(InputError, match=r"m\.msh: ") as e:
-        read(tmp_path, *made[:4], **kinds)
+        read(tmp_path, *content[:4], **kinds)
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
@@ -682,7 +683,7 @@ SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
 
 @pytest.mark.parametrize("writer", SAVED)
 def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
-    """Curves and points without a name, as of Mesh.SaveAll = 1, change nothing."""
+    """Unnamed curves and points, written with Mesh.SaveAll = 1, change nothing."""
     quads, curves, spots = parts()
     more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
     read = []
@@ -713,7 +714,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
 
 def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
-    """The entities of a text without the tag of its first curve, in binary."""
+    """Return a binary file whose first curve has no physical tag."""
     text = msh41(POINTS, *parts())
     (tmp_path / "a.msh").write_text(text)
     mesh = meshio.gmsh.read(tmp_path / "a.msh")
@@ -821,7 +822,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
 ):
     law = 'friction = "coulomb"\nmu = 0.3\n'
     same = "beam-ring/Nr=2/Nh=1/steps=1/friction=coulomb/mu=0.3/dual-bounds"
-    known = build(same).qp
+    expected_qp = build(same).qp
     for toml, keys in (
         (TOML, "/friction=coulomb/mu=0.3"),
         (law + TOML, ""),
@@ -831,11 +832,11 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
         qp = build(f"{described(toml=toml)}{keys}/steps=1/dual-bounds").qp
 
         assert qp.ub.size == 2 * (12 * NH + 1)
-        assert sorted(qp.ub) == pytest.approx(sorted(known.ub), abs=1e-9)
+        assert sorted(qp.ub) == pytest.approx(sorted(expected_qp.ub), abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("keys", "pair", "told"),
+    ("keys", "pair", "message"),
     [
         ("", 'friction = "tresca"', "contacts[0]: friction 'tresca' needs bound"),
         ("", 'friction = "tresca"\nbound = -1', "contacts[0]: bound = -1; expected a"),
@@ -848,12 +849,12 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
     ],
 )
 def test_a_law_of_a_pair_that_does_not_fit_is_refused_in_one_line(
-    described, keys, pair, told
+    described, keys, pair, message
 ):
     with pytest.raises(InputError) as e:
         build(f"{described(toml=TOML + pair)}{keys}/dual")
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -880,21 +881,21 @@ def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described
             read_bodies(Path("a.toml"), "strain")
 
 
-def test_contact_forces_of_several_pairs_are_told_pair_by_pair(tmp_path):
+def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
     """2 MN/m pass through a disc: each of its two contacts bears all of it."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
-    found = case.quantities(reference_solution(case.qp))
+    values = case.quantities(reference_solution(case.qp))
 
-    assert "contact_force" not in found
-    assert [pair["force"]["disc"][1] for pair in found["contacts"].values()] == (
+    assert "contact_force" not in values
+    assert [pair["force"]["disc"][1] for pair in values["contacts"].values()] == (
         pytest.approx([2e6, -2e6], rel=1e-6)
     )
 
 
 def test_the_contact_force_of_one_pair_is_its_force_on_the_master(described):
     case = build(described() + "/step=1/dual")
-    found = case.quantities(reference_solution(case.qp))
+    values = case.quantities(reference_solution(case.qp))
 
-    assert found["contact_force"] == pytest.approx(
-        found["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
+    assert values["contact_force"] == pytest.approx(
+        values["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
     )

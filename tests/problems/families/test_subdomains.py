@@ -1,4 +1,4 @@
-"""Every family in subdomains has the displacement that it has in one piece."""
+"""Families in subdomains: the displacement equals that of undivided bodies."""
 
 from functools import cache
 
@@ -114,7 +114,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
         ),
     ],
 )
-def test_what_is_not_built_is_refused_by_name(press, name, message):
+def test_unsupported_combinations_are_refused_by_name(press, name, message):
     with pytest.raises(InputError, match=message):
         built(name)
 
@@ -139,7 +139,7 @@ def test_keys_that_do_not_fit_are_refused_before_anything_is_built(
 
 @pytest.mark.parametrize(("n", "most"), [(4, 45), (8, 60)])
 def test_subdomains_of_graded_meshes_are_compact(n, most):
-    """In blocks of 8 × 8 cells, 95 and 359 products were needed."""
+    """With blocks of 8 × 8 cells instead, 95 and 359 products were needed."""
     case = built(f"hertz-plane/n={n}/feti=8/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
 

@@ -166,7 +166,7 @@ def test_halved_sides_are_the_same_polygons_with_the_body_on_their_left(named):
 
 
 def test_triangles_are_halved_into_similar_ones(named):
-    """Ratios of side to area stay, so that no angle degenerates."""
+    """Ratios of sides to area are preserved, so that no angle degenerates."""
 
     def shapes(mesh):
         cells = mesh.cells[mesh.cells[:, 2] == mesh.cells[:, 3]][:, :3]

@@ -1,4 +1,4 @@
-"""The stress fields that pictures and files get: exact where the strain is constant."""
+"""Recovered stress fields: exact for constant strain."""
 
 import numpy as np
 import pytest
@@ -94,7 +94,7 @@ def cube(fixed=NO_NODES):
     )  # fmt: skip
 
 
-def test_all_six_stresses_of_a_body_in_space_are_known():
+def test_all_six_stresses_of_a_body_in_space_are_exact():
     bodies, gradient = cube(), np.arange(9).reshape(3, 3) * 1e-3
     e = (gradient + gradient.T) / 2
     lame = STEEL.E * STEEL.nu / ((1 + STEEL.nu) * (1 - 2 * STEEL.nu))
@@ -117,14 +117,14 @@ def test_all_six_stresses_of_a_body_in_space_are_known():
 )
 def test_bodies_in_space_stand_under_forces_at_one_corner(inverse):
     """K⁺ of a cube on its clamped side, and of one that floats."""
-    held = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
-    bodies = cube(held)
+    fixed = dofs_of(np.flatnonzero(cube().mesh.points[:, 2] == 0), 3)
+    bodies = cube(fixed)
     b = np.zeros(bodies.mesh.dofs)
     b[-3:] = 1.0, -2.0, 3.0
     if inverse is factorise_floating:
         b -= bodies.rigid @ (bodies.rigid.T @ b)
-        held = held[:0]
+        fixed = fixed[:0]
 
     left = bodies.K @ inverse(bodies)(b) - b
 
-    assert abs(np.delete(left, held)).max() <= 1e-11
+    assert abs(np.delete(left, fixed)).max() <= 1e-11
