@@ -503,7 +503,7 @@ def _rows(
 
 
 def _freeze(M: Matrix) -> None:
-    """Make the buffers of a dense or sparse matrix read-only."""
+    """Set the buffers of a dense or sparse matrix read-only."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]
     for buffer in buffers:
         if isinstance(buffer, np.ndarray):

@@ -28,7 +28,7 @@ from mortarbench.harness.crossval.discretisation import (
 from mortarbench.harness.crossval.summary import as_data
 from mortarbench.harness.crossval.validation import validate_folder
 from mortarbench.harness.errors import InputError, some, unknown
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.names import CaseId, assemble
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.measurement import scratch_folder
@@ -104,7 +104,7 @@ def validate(
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
-    with full_disk_told(path):
+    with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
     pages = registries.validation_page(path, data, ())
     records = {r.case: r for r in read_journal(path, progress)}

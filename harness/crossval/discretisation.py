@@ -35,7 +35,7 @@ from time import perf_counter
 from mortarbench.harness.crossval.comparison import brief
 from mortarbench.harness.crossval.mesh_refinement import prolongation
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.mechanics import Extended, Grid, Mechanics, Real
 from mortarbench.harness.names import CaseId, assemble, unbuilt
@@ -205,7 +205,7 @@ def _write(path: Path, found: Iterable[Discretisation]) -> None:
     """Replace the file atomically."""
     data = {"schema": SCHEMA, "cases": [asdict(d) for d in found]}
     text = json.dumps(data, indent=1, allow_nan=False) + "\n"
-    with full_disk_told(path.parent):
+    with report_full_disk(path.parent):
         replace_file(path, text.encode())
 
 

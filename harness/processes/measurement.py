@@ -136,13 +136,13 @@ def measured(
     found = reply.answer["evaluated"] if by_ranks else None
     notes += found["notes"] if found is not None else []
     if found is not None and found["values"] is not None:
-        record = judged(record, qp, solution, found=found["values"]).replace(
+        record = judged(record, qp, solution, values=found["values"]).replace(
             quantities=found["quantities"] or {},
             recover_seconds=found["recover_seconds"],
             **(found["bounds"] or {}),
         )
     elif is_pointless:
-        record = judged(record, qp, solution, found=_NO_POINT)
+        record = judged(record, qp, solution, values=_NO_POINT)
     else:
         record = judged(record, whole() if by_ranks else qp, solution, prove)
     record = _within(memory_limit, noted(record, reply.message, *notes)).replace(

@@ -20,7 +20,7 @@ from typing import Any
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.copies import check_copies, merge_copies
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.store import copy_stored
 from mortarbench.harness.record import Record
 from mortarbench.harness.results.faults import FAULTS, read_faults
@@ -99,7 +99,7 @@ def merge(
     suite = as_toml(united(suites))
     for folder in folders:
         check_copies(folder)
-    with full_disk_told(out), locked(out):
+    with report_full_disk(out), locked(out):
         union = _Union()
         for folder in before:
             for record in read_journal(folder):

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness.errors import FaultError
-from mortarbench.harness.files.durable import full_disk_told, refuse_full_disk
+from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -84,7 +84,7 @@ class Executor:
             When the disk is full.
 
         """
-        with full_disk_told(self.scratch):
+        with report_full_disk(self.scratch):
             try:
                 if block.number != self._number:  # else it goes on with its next turns
                     self._number, self._entries = block.number, ()

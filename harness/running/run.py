@@ -17,7 +17,7 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.copies import keep_copies, refuse_own_copies
-from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.lines import Lines
 from mortarbench.harness.files.store import save
 from mortarbench.harness.plugin import Solver
@@ -95,7 +95,7 @@ def run(
     with (
         ended_by_signals(),
         _continuation_told(progress),
-        full_disk_told(out),
+        report_full_disk(out),
         locked(out) as held,
     ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}

@@ -468,7 +468,7 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Return y ≥ 0 with  columns·y = target  (p,); inf if none is found."""
-    from scipy.optimize import nnls  # late: it takes long, and workers need none
+    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
 
     try:
         y, left = nnls(columns, target)

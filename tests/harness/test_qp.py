@@ -131,8 +131,8 @@ def test_a_semidefinite_matrix_is_convex_up_to_rounding():
 @pytest.mark.parametrize(
     "module",
     [
-        "errors", "mechanics", "names", "operators", "plugin", "qp", "record",
-        "registry", "sets.box", "solution", "verify.kkt",
+        "digest", "errors", "files.qpfile", "mechanics", "names", "operators",
+        "plugin", "qp", "record", "registry", "sets.box", "solution", "verify.kkt",
     ],
 )  # fmt: skip
 def test_the_examples_of_docstrings_give_what_they_show(module):

@@ -358,7 +358,7 @@ def test_a_small_operator_is_multiplied_out_for_who_needs_its_entries(by_product
 
 
 def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
-    monkeypatch.setattr(measuring, "MOST_ASSEMBLED", 2)
+    monkeypatch.setattr(measuring, "MAX_ASSEMBLED_ROWS", 2)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
     assert s.status is Status.DECLINED

@@ -399,7 +399,7 @@ def test_the_older_names_of_p_and_q_are_known(written):
         ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
         ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
         ({"q": np.full(4, np.nan)}, "q holds NaN"),
-        ({"q": "text"}, "q is no matrix of numbers"),
+        ({"q": "text"}, "q is not a matrix of numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
         ({"m": 7}, "m is not 5"),
         ({"u": np.ones(4)}, "u has shape (4,), expected (5,)"),
