@@ -138,7 +138,7 @@ def test_every_form_is_the_same_problem(law, contact):
 @pytest.mark.parametrize("law", ["tresca/bound=5e7", "coulomb/mu=0.3"])
 def test_friction_opposes_the_slip_and_only_at_its_bound(law):
     case, s, values = solved(f"{SMALL}/friction={law}/dual")
-    friction, back = case.mechanics.friction, case.mechanics.back(s)
+    friction, back = case.mechanics.friction, case.mechanics.to_primal(s)
     force = back.z[case.mechanics.primal.h.size :]
     slip = friction.T @ back.x - friction.start
     slips = abs(slip) > 1e-9 * abs(slip).max()
