@@ -124,7 +124,7 @@ def one_step(
         bodies=of, linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, of.forces, of.fixed, laws),
         # friction may have to hold bodies
-        pressed=float(np.abs(of.forces.value).sum()),
+        initial_force=float(np.abs(of.forces.value).sum()),
     )  # fmt: skip
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)

@@ -74,7 +74,7 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
             quasi_static=p["loading"] == "quasi-static",
         ),
         # friction may have to hold bodies
-        pressed=float(np.abs(of.forces.value).sum()) if is_single else 0.0,
+        initial_force=float(np.abs(of.forces.value).sum()) if is_single else 0.0,
     )  # fmt: skip
 
 

@@ -91,7 +91,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         bodies=of, linearise=keyed_linearisation(p), results=error,
         stages=load_steps(1, 1, of.forces, of.fixed, (law_of(p),)),
         # friction may have to hold the blocks
-        pressed=float(np.abs(of.forces.value).sum()),
+        initial_force=float(np.abs(of.forces.value).sum()),
     )  # fmt: skip
 
 
