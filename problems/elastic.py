@@ -144,7 +144,7 @@ def one_step(
         linearise=keyed_linearisation({"contact": contact, "basis": basis}),
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
         # first bound of Coulomb's law: large enough to support bodies by friction
-        pressed=float(np.abs(elastic.forces.value).sum()),
+        initial_force=float(np.abs(elastic.forces.value).sum()),
     )  # fmt: skip
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)

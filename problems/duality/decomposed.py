@@ -1,7 +1,7 @@
-"""Elastic bodies in contact, in subdomains of one process or of several ranks.
+"""Load steps of decomposed elastic bodies in contact, on one process or several ranks.
 
-Nothing of the size of the whole is needed: contact is linearised at the displacement of
-the sides that may touch, from their nodes alone.
+No array of global size is needed: contact is linearised at the displacement of the
+contact sides, from their nodes alone.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ from mortarbench.problems.feti.tearing import SubdomainMesh
 class DecomposedLinearisation:
     """A linearised contact problem of bodies in subdomains; see `LinearisedProblem`.
 
-    Its methods are called by all ranks, and give them the same.
+    Its methods are called by all ranks together and return the same values on each.
     """
 
     stage: Stage
@@ -81,7 +81,7 @@ class DecomposedLinearisation:
 
     @property
     def friction(self) -> Friction:
-        """That of the nodes of the sides alone."""
+        """Friction at the nodes of the contact sides."""
         return self.sides.friction
 
     @cached_property
@@ -89,7 +89,7 @@ class DecomposedLinearisation:
         return self.dual.share().qp
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the dual with the bound of a friction, a share of it on each rank."""
+        """Solve the distributed dual with the given friction bounds."""
         limits = self.dual.bounds(friction.bound)
         return self.reference(self._qp.with_bounds(*limits), start)
 
@@ -100,127 +100,130 @@ class DecomposedLinearisation:
         return z[: self.sides.place.size]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) at the sides, without dimension, and the normal forces."""
+        """Return the nondimensional u (w,) at the sides and the normal forces."""
         dual, sides = self.dual, self.sides
-        found = local_solution(dual.subdomains, dual.halo, s)
-        vars(self).pop("_qp", None)  # explicit blocks are large, and done with
+        solution = local_solution(dual.subdomains, dual.halo, s)
+        vars(self).pop("_qp", None)  # explicit blocks are large and no longer needed
         forces = forces_at_nodes(self.normal_multipliers(s), sides.place, sides.places)
-        return found.at(sides.component), forces
+        return solution.at(sides.component), forces
 
 
 def decomposed_path(
     problem: ContactProblem, choice: Choice, ranks: Ranks, reference: ReferenceOverRanks
 ) -> LoadPath[DecomposedLinearisation]:
-    """Prepare the load steps of a contact problem in subdomains; called by all ranks.
+    """Return the load path of a decomposed contact problem; called by all ranks.
 
-    reference : solves shares of a dual, on all ranks together
+    reference : solves a distributed dual, on all ranks together
     """
-    layout, of = cached_layout(problem.bodies, choice.size), problem.bodies
-    known = list[LocalDual]()
+    layout, elastic = cached_layout(problem.bodies, choice.size), problem.bodies
+    previous = list[LocalDual]()
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
-        sides = linearised(problem, layout, stage, at)
-        parts = decompose(of, layout, choice.glue, stage, sides.contact)
-        if known:  # the bodies are the same, and so are what was made of them alone
-            known[0] = LocalDual(known[0].subdomains.with_problem(parts))
+        sides = linearise_sides(problem, layout, stage, at)
+        parts = decompose(elastic, layout, choice.glue, stage, sides.contact)
+        if previous:  # the bodies are unchanged: their subdomain classes are reused
+            previous[0] = LocalDual(previous[0].subdomains.with_problem(parts))
         else:
-            known.append(dual_on(parts, ranks))
-        return DecomposedLinearisation(stage, known[0], sides, reference)
+            previous.append(dual_on(parts, ranks))
+        return DecomposedLinearisation(stage, previous[0], sides, reference)
 
-    nothing = np.zeros(of.shape.dim * side_nodes(of.pairs).size)
-    places = sum(pair.slave.size for pair in of.pairs)
-    rest = State(nothing, nothing, np.full(places, problem.pressed))
+    zero = np.zeros(elastic.shape.dim * side_nodes(elastic.pairs).size)
+    places = sum(pair.slave.size for pair in elastic.pairs)
+    rest = State(zero, zero, np.full(places, problem.initial_force))
     return LoadPath(problem.stages, pose, rest)
 
 
 @lru_cache(maxsize=4)
 def cached_layout(bodies: ElasticBodies, size: int) -> Subdivision:
-    """Cut bodies; see `Shape.layout`."""
+    """Return the subdivision of bodies, cached; see `Shape.layout`."""
     return bodies.shape.layout(size)
 
 
 def distributed_qp_of(
     ranks: Ranks, problem: ContactProblem, choice: Choice, reference: ReferenceOverRanks
 ) -> DistributedQP:
-    """Emit this rank's share of the dual that is chosen; called by all ranks.
+    """Return the selected dual QP, distributed over ranks; called by all of them.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks, ranks know different ones, or
-        Coulomb's law does not settle or has less problems than are asked for.
+        If there are fewer subdomains than ranks, ranks have cut the bodies differently,
+        or the fixed point of Coulomb's law does not converge or has fewer iterates than
+        selected.
 
     """
     path = decomposed_path(problem, choice, ranks, reference)
     chosen = path.problem(choice.step, choice.iterate)
     last = path.last_of(choice.step)
-    before = [one for i in range(last) for one in path.problems(i)]
-    before += path.problems(last)[: path.problems(last).index(chosen)]
-    linearised, count = chosen.problem, len(path.problems(last))
-    sides = replace(linearised.sides, friction=chosen.friction)
+    previous = [one for i in range(last) for one in path.problems(i)]
+    previous += path.problems(last)[: path.problems(last).index(chosen)]
+    posed, count = chosen.problem, len(path.problems(last))
+    sides = replace(posed.sides, friction=chosen.friction)
 
-    def reported(found: LocalSolution) -> dict[str, Any]:
-        return _reported(
-            problem, DistributedSolution(found, sides, problem.bodies, count)
+    def reported(solution: LocalSolution) -> dict[str, Any]:
+        return _quantities(
+            problem, DistributedSolution(solution, sides, problem.bodies, count)
         )
 
-    dual = linearised.dual.with_bound(chosen.friction.bound)
-    first = before[0].problem.dual if before else None
-    return distributed_qp(dual, reported, first, len(before))
+    dual = posed.dual.with_bound(chosen.friction.bound)
+    first = previous[0].problem.dual if previous else None
+    return distributed_qp(dual, reported, first, len(previous))
 
 
 def decompose(
     bodies: ElasticBodies, layout: Subdivision, glue: str, stage: Stage,
     contact: Contact,
 ) -> DecomposedProblem:  # fmt: skip
-    """Describe elastic bodies under the load of a stage, before they are torn."""
+    """Return the decomposed problem of elastic bodies under the load of a stage."""
     unit = bodies.length / bodies.force
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
     E = np.array([m.E for m in bodies.materials]) * unit
     share = longitudinal_share(D)
-    force = stage.forces._replace(value=stage.forces.value * stage.part)
+    load = stage.forces._replace(value=stage.forces.value * stage.part)
     return DecomposedProblem(
         layout=layout, components=bodies.shape.dim, material=layout.body,
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
-        fixed=stage.fixed, load=force_lookup(force), glue=glue, contact=contact,
+        fixed=stage.fixed, load=force_lookup(load), glue=glue, contact=contact,
     )  # fmt: skip
 
 
 def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
-    """Return a function that looks forces up by components; zero elsewhere."""
+    """Return the map from components to forces; zero where none is given."""
     order = np.argsort(forces.component)
-    known = forces.component[order]
+    components = forces.component[order]
 
-    def of(asked: Nodes) -> Vector:
-        found = np.zeros(asked.size)
-        loaded = np.isin(asked, known)
-        found[loaded] = forces.value[order[np.searchsorted(known, asked[loaded])]]
-        return found
+    def of(component: Nodes) -> Vector:
+        values = np.zeros(component.size)
+        loaded = np.isin(component, components)
+        values[loaded] = forces.value[
+            order[np.searchsorted(components, component[loaded])]
+        ]
+        return values
 
     return of
 
 
 def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
-    """List the nodes of all sides that may touch."""
+    """Return the nodes of all contact sides, ascending."""
     return np.unique(np.concatenate([side for pair in pairs for side in pair]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LinearisedSides:
-    """Contact linearised from the nodes of the sides alone, without dimensions."""
+    """Contact linearised from the nodes of the sides alone, nondimensional."""
 
     bodies: ContactSides  #: of N nodes
-    node: Nodes  #: (N,) their numbers in the whole
-    nodes: int  #: of the whole
+    node: Nodes  #: (N,) their global numbers
+    nodes: int  #: number of all nodes
     B: csr_array  #: (m, 2N)
     c: Vector  #: (m,)
-    friction: Friction  #: none without rows
+    friction: Friction  #: without rows if there is no friction
     place: Nodes  #: (m,) slave node of each row
 
     @property
     def component(self) -> Nodes:
-        """Components of the whole that the columns are of, (2N,)."""
+        """Global components of the columns, (2N,)."""
         return dofs_of(self.node, self.bodies.mesh.dim)
 
     @property
@@ -230,7 +233,7 @@ class LinearisedSides:
 
     @property
     def contact(self) -> Contact:
-        """The rows of contact, then of friction, on all components of the whole."""
+        """Rows of contact, then of friction, in global components."""
         friction, B, c = self.friction, self.B, self.c
         if friction.bound.size:
             B = csr_array(vstack([B, friction.T]))
@@ -242,25 +245,25 @@ class LinearisedSides:
         return Contact(rows, c, friction.bound)
 
 
-def linearised(
+def linearise_sides(
     problem: ContactProblem, layout: Subdivision, stage: Stage, at: State
 ) -> LinearisedSides:
-    """Linearise contact where a stage begins."""
-    of = problem.bodies
-    node = side_nodes(of.pairs)
+    """Linearise contact at the start of a stage."""
+    elastic = problem.bodies
+    node = side_nodes(elastic.pairs)
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
-        body_of_node=np.asarray(layout.body[layout.holder(node)]), names=of.names,
+        body_of_node=np.asarray(layout.body[layout.holder(node)]), names=elastic.names,
         pairs=tuple(
             ContactPair(*(np.searchsorted(node, side) for side in pair))
-            for pair in of.pairs
+            for pair in elastic.pairs
         ),
-        length=of.length, force=of.force,
+        length=elastic.length, force=elastic.force,
     )  # fmt: skip
-    rows = problem.linearise(bodies, stage.laws)(at.u * of.length)
+    rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)
     return LinearisedSides(
         bodies=bodies, node=node, nodes=layout.nodes, B=csr_array(rows.B),
-        c=rows.c / of.length, place=rows.place,
+        c=rows.c / elastic.length, place=rows.place,
         friction=friction_of(
             bodies, rows, stage.laws, at.slip_origin, at.normal_forces
         ),
@@ -269,58 +272,62 @@ def linearised(
 
 @dataclass(frozen=True, eq=False)
 class DistributedSolution:
-    """The answer that ranks have found; see `ContactSolution`."""
+    """Solution distributed over ranks; see `ContactSolution`."""
 
     solution: LocalSolution
     linearised: LinearisedSides
-    of: ElasticBodies
+    elastic: ElasticBodies
     problems: int
 
     def at(self, component: Nodes) -> Vector:
-        """Return the displacement at components (k,) of the whole, on all ranks."""
+        """Return the nondimensional displacement at global components (k,)."""
         return self.solution.at(component)
 
     def largest(self, value: float) -> float:
-        """Return the largest of the numbers of all ranks."""
+        """Return the maximum of a value over all ranks."""
         return self.solution.bodies.ranks.extreme(value, np.max)
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Give the displaced subdomains of each rank."""
-        return local_meshes(self.solution, self.of.length)
+        """Yield the displaced local subdomains."""
+        return local_meshes(self.solution, self.elastic.length)
 
     @cached_property
     def sides(self) -> InterfaceState:
-        """Gather what ranks have found along the sides."""
-        sides, at = self.linearised, self.linearised.component
-        diagonal = self.solution.diagonal(at) if sides.friction.bound.size else 0 * at
-        free = np.full(at.size, np.inf)
+        """State of the contact interface, gathered on every rank."""
+        sides, component = self.linearised, self.linearised.component
+        w = component.size
+        diagonal, free = np.zeros(w), np.full(w, np.inf)
+        if sides.friction.bound.size:
+            diagonal = self.solution.diagonal(component)
         primal = QP(
-            P=csc_array(diags_array(diagonal.astype(float))), q=np.zeros(at.size),
-            A=no_rows(at.size), b=np.zeros(0), G=sides.B, h=sides.c, lb=-free, ub=free,
+            P=csc_array(diags_array(diagonal)), q=np.zeros(w),
+            A=no_rows(w), b=np.zeros(0), G=sides.B, h=sides.c, lb=-free, ub=free,
         )  # fmt: skip
         s = Solution(
-            status=Status.SOLVED, x=self.at(at), y=np.zeros(0), z=self.solution.z,
-            z_box=np.zeros(at.size),
+            status=Status.SOLVED, x=self.at(component), y=np.zeros(0),
+            z=self.solution.z, z_box=np.zeros(w),
         )  # fmt: skip
         return InterfaceState(sides.bodies, primal, s, sides.friction)
 
 
-def _reported(problem: ContactProblem, found: DistributedSolution) -> dict[str, Any]:
-    """Report what ranks have found; called by all of them."""
-    of, own = problem.bodies, found.solution.subdomains
-    layout = own.problem.layout
-    cells = sum(len(layout.cells(int(s))) for s in own.number)
-    inside = BulkResults(
-        nodes=layout.nodes, supports=own.problem.fixed.size,
-        elements=int(own.ranks.total(np.array([float(cells)]))[0]),
-        energy=found.solution.energy * of.force * of.length,
-        max_von_mises=_largest_von_mises(
-            found.solution, of.length, of.materials, of.plane
+def _quantities(
+    problem: ContactProblem, solution: DistributedSolution
+) -> dict[str, Any]:
+    """Return the quantities of a distributed solution; called by all ranks."""
+    elastic, local = problem.bodies, solution.solution.subdomains
+    layout = local.problem.layout
+    cells = sum(len(layout.cells(int(s))) for s in local.number)
+    bulk = BulkResults(
+        nodes=layout.nodes, supports=local.problem.fixed.size,
+        elements=int(local.ranks.total(np.array([float(cells)]))[0]),
+        energy=solution.solution.energy * elastic.force * elastic.length,
+        max_von_mises=_max_von_mises(
+            solution.solution, elastic.length, elastic.materials, elastic.plane
         ),
     )  # fmt: skip
-    at = found.sides
-    known = results_of(inside, at.bodies, at.primal, at.solution, at.friction)
-    return {**known, **problem.results(found)}
+    at = solution.sides
+    quantities = results_of(bulk, at.bodies, at.primal, at.solution, at.friction)
+    return {**quantities, **problem.results(solution)}
 
 
 def longitudinal_share(D: NDArray[np.float64]) -> Vector:
@@ -331,12 +338,12 @@ def longitudinal_share(D: NDArray[np.float64]) -> Vector:
 def elastic_class(
     part: SubdomainMesh, D: NDArray[np.float64], E: Vector
 ) -> SubdomainClass:
-    """Assemble one floating subdomain.
+    """Return the class of a floating elastic subdomain, with its assembled stiffness.
 
     Parameters
     ----------
-    D : (k, v, v) elasticity matrices of the materials, without dimension
-    E : (k,) their moduli, without dimension
+    D : (k, v, v) elasticity matrices of the materials, nondimensional
+    E : (k,) their moduli, nondimensional
 
     """
     cells, dim = part.cells, part.points.shape[1]
@@ -350,36 +357,35 @@ def elastic_class(
     )
 
 
-BATCH_NODES = 2**15  #: nodes of subdomains that are evaluated at once
-STRESS_LAYERS = (
-    3  #: cells from a node to the last that its recovered stress may depend on
-)
+BATCH_NODES = 2**15  #: nodes per batch of subdomains; bounds the memory of stresses
+#: layers of cells around a node on which its recovered stress may depend
+STRESS_LAYERS = 3
 
 
 def local_meshes(
-    found: LocalSolution, length: float, reach: int = 0
+    solution: LocalSolution, length: float, layers: int = 0
 ) -> Iterator[DisplacedMesh]:
-    """Give the displaced subdomains of each rank; called by all ranks.
+    """Return the displaced local subdomains, batch by batch; called by all ranks.
 
     Parameters
     ----------
-    length : of which displacements are multiples, m
-    reach : how many cells around subdomains are added, where there are so many
+    length : unit of displacements, m
+    layers : number of layers of neighbouring cells to add
 
     """
-    layout = found.subdomains.problem.layout
-    dim = found.subdomains.problem.components
-    batches = _batches(layout, found.subdomains.number)
-    around = [_around(layout, batch, reach) for batch in batches]
+    layout = solution.subdomains.problem.layout
+    dim = solution.subdomains.problem.components
+    batches = _batches(layout, solution.subdomains.number)
+    around = [_with_layers(layout, batch, layers) for batch in batches]
     node = np.unique(np.concatenate([part.node for part in around]))
-    here = found.bodies.components[::dim] // dim
+    here = solution.bodies.components[::dim] // dim
     place = np.minimum(np.searchsorted(here, node), here.size - 1)
-    lacks = here[place] != node
-    u = as_vectors(found.u, dim)[place]
-    everyones = found.bodies.ranks.comm.allgather(node[lacks])
-    asked = np.unique(np.concatenate(everyones))
-    told = as_vectors(found.at(dofs_of(asked, dim)), dim)
-    u[lacks] = told[np.searchsorted(asked, node[lacks])]
+    missing = here[place] != node
+    u = as_vectors(solution.u, dim)[place]
+    requests = solution.bodies.ranks.comm.allgather(node[missing])
+    requested = np.unique(np.concatenate(requests))
+    received = as_vectors(solution.at(dofs_of(requested, dim)), dim)
+    u[missing] = received[np.searchsorted(requested, node[missing])]
 
     def meshes() -> Iterator[DisplacedMesh]:
         for batch, part in zip(batches, around, strict=True):
@@ -392,48 +398,50 @@ def local_meshes(
 
 
 def _batches(layout: Subdivision, subdomains: Nodes) -> list[Nodes]:
-    """Group subdomains of one body, up to `BATCH_NODES` nodes or one subdomain."""
+    """Group subdomains of one body into batches of at most `BATCH_NODES` nodes."""
     sizes = np.diff(layout.subdomain_nodes(subdomains).start)
-    first, held = [0], 0
+    first, nodes = [0], 0
     for s, size in enumerate(sizes):
         other = layout.body[subdomains[s]] != layout.body[subdomains[first[-1]]]
-        if s > first[-1] and (other or held + size > BATCH_NODES):
+        if s > first[-1] and (other or nodes + size > BATCH_NODES):
             first.append(s)
-            held = 0
-        held += int(size)
+            nodes = 0
+        nodes += int(size)
     return np.split(subdomains, first[1:])
 
 
-class _Around(NamedTuple):
-    """Subdomains of one body with cells around them."""
+class _Patch(NamedTuple):
+    """Subdomains of one body with layers of neighbouring cells."""
 
-    node: Nodes  #: (N,) in the whole
-    cells: Nodes  #: (E, 4) of these nodes
-    inner: NDArray[np.bool_]  #: (N,) those of the subdomains
+    node: Nodes  #: (N,) global numbers
+    cells: Nodes  #: (E, 4) places of corners in `node`
+    inner: NDArray[np.bool_]  #: (N,) True for nodes of the subdomains
 
 
-def _around(layout: Subdivision, subdomains: Nodes, reach: int) -> _Around:
-    """Take subdomains of one body and so many layers of cells around them."""
-    own = np.unique(layout.subdomain_nodes(subdomains).number)
-    taken = np.union1d(subdomains, _holders(layout, own)) if reach else subdomains
-    nodes, cells = _cells_of(layout, taken)
-    reached, kept = own, np.ones(len(cells), dtype=bool)
-    for _ in range(reach):
-        more = np.setdiff1d(_holders(layout, reached), taken)
-        if more.size:
-            taken = np.concatenate([taken, more])
-            nodes, cells = _cells_of(layout, taken)
-        kept = np.asarray(np.isin(nodes, reached)[cells].any(axis=1))
+def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
+    """Return subdomains of one body with layers of neighbouring cells."""
+    inside = np.unique(layout.subdomain_nodes(subdomains).number)
+    included = (
+        np.union1d(subdomains, _holders(layout, inside)) if layers else subdomains
+    )
+    nodes, cells = _cells_of(layout, included)
+    reached, selected = inside, np.ones(len(cells), dtype=bool)
+    for _ in range(layers):
+        neighbours = np.setdiff1d(_holders(layout, reached), included)
+        if neighbours.size:
+            included = np.concatenate([included, neighbours])
+            nodes, cells = _cells_of(layout, included)
+        selected = np.asarray(np.isin(nodes, reached)[cells].any(axis=1))
         used = np.zeros(nodes.size, dtype=bool)
-        used[cells[kept]] = True
+        used[cells[selected]] = True
         reached = nodes[used]
     place = np.searchsorted(reached, nodes)
-    inner = np.isin(reached, own, assume_unique=True)
-    return _Around(reached, place[cells[kept]], inner)
+    inner = np.isin(reached, inside, assume_unique=True)
+    return _Patch(reached, place[cells[selected]], inner)
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of subdomains, and their cells (E, 4) as places in these."""
+    """Return the nodes of subdomains, and their cells (E, 4) as places in them."""
     torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [
@@ -444,26 +452,26 @@ def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
 
 
 def _holders(layout: Subdivision, node: Nodes) -> Nodes:
-    """List the subdomains that have any of some nodes besides others."""
+    """Return the subdomains that share any of some nodes with others."""
     multiplicity = layout.multiplicity(node)
     several = multiplicity > 1
     copies = range(int(multiplicity.max(initial=1)))
-    held = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
-    return np.unique(np.concatenate(held))
+    holders = [layout.holder(node[several & (multiplicity > c)], c) for c in copies]
+    return np.unique(np.concatenate(holders))
 
 
-def _largest_von_mises(
-    found: LocalSolution,
+def _max_von_mises(
+    solution: LocalSolution,
     length: float,
     materials: tuple[Material, ...],
     plane: Plane | None,
 ) -> list[float]:
-    """Return the largest von Mises stress of each body, recovered at nodes, Pa."""
+    """Return the largest nodal von Mises stress of each body, Pa."""
     D = elasticity_matrices(materials, plane)
     largest = np.zeros(len(materials))
-    for b, mesh, inner, u in local_meshes(found, length, STRESS_LAYERS):
+    for b, mesh, inner, u in local_meshes(solution, length, STRESS_LAYERS):
         stress = recover(mesh, centre_stress(mesh, D[b], u))[inner]
-        most = von_mises(stress, materials[b].nu, plane).max()
-        largest[b] = max(largest[b], most)
-    everyones = found.bodies.ranks.gather_all(largest)
-    return [float(most) for most in everyones.max(axis=0)]
+        maximum = von_mises(stress, materials[b].nu, plane).max()
+        largest[b] = max(largest[b], maximum)
+    all_ranks = solution.bodies.ranks.gather_all(largest)
+    return [float(maximum) for maximum in all_ranks.max(axis=0)]

@@ -1,12 +1,13 @@
-"""The dual of a contact problem on torn bodies, with its way back (Total FETI).
+"""The dual of a contact problem on decomposed bodies, with its inverse (Total FETI).
 
 ::
 
     min ½λᵀFλ − dᵀλ   subject to   λ_I ≥ 0,   RᵀBᵀλ = Rᵀf
     F = BK⁺Bᵀ,   d = BK⁺f − c,   K = diag(K_s),   R = diag(R_s)
 
-as in `problems.duality.dualisation`, but that everything is a sum over subdomains: F is
-an operator of plain arrays (`problems.feti.operators`), and RᵀBᵀ is sparse.
+as in `problems.duality.dualisation`, but assembled from subdomains (Dostál, Horák and
+Kučera 2006): F is an operator, a sum over subdomains stored as plain arrays
+(`problems.feti.operators`), and RᵀBᵀ is sparse.
 """
 
 from __future__ import annotations
@@ -26,35 +27,36 @@ from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 
 
 def feti_dual(
-    torn: DecomposedBodies, primal: QP, friction: Friction = NO_FRICTION
+    bodies: DecomposedBodies, primal: QP, friction: Friction = NO_FRICTION
 ) -> Transformed:
-    """Turn a contact problem on torn bodies into its dual.
+    """Return the dual of a contact problem on decomposed bodies.
 
-    The way back takes  v = K⁺(f − Bᵀλ) − Rα  with α the multipliers of RᵀBᵀλ = Rᵀf,
-    and averages the copies of a node, which are the same at the solution:
-    u = (TᵀT)⁻¹Tᵀv. Multipliers of the supports are the reactions, from stationarity.
+    The inverse map computes  v = K⁺(f − Bᵀλ) − Rα  with α the multipliers of
+    RᵀBᵀλ = Rᵀf, and averages the copies of each node, which agree at the solution:
+    u = (TᵀT)⁻¹Tᵀv. The multipliers of the supports, the reactions, follow from
+    stationarity.
 
     Parameters
     ----------
-    torn : its last rows are the contact rows of `primal`, then those of the friction
-    primal : the problem of the whole
+    bodies : their last rows are the contact rows of `primal`, then of friction
+    primal : the problem of the undivided bodies
     friction : with a given bound
 
     """
-    domains, R, T = torn.domains, torn.domains.kernel, torn.spread
-    B, f, m_E, scale = torn.B, torn.f, torn.equalities, torn.scale
+    domains, R, T = bodies.domains, bodies.domains.kernel, bodies.spread
+    B, f, m_E, scale = bodies.B, bodies.f, bodies.equalities, bodies.scale
     free = domains.inverse(f)
     m_I = primal.h.size
     bound = friction.bound / scale[m_I:]
     qp = QP(
-        P=dual_operator(B, domains, m_E), q=torn.c - B @ free,
+        P=dual_operator(B, domains, m_E), q=bodies.c - B @ free,
         A=csr_array((B @ R).T), b=R.T @ f,
-        G=no_rows(torn.c.size), h=np.zeros(0),
+        G=no_rows(bodies.c.size), h=np.zeros(0),
         lb=np.concatenate([np.full(m_E, -np.inf), np.zeros(m_I), -bound]),
         ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
-    copies[copies == 0] = 1  # eliminated components are zero
+    copies[copies == 0] = 1  # eliminated components have no copy, and u = 0 there
     B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:
@@ -69,27 +71,30 @@ def feti_dual(
     return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), displacement)
 
 
-def feti_matrices(torn: DecomposedBodies, dual: QP) -> dict[str, Any]:
-    """Name the matrices of the dual as the paper does: F, d, B, c and R."""
-    R = torn.domains.kernel
-    return {"F": dual.P, "d": -dual.q, "B": torn.B, "c": torn.c, "R": R}
+def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
+    """Return the matrices of the dual under their names in the paper: F, d, B, c, R."""
+    R = bodies.domains.kernel
+    return {"F": dual.P, "d": -dual.q, "B": bodies.B, "c": bodies.c, "R": R}
 
 
-def decomposition_quantities(torn: DecomposedBodies, dual: QP) -> dict[str, Any]:
-    """Report how bodies are torn, and how F is multiplied with.
+def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
+    """Return the quantities of a decomposition.
 
-    kinds: of subdomains, each with one factor. torn_dofs: all copies counted.
-    multipliers: rows of B. explicit_subdomains: whose blocks (K⁺)_bb and S_bb are
-    formed, the others solve in every product. explicit_mib: what they take, MiB.
+    kinds: number of classes of congruent subdomains, each with one factor. torn_dofs:
+    unknowns including all copies. multipliers: rows of B. explicit_subdomains: number
+    of subdomains with explicit blocks (K⁺)_bb and S_bb; the others take a solve in
+    every product. explicit_mib: memory for these blocks, MiB.
     """
     explicit = dual.P.arrays["explicit"]
-    sizes = np.array([part.size for part in touched_components(torn.B, torn.domains)])
-    taken = block_bytes(sizes, torn.domains)
+    sizes = np.array(
+        [part.size for part in touched_components(bodies.B, bodies.domains)]
+    )
+    taken = block_bytes(sizes, bodies.domains)
     return {
-        "subdomains": torn.class_of.size,
-        "kinds": len(torn.classes),
-        "torn_dofs": torn.f.size,
-        "multipliers": torn.c.size,
-        "explicit_subdomains": int(explicit[torn.class_of].sum()),
+        "subdomains": bodies.class_of.size,
+        "kinds": len(bodies.classes),
+        "torn_dofs": bodies.f.size,
+        "multipliers": bodies.c.size,
+        "explicit_subdomains": int(explicit[bodies.class_of].sum()),
         "explicit_mib": float(taken[explicit].sum() / 2**20),
     }

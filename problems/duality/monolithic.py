@@ -1,8 +1,8 @@
-"""Undivided bodies in contact: the QP of a load step, with one factor of K for all.
+"""Load steps of undivided bodies in contact, with one factor of K for all QPs.
 
-Contact rows are linearised at displacements of the contact sides: those of a step are
-had from its dual solution by one small product, and only displacements that are asked
-for are recovered everywhere, by one solve with the factor of K each.
+Contact rows are linearised at displacements of the contact sides, which follow from the
+dual solution of a step by one small product. Displacements elsewhere are recovered on
+demand, by one solve with the factor of K each.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from mortarbench.problems.fem.mesh import Nodes
 
 Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
 
-#: residual that a reference solve may leave: the next step is linearised there
+#: largest KKT residual of a reference solve; the next step is linearised there
 MAX_REFERENCE_RESIDUAL = 1e-6
 
 
@@ -49,16 +49,25 @@ MAX_REFERENCE_RESIDUAL = 1e-6
 class MonolithicLinearisation:
     """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
 
-    bodies: Bodies  #: with the load and the supports of its stage
+    bodies: Bodies  #: with the load and the supports of the stage
     primal: QP  #: (1) of the paper
     friction: Friction
     place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
-    dual: Callable[[], Transformed]  #: of these rows, whatever the bounds of friction
+    dual: Callable[
+        [], Transformed
+    ]  #: the dual for these rows; friction bounds are replaced later
     reference: Reference
-    part: float  #: of the load
+    part: float  #: load factor
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the dual with the bound of a friction."""
+        """Solve the dual with the given friction bounds.
+
+        Raises
+        ------
+        ArithmeticError
+            If the residual exceeds `MAX_REFERENCE_RESIDUAL`.
+
+        """
         qp = with_friction_bound(self.dual().qp, friction)
         s = self.reference(qp)
         if not (worst := kkt_residuals(qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
@@ -69,12 +78,12 @@ class MonolithicLinearisation:
         return s
 
     def normal_multipliers(self, s: Solution) -> Vector:
-        """Return the multipliers λ_n (m,) of the contact rows; friction's follow."""
+        """Return the multipliers λ_n (m,) of the contact rows."""
         m, k = self.place.size, self.friction.bound.size
         return s.x[-m - k :][:m]
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (n,), right on the contact sides, and the normal forces."""
+        """Return u (n,), valid on the contact sides, and the normal nodal forces."""
         places = sum(pair.slave.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces
@@ -87,18 +96,18 @@ class MonolithicPath(LoadPath[MonolithicLinearisation]):
     _answers: dict[int, Solution] = field(default_factory=dict, init=False)
 
     def primal(self, k: int) -> QP:
-        """Emit the QP of step k (1, 2, …), as last linearised, without friction."""
+        """Return the QP of step k ≥ 1 in its last linearisation, without friction."""
         return self.problem(k).problem.primal
 
     def answer(self, k: int) -> Solution:
-        """Return the solution of the primal problem of step k (1, 2, …)."""
+        """Return the solution of the primal problem of step k ≥ 1."""
         if k not in self._answers:
             last = self.problem(k)
             self._answers[k] = last.problem.dual().recover(last.solution())
         return self._answers[k]
 
     def solution(self, k: int) -> Vector:
-        """Return the non-dimensional displacement (n,) after step k; zero for k = 0."""
+        """Return the nondimensional displacement (n,) after step k; zero for k = 0."""
         return self.answer(k).x if k else self.initial.u
 
 
@@ -113,15 +122,15 @@ def load_path(
     transform: Transform = dual_bounds,
     laws: tuple[FrictionLaw, ...] = (),
     quasi_static: bool = True,
-    pressed: float = 0.0,
+    initial_force: float = 0.0,
 ) -> MonolithicPath:
-    """Prepare the load steps of assembled bodies, linearised by the laws' own rows.
+    """Return the load path of assembled bodies for a given linearisation of contact.
 
     Parameters
     ----------
-    factorise : K⁺ that `transform` needs, when the first problem is to be solved
-    laws : of each pair; none for no friction at all
-    pressed : normal force of each slave node that Coulomb's law begins from
+    factorise : returns the K⁺ for `transform`; called before the first solve
+    laws : one per contact pair; empty without friction
+    initial_force : normal force per slave node, the start of Coulomb's fixed point
 
     """
     stages = load_steps(
@@ -129,30 +138,38 @@ def load_path(
         quasi_static=quasi_static,
     )  # fmt: skip
     return _path(
-        bodies, stages, lambda _: linearise, factorise, reference, transform, pressed
+        bodies,
+        stages,
+        lambda _: linearise,
+        factorise,
+        reference,
+        transform,
+        initial_force,
     )
 
 
 @lru_cache(maxsize=4)
 def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
-    """Prepare the load steps of a contact problem on undivided bodies.
+    """Return the load path of a contact problem on undivided bodies.
 
-    Where supports hold all bodies, contact rows alone are dualised.
+    If supports exclude all rigid motions, only the contact rows are dualised.
     """
-    of, stages = problem.bodies, problem.stages
-    held = np.unique(np.concatenate([stage.fixed for stage in stages]))
-    bodies = of.assembled
+    elastic, stages = problem.bodies, problem.stages
+    fixed = np.unique(np.concatenate([stage.fixed for stage in stages]))
+    bodies = elastic.assembled
 
     def factor() -> GeneralisedInverse:
-        if held.size == of.fixed.size:
-            return of.floating
-        return factorise_floating(replace(bodies, B_D=support_rows(bodies.mesh, held)))
+        if fixed.size == elastic.fixed.size:
+            return elastic.floating
+        return factorise_floating(replace(bodies, B_D=support_rows(bodies.mesh, fixed)))
 
-    is_supported = of.is_supported and all(stage.fixed is of.fixed for stage in stages)
+    is_supported = elastic.is_supported and all(
+        stage.fixed is elastic.fixed for stage in stages
+    )
     return _path(
         bodies, stages, lambda laws: problem.linearise(bodies, laws),
-        (lambda: of.clamped) if is_supported else factor, reference,
-        dual_bounds if is_supported else dualise, problem.pressed,
+        (lambda: elastic.clamped) if is_supported else factor, reference,
+        dual_bounds if is_supported else dualise, problem.initial_force,
     )  # fmt: skip
 
 
@@ -163,48 +180,48 @@ def _path(
     factorise: Callable[[], GeneralisedInverse],
     reference: Reference,
     transform: Transform,
-    pressed: float,
+    initial_force: float,
 ) -> MonolithicPath:
     inverse = cache(factorise)
-    # loads and supports may act in several stages; K⁺f is that of a whole load
-    known, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
+    # loads and supports recur in several stages; K⁺f is stored for the full load
+    bodies_by_stage, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
 
-    def under(stage: Stage) -> Bodies:
+    def bodies_of(stage: Stage) -> Bodies:
         names = id(stage.forces), id(stage.fixed)
-        if names not in known:
+        if names not in bodies_by_stage:
             f = np.zeros(bodies.mesh.dofs)
             f[stage.forces.component] = stage.forces.value
             held = support_rows(bodies.mesh, stage.fixed)
-            known[names] = replace(bodies, f=f, B_D=held)
-        return known[names]
+            bodies_by_stage[names] = replace(bodies, f=f, B_D=held)
+        return bodies_by_stage[names]
 
     def pose(stage: Stage, at: State) -> MonolithicLinearisation:
         rows = linearise(stage.laws)(at.u * bodies.length)
-        own, load = under(stage), id(stage.forces)
-        primal = primal_qp(own, rows, stage.part)
-        first = friction_of(own, rows, stage.laws, at.slip_origin, at.normal_forces)
+        loaded, load = bodies_of(stage), id(stage.forces)
+        primal = primal_qp(loaded, rows, stage.part)
+        first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
         if first.bound.size and not any(law.mu for law in stage.laws):
-            check_friction(own, rows.B, first, stage.step, stage.part)
+            check_friction(loaded, rows.B, first, stage.step, stage.part)
 
         @cache
         def dual() -> Transformed:
             if load not in free:
-                free[load] = inverse()(own.f)
+                free[load] = inverse()(loaded.f)
             return transform(primal, inverse(), free[load] * stage.part, first)
 
         return MonolithicLinearisation(
-            own, primal, first, rows.place, dual, reference, stage.part
+            loaded, primal, first, rows.place, dual, reference, stage.part
         )
 
     places = sum(pair.slave.size for pair in bodies.pairs)
     nothing = np.zeros(bodies.mesh.dofs)
     return MonolithicPath(
-        stages, pose, State(nothing, nothing, np.full(places, pressed))
+        stages, pose, State(nothing, nothing, np.full(places, initial_force))
     )
 
 
 def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
-    """Emit  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M  without dimensions; (1)."""
+    """Return the nondimensional QP (1),  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M."""
     n = bodies.mesh.dofs
     return QP(
         P=bodies.K, q=-load_factor * bodies.f,

@@ -91,7 +91,7 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
     return ContactProblem(
         bodies=elastic, linearise=keyed_linearisation(p), stages=stages,
         # first bound of Coulomb's law: large enough to support bodies by friction
-        pressed=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
+        initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )  # fmt: skip
 
 

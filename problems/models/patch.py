@@ -92,7 +92,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         bodies=elastic, linearise=keyed_linearisation(p), results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
         # first bound of Coulomb's law: large enough to support blocks by friction
-        pressed=float(np.abs(elastic.forces.value).sum()),
+        initial_force=float(np.abs(elastic.forces.value).sum()),
     )  # fmt: skip
 
 

@@ -59,6 +59,6 @@ def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> C
         bodies=of,
         linearise=keyed_linearisation({"contact": "mortar", "basis": "dual"}),
         stages=load_steps(1, 1, of.forces, of.fixed, (law,)),
-        pressed=float(np.abs(bodies.f).sum()),
+        initial_force=float(np.abs(bodies.f).sum()),
     )  # fmt: skip
     return case_of(problem, form, Choice(), reference_solution)

@@ -509,11 +509,11 @@ def test_a_file_above_the_limit_is_not_even_digested(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"1.5", b"1_5", "'1_5' is no number"),
+        (b"1.5", b"1_5", "'1_5' is not a number"),
         (b"1.5", b"1e400", "'1e400' exceeds"),
-        (b"1.5", b"inf", "'inf' is no finite number"),
-        (b"1.5", b"nan", "'nan' is no number"),
-        (b"1.5", "\u0661".encode(), "is no number"),
+        (b"1.5", b"inf", "'inf' is not a finite number"),
+        (b"1.5", b"nan", "'nan' is not a number"),
+        (b"1.5", "\u0661".encode(), "is not a number"),
         (b"-3.0", b"inf", "constant of the objective is infinite"),
         (b"2.5", b"-1e999", "'-1e999' exceeds"),
         (b" UP BND", b" UP" * 10**5 + b" BND", "line 18"),

@@ -95,9 +95,8 @@ def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
 
     assert values["contact_force"] == pytest.approx(0.25, rel=1e-10)
     assert 0 < values["active"] < values["contact_rows"]
-    assert kkt_residuals(built("primal", S=2, n=8).qp, case.mechanics.to_primal(s)).worst < (
-        1e-9
-    )
+    primal = built("primal", S=2, n=8).qp
+    assert kkt_residuals(primal, case.mechanics.to_primal(s)).worst < 1e-9
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "redundant"])

@@ -309,7 +309,7 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
     [
         ("r4                 3.0", "r9 3.0", "line 16: row 'r9' is not among ROWS"),
         ("    c1        c2  ", "    c1 c9 ", "line 31: column 'c9' is not among COL"),
-        ("20.0", "2O.0", "line 25: '2O.0' is no number"),
+        ("20.0", "2O.0", "line 25: '2O.0' is not a number"),
         (" UP bnd", " UQ bnd", "line 25: unknown bound type 'UQ'; known: FR, FX, LO"),
         (" UP bnd", " BV bnd", "line 25: bound BV makes the variable discrete"),
         ("RANGES", "RANGE", "line 21: unknown section 'RANGE'; did you mean 'RANGES'?"),
