@@ -47,16 +47,19 @@ from mortarbench.harness.verify.measure import (
     reason_to_decline,
 )
 
-FINDS = "finds the planted solution"  #: how the checks begin that need an answer
-KEEPS = "keeps its answer"  #: how those begin that compare equivalent formulations
+#: how the checks begin that need an answer
+SOLUTION_PREFIX = "finds the planted solution"
+#: how those begin that compare equivalent formulations
+INVARIANCE_PREFIX = "keeps its answer"
 #: what a solver that needs the entries of P has to say
 _DECLINE_OPERATORS = (
     "a solver that needs the entries of P has in declines(self, qp) the line "
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-LOST = 8 * float(np.finfo(float).eps)  #: of a gradient's terms: rounding
-ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
+GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)  #: of a gradient's terms: rounding
+#: repeats may differ by; memory's alignment changes sums' order
+REPEAT_ROUNDING = 1e-12
 
 
 class Grade(StrEnum):
@@ -161,7 +164,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
         return Result(Grade.PASS)
     size = max(np.abs(v).max(initial=0) for v in (qp.P @ s.x, qp.q, s.z_box))
     what = f"a multiplier of {worst:.1e} on an absent bound"
-    if not worst <= LOST * size:
+    if not worst <= GRADIENT_ROUNDING * size:
         raise BrokenError(f"{what}; expected 0")
     return Result(Grade.PASS, f"{what}: rounding; 0 would be right")
 
@@ -174,7 +177,7 @@ def _repeats_are_cold_and_alike(solver: Solver) -> None:
     for s in others:
         if s.iterations != first.iterations:
             raise BrokenError(f"iterations: {first.iterations}, then {s.iterations}")
-        _near("x of a repeat", s.x, first.x, ROUNDING)
+        _near("x of a repeat", s.x, first.x, REPEAT_ROUNDING)
 
 
 def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
@@ -296,7 +299,7 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     for shape in SHAPES:
         for dense in (False, True):
             stored = "dense" if dense else "sparse"
-            name = f"{FINDS}: {shape}, {stored}"
+            name = f"{SOLUTION_PREFIX}: {shape}, {stored}"
             yield name, partial(_finds_the_planted_solution, shape, dense)
     for shape in SHAPES:
         for tol in (1e-3, 1e-6):
@@ -317,7 +320,10 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     yield "solves a sequence", _a_sequence_is_solved
     for form in FORMS:
         for change in changes_of(form):
-            yield f"{KEEPS}: {form}, {change}", partial(_keeps_its_answer, form, change)
+            yield (
+                f"{INVARIANCE_PREFIX}: {form}, {change}",
+                partial(_keeps_its_answer, form, change),
+            )
 
 
 CHECKS: Mapping[str, Check] = dict(_all_checks())

@@ -34,7 +34,8 @@ from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8
-ALLOWED = 10 * VERIFIED_FACTOR * TOL  #: of the energies; 10 for what adds up over rows
+#: of the energies; 10 for what adds up over rows
+MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
 #: the beam-ring's load and length, 10⁸ N/m and 2 m, as powers of two: forces are per
 #: thickness, so that stiffness is measured in Pa, MPa and GPa
@@ -74,10 +75,10 @@ def same_answer(
     qp = strings(form)
     old = old or answer(solver, qp)
     before = _fault(qp, old)
-    if before and change != AS_IT_IS:
+    if before and change != UNCHANGED:
         raise DeclinedError(f"not solved as it is: {before}")
     new = CHANGES[change](qp, form)
-    s = old if change == AS_IT_IS else answer(solver, new.qp)
+    s = old if change == UNCHANGED else answer(solver, new.qp)
     if after := _fault(new.qp, s):
         raise WeakError(after)
     back = new.recover(s)
@@ -115,9 +116,10 @@ def _energy(qp: QP, x: Vector) -> float:
 
 
 def _compare(what: str, by: float) -> None:
-    if not by <= ALLOWED:
+    if not by <= MAX_ENERGY_CHANGE:
         raise WeakError(
-            f"verified, but {what} changed by {by:.1e} of the energy; {ALLOWED:g} is ok"
+            f"verified, but {what} changed by {by:.1e} of the energy; "
+            f"{MAX_ENERGY_CHANGE:g} is ok"
         )
 
 
@@ -142,10 +144,10 @@ _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
 Change = Callable[[QP, str], Equivalent]  #: of the strings in a form
 
-AS_IT_IS = "as it is"
+UNCHANGED = "as it is"
 
 CHANGES: Mapping[str, Change] = {
-    AS_IT_IS: lambda qp, form: Equivalent(qp, lambda s: s),
+    UNCHANGED: lambda qp, form: Equivalent(qp, lambda s: s),
     **{f"units {name}": partial(_units, name) for name in UNITS},
     "unknowns permuted": lambda qp, _: permute_unknowns(qp, _order(qp.q.size)),
     "rows permuted": lambda qp, _: permute_rows(

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from mortarbench.harness.conformance.conformance import KEEPS, Grade, Result
+from mortarbench.harness.conformance.conformance import INVARIANCE_PREFIX, Grade, Result
 from mortarbench.harness.conformance.equivalence import (
-    AS_IT_IS,
     CHANGES,
     TOL,
+    UNCHANGED,
     UNITS,
     changes_of,
 )
 from mortarbench.harness.conformance.manufactured import FORMS
 
-TOLD = 2.0  #: times the iterations that are worth telling
+MIN_LISTED_WORK_RATIO = 2.0  #: times the iterations that are worth telling
 
 Results = Mapping[str, Result]  #: of one solver, by the name of the check
 
@@ -44,7 +44,7 @@ declines the changed QP. A blank: it solves no form that this changes.
 
 def weaknesses_page(results: Mapping[str, Results]) -> str:
     """Tabulate how the checks of equivalent formulations ended, in Markdown."""
-    heads = [change for change in CHANGES if change != AS_IT_IS]
+    heads = [change for change in CHANGES if change != UNCHANGED]
     lines = [
         *_units(),
         KEY,
@@ -52,7 +52,7 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
         f"| --- | --- |{' --- |' * len(heads)}",
     ]
     for name, checks in results.items():
-        solved = [f for f in FORMS if _grade(checks, f, AS_IT_IS) is Grade.PASS]
+        solved = [f for f in FORMS if _grade(checks, f, UNCHANGED) is Grade.PASS]
         cells = [
             ", ".join(solved),
             *(_cell(checks, solved, change) for change in heads),
@@ -75,7 +75,7 @@ def _units() -> Iterator[str]:
 
 
 def _grade(checks: Results, form: str, change: str) -> Grade | None:
-    check = checks.get(f"{KEEPS}: {form}, {change}")
+    check = checks.get(f"{INVARIANCE_PREFIX}: {form}, {change}")
     return check.grade if check else None
 
 
@@ -85,8 +85,10 @@ def _cell(checks: Results, solved: list[str], change: str) -> str:
     if not grades:
         return ""
     told = [marks[g].format(f) for f, g in grades.items() if g in marks]
-    work = max(checks[f"{KEEPS}: {f}, {change}"].work or 1.0 for f in grades)
-    if work >= TOLD:
+    work = max(
+        checks[f"{INVARIANCE_PREFIX}: {f}, {change}"].work or 1.0 for f in grades
+    )
+    if work >= MIN_LISTED_WORK_RATIO:
         told.append(f"×{work:.2g}")
     return ", ".join(told) or "·"
 
@@ -97,5 +99,5 @@ def _told(results: Mapping[str, Results]) -> Iterator[str]:
         for form in FORMS:
             for change in changes_of(form):
                 if _grade(checks, form, change) is Grade.WEAK:
-                    message = checks[f"{KEEPS}: {form}, {change}"].message
+                    message = checks[f"{INVARIANCE_PREFIX}: {form}, {change}"].message
                     yield f"{line_of(name, form, change)}{message}."

@@ -13,11 +13,12 @@ from rich.text import Text
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.environment.noise import NoiseFloor
 
-ENOUGH_MEMORY_MIB = 2048
-QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells
-FINE_CLOCK_SECONDS = 1e-6
-STEADY = 0.10  #: one pair of equal measurements differs by less, 19 times out of 20
-EQUAL = 0.01  #: an A/A ratio nearer to 1 than this is as good as 1
+MIN_MEMORY_MIB = 2048
+MAX_QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells
+MAX_CLOCK_STEP_SECONDS = 1e-6
+#: one pair of equal measurements differs by less, 19 times out of 20
+MAX_PAIR_SCATTER = 0.10
+MAX_RATIO_BIAS = 0.01  #: an A/A ratio nearer to 1 than this is as good as 1
 ONE_THREAD = (
     "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
     "RAYON_NUM_THREADS=1"
@@ -76,11 +77,11 @@ def as_json(
 
 def load_advice(load: float) -> str:
     """Say what to do about other programs; empty where they keep quiet."""
-    if load <= QUIET_LOAD:
+    if load <= MAX_QUIET_LOAD:
         return ""
     return (
         "Stop other programs (top lists them) and wait until the load is below "
-        f"{QUIET_LOAD}"
+        f"{MAX_QUIET_LOAD}"
     )
 
 
@@ -137,8 +138,8 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "memory",
         f"{available} of {total} MiB free" if is_known else None,
-        f"Make room for {ENOUGH_MEMORY_MIB} MiB, or lower memory_limit in the suite"
-        * (is_known and available < ENOUGH_MEMORY_MIB),
+        f"Make room for {MIN_MEMORY_MIB} MiB, or lower memory_limit in the suite"
+        * (is_known and available < MIN_MEMORY_MIB),
     )
 
 
@@ -182,11 +183,13 @@ def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
 
 def _clock(noise: NoiseFloor) -> Iterable[Check]:
     step = noise.clock_seconds
-    coarse = "" if step <= FINE_CLOCK_SECONDS else "Measure on a machine with a clock"
+    coarse = (
+        "" if step <= MAX_CLOCK_STEP_SECONDS else "Measure on a machine with a clock"
+    )
     yield _check(
         "Clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
     )
-    biased = abs(noise.ratio - 1) > EQUAL and not noise.low <= 1 <= noise.high
+    biased = abs(noise.ratio - 1) > MAX_RATIO_BIAS and not noise.low <= 1 <= noise.high
     yield _check(
         "Clock",
         "A/A ratio",
@@ -201,7 +204,7 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
         "noise floor",
         f"two equal measurements differ by up to {noise.one_pair:.1%} (19 of 20)",
         f"Raise repeats: a single measurement tells nothing below {noise.one_pair:.0%}"
-        if noise.one_pair > STEADY
+        if noise.one_pair > MAX_PAIR_SCATTER
         else "",
     )
 

@@ -9,8 +9,8 @@ from mortarbench.harness.errors import shortened
 
 Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
 
-_MOST = 48  #: characters of a value
-_TOLD = 3  #: differences
+_MAX_VALUE_CHARACTERS = 48  #: characters of a value
+_MAX_LISTED = 3  #: differences
 
 _NAMES = {
     "machine.cpu": "processor",
@@ -65,8 +65,8 @@ def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
         else f"other {named(key)}"
         for key, a, b in changes
     ]
-    rest = [f"and {len(told) - _TOLD} more"] * (len(told) > _TOLD)
-    return "; ".join([*told[:_TOLD], *rest])
+    rest = [f"and {len(told) - _MAX_LISTED} more"] * (len(told) > _MAX_LISTED)
+    return "; ".join([*told[:_MAX_LISTED], *rest])
 
 
 def _is_short(value: Any) -> bool:
@@ -80,4 +80,4 @@ def _shown(value: Any) -> str:
         case bool():
             return "yes" if value else "no"
         case _:
-            return shortened(str(value), _MOST)
+            return shortened(str(value), _MAX_VALUE_CHARACTERS)

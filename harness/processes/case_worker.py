@@ -49,12 +49,12 @@ from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
-MOST_CERTIFIED = 10_000  #: points whose bounds are kept
+MAX_STORED_BOUNDS = 10_000  #: points whose bounds are kept
 #: s; the first dual case of a process is built twice where building took less. First
 #: calls (pages, caches, late imports) took 12 of the 14 ms of dualising the smallest
 #: demo case, and would be charged to its form. Importing alone may take a second. After
 #: ten seconds of building, such milliseconds do not matter, and building twice would.
-WARM_UP = 10.0
+MAX_WARM_UP_SECONDS = 10.0
 
 
 @dataclass(eq=False)
@@ -130,7 +130,7 @@ class CaseWorker:
             return {
                 k: v for k, v in bounds.items() if k != "certify_seconds"
             }, objection
-        while len(self._bounds) >= MOST_CERTIFIED:
+        while len(self._bounds) >= MAX_STORED_BOUNDS:
             del self._bounds[next(iter(self._bounds))]
         self._bounds[key] = certified(case, s)
         return self._bounds[key]
@@ -150,7 +150,7 @@ class CaseWorker:
             case = self._built(name)
             if not self._warm and case.dualise_seconds is not None:
                 self._warm = True
-                if self._build_seconds < WARM_UP:
+                if self._build_seconds < MAX_WARM_UP_SECONDS:
                     case = self._built(name)
         self._cases[name.name] = case
         return case

@@ -43,13 +43,12 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
-OWN_SECONDS_PER_REPEAT = (
-    3e-4  #: 0.12 ms on a busy machine, so that none is accused of it
-)
-FAR_LESS = 20.0  #: a repeat that is so many times faster …
-LEAST_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
-LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
+HARNESS_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
+#: 0.12 ms on a busy machine, so that none is accused of it
+HARNESS_SECONDS_PER_REPEAT = 3e-4
+MIN_SUSPICIOUS_SPEEDUP = 20.0  #: a repeat that is so many times faster …
+MIN_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
+MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
@@ -205,7 +204,7 @@ def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     inner, first = told.inner_loops, answer["first_seconds"]
     times = inner + (first is not None)
     reported = (first or 0.0) + inner * told.total_seconds
-    least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
+    least = clock.least - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
     if max(0.0, least) <= reported <= clock.most:
         return (told,)
     seen = clock.seen / times
@@ -232,14 +231,14 @@ def _cached(
     first = first or m.total_seconds
     before = first_seconds.setdefault(what, first)
     compared = [
-        (first, m.total_seconds, LEAST_GAIN_SECONDS, "solves"),
-        (before, first, LEAST_GAIN_BETWEEN_SECONDS, "measurements"),
+        (first, m.total_seconds, MIN_GAIN_SECONDS, "solves"),
+        (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
     ]
     return [
         f"took {slow:.3g} s the first time and {fast:.3g} s later: something is kept "
         f"between {these}, or was loaded at the first"
         for slow, fast, gain, these in compared
-        if slow > FAR_LESS * fast and slow - fast > gain
+        if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
     ]
 
 

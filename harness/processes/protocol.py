@@ -27,9 +27,9 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-LONGEST_REPLY = 2**22  #: bytes
-MOST_ECHOED = 200  #: characters of a foreign reply that a message repeats
-LONGEST_FAULT = 2000  #: characters
+MAX_REPLY_BYTES = 2**22  #: bytes
+MAX_EXCERPT_CHARACTERS = 200  #: characters of a foreign reply that a message repeats
+MAX_FAULT_CHARACTERS = 2000  #: characters
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def answer_requests(
             except Exception as e:  # ours: handlers let nothing through that is not
                 traceback.print_exc()
                 what = " ".join(f"{type(e).__name__}: {e}".split())
-                reply = {"event": "fault", "what": what[:LONGEST_FAULT]}
+                reply = {"event": "fault", "what": what[:MAX_FAULT_CHARACTERS]}
             _send(replies, **reply)
 
 
@@ -117,8 +117,12 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
 
 
 def _shown(line: bytes) -> str:
-    text = repr(line[: MOST_ECHOED + 1].decode(errors="backslashreplace"))
-    return text if len(line) <= MOST_ECHOED else f"{text[:MOST_ECHOED]}…"
+    text = repr(line[: MAX_EXCERPT_CHARACTERS + 1].decode(errors="backslashreplace"))
+    return (
+        text
+        if len(line) <= MAX_EXCERPT_CHARACTERS
+        else f"{text[:MAX_EXCERPT_CHARACTERS]}…"
+    )
 
 
 def measures(request: Mapping[str, Any]) -> bool:

@@ -38,7 +38,7 @@ from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.footprint import Footprint
 from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
 from mortarbench.harness.processes.protocol import (
-    LONGEST_REPLY,
+    MAX_REPLY_BYTES,
     ForeignReplyError,
     event_of,
     measures,
@@ -55,25 +55,27 @@ POINT_SECONDS = 120.0  #: to write the point of an answer
 CLOSE_SECONDS = 1.0
 END_SECONDS = 1.0  #: for the sub-reaper to end when all below it are dead
 SETTLE_SECONDS = 0.5  #: after an answer: threads of pools go to sleep within that
-BUSY = 0.5  #: share of the time between answer and request that is too much CPU time
-LEAST_BUSY_SECONDS = 0.01  #: CPU time between answer and request that is nothing
+#: share of the time between answer and request that is too much CPU time
+MAX_IDLE_CPU_SHARE = 0.5
+MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is nothing
 LOG_BYTES = 2**20  #: what a solver may print before we drop it
-LAST_WORDS = 300  #: characters of its last line that a message holds
-_LAST_BYTES = 2**16  #: of the log, among which its last line is looked for
-_LEAST_FD = 3  #: of a pipe: those below are the standard streams, even if closed
-NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
+MAX_LAST_LINE_CHARACTERS = 300  #: characters of its last line that a message holds
+_LOG_TAIL_BYTES = 2**16  #: of the log, among which its last line is looked for
+_MIN_FD = 3  #: of a pipe: those below are the standard streams, even if closed
+#: of the memory limit: who fails beyond that failed for want of memory
+MEMORY_LIMIT_SHARE = 0.9
 
 _TURN = Turn()  #: of the thread that starts, asks, stops or ends a worker
 
-REPLACED = "the worker was busy while idle, and was replaced"
+REPLACEMENT_NOTE = "the worker was busy while idle, and was replaced"
 
 _CPUCLOCK_SCHED = 2  #: with a process number, names its clock; see clock_getcpuclockid
 #: signals that solvers do not end by; before a solve, somebody else sent them
-_FROM_OUTSIDE = {
+_EXTERNAL_SIGNALS = {
     signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT,
 }  # fmt: skip
 #: last words of a process that the machine let down before it solved anything
-_MACHINE = re.compile(
+_MACHINE_FAILURE = re.compile(
     r"No space left on device|Disk quota exceeded|Too many open files"
     r"|Read-only file system|Input/output error|cannot be started"
 )
@@ -176,7 +178,7 @@ class WorkerProcess:
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
-        notes = [REPLACED] if was_busy else []
+        notes = [REPLACEMENT_NOTE] if was_busy else []
         while True:
             is_new = not self._is_warm
             try:
@@ -199,7 +201,7 @@ class WorkerProcess:
             self._kill()
         elif self._stays_busy():
             self._kill()
-            notes.append(REPLACED)
+            notes.append(REPLACEMENT_NOTE)
         else:
             self._idle_since = (time.monotonic(), self._cpu_seconds())
         return Reply(
@@ -280,7 +282,10 @@ class WorkerProcess:
         peak, message, verdict = self._peak_mib or None, str(end), end.verdict
         is_fault = end.is_fault or (
             end.is_early
-            and (end.signal in _FROM_OUTSIDE or _MACHINE.search(message) is not None)
+            and (
+                end.signal in _EXTERNAL_SIGNALS
+                or _MACHINE_FAILURE.search(message) is not None
+            )
         )
         if out_of_memory(message, peak, memory_limit):
             verdict, is_fault = Verdict.MEMORY_LIMIT, False
@@ -314,7 +319,7 @@ class WorkerProcess:
             except _EndedError as end:
                 if end.is_fault:
                     raise
-                self._warms_up = end.signal in _FROM_OUTSIDE and not is_last
+                self._warms_up = end.signal in _EXTERNAL_SIGNALS and not is_last
                 self._kill()
                 self._spawn(memory_limit)
 
@@ -385,8 +390,10 @@ class WorkerProcess:
             if newline:
                 self._unread = rest
                 break
-            if len(self._unread) > LONGEST_REPLY:
-                how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
+            if len(self._unread) > MAX_REPLY_BYTES:
+                how = (
+                    f"more than {MAX_REPLY_BYTES >> 20} MiB came without an end of line"
+                )
                 raise ended(Verdict.FAILED, how)
             if dead and not has_more:
                 raise ended(Verdict.CRASHED, *self._death())
@@ -428,7 +435,7 @@ class WorkerProcess:
                 break
             self._unread += chunk
             has_more = True
-            if b"\n" in chunk or len(self._unread) > LONGEST_REPLY:
+            if b"\n" in chunk or len(self._unread) > MAX_REPLY_BYTES:
                 break
         return has_more
 
@@ -485,7 +492,9 @@ class WorkerProcess:
         if self._idle_since is None:
             return False
         since, used = self._idle_since
-        allowed = max(LEAST_BUSY_SECONDS, BUSY * (time.monotonic() - since))
+        allowed = max(
+            MIN_BUSY_CPU_SECONDS, MAX_IDLE_CPU_SHARE * (time.monotonic() - since)
+        )
         return self._cpu_seconds() - used > allowed
 
     def _stays_busy(self) -> bool:
@@ -498,7 +507,7 @@ class WorkerProcess:
         pause, used = POLL_SECONDS / 100, self._cpu_seconds()
         while self._runs():
             if time.monotonic() > deadline:
-                return self._cpu_seconds() - used > LEAST_BUSY_SECONDS
+                return self._cpu_seconds() - used > MIN_BUSY_CPU_SECONDS
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         return False
@@ -527,9 +536,9 @@ class WorkerProcess:
             how, number = _way_to_end(self._pinned)
         last = ""
         with suppress(OSError), self._log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _LAST_BYTES))
-            text = file.read(_LAST_BYTES).decode(errors="replace")
-            last = text.strip().rpartition("\n")[2][-LAST_WORDS:]
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES))
+            text = file.read(_LOG_TAIL_BYTES).decode(errors="replace")
+            last = text.strip().rpartition("\n")[2][-MAX_LAST_LINE_CHARACTERS:]
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
@@ -579,10 +588,10 @@ os.register_at_fork(after_in_child=WorkerProcess.forget_all)
 def _pipe() -> tuple[int, int]:
     """Open a pipe whose numbers a program can inherit beside its standard streams."""
     ends = os.pipe()
-    if min(ends) >= _LEAST_FD:
+    if min(ends) >= _MIN_FD:
         return ends
     try:
-        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _LEAST_FD) for e in ends)
+        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
     finally:
         for end in ends:
             os.close(end)
@@ -647,7 +656,7 @@ def _oom_kills() -> int:
     return 0
 
 
-_EXHAUSTION = re.compile(
+_ALLOCATION_FAILURE = re.compile(
     r"MemoryError|bad_?alloc|out of memory|(un|can ?not |not )(able to )?allocate"
     r"|memory allocation|allocation (error|fail)",
     re.IGNORECASE,
@@ -664,5 +673,5 @@ def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     message : of the failure, its last words included
     limit : MiB
     """
-    near = peak_mib is not None and peak_mib >= NEAR * limit
-    return near or _EXHAUSTION.search(message) is not None
+    near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit
+    return near or _ALLOCATION_FAILURE.search(message) is not None

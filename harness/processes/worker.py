@@ -56,7 +56,7 @@ from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
-_MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
+_MAX_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
 
 
 def serve(
@@ -140,7 +140,7 @@ class _Bench:
         self._ballast = np.empty(0)
         with suppress(AttributeError):  # glibc only
             ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
-        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
+        self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         source = source_of(request)
         if source.is_shared:
             assert self.on_ranks is not None

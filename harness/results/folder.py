@@ -36,15 +36,22 @@ from mortarbench.harness.suite.suite import Suite, read_stored
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-_CONCLUDED = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+_RESULT_FILES = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
 REMEDY = "choose another --out or use --fresh"
-MOST_LEVELS = 30  #: of folders in those of a run, which nests three
+MAX_FOLDER_DEPTH = 30  #: of folders in those of a run, which nests three
 _LOCK = ".lock"
-_MARK = b"held by runs of mortarbench\n"  #: what is in it
+_LOCK_CONTENT = b"held by runs of mortarbench\n"  #: what is in it
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
 #: how the names of files begin that are written beside the folders
-_BESIDE = (_LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.")
+_FILE_PREFIXES = (
+    _LOCK,
+    FAULTS,
+    "environment.",
+    "suite.",
+    "validation.",
+    "discretisation.",
+)
 
 
 def refuse_links(folder: Path) -> None:
@@ -71,7 +78,7 @@ def refuse_links(folder: Path) -> None:
                         _only_plain(entry.path)
                 elif entry.name == COPIES:
                     _only_plain_copies(entry)
-                elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
+                elif entry.name.startswith(_FILE_PREFIXES) and not _is_plain(entry):
                     raise _not_plain(entry.path, "a file of its own")
     except OSError as e:
         raise InputError(
@@ -82,7 +89,7 @@ def refuse_links(folder: Path) -> None:
 def _only_plain(folder: str) -> None:
     """Refuse links, pipes and devices in a folder, and folders nested too deeply."""
     level = [folder]
-    for _ in range(MOST_LEVELS):
+    for _ in range(MAX_FOLDER_DEPTH):
         inner = []
         for each in level:
             with os.scandir(each) as entries:
@@ -94,7 +101,7 @@ def _only_plain(folder: str) -> None:
         level = inner
     if level:
         raise InputError(
-            f"{folder}: folders nested deeper than {MOST_LEVELS} levels; expected "
+            f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; expected "
             "those that a run writes; move the deep ones away"
         )
 
@@ -145,9 +152,11 @@ def refuse_foreign(folder: Path) -> None:
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
     with suppress(InputError), opened(folder / _LOCK) as lock:
-        if lock.read(len(_MARK) + 1) == _MARK:  # of a run that was cut off at once
+        if (
+            lock.read(len(_LOCK_CONTENT) + 1) == _LOCK_CONTENT
+        ):  # of a run that was cut off at once
             return
-    ours = (*_FOLDERS, *_FILES, *_CONCLUDED)
+    ours = (*_FOLDERS, *_FILES, *_RESULT_FILES)
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
@@ -248,7 +257,7 @@ def _locked(folder: Path) -> int:
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _leads_to(folder / _LOCK, fd):  # else it was deleted before we locked it
-                os.pwrite(fd, _MARK, 0)
+                os.pwrite(fd, _LOCK_CONTENT, 0)
                 return fd
         except BlockingIOError:
             os.close(fd)
@@ -295,7 +304,7 @@ def claim(
     if fresh:
         for name in _FOLDERS:
             shutil.rmtree(out / name, ignore_errors=True)
-        for name in _CONCLUDED:
+        for name in _RESULT_FILES:
             (out / name).unlink(missing_ok=True)
         remove_copies(out)
     describe(out, suite, environment)

@@ -35,7 +35,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml, united
 from mortarbench.harness.suite.suite import read_stored
 
-_AGAIN = "are there already, and count once"
+_DUPLICATES_NOTE = "are there already, and count once"
 JOURNAL = "merged"  #: name of the only journal of a folder that was merged
 
 
@@ -106,7 +106,7 @@ def merge(
                 union.add(record)
         for source, records in read.items():
             if again := sum(map(union.add, records)):
-                tell(f"{source}: {again} of {len(records)} {_AGAIN}")
+                tell(f"{source}: {again} of {len(records)} {_DUPLICATES_NOTE}")
         for source, records in read.items():
             _copy_solutions(source, out, records, tell)
         merge_copies(list(read), out, tell)

@@ -19,7 +19,12 @@ from mortarbench.harness.results.folder import environment_of, suite_text
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.suite.solver_options import without_options
-from mortarbench.harness.suite.suite import NULL, asked_solvers, limits, steps_up_to
+from mortarbench.harness.suite.suite import (
+    NULL_SUFFIX,
+    asked_solvers,
+    limits,
+    steps_up_to,
+)
 from mortarbench.harness.verify.verdicts import new_record, plain
 
 
@@ -133,7 +138,7 @@ def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
 def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
     """Find the solver of a label: of the suite, or of the command line."""
     name = record.solver
-    for name in without_options(record.solver.removesuffix(NULL)):
+    for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):
         if name in known:
             spec = known[name]
             break

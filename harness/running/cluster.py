@@ -45,9 +45,10 @@ if TYPE_CHECKING:  # it needs the package distributed
 
 LOCAL = "local"
 CONNECT_SECONDS = 10
-LOOK_SECONDS = 2.0  #: for workers that joined or were lost
-MOST_LOST = 4  #: workers that a block may cost
-_UNGUARDED = 75  #: exit code of a process whose main script starts a run at its import
+CLUSTER_POLL_SECONDS = 2.0  #: for workers that joined or were lost
+MAX_LOST_WORKERS = 4  #: workers that a block may cost
+#: exit code of a process whose main script starts a run at its import
+_UNGUARDED_SCRIPT_CODE = 75
 
 Keep = Callable[[str, Mapping[str, Any]], None]
 
@@ -209,7 +210,9 @@ class _Cluster:
         try:
             while self._top_up(blocks):
                 try:
-                    yield from self._measured(self._done.get(timeout=LOOK_SECONDS))
+                    yield from self._measured(
+                        self._done.get(timeout=CLUSTER_POLL_SECONDS)
+                    )
                 except Empty:
                     if self.client.status != "running":
                         raise _SchedulerGoneError from None
@@ -295,7 +298,7 @@ class _Cluster:
             begun.lost += 1
             begun.part += begun.is_measured
             begun.is_measured = False
-            if begun.lost < MOST_LOST:
+            if begun.lost < MAX_LOST_WORKERS:
                 self._left.append(begun)
             else:
                 case = begun.block.turns[0][0].case
@@ -361,11 +364,11 @@ def _refuse_unguarded_script() -> None:
 
     """
     if getattr(current_process(), "_inheriting", False):
-        raise SystemExit(_UNGUARDED)
+        raise SystemExit(_UNGUARDED_SCRIPT_CODE)
     first = get_context("spawn").Process(target=int)
     first.start()
     first.join()
-    if first.exitcode == _UNGUARDED:
+    if first.exitcode == _UNGUARDED_SCRIPT_CODE:
         raise InputError(
             "the processes of Dask import the main script, which starts this run once "
             'more there; put what runs below `if __name__ == "__main__":`'

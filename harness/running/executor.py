@@ -37,8 +37,8 @@ from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-_MOST_PROVEN = 1000  #: small QPs whose optima are kept
-LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
+_MAX_STORED_OPTIMA = 1000  #: small QPs whose optima are kept
+MAX_STEP_TOL = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
 
 
 @dataclass(eq=False)
@@ -286,7 +286,7 @@ class Executor:
         """Prove the optimum of the QP of an entry, once."""
         if at.digest not in self._optima:
             found = proven_optimum(qp, partial(self._reference, at))
-            while len(self._optima) >= _MOST_PROVEN:
+            while len(self._optima) >= _MAX_STORED_OPTIMA:
                 del self._optima[next(iter(self._optima))]
             self._optima[at.digest] = found
         return self._optima[at.digest]
@@ -347,7 +347,7 @@ def _step_tol(record: Record, at: Entry) -> float | None:
     a part θ of that is enough (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). The
     last QP of a fixed point is solved to the tolerance.
     """
-    worth = min(LOOSEST, record.tighten * float(at.meta.get("unsettled", 0.0)))
+    worth = min(MAX_STEP_TOL, record.tighten * float(at.meta.get("unsettled", 0.0)))
     return worth if worth > record.tol else None
 
 

@@ -15,8 +15,12 @@ from typing import Any
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.suite.suite import DEFAULTS, suite_text
 
-SAME = ("time_limit", "memory_limit", "accuracy")  #: what a verdict or time depends on
-RAISED = ("repeats", "max_repeats", "budget")  #: may grow
+FIXED_KEYS = (
+    "time_limit",
+    "memory_limit",
+    "accuracy",
+)  #: what a verdict or time depends on
+GROWING_KEYS = ("repeats", "max_repeats", "budget")  #: may grow
 
 _AND = "-and-"  #: between the names of suites that were united
 
@@ -33,10 +37,10 @@ def refused(then: Table, now: Table) -> str:
 
 
 def _settings(then: Table, now: Table) -> Iterator[str]:
-    for key in ("name", *SAME):
+    for key in ("name", *FIXED_KEYS):
         if then.get(key) != now.get(key):
             yield _was(key, then.get(key), now.get(key))
-    for key in RAISED:
+    for key in GROWING_KEYS:
         if now[key] < then[key]:
             yield f"{_was(key, then[key], now[key])}; it may only grow"
     finer = "it may only become finer"
@@ -90,7 +94,7 @@ def _refuse_unequal(of: str, whole: Table, folder: str, table: Table) -> None:
     if not whole:
         return
     a, b = {**DEFAULTS, **whole}, {**DEFAULTS, **table}
-    for key in SAME:
+    for key in FIXED_KEYS:
         if a[key] != b[key]:
             raise InputError(
                 f"{key} is {_said(a[key])} in {of}, {_said(b[key])} in {folder}; "
@@ -115,7 +119,7 @@ def _add(whole: dict[str, Any], table: Table) -> None:
         *str(table.get("name")).split(_AND),
     ]
     whole["name"] = _AND.join(dict.fromkeys(filter(None, names)))
-    for key in RAISED:
+    for key in GROWING_KEYS:
         if key in table:
             whole[key] = max(table[key], whole.get(key, DEFAULTS[key]))
     for key in ("tolerances", "solvers", "problems"):

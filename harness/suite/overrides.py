@@ -15,7 +15,7 @@ from mortarbench.harness.names import CaseId, match, parse
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.solver_options import swept
-from mortarbench.harness.suite.suite import NULL, Suite
+from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
 
 
 def with_overrides(
@@ -52,7 +52,9 @@ def with_overrides(
                 with checked.located("--solver"):
                     resolve(chosen[name], {**known, **registry})
         kept = dict.fromkeys(solvers)
-        null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
+        null = [
+            n for n in chosen if n not in kept and n.removesuffix(NULL_SUFFIX) in kept
+        ]
         changes["solvers"] = tuple(chosen[name] for name in (*kept, *null))
     if options:
         asked = changes.get("solvers", suite.solvers)

@@ -19,7 +19,7 @@ from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import SolverSpec, option_types, options_of, resolve
-from mortarbench.harness.suite.suite import NULL
+from mortarbench.harness.suite.suite import NULL_SUFFIX
 
 _KEY = re.compile(r"[^\W\d]\w*")
 _NUMBERS = {
@@ -31,7 +31,7 @@ _NUMBERS = {
 }  # digits of other scripts and 1_0 are numbers to Python alone
 _TRUTH = {"true": True, "false": False}
 _PLAIN = (bool, Real, str, NoneType)  #: types of values from a Python program
-_MOST = 1000  #: solvers that a sweep may span
+_MAX_VARIANTS = 1000  #: solvers that a sweep may span
 
 
 def given_options(texts: Iterable[str]) -> dict[str, list[str]]:
@@ -138,7 +138,7 @@ def swept(
     found: dict[str, SolverSpec] = {}
     for spec, solver in zip(specs, solvers, strict=True):
         for options in _combinations(spec.name, solver, given):
-            null = NULL if spec.role == "null" else ""
+            null = NULL_SUFFIX if spec.role == "null" else ""
             label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
             if label in found:
                 raise InputError(
@@ -155,9 +155,10 @@ def _combinations(
     name: str, solver: Solver, given: Mapping[str, Sequence[str]]
 ) -> Iterator[dict[str, Any]]:
     own = {key: given[key] for key in given if key in options_of(solver)}
-    if (count := prod(map(len, own.values()))) > _MOST:
+    if (count := prod(map(len, own.values()))) > _MAX_VARIANTS:
         raise InputError(
-            f"--option spans {count} variants of {name}; expected at most {_MOST}"
+            f"--option spans {count} variants of {name}; expected at most "
+            f"{_MAX_VARIANTS}"
         )
     for values in product(*own.values()):
         with located("--option"):

@@ -39,7 +39,7 @@ DEFAULTS: Mapping[str, Any] = {
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
-NULL = " (A/A)"  #: after the label of a solver that is measured once more
+NULL_SUFFIX = " (A/A)"  #: after the label of a solver that is measured once more
 
 
 def _between(key: str, value: Any) -> float | None:
@@ -380,7 +380,7 @@ def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec
     known = {spec.label: spec for spec in specs}
     if (label := checked.text("null_arm", label)) not in known:
         raise unknown("null_arm", label, known)
-    return (*specs, replace(known[label], label=f"{label}{NULL}", role="null"))
+    return (*specs, replace(known[label], label=f"{label}{NULL_SUFFIX}", role="null"))
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:

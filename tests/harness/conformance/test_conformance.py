@@ -13,7 +13,12 @@ import pytest
 
 from mortarbench.harness import Solution, Status, kkt_residuals
 from mortarbench.harness.conformance import conformance
-from mortarbench.harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from mortarbench.harness.conformance.conformance import (
+    CHECKS,
+    INVARIANCE_PREFIX,
+    Grade,
+    run_check,
+)
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     DeclinedError,
@@ -59,7 +64,7 @@ NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
 SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
 #: no condition of conformance are equivalent formulations, which have their own test
-STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
+STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: take seconds for all equivalent formulations
 REWRITTEN = {
     "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",

@@ -27,7 +27,7 @@ from mortarbench.harness.processes.measurement import (
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
 from mortarbench.harness.processes.reaper import lives, state
 from mortarbench.harness.processes.supervisor import (
-    REPLACED,
+    REPLACEMENT_NOTE,
     Clock,
     Reply,
     WorkerProcess,
@@ -61,7 +61,7 @@ OUTCOMES = {
     "executeddaemon": (Verdict.VERIFIED, "^$"),
     "forkbomb": (Verdict.VERIFIED, "^$"),
     "hangswithadaemon": (Verdict.TIME_LIMIT, "killed after 1 s"),
-    "burns": (Verdict.VERIFIED, REPLACED),
+    "burns": (Verdict.VERIFIED, REPLACEMENT_NOTE),
     "pools": (Verdict.VERIFIED, "^$"),
     "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "sharespages": (Verdict.VERIFIED, "^$"),

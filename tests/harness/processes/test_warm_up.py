@@ -62,6 +62,6 @@ def test_the_first_dual_case_of_a_process_is_built_twice_and_the_second_counts(b
 
 
 def test_a_case_that_takes_long_is_not_built_twice(build, monkeypatch):
-    monkeypatch.setattr(case_worker, "WARM_UP", 0.02)
+    monkeypatch.setattr(case_worker, "MAX_WARM_UP_SECONDS", 0.02)
     assert build("dual", n=2) == 0.01
     assert build.family.built == ["dual"]
