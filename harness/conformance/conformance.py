@@ -20,7 +20,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness.conformance.equivalence import (
     DeclinedError,
-    WeakError,
+    WeaknessError,
     changes_of,
     same_answer,
 )
@@ -79,11 +79,11 @@ class Result(NamedTuple):
     work: float | None = None  #: iterations, relative to those before a change
 
 
-class BrokenError(Exception):
+class ContractError(Exception):
     """What a solver did wrong."""
 
 
-#: raises that, DeclinedError or WeakError; where there is a remark, returns it
+#: raises that, DeclinedError or WeaknessError; where there is a remark, returns it
 Check = Callable[[Solver], Result | None]
 
 
@@ -91,11 +91,11 @@ def run_check(name: str, solver: Solver) -> Result:
     """Run one of `CHECKS`."""
     try:
         return CHECKS[name](solver) or Result(Grade.PASS)
-    except BrokenError as e:
+    except ContractError as e:
         return Result(Grade.FAIL, str(e))
     except DeclinedError as e:
         return Result(Grade.DECLINE, str(e))
-    except WeakError as e:
+    except WeaknessError as e:
         return Result(Grade.WEAK, str(e))
 
 
@@ -103,7 +103,7 @@ def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
     """Solve by the harness's own clock, and insist on a point, right or wrong."""
     s = _ended(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
-        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+        raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
     return s
 
 
@@ -124,11 +124,13 @@ def _solved(solver: Solver, qp: QP, tol: float, factor: float) -> Solution:
 
 def _judge(qp: QP, s: Solution, allowed: float) -> None:
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+        raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
     residuals = kkt_residuals(qp, s)
     if not residuals.worst <= allowed:
         values = ", ".join(f"{k} {v:.1e}" for k, v in residuals._asdict().items())
-        raise BrokenError(f"claimed solved, but residuals are {values}; {allowed:g} ok")
+        raise ContractError(
+            f"claimed solved, but residuals are {values}; {allowed:g} ok"
+        )
 
 
 def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
@@ -165,7 +167,7 @@ def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
     size = max(np.abs(v).max(initial=0) for v in (qp.P @ s.x, qp.q, s.z_box))
     what = f"a multiplier of {worst:.1e} on an absent bound"
     if not worst <= GRADIENT_ROUNDING * size:
-        raise BrokenError(f"{what}; expected 0")
+        raise ContractError(f"{what}; expected 0")
     return Result(Grade.PASS, f"{what}: rounding; 0 would be right")
 
 
@@ -173,10 +175,10 @@ def _repeats_are_cold_and_alike(solver: Solver) -> None:
     qp, _ = manufactured("bounds", n=60)
     first, *others = (_solve(solver, qp, 1e-6) for _ in range(3))
     if first.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {first.status}: {first.message}")
+        raise ContractError(f"ended as {first.status}: {first.message}")
     for s in others:
         if s.iterations != first.iterations:
-            raise BrokenError(f"iterations: {first.iterations}, then {s.iterations}")
+            raise ContractError(f"iterations: {first.iterations}, then {s.iterations}")
         _near("x of a repeat", s.x, first.x, REPEAT_ROUNDING)
 
 
@@ -186,9 +188,9 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     s = _solve(solver, qp, 1e-6)
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
-            raise BrokenError("changed the QP that it was given")
+            raise ContractError("changed the QP that it was given")
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message}")
+        raise ContractError(f"ended as {s.status}: {s.message}")
 
 
 def _a_misspelt_option_is_refused(solver: Solver) -> None:
@@ -196,16 +198,16 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
         type(solver)(**{"no_such_option": 1})
     except TypeError:
         return
-    raise BrokenError("takes any option; expected TypeError for no_such_option")
+    raise ContractError("takes any option; expected TypeError for no_such_option")
 
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
     qp = problem()
     s = _ended(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
-        raise BrokenError("claims to have solved what has no solution")
+        raise ContractError("claims to have solved what has no solution")
     if not s.message:
-        raise BrokenError(f"ended as {s.status} without a message; expected a reason")
+        raise ContractError(f"ended as {s.status} without a message; expected a reason")
     if s.status is Status.INFEASIBLE and infeasibility_margin(qp, s) is not None:
         return Result(Grade.PASS, "verified infeasible")
     return Result(Grade.PASS, f"ended as {s.status}: {s.message}")
@@ -215,8 +217,8 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
     qp, _ = manufactured("bounds")
     try:
         _solved(solver, replace(qp, P=aslinearoperator(qp.P)), 1e-6, VERIFIED_FACTOR)
-    except BrokenError as e:
-        raise BrokenError(f"P is an operator: {e}; {_DECLINE_OPERATORS}") from None
+    except ContractError as e:
+        raise ContractError(f"P is an operator: {e}; {_DECLINE_OPERATORS}") from None
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
@@ -239,9 +241,9 @@ def _runs_in_one_thread(solver: Solver) -> None:
     finally:
         os.sched_setaffinity(0, allowed)
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message}")
+        raise ContractError(f"ended as {s.status}: {s.message}")
     if used > 1.2 * passed + 0.02:
-        raise BrokenError(f"used {used:.2f} s CPU within {passed:.2f} s; one thread?")
+        raise ContractError(f"used {used:.2f} s CPU within {passed:.2f} s; one thread?")
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
@@ -256,15 +258,15 @@ def _a_sequence_is_solved(solver: Solver) -> None:
             if (reason := reason_to_decline(solver, qp)) is not None:
                 raise DeclinedError(reason)
             _judge(qp, prepare(qp)(), VERIFIED_FACTOR * 1e-6)
-        except (BrokenError, ReasonError) as e:
-            raise BrokenError(f"QP {i + 1} of the sequence: {e}") from None
+        except (ContractError, ReasonError) as e:
+            raise ContractError(f"QP {i + 1} of the sequence: {e}") from None
         except DeclinedError:
             raise
         except ImportError as e:
             raise DeclinedError(f"not installed: {e.name}") from None
         except Exception as e:  # the solver's own code
             message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
-            raise BrokenError(message) from None
+            raise ContractError(message) from None
 
 
 def _sequence() -> list[QP]:
@@ -286,7 +288,7 @@ def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
 def _near(what: str, got: Vector | float, expected: Vector | float, by: float) -> None:
     error = float(np.max(np.abs(np.subtract(got, expected)), initial=0.0))
     if not error <= by:
-        raise BrokenError(f"{what} is {error:.1e} off the known one; {by:.1e} is ok")
+        raise ContractError(f"{what} is {error:.1e} off the known one; {by:.1e} is ok")
 
 
 def _buffers(qp: QP) -> Iterator[Vector]:

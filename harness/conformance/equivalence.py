@@ -46,7 +46,7 @@ UNITS: Mapping[str, tuple[float, float]] = {
 }
 
 
-class WeakError(Exception):
+class WeaknessError(Exception):
     """What an equivalent formulation changed."""
 
 
@@ -68,7 +68,7 @@ def same_answer(
     ------
     DeclinedError
         When the solver declines either, or does not solve them as they are.
-    WeakError
+    WeaknessError
         When verdict or answer are not the same; with no change: when it fails.
 
     """
@@ -80,7 +80,7 @@ def same_answer(
     new = CHANGES[change](qp, form)
     s = old if change == UNCHANGED else answer(solver, new.qp)
     if after := _fault(new.qp, s):
-        raise WeakError(after)
+        raise WeaknessError(after)
     back = new.recover(s)
     energy = max(_energy(qp, old.x), new.scale * _energy(new.qp, s.x))
     by = back.x - old.x
@@ -117,7 +117,7 @@ def _energy(qp: QP, x: Vector) -> float:
 
 def _compare(what: str, by: float) -> None:
     if not by <= MAX_ENERGY_CHANGE:
-        raise WeakError(
+        raise WeaknessError(
             f"verified, but {what} changed by {by:.1e} of the energy; "
             f"{MAX_ENERGY_CHANGE:g} is ok"
         )

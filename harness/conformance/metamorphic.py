@@ -45,7 +45,7 @@ class Equivalent(NamedTuple):
     scale: float = 1.0  #: old objective = scale·new objective + constant,
     constant: float = 0.0  #: at every point
 
-    def then(self, change: Callable[[QP], Equivalent]) -> Equivalent:
+    def followed_by(self, change: Callable[[QP], Equivalent]) -> Equivalent:
         """Change the new QP once more."""
         new = change(self.qp)
         return Equivalent(
@@ -74,7 +74,9 @@ def change_units(qp: QP, *, unknown: float, objective: float) -> Equivalent:
     s = unknown
     T = diags_array(np.full(qp.q.size, s))
     A, G = (diags_array(np.full(v.size, 1 / s)) for v in (qp.b, qp.h))
-    return _unknowns(qp, T, objective=objective).then(lambda new: _rows(new, A, G))
+    return _unknowns(qp, T, objective=objective).followed_by(
+        lambda new: _rows(new, A, G)
+    )
 
 
 def permute_unknowns(qp: QP, order: Order) -> Equivalent:

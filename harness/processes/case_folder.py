@@ -25,7 +25,7 @@ from mortarbench.harness.files.reading import read_text
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
+class StoredCase:
     """A built case."""
 
     qp: Path  #: see `harness.files.qpfile`
@@ -33,11 +33,11 @@ class Entry:
     meta: Mapping[str, Any]  #: of the case, as the case worker told it
 
 
-def entry(
+def find_or_build(
     folder: Path,
     identity: Sequence[Any],
     make: Callable[[Path], Mapping[str, Any]],
-) -> Entry:
+) -> StoredCase:
     """Find a case, or have it built by the one process that comes first.
 
     folder : made if need be, in one that is there
@@ -47,8 +47,8 @@ def entry(
     """
     folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
-    with _held(folder / f"{key}.lock"):
-        found = _found(folder, key)
+    with _locked(folder / f"{key}.lock"):
+        found = _look_up(folder, key)
         if found is not None:
             return found
         new = folder / f"{key}.new"
@@ -63,7 +63,7 @@ def entry(
         index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
         text = json.dumps({**index, "check": _check(index)})
         replace_file(folder / f"{key}.json", text.encode())
-        return Entry(qp=path, digest=digest, meta=meta)
+        return StoredCase(qp=path, digest=digest, meta=meta)
 
 
 def content_digest(path: Path) -> str:
@@ -72,7 +72,7 @@ def content_digest(path: Path) -> str:
         return hex_digest(pieces(file), 24)
 
 
-def _found(folder: Path, key: str) -> Entry | None:
+def _look_up(folder: Path, key: str) -> StoredCase | None:
     """Look up an entry; return None if there is none, or a damaged one."""
     try:
         index = json.loads(read_text(folder / f"{key}.json"))
@@ -83,7 +83,7 @@ def _found(folder: Path, key: str) -> Entry | None:
             return None
         if content_digest(path) != index["digest"]:
             return None
-        return Entry(qp=path, digest=index["digest"], meta=index["meta"])
+        return StoredCase(qp=path, digest=index["digest"], meta=index["meta"])
     except (
         InputError, OSError, ValueError, KeyError, TypeError, AttributeError,
         RecursionError,
@@ -97,7 +97,7 @@ def _check(index: Mapping[str, Any]) -> str:
 
 
 @contextmanager
-def _held(lock: Path) -> Iterator[None]:
+def _locked(lock: Path) -> Iterator[None]:
     """Have one process at a time look up or build a case."""
     fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:

@@ -76,7 +76,7 @@ class CaseWorker:
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
         """Answer one request, whatever the family's code does."""
         if "solve" in request:
-            return self._solved(Path(request["solve"]), Path(request["point"]))
+            return self._solve(Path(request["solve"]), Path(request["point"]))
         asked = request.get("build") or request.get("describe") or request["shared"]
         name = CaseId(**{**asked, "family": self.families[asked["family"]]})
         if "shared" in request:
@@ -90,17 +90,17 @@ class CaseWorker:
                 "past_end": isinstance(e, PastEndError),
             }
         if "build" in request:
-            return self._written(case, name, Path(request["qp"]))
-        return self._described(case, name, request)
+            return self._write(case, name, Path(request["qp"]))
+        return self._describe(case, name, request)
 
-    def _described(
+    def _describe(
         self, case: Case, name: CaseId, request: dict[str, Any]
     ) -> dict[str, Any]:
         s = read_point(Path(request["point"]), Status.SOLVED)
         start = perf_counter()
         quantities, note = quantities_of(case, s)
         seconds = perf_counter() - start
-        bounds, objection = self._certified(case, name, s)
+        bounds, objection = self._certify(case, name, s)
         notes = [text for text in (note, objection) if text]
         if request["fields"] is not None and case.fields is not None:
             try:
@@ -116,7 +116,7 @@ class CaseWorker:
             "seconds": seconds,
         }
 
-    def _certified(
+    def _certify(
         self, case: Case, name: CaseId, s: Solution
     ) -> tuple[dict[str, Any], str]:
         """Bound the error of a point; one that came before is not certified again.
@@ -135,7 +135,7 @@ class CaseWorker:
         self._bounds[key] = certified(case, s)
         return self._bounds[key]
 
-    def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
+    def _solve(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
             write_point(point, self.reference(load_qp(qp, operators=self.operators)[0]))
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -147,21 +147,21 @@ class CaseWorker:
         while len(self._cases) >= keep:  # before building: two may be too large
             del self._cases[next(iter(self._cases))]
         if case is None:
-            case = self._built(name)
+            case = self._build(name)
             if not self._warm and case.dualise_seconds is not None:
                 self._warm = True
                 if self._build_seconds < MAX_WARM_UP_SECONDS:
-                    case = self._built(name)
+                    case = self._build(name)
         self._cases[name.name] = case
         return case
 
-    def _built(self, name: CaseId) -> Case:
+    def _build(self, name: CaseId) -> Case:
         start = perf_counter()
         case = name.build(self.reference)
         self._build_seconds = perf_counter() - start
         return case
 
-    def _written(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
+    def _write(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
         meta = {
             "name": name.name,
             "scale": case.scale,

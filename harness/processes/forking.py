@@ -42,7 +42,7 @@ class Fork:
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
-        self._pinned = os.pidfd_open(
+        self._process_fd = os.pidfd_open(
             pid
         )  # its number is another's once it is collected
         self.stdin = stdin  #: its tree is killed when this is closed, or we are dead
@@ -58,16 +58,16 @@ class Fork:
         """
         deadline = None if timeout is None else time.monotonic() + timeout
         with suppress(ChildProcessError):  # it was collected with its tree
-            while os.waitid(os.P_PIDFD, self._pinned, _ENDED) is None:
+            while os.waitid(os.P_PIDFD, self._process_fd, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
                 time.sleep(_POLL_SECONDS)
-        os.close(self._pinned)
+        os.close(self._process_fd)
 
     def kill(self) -> None:
         """Send SIGKILL."""
         with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._pinned, signal.SIGKILL)
+            signal.pidfd_send_signal(self._process_fd, signal.SIGKILL)
 
 
 def fork(

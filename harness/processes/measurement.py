@@ -22,7 +22,7 @@ from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.forking import Serve
 from mortarbench.harness.processes.protocol import Source, source_of
-from mortarbench.harness.processes.ranks import without_content
+from mortarbench.harness.processes.ranks import qp_of_sizes
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import (
@@ -54,7 +54,7 @@ _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 
 
-class Measured(NamedTuple):
+class JudgedMeasurement(NamedTuple):
     """One measurement, judged."""
 
     record: Record
@@ -64,7 +64,7 @@ class Measured(NamedTuple):
     is_undescribed: bool = True
 
 
-def measured(
+def measure_and_judge(
     worker: WorkerProcess,
     whole: Callable[[], QP],
     record: Record,
@@ -73,7 +73,7 @@ def measured(
     time_limit: float,
     memory_limit: float,
     prove: Proves,
-) -> Measured:
+) -> JudgedMeasurement:
     """Fill in `record` by one measurement.
 
     whole : gives the QP. Where ranks emit it themselves and evaluate the answer, it is
@@ -109,12 +109,12 @@ def measured(
             cpu=reply.cpu,
         )
         if source_of(request) is Source.RANKS:
-            qp, record = _as_told(reply.emitted, record)
+            qp, record = sizes_from_ranks(reply.emitted, record)
         else:
             qp = whole()
             record = record.but(sizes=qp.sizes)
         if reply.answer is None:
-            return Measured(record.but(verdict=reply.verdict), None)
+            return JudgedMeasurement(record.but(verdict=reply.verdict), None)
         solution = replace(
             read_point(out, Status(reply.answer["claimed"])),
             iterations=reply.answer["iterations"],
@@ -129,7 +129,7 @@ def measured(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    record, *notes = _timed(reply, record, worker.first_seconds)
+    record, *notes = _with_cost(reply, record, worker.first_seconds)
     sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
     is_pointless = by_ranks and not has_point(solution)
     found = reply.answer["evaluated"] if by_ranks else None
@@ -144,11 +144,11 @@ def measured(
         record = judged(record, qp, solution, found=_NO_POINT)
     else:
         record = judged(record, whole() if by_ranks else qp, solution, prove)
-    record = _within(memory_limit, noted(record, reply.message, *notes)).but(
+    record = _check_memory(memory_limit, noted(record, reply.message, *notes)).but(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
     lacks = found is None or None in (found["quantities"], found["bounds"])
-    return Measured(record, solution, lacks and not is_pointless)
+    return JudgedMeasurement(record, solution, lacks and not is_pointless)
 
 
 def _as_tuples(data: Any) -> Any:
@@ -158,17 +158,17 @@ def _as_tuples(data: Any) -> Any:
     return tuple(data) if isinstance(data, list) else data
 
 
-def _timed(
+def _with_cost(
     reply: Reply, record: Record, first_seconds: dict[Hashable, float]
 ) -> tuple[Record, *tuple[str, ...]]:
     """Fill in what the measurement cost; with notes on what cannot be believed."""
     assert reply.answer is not None
-    cost, *notes = _believed(reply)
+    cost, *notes = _plausible_cost(reply)
     if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
         first, what = reply.answer["first_seconds"], (record.qp, record.asked_tol)
-        notes = _cached(cost, first, first_seconds, what)
+        notes = _caching_notes(cost, first, first_seconds, what)
     return record.but(**asdict(cost)), *notes
 
 
@@ -180,17 +180,19 @@ def case_request(record: Record) -> dict[str, Any]:
     return {"case": case}
 
 
-def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Record]:
+def sizes_from_ranks(
+    emitted: Mapping[str, Any] | None, record: Record
+) -> tuple[QP, Record]:
     """Take what ranks tell of a QP that they have emitted; nothing, if they did not."""
     if emitted is None or not emitted["sizes"]:
-        return without_content(0, 0), record
+        return qp_of_sizes(0, 0), record
     sizes = emitted["sizes"]
-    return without_content(sizes["variables"], sizes["equalities"]), record.but(
+    return qp_of_sizes(sizes["variables"], sizes["equalities"]), record.but(
         sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
     )
 
 
-def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
+def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     """Return the worker's times if the parent's clock allows them, else the parent's.
 
     They may sum to no more time than passed between request and end, and to no less
@@ -215,7 +217,7 @@ def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     )
 
 
-def _cached(
+def _caching_notes(
     m: Measurement,
     first: float | None,
     first_seconds: dict[Hashable, float],
@@ -242,7 +244,7 @@ def _cached(
     ]
 
 
-def _within(limit: float, record: Record) -> Record:
+def _check_memory(limit: float, record: Record) -> Record:
     """Say so where an answer went beyond the memory limit, or failed because of it."""
     if record.verdict is Verdict.DECLINED:
         return record
@@ -276,7 +278,7 @@ def single_worker(
             worker.close()
 
 
-def measured_once(
+def measure_once(
     worker: WorkerProcess,
     case: Callable[[], Case],
     record: Record,
@@ -284,7 +286,7 @@ def measured_once(
     *,
     source: Source = Source.FILE,
 ) -> tuple[Record, Solution | None]:
-    """Do as `measured`, without limits, and say what the point means.
+    """Do as `measure_and_judge`, without limits, and say what the point means.
 
     case : gives the case, built when it is first asked for
     reference : solves the QP where residuals cannot decide
@@ -294,7 +296,7 @@ def measured_once(
     Raises
     ------
     FaultError
-        As `measured`, after a second try.
+        As `measure_and_judge`, after a second try.
 
     """
     with scratch_folder() as scratch:
@@ -309,7 +311,7 @@ def measured_once(
             if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
-            measured, worker, lambda: case().qp, record, request,
+            measure_and_judge, worker, lambda: case().qp, record, request,
             time_limit=inf, memory_limit=inf, prove=proves(reference),
         )  # fmt: skip
         try:

@@ -91,7 +91,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     )  # fmt: skip
     for fd in (*fds, write):
         os.close(fd)
-    first = _Ends(read, ranks).first(process.pid)
+    first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
         said = first or f"one of {ranks} ranks ended: mpiexec says {code}"
@@ -99,7 +99,7 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     return 0 if code == 0 else 1
 
 
-class _Ends:
+class _RankExits:
     """The ends of ranks, in the order of time.
 
     The kernel lists what becomes ready in that order, see epoll(7), however late we
@@ -114,7 +114,7 @@ class _Ends:
         self._unread = b""
         self._rank_of: dict[int, int] = {}  # by a file descriptor of its process
         self._first: int | str | None = None  # a rank, or what one said of its failure
-        self._way: dict[int, str] = {}  # how ranks ended
+        self._exit_description: dict[int, str] = {}  # how ranks ended
         self._events = epoll()
         self._events.register(record, EPOLLIN)
 
@@ -132,18 +132,20 @@ class _Ends:
             has_ended = mpi in ready
             for fd in ready:
                 if fd in self._rank_of:
-                    self._note(self._rank_of.pop(fd))
+                    self._record_first(self._rank_of.pop(fd))
                     os.close(fd)
                 else:
                     self._take_records()
                 if fd == mpi:  # ranks that end now, end because it has
-                    self._note("")
+                    self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + ALONE_SECONDS
         if self._first is None or isinstance(self._first, str):
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
-        way = self._way.get(self._first, "killed, as was the process above it")
+        way = self._exit_description.get(
+            self._first, "killed, as was the process above it"
+        )
         return f"{one} of {self._ranks} ranks ended: {way}"
 
     def _take_records(self) -> None:
@@ -159,25 +161,25 @@ class _Ends:
 
     def _take(self, line: Mapping[str, Any]) -> None:
         if "failed" in line:
-            self._note(line["failed"])
+            self._record_first(line["failed"])
         elif "status" in line:
-            self._way[line["rank"]] = _way_to_end(line["status"])
+            self._exit_description[line["rank"]] = _describe_exit(line["status"])
         else:
             for number in (line["process"], line["above"]):
                 try:
                     process = os.pidfd_open(number)
                 except ProcessLookupError:  # it has ended already
-                    self._note(line["rank"])
+                    self._record_first(line["rank"])
                 else:
                     self._rank_of[process] = line["rank"]
                     self._events.register(process, EPOLLIN)
 
-    def _note(self, first: int | str) -> None:
+    def _record_first(self, first: int | str) -> None:
         if self._first is None:
             self._first = first
 
 
-def _way_to_end(status: int) -> str:
+def _describe_exit(status: int) -> str:
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         return f"{signal.strsignal(number)} (signal {number})"
@@ -220,7 +222,7 @@ def follow(
                 run = share = emitted = None  # before another one is made
                 # what all raise, or agree upon, is told by rank 0
                 with suppress(InputError, RankFailedError):
-                    emitted, _ = _emitted(emit, order["case"], ranks)
+                    emitted, _ = _emit_on_ranks(emit, order["case"], ranks)
                 limit(order["memory_limit"])
             elif "declines" in order and emitted is not None:
                 solver.declines(emitted.share().qp)
@@ -239,20 +241,20 @@ def follow(
                 limit(None)
                 evaluated_by_ranks(emitted, solution, ranks)
             elif run is not None and share is not None:
-                solution, _ = _solved(run, share, ranks)
+                solution, _ = _solve_on_ranks(run, share, ranks)
         except BaseException as e:
-            if _ordered(ranks, ALONE_SECONDS):
+            if _wait_for_order(ranks, ALONE_SECONDS):
                 continue  # rank 0 has failed alike, and says so
             abort(ranks, e)
 
 
 def _next_order(ranks: Ranks) -> dict[str, Any] | None:
-    _ordered(ranks, np.inf)
+    _wait_for_order(ranks, np.inf)
     order: dict[str, Any] | None = ranks.comm.recv(source=0, tag=_ORDER)
     return order
 
 
-def _ordered(ranks: Ranks, seconds: float) -> bool:
+def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
     """Wait for an order without keeping a CPU busy; whether one came."""
     deadline = time.monotonic() + seconds
     while not ranks.comm.iprobe(source=0, tag=_ORDER):
@@ -262,7 +264,7 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
-class Spent(NamedTuple):
+class RankCosts(NamedTuple):
     """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
 
     seconds: Mapping[str, tuple[float, float]] = {}
@@ -274,7 +276,7 @@ class Spent(NamedTuple):
         return {f"rank_{name}": table for name, table in self._asdict().items()}
 
 
-class OnRanks:
+class ParallelSolver:
     """A solver on rank 0, which has the others do their share, or the same.
 
     Attributes
@@ -290,14 +292,14 @@ class OnRanks:
         self._ranks = ranks
         self._emit = emit
         self._emitted: Emitted | None = None
-        self._unemitted: Exception | None = None
+        self._emission_error: Exception | None = None
         self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
-        self.spent = Spent()
-        self._own: Solution | None = None
+        self.spent = RankCosts()
+        self._local_solution: Solution | None = None
 
-    def shares(
+    def emit(
         self, case: Mapping[str, Any], memory_limit: float | None
     ) -> tuple[QP, dict[str, Any]]:
         """Have all ranks make their shares of the next QP.
@@ -310,18 +312,18 @@ class OnRanks:
 
         """
         self._order({"case": dict(case), "memory_limit": memory_limit})
-        self._emitted = self._unemitted = self._own = None
+        self._emitted = self._emission_error = self._local_solution = None
         try:
-            self._emitted, told = _emitted(self._emit, case, self._ranks)
+            self._emitted, told = _emit_on_ranks(self._emit, case, self._ranks)
         except (InputError, RankFailedError) as e:
-            self._unemitted = e
-            return without_content(0, 0), {
+            self._emission_error = e
+            return qp_of_sizes(0, 0), {
                 "sizes": {}, "digest": "", "build_seconds": None
             }  # fmt: skip
         of = self._emitted
-        return without_content(of.variables, of.equality_rows), told
+        return qp_of_sizes(of.variables, of.equality_rows), told
 
-    def evaluated(self) -> dict[str, Any] | None:
+    def evaluate(self) -> dict[str, Any] | None:
         """Have all ranks evaluate the last answer, if they emitted its QP; see there.
 
         Returns
@@ -329,14 +331,14 @@ class OnRanks:
         as `harness.verify.verdicts.evaluated_by_ranks`
 
         """
-        if self._emitted is None or self._own is None:
+        if self._emitted is None or self._local_solution is None:
             return None
         self._order({"evaluate": True})
-        return evaluated_by_ranks(self._emitted, self._own, self._ranks)
+        return evaluated_by_ranks(self._emitted, self._local_solution, self._ranks)
 
-    def takes(self, path: Path, memory_limit: float | None) -> None:
+    def use_file(self, path: Path, memory_limit: float | None) -> None:
         """Say in which file the next QP is, which is not emitted."""
-        self._emitted = self._unemitted = self._own = None
+        self._emitted = self._emission_error = self._local_solution = None
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
@@ -354,9 +356,9 @@ class OnRanks:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
-        if self._unemitted is not None:  # other failures show when it is prepared
-            of_input = isinstance(self._unemitted, InputError)
-            return str(self._unemitted) if of_input else None
+        if self._emission_error is not None:  # other failures show when it is prepared
+            of_input = isinstance(self._emission_error, InputError)
+            return str(self._emission_error) if of_input else None
         if self._emitted is not None:
             self._order({"declines": True})
             return self._solver.declines(self._emitted.share().qp)
@@ -372,8 +374,8 @@ class OnRanks:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Prepare on all ranks; it is done when the last one is."""
-        if self._unemitted is not None:
-            raise self._unemitted
+        if self._emission_error is not None:
+            raise self._emission_error
         if self._emitted is not None:
             self._order({"tol": tol})
             share = self._emitted.share()
@@ -389,10 +391,10 @@ class OnRanks:
 
         def solve() -> Solution:
             self._order({})
-            self._own, found = _solved(run, share, self._ranks)
+            self._local_solution, found = _solve_on_ranks(run, share, self._ranks)
             assert found is not None  # this is rank 0
             solution, spent = found
-            self.spent = Spent() if self._copies else spent
+            self.spent = RankCosts() if self._copies else spent
             return solution
 
         return solve
@@ -402,10 +404,10 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
-def _emitted(
+def _emit_on_ranks(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
 ) -> tuple[Emitted, dict[str, Any]]:
-    """Emit on all ranks, and tell of it what `OnRanks.shares` does.
+    """Emit on all ranks, and tell of it what `ParallelSolver.emit` does.
 
     Raises
     ------
@@ -427,7 +429,7 @@ def _emitted(
         raise RankFailedError(f"emission: {why}") from e
 
 
-def without_content(variables: int, equality_rows: int) -> QP:
+def qp_of_sizes(variables: int, equality_rows: int) -> QP:
     """Make a QP with the sizes of one that no process has; it holds no numbers."""
     n, m = variables, equality_rows
     nothing = np.broadcast_to(0.0, n)
@@ -446,9 +448,9 @@ def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
     return product.share(qp, ranks)
 
 
-def _solved(
+def _solve_on_ranks(
     run: Callable[[], Solution], share: Share, ranks: Ranks
-) -> tuple[Solution, tuple[Solution, Spent] | None]:
+) -> tuple[Solution, tuple[Solution, RankCosts] | None]:
     """Solve: a slice of the solution, and on rank 0 all of it and what was spent."""
     ranks.clear()
     s = run()
@@ -464,7 +466,7 @@ def _solved(
         "rank_peak_mib_largest": max(peaks),
         "rank_peak_mib_mean": sum(peaks) / ranks.size,
     }  # fmt: skip
-    spent = Spent(*map(_mean_and_largest, tables))
+    spent = RankCosts(*map(_mean_and_largest, tables))
     return s, (replace(found, reported=reported), spent)
 
 

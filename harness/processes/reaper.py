@@ -65,7 +65,7 @@ def descendants(root: int) -> list[int]:
                     children = list(map(int, file.read().split()))
                     unseen += children
                     found += children
-    return [process for process in found if lives(process)]
+    return [process for process in found if is_alive(process)]
 
 
 def _is_below(process: int, root: int) -> bool:
@@ -75,7 +75,7 @@ def _is_below(process: int, root: int) -> bool:
     return process == root > 0
 
 
-def lives(process: int) -> bool:
+def is_alive(process: int) -> bool:
     """Whether there is such a process, and it is no zombie."""
     return state(process) not in ("", "Z", "X")
 
@@ -95,7 +95,7 @@ def _status(where: int | str, field: int) -> str:
         return ""
 
 
-def end_all(root: int) -> None:
+def kill_descendants(root: int) -> None:
     """Kill every process below `root`, and wait until they are gone.
 
     They are stopped first, until there are no new ones: what is stopped cannot fork,
@@ -136,7 +136,7 @@ def _send(process: int, number: int, root: int) -> None:
             os.close(opened)
 
 
-def segments() -> dict[int, int]:
+def shared_segments() -> dict[int, int]:
     """List this user's System V segments: number and creator."""
     found = {}
     with suppress(OSError), open(SEGMENTS) as file:  # a kernel without them
@@ -176,8 +176,8 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
-    reaper, before = os.getpid(), segments().keys()
-    worker = _mortal_fork()
+    reaper, before = os.getpid(), shared_segments().keys()
+    worker = _fork_bound_to_parent()
     if worker == 0:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -206,19 +206,19 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         ended |= _reap()
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
-    end_all(reaper)
+    kill_descendants(reaper)
     _reap()  # or they stay in the table of processes where init collects nothing
     # System V segments of processes that have ended; a number that belongs to a living
     # process is not theirs any longer
-    for segment, creator in segments().items():
-        if segment not in before and creator in creators and not lives(creator):
+    for segment, creator in shared_segments().items():
+        if segment not in before and creator in creators and not is_alive(creator):
             ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
     _end_as(status)
 
 
 def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
     rank = int(next((os.environ[name] for name in _RANKS if name in os.environ), -1))
-    child = _mortal_fork()
+    child = _fork_bound_to_parent()
     if child == 0:
         _execute(command)
     _write(record, rank=rank, process=child, above=os.getpid())
@@ -234,7 +234,7 @@ def _write(record: int, **what: int) -> None:
         os.write(record, f"{{{line}}}\n".encode())
 
 
-def _mortal_fork() -> int:
+def _fork_bound_to_parent() -> int:
     """Fork a process that is killed when this one ends; returns as `os.fork`."""
     parent = os.getpid()
     child = os.fork()

@@ -37,6 +37,7 @@ from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.footprint import Footprint
 from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
     MAX_REPLY_BYTES,
     ForeignReplyError,
@@ -44,7 +45,6 @@ from mortarbench.harness.processes.protocol import (
     measures,
     source_of,
 )
-from mortarbench.harness.processes.turns import Turn
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
@@ -65,7 +65,7 @@ _MIN_FD = 3  #: of a pipe: those below are the standard streams, even if closed
 #: of the memory limit: who fails beyond that failed for want of memory
 MEMORY_LIMIT_SHARE = 0.9
 
-_TURN = Turn()  #: of the thread that starts, asks, stops or ends a worker
+_LOCK = ForkSafeLock()  #: of the thread that starts, asks, stops or ends a worker
 
 REPLACEMENT_NOTE = "the worker was busy while idle, and was replaced"
 
@@ -128,7 +128,7 @@ class WorkerProcess:
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
         self._worker = 0  # its child, once it is ready
-        self._pinned = self._pinned_worker = -1  # file descriptors of both
+        self._reaper_fd = self._worker_fd = -1  # file descriptors of both
         self._cpu = -1
         self._requests = self._replies = -1  # our ends of the two pipes
         self._unread = bytearray()
@@ -140,10 +140,10 @@ class WorkerProcess:
         self._footprint = Footprint()
         self._peak_mib = 0.0
         self._emitted: dict[str, Any] | None = None  # what was told of the QP
-        with _TURN:
+        with _LOCK:
             self._all.add(self)
 
-    @_TURN
+    @_LOCK
     def fork(self, serve: Serve) -> None:
         """Start at once, as a fork of this process that calls `serve`.
 
@@ -155,10 +155,10 @@ class WorkerProcess:
             return
         try:
             self._spawn(inf, serve)
-        except (_EndedError, OSError):
+        except (_WorkerEndError, OSError):
             self._kill()
 
-    @_TURN
+    @_LOCK
     def ask(
         self, request: Mapping[str, Any], *, time_limit: float, memory_limit: float
     ) -> Reply:
@@ -185,13 +185,13 @@ class WorkerProcess:
                 if is_new:
                     self._start(memory_limit)
                     self._is_warm = True
-                answer, clock = self._asked(request, time_limit, memory_limit)
+                answer, clock = self._exchange(request, time_limit, memory_limit)
                 break
-            except _EndedError as end:
+            except _WorkerEndError as end:
                 self._kill()
                 if end.is_early and not is_new:
                     continue
-                return self._ended(end, memory_limit)
+                return self._reply_to_end(end, memory_limit)
             except OSError as e:  # no process, no pipe, no log: ours, or the machine's
                 self._kill()
                 return Reply(fault=True, message=one_line(e))
@@ -213,7 +213,7 @@ class WorkerProcess:
             **facts,
         )
 
-    @_TURN
+    @_LOCK
     def close(self) -> None:
         """Let the worker end by itself, soon; its children end with it."""
         try:
@@ -232,7 +232,7 @@ class WorkerProcess:
             worker._disown()
         cls._all.clear()
 
-    def _asked(
+    def _exchange(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
     ) -> tuple[dict[str, Any], Clock | None]:
         with suppress(OSError):
@@ -271,13 +271,13 @@ class WorkerProcess:
             else:
                 limit = POINT_SECONDS if measures(request) else time_limit
                 answer = self._await("done", limit, memory_limit)
-        except _EndedError as end:
+        except _WorkerEndError as end:
             end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
             raise
         self._trim_log()
         return answer, clock
 
-    def _ended(self, end: _EndedError, memory_limit: float) -> Reply:
+    def _reply_to_end(self, end: _WorkerEndError, memory_limit: float) -> Reply:
         """Tell a solver's end from one that the machine or somebody brought about."""
         peak, message, verdict = self._peak_mib or None, str(end), end.verdict
         is_fault = end.is_fault or (
@@ -316,7 +316,7 @@ class WorkerProcess:
                 self._send({"warm_up": True})
                 self._facts = _facts(self._await("warm", WARM_UP_SECONDS, memory_limit))
                 return
-            except _EndedError as end:
+            except _WorkerEndError as end:
                 if end.is_fault:
                     raise
                 self._warms_up = end.signal in _EXTERNAL_SIGNALS and not is_last
@@ -358,10 +358,10 @@ class WorkerProcess:
         finally:
             os.close(their_requests)
             os.close(their_replies)
-        self._pinned = os.pidfd_open(self._process.pid)
+        self._reaper_fd = os.pidfd_open(self._process.pid)
         self._await("ready", START_SECONDS, memory_limit)
         for worker in self._tree()[:1]:  # what comes later is listed later
-            self._pinned_worker = os.pidfd_open(worker)
+            self._worker_fd = os.pidfd_open(worker)
             if worker in self._tree():  # or its number could be another's by now
                 self._worker = worker
         if not self._worker:
@@ -374,13 +374,13 @@ class WorkerProcess:
     def _await(
         self, event: str, limit: float, memory_limit: float, *, stage: str = ""
     ) -> dict[str, Any]:
-        """Wait for an event; whatever else happens is raised as `_EndedError`.
+        """Wait for an event; whatever else happens is raised as `_WorkerEndError`.
 
         stage : of a measurement, which the error then begins with
         """
 
-        def ended(verdict: Verdict, how: str, *more: int) -> _EndedError:
-            return _EndedError(event, verdict, how, *more, stage=stage)
+        def ended(verdict: Verdict, how: str, *more: int) -> _WorkerEndError:
+            return _WorkerEndError(event, verdict, how, *more, stage=stage)
 
         deadline = time.monotonic() + limit
         while True:
@@ -484,9 +484,9 @@ class WorkerProcess:
 
     def _signal(self, number: signal.Signals) -> None:
         """Send a signal to the worker, if it is there."""
-        if self._pinned_worker != -1:
+        if self._worker_fd != -1:
             with suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pinned_worker, number)
+                signal.pidfd_send_signal(self._worker_fd, number)
 
     def _has_been_busy(self) -> bool:
         if self._idle_since is None:
@@ -523,17 +523,17 @@ class WorkerProcess:
 
         True where there is none.
         """
-        if self._pinned == -1:
+        if self._reaper_fd == -1:
             return True
         look = poll()
-        look.register(self._pinned)
+        look.register(self._reaper_fd)
         return bool(look.poll(0))
 
     def _death(self) -> tuple[str, int]:
         """How a dead worker ended, its last words included, and by which signal."""
         how, number = "ended, and other code of this process took its exit code", 0
         with suppress(ChildProcessError):
-            how, number = _way_to_end(self._pinned)
+            how, number = _describe_exit(self._reaper_fd)
         last = ""
         with suppress(OSError), self._log.open("rb") as file:
             file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES))
@@ -546,7 +546,7 @@ class WorkerProcess:
         if self._process is not None:
             self._footprint.notice(self._tree())
             if not self._is_dead():
-                reaper.end_all(self._process.pid)
+                reaper.kill_descendants(self._process.pid)
             if self._process.stdin is not None:
                 self._process.stdin.close()  # the sub-reaper collects the dead and ends
             try:
@@ -571,7 +571,7 @@ class WorkerProcess:
         self._is_warm = False
         self._worker, self._is_stopped, self._was_busy = 0, False, False
         self._idle_since = None
-        for name in ("_replies", "_requests", "_pinned", "_pinned_worker"):
+        for name in ("_replies", "_requests", "_reaper_fd", "_worker_fd"):
             self._close(name)
 
     def _close(self, name: str) -> None:
@@ -598,7 +598,7 @@ def _pipe() -> tuple[int, int]:
     return read, write
 
 
-def _way_to_end(process: int) -> tuple[str, int]:
+def _describe_exit(process: int) -> tuple[str, int]:
     """Describe the end of a process, and return the signal that ended it; 0: none.
 
     process : a file descriptor, see pidfd_open(2)
@@ -617,7 +617,7 @@ def _way_to_end(process: int) -> tuple[str, int]:
     return names.get(end.si_status, f"signal {end.si_status}"), end.si_status
 
 
-class _EndedError(Exception):
+class _WorkerEndError(Exception):
     """A worker that did not come to the event we waited for.
 
     event : that

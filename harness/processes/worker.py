@@ -50,7 +50,7 @@ from mortarbench.harness.processes.protocol import (
     answer_requests,
     source_of,
 )
-from mortarbench.harness.processes.ranks import OnRanks, Spent, follow
+from mortarbench.harness.processes.ranks import ParallelSolver, RankCosts, follow
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
@@ -76,7 +76,7 @@ def serve(
     emit : has ranks emit the case of a request
     copies : each of them solves by itself instead, all at the same time
     """
-    bench = _Bench(solver, operators)
+    bench = _SolverHost(solver, operators)
     if ranks is None or emit is None:
         answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
         return
@@ -86,12 +86,12 @@ def serve(
         bench.warm_up()
         follow(solver, ranks, operators, emit, _limit_memory)
         return
-    bench.on_ranks = OnRanks(solver, ranks, emit, copies=copies)
+    bench.parallel = ParallelSolver(solver, ranks, emit, copies=copies)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
-    bench.on_ranks.end()
+    bench.parallel.end()
 
 
-class _Bench:
+class _SolverHost:
     """One solver, what it was handed last, and the sequence that it is in."""
 
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
@@ -99,9 +99,11 @@ class _Bench:
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
         self._at = -1  # the step of the sequence that came last
-        self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
+        self._verified_files: dict[str, tuple[int, ...]] = {}  # files by digest
         self._ballast = np.empty(0)
-        self.on_ranks: OnRanks | None = None  #: what measures in place of the solver
+        self.parallel: ParallelSolver | None = (
+            None  #: what measures in place of the solver
+        )
 
     def warm_up(self) -> dict[str, Any]:
         """Solve a QP with bounds and one with rows; how that ends will show later.
@@ -118,7 +120,7 @@ class _Bench:
         no_row = dict(A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0))
         one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
         for rows in (no_row, one_row_each):
-            _measured_here(self._solver, QP(P=P, **pull, **rows), 1e-6)
+            _measure_in_process(self._solver, QP(P=P, **pull, **rows), 1e-6)
         canary_seconds()
         gc.freeze()  # the modules that are loaded by now need no further collecting
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
@@ -143,17 +145,15 @@ class _Bench:
         self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         source = source_of(request)
         if source.is_shared:
-            assert self.on_ranks is not None
-            qp, told = self.on_ranks.shares(
-                request["case"], request.get("memory_limit")
-            )
+            assert self.parallel is not None
+            qp, told = self.parallel.emit(request["case"], request.get("memory_limit"))
             events.reached("emitted", told)
         else:
-            qp = self._loaded(request)
+            qp = self._load(request)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        timed = _measured_here(
-            self.on_ranks or self._solver,
+        timed = _measure_in_process(
+            self.parallel or self._solver,
             qp,
             request["tol"],
             prepare=self._step(request),
@@ -164,12 +164,12 @@ class _Bench:
         _limit_memory(None)
         s = timed.solution
         write_point(Path(request["out"]), s)
-        spent = Spent() if self.on_ranks is None else self.on_ranks.spent
+        spent = RankCosts() if self.parallel is None else self.parallel.spent
         evaluated = dict[str, Any]()
-        if source.is_shared and self.on_ranks is not None:
+        if source.is_shared and self.parallel is not None:
             events.reached("measured", {})
             judges = source is Source.RANKS
-            found = self.on_ranks.evaluated() if judges else None
+            found = self.parallel.evaluate() if judges else None
             evaluated = {"evaluated": found}
         return {
             **evaluated,
@@ -184,19 +184,19 @@ class _Bench:
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
-    def _loaded(self, request: dict[str, Any]) -> QP:
+    def _load(self, request: dict[str, Any]) -> QP:
         path, digest = Path(request["qp"]), request.get("digest")
         if digest is not None:
             at = path.stat()  # a file that has not changed is known
             seen = (at.st_ino, at.st_size, at.st_mtime_ns)
-            if self._trusted.get(digest) != seen:
+            if self._verified_files.get(digest) != seen:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
-                self._trusted[digest] = seen
+                self._verified_files[digest] = seen
         vouched = digest is not None  # or it may be anybody's
         qp, _ = load_qp(path, operators=self._operators if vouched else None)
-        if self.on_ranks is not None:
-            self.on_ranks.takes(path, request.get("memory_limit"))
+        if self.parallel is not None:
+            self.parallel.use_file(path, request.get("memory_limit"))
         return qp
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
@@ -209,7 +209,9 @@ class _Bench:
         self._at, tol = step, request["tol"]
         if step == 0:
             self._chain = None
-        begin = partial(_begun, self._solver, tightens=request.get("tightens", False))
+        begin = partial(
+            _begin_sequence, self._solver, tightens=request.get("tightens", False)
+        )
 
         def prepare(qp: QP) -> Callable[[], Solution]:
             if self._chain is None:  # on the clock, as its step is
@@ -219,7 +221,7 @@ class _Bench:
         return prepare
 
 
-def _begun(
+def _begin_sequence(
     solver: Any, tol: float, *, tightens: bool
 ) -> Callable[[QP, float], Callable[[], Solution]]:
     """Begin a sequence whose steps all have that tolerance, or each its own."""
@@ -274,7 +276,7 @@ def _limit_memory(mib: float | None) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def _measured_here(
+def _measure_in_process(
     solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
     **how: Any,
 ) -> Timed:  # fmt: skip

@@ -58,7 +58,7 @@ def read_faults(folder: Path) -> list[Fault]:
     return [_parsed(line, path, number) for number, line in enumerate(lines, 1)]
 
 
-def left(faults: Iterable[Fault], made: Iterable[str]) -> list[Fault]:
+def remaining_faults(faults: Iterable[Fault], made: Iterable[str]) -> list[Fault]:
     """Choose the last fault of each measurement that is not `made`, by run_id."""
     last = {fault.run_id: fault for fault in faults}
     for run_id in made:

@@ -30,7 +30,7 @@ from mortarbench.harness.files.reading import (
     toml,
 )
 from mortarbench.harness.results.faults import FAULTS
-from mortarbench.harness.suite.growth import refused
+from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, read_stored
 
 #: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
@@ -165,7 +165,7 @@ def refuse_foreign(folder: Path) -> None:
         )
 
 
-class Held:
+class FolderLock:
     """A result folder that this process holds against every other run.
 
     Raises
@@ -192,7 +192,7 @@ class Held:
             When the folder was moved away, or another run took it meanwhile.
 
         """
-        there = _leads_to(self._folder, self._there)
+        there = _is_same_file(self._folder, self._there)
         if not there:
             now = os.readlink(f"/proc/self/fd/{self._there}")
             if not now.endswith(" (deleted)"):
@@ -200,14 +200,14 @@ class Held:
                     f"{self._folder} was moved to {now} while the run wrote to it; all "
                     "that was measured is there, and --out with that path continues"
                 )
-        if not (there and _leads_to(self._folder / _LOCK, self._lock)):
+        if not (there and _is_same_file(self._folder / _LOCK, self._lock)):
             self.close()
             self._take()
         return there
 
     def _take(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _locked(self._folder)
+        self._lock = _open_lock(self._folder)
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
         self._there = os.open(self._folder, flags)
 
@@ -219,7 +219,7 @@ class Held:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[Held]:
+def lock_folder(folder: Path) -> Iterator[FolderLock]:
     """Keep every other run off a result folder, which is made if need be.
 
     What writers that were killed left unfinished there is deleted.
@@ -232,7 +232,7 @@ def locked(folder: Path) -> Iterator[Held]:
     """
     try:
         with full_disk_told(folder):
-            held = Held(folder)
+            lock = FolderLock(folder)
     except OSError as e:
         raise InputError(
             f"{folder}: {e.strerror}; expected a folder that can be written"
@@ -240,12 +240,12 @@ def locked(folder: Path) -> Iterator[Held]:
     try:
         own = [folder / name for name in _FOLDERS]
         remove_unfinished(folder, own, shared=[folder / COPIES])
-        yield held
+        yield lock
     finally:
-        held.close()
+        lock.close()
 
 
-def _locked(folder: Path) -> int:
+def _open_lock(folder: Path) -> int:
     """Open the lock of a folder and lock it, until the file descriptor is closed.
 
     The file tells, too, that one of our runs began here: one that was killed at once
@@ -256,7 +256,8 @@ def _locked(folder: Path) -> int:
         fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _leads_to(folder / _LOCK, fd):  # else it was deleted before we locked it
+            # without this, the lock would be on a file deleted between open and flock
+            if _is_same_file(folder / _LOCK, fd):
                 os.pwrite(fd, _LOCK_CONTENT, 0)
                 return fd
         except BlockingIOError:
@@ -270,7 +271,7 @@ def _locked(folder: Path) -> int:
         os.close(fd)
 
 
-def _leads_to(path: Path, fd: int) -> bool:
+def _is_same_file(path: Path, fd: int) -> bool:
     """Whether a path is that of an open file or folder."""
     try:
         return os.path.samestat(path.stat(), os.fstat(fd))
@@ -336,7 +337,7 @@ def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> boo
         except InputError as e:
             raise InputError(f"{e}; restore it, or use --fresh") from None
         has_grown = before != now
-        if has_grown and (changed := refused(before, now)):
+        if has_grown and (changed := incompatibility(before, now)):
             raise InputError(f"{out} holds another suite ({changed}); {REMEDY}")
     if environment_file.exists():
         then = _environment(environment_file)

@@ -23,8 +23,8 @@ from mortarbench.harness.results.folder import refuse_links
 class Journal:
     """The writer's end of one file ``FOLDER/journal/NAME.jsonl``.
 
-    Hold `harness.results.folder.locked` while one is open: a second writer could cut
-    off a line that this one is writing. Whatever files there are beside it are held
+    Hold `harness.results.folder.lock_folder` while one is open: a second writer could
+    cut off a line that this one is writing. Whatever files there are beside it are held
     open, too, so that a journal that is deleted meanwhile can be written again.
 
     restored : told in a line when that was necessary

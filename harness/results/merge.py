@@ -27,12 +27,12 @@ from mortarbench.harness.results.faults import FAULTS, read_faults
 from mortarbench.harness.results.folder import (
     environment_of,
     keep_environment,
-    locked,
+    lock_folder,
     refuse_foreign,
     refuse_links,
 )
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.suite.growth import as_toml, united
+from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
 _DUPLICATES_NOTE = "are there already, and count once"
@@ -96,10 +96,10 @@ def merge(
     folders = [*before, *read]
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
-    suite = as_toml(united(suites))
+    suite = as_toml(unite(suites))
     for folder in folders:
         check_copies(folder)
-    with full_disk_told(out), locked(out):
+    with full_disk_told(out), lock_folder(out):
         union = _Union()
         for folder in before:
             for record in read_journal(folder):

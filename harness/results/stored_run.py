@@ -21,8 +21,8 @@ from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.suite.solver_options import without_options
 from mortarbench.harness.suite.suite import (
     NULL_SUFFIX,
-    asked_solvers,
     limits,
+    solvers_by_label,
     steps_up_to,
 )
 from mortarbench.harness.verify.verdicts import new_record, plain
@@ -59,9 +59,9 @@ def open_stored_run(
 
     """
     records = read_journal(folder)
-    record = _found(folder, run_id, records)
+    record = _find_record(folder, run_id, records)
     environment, text = environment_of(folder, record.environment), suite_text(folder)
-    spec = _asked(record, asked_solvers(text))
+    spec = _find_solver(record, solvers_by_label(text))
     try:
         if record.family not in families:
             raise InputError(f"unknown family {record.family!r}")
@@ -118,7 +118,7 @@ def _cell(r: Record) -> tuple[Any, ...]:
     return r.mode, r.case, r.solver, r.options, r.tol, r.accuracy
 
 
-def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
+def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
     by_id = {r.run_id: r for r in records}
     candidates = [name for name in by_id if run_id and name.startswith(run_id)]
     if run_id in by_id or len(candidates) == 1:
@@ -135,7 +135,7 @@ def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
     raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
 
 
-def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
+def _find_solver(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
     """Find the solver of a label: of the suite, or of the command line."""
     name = record.solver
     for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):

@@ -60,7 +60,7 @@ class Result:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unbuilt:
+class BuildFailure:
     """Instead of results: a case of the block could not be built."""
 
     block: WorkUnit
@@ -69,15 +69,15 @@ class Unbuilt:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unmade:
+class MeasurementFault:
     """Instead of a result: a fault of ours or of the machine prevented it."""
 
     record: Record  #: of what was to be measured
     reason: str  #: one line
-    tried_again: bool  #: at once: another `Unmade`, or a `Result`, follows
+    tried_again: bool  #: at once: another `MeasurementFault`, or a `Result`, follows
 
 
-Outcome = Result | Unbuilt | Unmade
+Outcome = Result | BuildFailure | MeasurementFault
 
 
 class Engine(Protocol):
@@ -92,7 +92,7 @@ class Engine(Protocol):
         """Carry out all of `blocks`."""
 
 
-class Opens(Protocol):
+class EngineFactory(Protocol):
     """What makes the engine of a run."""
 
     def __call__(

@@ -30,13 +30,13 @@ from mortarbench.harness.record import Record
 from mortarbench.harness.registry import PluginFile
 from mortarbench.harness.results.folder import differences
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
     Engine,
-    Opens,
+    EngineFactory,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
     WorkUnit,
 )
 
@@ -65,7 +65,7 @@ def on_cluster(
     environment: Mapping[str, Any],
     keep: Keep,
     warn: Callable[[str], None],
-) -> Iterator[Opens]:
+) -> Iterator[EngineFactory]:
     """Connect to a Dask cluster, and give what opens the engine of a run on it.
 
     So an address that is wrong is refused before there is a result folder.
@@ -94,7 +94,7 @@ def on_cluster(
         ) from None
 
     with ExitStack() as stack:
-        client = _connected(address, stack)
+        client = _connect(address, stack)
 
         @contextmanager
         def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
@@ -103,7 +103,7 @@ def on_cluster(
             name = f"mortarbench-{client.id}"
             nodes = Nodes(environment, keep, warn)
             try:
-                _forget_lost_runs(client)
+                _end_orphaned_runs(client)
                 files = [file.resolved() for file in plugins]
                 workers = client.scheduler_info(n_workers=-1)["workers"].values()
                 hosts = Counter(worker["host"] for worker in workers)
@@ -124,7 +124,7 @@ def on_cluster(
                     with suppress(OSError, KeyError):
                         if client.status == "running":
                             client.unregister_worker_plugin(name)
-                            _forget_lost_runs(client)
+                            _end_orphaned_runs(client)
             except Exception as e:
                 is_gone = isinstance(e, _SchedulerGoneError)
                 is_gone = is_gone or client.status != "running"
@@ -177,7 +177,7 @@ class Nodes:
 
 
 @dataclass(eq=False, kw_only=True)
-class _Begun:
+class _ActiveBlock:
     """A block, of which one turn at a time is a task of Dask."""
 
     block: WorkUnit
@@ -202,8 +202,10 @@ class _Cluster:
     address: str
     warn: Callable[[str], None]
     _done: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
-    _under_way: dict[Any, _Begun] = field(default_factory=dict)  # by their futures
-    _left: deque[_Begun] = field(default_factory=deque)
+    _under_way: dict[Any, _ActiveBlock] = field(
+        default_factory=dict
+    )  # by their futures
+    _left: deque[_ActiveBlock] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Carry out all of `blocks`."""
@@ -218,7 +220,7 @@ class _Cluster:
                         raise _SchedulerGoneError from None
                     # a worker may be busy with a run whose parent has died, and the
                     # scheduler have noticed only now
-                    _forget_lost_runs(self.client)
+                    _end_orphaned_runs(self.client)
                 yield from self._recovered()
         finally:
             for future in self._under_way:
@@ -226,10 +228,10 @@ class _Cluster:
 
     def _top_up(self, blocks: Iterator[WorkUnit]) -> bool:
         """Give every idle worker a block to do; False when all blocks are done."""
-        idle = self._workers() - {begun.worker for begun in self._under_way.values()}
+        idle = self._workers() - {active.worker for active in self._under_way.values()}
         while idle or not self._under_way:
             if not self._left and (block := next(blocks, None)) is not None:
-                self._left.append(_Begun(block=block, left=list(block.turns)))
+                self._left.append(_ActiveBlock(block=block, left=list(block.turns)))
             if not self._left:
                 return bool(self._under_way)
             if not idle:
@@ -237,9 +239,9 @@ class _Cluster:
                 self.client.wait_for_workers(1)
                 idle = self._workers()
             if idle:
-                begun = self._left.popleft()
-                begun.worker = idle.pop()
-                self._submit(begun)
+                active = self._left.popleft()
+                active.worker = idle.pop()
+                self._submit(active)
         return True
 
     def _workers(self) -> set[str]:
@@ -249,22 +251,22 @@ class _Cluster:
         except OSError as e:
             raise _SchedulerGoneError from e
 
-    def _submit(self, begun: _Begun) -> None:
+    def _submit(self, active: _ActiveBlock) -> None:
         """Submit the next turn of a block to its worker."""
         from mortarbench.harness.running.dask_worker import execute
 
-        turn = replace(begun.block, turns=(begun.left[0],))
+        turn = replace(active.block, turns=(active.left[0],))
         future = self.client.submit(
-            execute, self.name, turn, workers=[begun.worker], pure=False
+            execute, self.name, turn, workers=[active.worker], pure=False
         )
-        self._under_way[future] = begun
+        self._under_way[future] = active
         future.add_done_callback(self._done.put)
 
     def _measured(self, future: Any) -> Iterator[Outcome]:
         """Give back what came of a turn, and submit the next one of its block."""
         from distributed import CancelledError
 
-        if (begun := self._under_way.get(future)) is None:  # its worker was lost
+        if (active := self._under_way.get(future)) is None:  # its worker was lost
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
@@ -273,44 +275,44 @@ class _Cluster:
         except TimeoutError:  # the worker is lost, or about to be found so
             self._done.put(future)
             return
-        del self._under_way[future], begun.left[0]
-        begun.is_measured = True
+        del self._under_way[future], active.left[0]
+        active.is_measured = True
         self.nodes.meet(delivery.node, delivery.digest, delivery.environment)
         for outcome in delivery.outcomes:
             match outcome:
-                case Unbuilt():
-                    yield replace(outcome, block=begun.block)
+                case BuildFailure():
+                    yield replace(outcome, block=active.block)
                     return
                 case Result():
-                    yield replace(outcome, part=begun.part)
-                case Unmade():
+                    yield replace(outcome, part=active.part)
+                case MeasurementFault():
                     yield outcome
-        if begun.left:
-            self._submit(begun)
+        if active.left:
+            self._submit(active)
 
     def _recovered(self) -> Iterator[Outcome]:
         """Leave the blocks of workers that were lost to others."""
         there = self._workers()
         lost = {f: b for f, b in self._under_way.items() if b.worker not in there}
-        for future, begun in lost.items():
+        for future, active in lost.items():
             del self._under_way[future]
             future.cancel()
-            begun.lost += 1
-            begun.part += begun.is_measured
-            begun.is_measured = False
-            if begun.lost < MAX_LOST_WORKERS:
-                self._left.append(begun)
+            active.lost += 1
+            active.part += active.is_measured
+            active.is_measured = False
+            if active.lost < MAX_LOST_WORKERS:
+                self._left.append(active)
             else:
-                case = begun.block.turns[0][0].case
+                case = active.block.turns[0][0].case
                 reason = f"{case} was given up: every Dask worker that took it was lost"
-                yield Unbuilt(block=begun.block, reason=reason)
+                yield BuildFailure(block=active.block, reason=reason)
 
 
 class _SchedulerGoneError(Exception):
     pass
 
 
-def _connected(address: str, stack: ExitStack) -> Any:
+def _connect(address: str, stack: ExitStack) -> Any:
     """Connect to a scheduler, started first if it is to be local.
 
     Raises
@@ -323,7 +325,7 @@ def _connected(address: str, stack: ExitStack) -> Any:
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we tell ourselves
     if address == LOCAL:
-        with _interrupted_later():
+        with _delay_interrupt():
             _refuse_unguarded_script()
             cluster = LocalCluster(
                 n_workers=len(os.sched_getaffinity(0)),
@@ -381,7 +383,7 @@ def _refuse_unguarded_script() -> None:
 
 
 @contextmanager
-def _interrupted_later() -> Iterator[None]:
+def _delay_interrupt() -> Iterator[None]:
     """Keep Ctrl-C from what is started here, and put it off until that is done.
 
     A terminal sends SIGINT to all processes at once. Dask's would print a traceback
@@ -410,7 +412,7 @@ def _interrupted_later() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
-def _forget_lost_runs(client: Any) -> None:
+def _end_orphaned_runs(client: Any) -> None:
     """Have workers end the processes of runs whose parent has died."""
 
     def lost(dask_scheduler: Any) -> list[str]:

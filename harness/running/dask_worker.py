@@ -44,7 +44,7 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Opens an executor in every Dask worker, those that join later included.
+    """EngineFactory an executor in every Dask worker, those that join later included.
 
     commands : of the parent; its Python is replaced by that of the node
     plugins : files, which must be there under the same paths
@@ -60,7 +60,7 @@ class ExecutorPlugin(WorkerPlugin):
     sharing: int
     packages: Sequence[str]
     _python: str = sys.executable
-    _open: _Open | None = None
+    _session: _Session | None = None
     _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
@@ -79,9 +79,9 @@ class ExecutorPlugin(WorkerPlugin):
         self._ended = True
         if not self._busy.acquire(blocking=False):
             return
-        if self._open is not None:
-            self._open.stack.close()
-            self._open = None
+        if self._session is not None:
+            self._session.stack.close()
+            self._session = None
         self._busy.release()
 
     def execute(self, block: WorkUnit) -> Delivery:
@@ -95,13 +95,13 @@ class ExecutorPlugin(WorkerPlugin):
         """
         try:
             with self._busy:
-                return self._carried_out(block)
+                return self._carry_out(block)
         finally:
             if self._ended:
                 self.teardown()
 
-    def _carried_out(self, block: WorkUnit) -> Delivery:
-        opened = self._open = self._open or self._opened()
+    def _carry_out(self, block: WorkUnit) -> Delivery:
+        opened = self._session = self._session or self._open_session()
         os.sched_setaffinity(0, {opened.cpu.number})  # of this thread
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
@@ -120,7 +120,7 @@ class ExecutorPlugin(WorkerPlugin):
             environment=opened.environment,
         )
 
-    def _opened(self) -> _Open:
+    def _open_session(self) -> _Session:
         for file in self.plugins:
             if not file.path.is_file():
                 raise InputError(
@@ -148,7 +148,7 @@ class ExecutorPlugin(WorkerPlugin):
             )
             executor = Executor(commands, scratch, scratch / "cases", operators)
             stack.callback(executor.close)
-            return _Open(
+            return _Session(
                 executor=executor,
                 cpu=cpu,
                 environment=environment,
@@ -177,7 +177,7 @@ def execute(name: str, block: WorkUnit) -> Delivery:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Open:
+class _Session:
     executor: Executor
     cpu: _Cpu
     environment: dict[str, Any]
@@ -190,13 +190,13 @@ class _Cpu:
 
     def __init__(self) -> None:
         stack = ExitStack()
-        self.number = own_cpu(stack)
+        self.number = claim_cpu(stack)
         finalize(self, stack.close)
 
 
 #: by the Dask worker of this process
-_held: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
-_holding = Lock()
+_cpus: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
+_cpus_lock = Lock()
 
 
 def _cpu_of(worker: str) -> _Cpu:
@@ -208,15 +208,15 @@ def _cpu_of(worker: str) -> _Cpu:
     Raises
     ------
     InputError
-        As `own_cpu`.
+        As `claim_cpu`.
 
     """
-    with _holding:
-        held = _held[worker] = _held.get(worker) or _Cpu()
+    with _cpus_lock:
+        held = _cpus[worker] = _cpus.get(worker) or _Cpu()
     return held
 
 
-def own_cpu(stack: ExitStack) -> int:
+def claim_cpu(stack: ExitStack) -> int:
     """Take a CPU that no other executor on this machine has; the kernel gives it back.
 
     Raises

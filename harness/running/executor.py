@@ -16,20 +16,20 @@ from mortarbench.harness.files.durable import full_disk_told, refuse_full_disk
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
-from mortarbench.harness.processes.case_folder import Entry, entry
-from mortarbench.harness.processes.measurement import case_request, measured
+from mortarbench.harness.processes.case_folder import StoredCase, find_or_build
+from mortarbench.harness.processes.measurement import case_request, measure_and_judge
 from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
     Engine,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
     WorkUnit,
 )
 from mortarbench.harness.solution import Solution, Status
@@ -57,7 +57,7 @@ class Executor:
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
     _number: int = -1  # of the last block
-    _entries: tuple[Entry, ...] = ()  # of that, once they are built
+    _entries: tuple[StoredCase, ...] = ()  # of that, once they are built
     _end: str = ""  # why there are fewer than its sequence asked for
     _loaded: dict[str, QP] = field(default_factory=dict)  # theirs, by digest
     #: of small QPs, by digest
@@ -90,8 +90,8 @@ class Executor:
                     self._number, self._entries = block.number, ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
-            except _UnbuiltError as e:
-                yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
+            except _BuildError as e:
+                yield BuildFailure(block=block, reason=e.reason, trace=e.trace)
 
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
         """Measure one solver; after a fault that is not its own, once more.
@@ -119,7 +119,9 @@ class Executor:
             self._worker(label).close()
             missing = [record for record in turn if record.run_id not in made]
             for record in missing[: 1 if tried_again else None]:
-                yield Unmade(record=record, reason=reason, tried_again=tried_again)
+                yield MeasurementFault(
+                    record=record, reason=reason, tried_again=tried_again
+                )
 
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
@@ -147,7 +149,7 @@ class Executor:
             def proven(qp: QP, step: int = step) -> Optimum | None:
                 return self._optimum(self._entries[step], qp)
 
-            record, solution, is_undescribed = measured(
+            record, solution, is_undescribed = measure_and_judge(
                 self._worker(turn[0].solver), whole, record, request,
                 time_limit=block.time_limit, memory_limit=block.memory_limit,
                 prove=proven,
@@ -156,12 +158,12 @@ class Executor:
                 refuse_full_disk(self.scratch, "")  # whatever it died of
             is_pointless = solution is None or not has_point(solution)
             if solution is None or is_pointless or is_undescribed:
-                yield self._described(block, record, solution)
+                yield self._describe(block, record, solution)
             else:
                 yield Result(record=record, point=point_arrays(solution))
             stopped = is_pointless and record.verdict is not Verdict.DECLINED
             if block.is_sequence and stopped:  # what it carried is lost
-                yield from _broken(there[step + 1 :], record)
+                yield from _unreached_steps(there[step + 1 :], record)
                 break
         for record in turn[len(there) :]:
             declined = record.but(verdict=Verdict.DECLINED, message=self._end)
@@ -207,12 +209,12 @@ class Executor:
         """Build the cases of a block, of a sequence as many as there are; once."""
         if self._entries:
             return
-        entries: list[Entry] = []
+        entries: list[StoredCase] = []
         self._end = ""
         for record in turn:
             try:
                 entries.append(self._entry(record, block))
-            except _UnbuiltError as e:
+            except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
                 self._end = e.reason
@@ -220,7 +222,7 @@ class Executor:
         self._entries = tuple(entries)
         self._loaded = {e.digest: self._qp(e) for e in entries}
 
-    def _described(
+    def _describe(
         self, block: WorkUnit, record: Record, solution: Solution | None
     ) -> Result:
         """Add what the point means, which the case worker knows."""
@@ -243,21 +245,23 @@ class Executor:
                 recover_seconds=answer["seconds"],
                 **answer["bounds"],
             )
-        except _UnbuiltError as e:
+        except _BuildError as e:
             notes = [f"no quantities: {e.reason}"]
         stored = read_arrays(fields, ()) if fields.exists() else None
         return Result(
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, record: Record, block: WorkUnit) -> Entry:
+    def _entry(self, record: Record, block: WorkUnit) -> StoredCase:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
             meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
             return meta
 
         r = record
-        return entry(self.cases, [r.family, r.params, r.form, r.environment], make)
+        return find_or_build(
+            self.cases, [r.family, r.params, r.form, r.environment], make
+        )
 
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
@@ -273,16 +277,16 @@ class Executor:
             if reply.fault:
                 raise FaultError(reply.message)
             case = block.turns[0][0].case
-            raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
+            raise _BuildError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:
             refuse_full_disk(self.scratch, reply.answer["unbuilt"])
             answer = reply.answer
-            raise _UnbuiltError(
+            raise _BuildError(
                 answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
             )
         return reply.answer
 
-    def _optimum(self, at: Entry, qp: QP) -> Optimum | None:
+    def _optimum(self, at: StoredCase, qp: QP) -> Optimum | None:
         """Prove the optimum of the QP of an entry, once."""
         if at.digest not in self._optima:
             found = proven_optimum(qp, partial(self._reference, at))
@@ -291,7 +295,7 @@ class Executor:
             self._optima[at.digest] = found
         return self._optima[at.digest]
 
-    def _reference(self, at: Entry, qp: QP) -> Solution:
+    def _reference(self, at: StoredCase, qp: QP) -> Solution:
         """Have the case worker solve the QP of an entry by the reference.
 
         Raises
@@ -317,7 +321,7 @@ class Executor:
             self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
 
-    def _qp(self, at: Entry) -> QP:
+    def _qp(self, at: StoredCase) -> QP:
         if at.digest not in self._loaded:
             self._loaded[at.digest] = load_qp(at.qp, operators=self.operators)[0]
         return self._loaded[at.digest]
@@ -328,7 +332,7 @@ class Executor:
 
 
 @contextmanager
-def one_by_one(
+def local_engine(
     commands: Commands,
     scratch: Path,
     cases: Path,
@@ -340,7 +344,7 @@ def one_by_one(
         yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
 
 
-def _step_tol(record: Record, at: Entry) -> float | None:
+def _step_tol(record: Record, at: StoredCase) -> float | None:
     """Find what a step is worth solving to, where that is looser than what is asked.
 
     The QP is as far from the fixed point as `harness.plugin.Case.unsettled` says, and
@@ -351,14 +355,14 @@ def _step_tol(record: Record, at: Entry) -> float | None:
     return worth if worth > record.tol else None
 
 
-def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
+def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     """Give the steps that a sequence did not come to, because of how one ended."""
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
         yield Result(record=record.but(verdict=end.verdict, message=reason))
 
 
-class _UnbuiltError(Exception):
+class _BuildError(Exception):
     def __init__(self, reason: str, trace: str, *, past_end: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason

@@ -95,7 +95,7 @@ def _student(freedom: float, coverage: float = COVERAGE) -> float:
     return float(stdtrit(freedom, 0.5 + coverage / 2))
 
 
-def widest(times: Mapping[str, Mapping[Block, float]]) -> float | None:
+def largest_half_width(times: Mapping[str, Mapping[Block, float]]) -> float | None:
     """Return the half-width of the least certain ratio to the fastest solver.
 
     times : seconds by solver and block; None with fewer than two solvers, infinity

@@ -27,24 +27,24 @@ from mortarbench.harness.registry import SolverSpec, options_of
 from mortarbench.harness.results.faults import FAULTS, Fault
 from mortarbench.harness.results.folder import (
     REMEDY,
-    Held,
+    FolderLock,
     claim,
     describe,
-    locked,
+    lock_folder,
     refuse_foreign,
     refuse_other,
     scratch_in,
 )
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
-    Opens,
+    EngineFactory,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
 )
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
@@ -73,7 +73,7 @@ def run(
     digest: str,
     progress: Progress,
     fresh: bool = False,
-    engine: Opens = one_by_one,
+    engine: EngineFactory = local_engine,
 ) -> Missing:
     """Measure what the result folder `out` lacks of `suite`; return what it still does.
 
@@ -96,7 +96,7 @@ def run(
         ended_by_signals(),
         _continuation_told(progress),
         full_disk_told(out),
-        locked(out) as held,
+        lock_folder(out) as lock,
     ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
@@ -124,19 +124,19 @@ def run(
                 progress=progress,
             )
             for record in past:
-                schedule.note(record)
+                schedule.add(record)
             progress.start(schedule.cells)
-            book = _Book(
+            recorder = _Recorder(
                 out=out,
-                held=held,
+                lock=lock,
                 journal=journal,
                 schedule=schedule,
                 progress=progress,
             )
             with engine(commands, scratch, out.resolve() / "cases") as execute:
                 for outcome in execute(schedule.blocks()):
-                    book.take(outcome)
-                    if book.was_deleted:
+                    recorder.take(outcome)
+                    if recorder.was_deleted:
                         describe(out, suite, environment)
                         journal.restore()
                         raise InputError(
@@ -144,15 +144,15 @@ def run(
                             "is there again, solutions stored before are lost; the "
                             "same command continues"
                         )
-        return Missing(unbuilt=schedule.unbuilt, faults=book.left())
+        return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
 
 
 @dataclass(eq=False, kw_only=True)
-class _Book:
+class _Recorder:
     """Writes down what an engine gives back, once, and tells who watches."""
 
     out: Path
-    held: Held
+    lock: FolderLock
     journal: Journal
     schedule: Schedule
     progress: Progress
@@ -172,40 +172,44 @@ class _Book:
 
         """
         match outcome:
-            case Unbuilt():
+            case BuildFailure():
                 _log.debug("%s\n%s", outcome.reason, outcome.trace)
                 if self.schedule.give_up(outcome.block):
                     self.progress.warn(outcome.reason)
                 for turn in outcome.block.turns:
                     for record in turn:
                         self._count(record, None)
-            case Unmade():
+            case MeasurementFault():
                 self._take_fault(outcome)
-            case Result() if self.schedule.knows(outcome.record):
+            case Result() if self.schedule.is_settled(outcome.record):
                 # of a block, or a sequence, that was done again
                 self._count(outcome.record, None)
             case Result():
                 self._take_result(outcome)
 
-    def left(self) -> list[Fault]:
+    def remaining_faults(self) -> list[Fault]:
         """List the last fault of each measurement that was not made."""
-        return [f for run_id, f in self._left.items() if not self.schedule.made(run_id)]
+        return [
+            f
+            for run_id, f in self._left.items()
+            if not self.schedule.is_measured(run_id)
+        ]
 
     def _take_result(self, result: Result) -> None:
         record = result.record
         if result.part:
-            number = self.schedule.number_of_part(record.block, result.part)
+            number = self.schedule.block_of_part(record.block, result.part)
             record = record.but(block=number)
-        self.was_deleted = not self.held.is_there()
+        self.was_deleted = not self.lock.is_there()
         if result.point is not None:
             record = record.but(vectors=save(self.out, result.point))
         if result.fields is not None:
             record = record.but(fields=save(self.out, result.fields))
         self.journal.append(record)
-        self.schedule.note(record)
+        self.schedule.add(record)
         self._count(record, record)
 
-    def _take_fault(self, unmade: Unmade) -> None:
+    def _take_fault(self, unmade: MeasurementFault) -> None:
         record, what = unmade.record, unmade.reason
         fault = Fault(
             time=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -215,7 +219,7 @@ class _Book:
             what=what,
             tried_again=unmade.tried_again,
         )
-        self.was_deleted = not self.held.is_there()
+        self.was_deleted = not self.lock.is_there()
         with Lines(self.out / FAULTS, self.progress.warn) as faults:
             faults.append(fault.to_json())
         then = "it is tried again" if unmade.tried_again else "it was not measured"

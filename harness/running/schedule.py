@@ -18,7 +18,7 @@ from typing import Any
 
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
-from mortarbench.harness.running.pairs import Block, widest
+from mortarbench.harness.running.pairs import Block, largest_half_width
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
@@ -48,7 +48,7 @@ class Schedule:
         s = self.suite
         return len(s.names) * len(s.tolerances) * self._most * len(s.solvers)
 
-    def note(self, record: Record) -> None:
+    def add(self, record: Record) -> None:
         """Know of a measurement that is in the journal."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
@@ -57,16 +57,16 @@ class Schedule:
         if self.suite.precision is not None:
             self._seen.setdefault(_cell(record), []).append(record)
 
-    def knows(self, record: Record) -> bool:
+    def is_settled(self, record: Record) -> bool:
         """Whether nothing is left to be learnt from measuring that."""
         declined = (record.solver, _cell(record)) in self._declined
         return declined or record.run_id in self._done
 
-    def made(self, run_id: str) -> bool:
+    def is_measured(self, run_id: str) -> bool:
         """Whether that measurement is in the journal."""
         return run_id in self._done
 
-    def number_of_part(self, block: int, part: int) -> int:
+    def block_of_part(self, block: int, part: int) -> int:
         """Give what was measured later or elsewhere of a block a number of its own."""
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next
@@ -115,7 +115,7 @@ class Schedule:
         for solver in {r.solver for r in records} - failed:
             mine = [r for r in records if r.solver == solver and r.total_seconds]
             times[solver] = _by_block(mine)
-        width = widest(times)
+        width = largest_half_width(times)
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
@@ -138,7 +138,7 @@ class Schedule:
                 )
                 for case in group.cases
             )
-            if is_given_up or all(map(self.knows, turn)):
+            if is_given_up or all(map(self.is_settled, turn)):
                 self._skip(len(turn))
             else:
                 left.append(turn)

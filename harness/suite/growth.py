@@ -27,7 +27,7 @@ _AND = "-and-"  #: between the names of suites that were united
 Table = Mapping[str, Any]  #: of a suite's TOML
 
 
-def refused(then: Table, now: Table) -> str:
+def incompatibility(then: Table, now: Table) -> str:
     """Say what makes a changed suite another one; empty if it only asks for more.
 
     Cases are not compared here: `harness.running.run` holds them against the journal.
@@ -70,7 +70,7 @@ def _said(value: object) -> str:
     return "not set" if value is None else shown(value)
 
 
-def united(tables: Mapping[str, Table]) -> dict[str, Any]:
+def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
     """Unite suites: the first one's settings, and all that any of them asks for.
 
     tables : by the folder that each is from, as `harness.suite.suite.read_stored` reads

@@ -14,7 +14,7 @@ from mortarbench.harness.files.reading import toml
 from mortarbench.harness.names import CaseId, match, parse
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.solver_options import swept
+from mortarbench.harness.suite.solver_options import sweep
 from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
 
 
@@ -58,7 +58,7 @@ def with_overrides(
         changes["solvers"] = tuple(chosen[name] for name in (*kept, *null))
     if options:
         asked = changes.get("solvers", suite.solvers)
-        changes["solvers"] = swept(asked, options, registry)
+        changes["solvers"] = sweep(asked, options, registry)
     if cases:
         changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:

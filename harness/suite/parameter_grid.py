@@ -19,7 +19,7 @@ from mortarbench.harness.plugin import Family
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 
 
-def planned(
+def expand_problems(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> tuple[tuple[CaseId, ...], tuple[tuple[CaseId, ...], ...]]:
     """All cold cases in the order written, and all sequences of cases.

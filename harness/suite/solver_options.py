@@ -34,7 +34,7 @@ _PLAIN = (bool, Real, str, NoneType)  #: types of values from a Python program
 _MAX_VARIANTS = 1000  #: solvers that a sweep may span
 
 
-def given_options(texts: Iterable[str]) -> dict[str, list[str]]:
+def parse_options(texts: Iterable[str]) -> dict[str, list[str]]:
     """Split ``KEY=VALUE`` or ``KEY=VALUE,VALUE``; of a key given again, go on.
 
     Raises
@@ -54,7 +54,7 @@ def given_options(texts: Iterable[str]) -> dict[str, list[str]]:
     return found
 
 
-def as_given(options: Mapping[str, Any]) -> dict[str, list[str]]:
+def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
     """Write options that a Python program gives as the command line does.
 
     Raises
@@ -93,10 +93,10 @@ def options_for(
     Raises
     ------
     InputError
-        When an option has several values; as `swept`.
+        When an option has several values; as `sweep`.
 
     """
-    given = given_options(texts)
+    given = parse_options(texts)
     if not given:
         return {}
     with located("--option"):
@@ -112,7 +112,7 @@ def options_for(
     return options
 
 
-def swept(
+def sweep(
     specs: Sequence[SolverSpec],
     given: Mapping[str, Sequence[str]],
     registry: Mapping[str, Solver],

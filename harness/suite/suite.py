@@ -19,7 +19,7 @@ from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.record import TIGHTENING
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.parameter_grid import planned
+from mortarbench.harness.suite.parameter_grid import expand_problems
 
 DEFAULTS: Mapping[str, Any] = {
     "tolerances": [1e-6],
@@ -158,7 +158,7 @@ def parse_suite(
                 f"name = {shown(table['name'])} is no name of a folder; "
                 "expected letters, digits, '.', '-' and '_'"
             )
-        cases, sequences = planned(
+        cases, sequences = expand_problems(
             table["problems"], families, folder, _most_cases(table)
         )
         numbers: dict[str, Any] = {
@@ -267,7 +267,7 @@ def _toml_value(where: str, value: Any) -> str:
     )
 
 
-def asked_solvers(text: str) -> dict[str, SolverSpec]:
+def solvers_by_label(text: str) -> dict[str, SolverSpec]:
     """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
     table = toml(text)
     specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
@@ -286,7 +286,9 @@ def steps_up_to(
 
     """
     table = {**DEFAULTS, **toml(text)}
-    _, sequences = planned(table.get("problems"), families, Path(), _most_cases(table))
+    _, sequences = expand_problems(
+        table.get("problems"), families, Path(), _most_cases(table)
+    )
     for steps in sequences:
         if name in steps:
             return steps[: steps.index(name) + 1]

@@ -22,7 +22,7 @@ from mortarbench.harness.conformance.conformance import (
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     DeclinedError,
-    WeakError,
+    WeaknessError,
     answer,
     changes_of,
     same_answer,
@@ -153,7 +153,7 @@ def weaknesses(solver):
             try:
                 old = old or answer(solver, strings(form))
                 same_answer(form, change, solver, old)
-            except WeakError:
+            except WeaknessError:
                 weak.append((form, change))
             except DeclinedError:
                 continue

@@ -51,11 +51,11 @@ TRANSFORMS = NAMES_AND_UNITS | {
     ),
     "all": lambda qp: (
         TRANSFORMS["units"](qp)
-        .then(TRANSFORMS["unknowns shifted"])
-        .then(TRANSFORMS["unknowns permuted"])
-        .then(TRANSFORMS["mirrored"])
-        .then(TRANSFORMS["rows twice"])
-        .then(TRANSFORMS["rows scaled"])
+        .followed_by(TRANSFORMS["unknowns shifted"])
+        .followed_by(TRANSFORMS["unknowns permuted"])
+        .followed_by(TRANSFORMS["mirrored"])
+        .followed_by(TRANSFORMS["rows twice"])
+        .followed_by(TRANSFORMS["rows scaled"])
     ),
 }
 

@@ -20,12 +20,12 @@ from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.processes.measurement import (
-    _believed,
-    measured,
+    _plausible_cost,
+    measure_and_judge,
     scratch_folder,
 )
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
-from mortarbench.harness.processes.reaper import lives, state
+from mortarbench.harness.processes.reaper import is_alive, state
 from mortarbench.harness.processes.supervisor import (
     REPLACEMENT_NOTE,
     Clock,
@@ -123,7 +123,7 @@ def left(watched):
         with suppress(OSError):
             environment = (entry / "environ").read_bytes().split(b"\0")
             mine = f"WATCHED={watched}".encode() in environment
-            if mine and int(entry.name) != os.getpid() and lives(int(entry.name)):
+            if mine and int(entry.name) != os.getpid() and is_alive(int(entry.name)):
                 found.append(int(entry.name))
     return found
 
@@ -150,7 +150,7 @@ class Bench:
             sample_seconds=SAMPLE_SECONDS,
         )  # fmt: skip
         worker = self.workers[solver]
-        return measured(
+        return measure_and_judge(
             worker, lambda: self.qp, record, request, time_limit=time_limit,
             memory_limit=self.memory_limit, prove=proves(reference_solution),
         )[0]  # fmt: skip
@@ -209,7 +209,7 @@ def test_a_time_is_believed_within_what_the_parent_knows(
         first_seconds=first, inner=inner,
     )  # fmt: skip
     reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
-    m, *notes = _believed(reply)
+    m, *notes = _plausible_cost(reply)
 
     assert bool(notes) is not is_believed
     if is_believed:

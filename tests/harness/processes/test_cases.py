@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mortarbench.harness.processes.case_folder import entry
+from mortarbench.harness.processes.case_folder import find_or_build
 
 
 def name(**params):
@@ -24,7 +24,7 @@ def get(tmp_path):
             path.write_bytes(content)
             return {"scale": 2.0}
 
-        return entry(tmp_path / "cases", [*case, environment], make)
+        return find_or_build(tmp_path / "cases", [*case, environment], make)
 
     get.made = []
     return get
@@ -77,7 +77,7 @@ def test_a_build_that_fails_leaves_no_entry(get, tmp_path):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        entry(tmp_path / "cases", [*name(n=1), "here"], fails)
+        find_or_build(tmp_path / "cases", [*name(n=1), "here"], fails)
 
     assert {p.suffix for p in (tmp_path / "cases").iterdir()} == {".lock"}
     assert get(name(n=1)).qp.read_bytes() == b"content"

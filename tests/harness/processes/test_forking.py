@@ -10,7 +10,7 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness.limits import ONE_THREAD, VARIABLE
 from mortarbench.harness.names import CaseId
-from mortarbench.harness.processes.reaper import lives
+from mortarbench.harness.processes.reaper import is_alive
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
@@ -162,7 +162,7 @@ def test_what_a_fork_starts_ends_with_its_measurement(results, folder):
     (verdict, _, first), after = results["daemon"]
 
     assert (verdict, first["how"]) == (None, "fork")
-    assert not lives(int((folder / "daemon").read_text()))
+    assert not is_alive(int((folder / "daemon").read_text()))
     assert results["left"] == []
     assert after == [None, "", {"how": "command"}]
 
@@ -177,7 +177,7 @@ def test_a_fork_that_dies_is_replaced_by_a_worker_that_the_command_starts(result
 
 def test_a_fork_ends_when_its_parent_is_killed(results):
     ((_, _, answer),) = results["stay"]
-    assert soon(lambda: not lives(answer["process"]))
+    assert soon(lambda: not is_alive(answer["process"]))
 
 
 def test_the_command_forks_before_it_builds(monkeypatch, capsys):

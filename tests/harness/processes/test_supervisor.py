@@ -239,7 +239,7 @@ def test_a_machine_that_stands_still_meanwhile_spares_no_process(monkeypatch):
     try:
         while len(below := descendants(shell.pid)) < 2:
             pass
-        reaper.end_all(shell.pid)
+        reaper.kill_descendants(shell.pid)
 
         assert shell.wait(timeout=10) == 0  # it waits for both
         assert not any(map(running, below))

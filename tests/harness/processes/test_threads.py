@@ -13,8 +13,8 @@ from threading import Event, Thread
 import pytest
 
 from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.supervisor import WorkerProcess
-from mortarbench.harness.processes.turns import Turn
 from tests.harness.processes.test_supervisor import SHOWS
 from tests.support.waiting import soon
 
@@ -163,7 +163,7 @@ def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
         pid = other.ask({}, **LIMITS).answer["pid"]
     finally:
         other.close()
-    assert soon(lambda: not reaper.lives(pid))
+    assert soon(lambda: not reaper.is_alive(pid))
 
 
 def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
@@ -172,7 +172,7 @@ def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
         monkeypatch.setattr(reaper, "descendants", lambda *_: found.pop(0))
-        reaper.end_all(root.pid)
+        reaper.kill_descendants(root.pid)
         assert found == []
         assert reaper.state(stranger.pid) in "SR"
         for process in (root, stranger):
@@ -207,7 +207,7 @@ def test_a_fork_of_a_process_leaves_its_workers_alone(worker):
 
 
 def test_a_fork_does_not_wait_for_a_thread_that_is_not_in_it():
-    turn, taken, done = Turn(), Event(), Event()
+    turn, taken, done = ForkSafeLock(), Event(), Event()
 
     def hold():
         with turn:
@@ -268,7 +268,7 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
     assert solve.returncode == code
     assert len(said.splitlines()) == 1, said
     assert not list(tmp_path.glob("mortarbench-*"))
-    assert soon(lambda: not reaper.lives(process))
+    assert soon(lambda: not reaper.is_alive(process))
 
 
 HANGS = """
@@ -376,10 +376,10 @@ def test_segments_of_a_worker_count_for_its_limit_and_go_with_it(
             assert reply.verdict == "memory_limit"
         else:
             assert reply.peak_mib > 64
-            assert int(file.read_text()) in reaper.segments()
+            assert int(file.read_text()) in reaper.shared_segments()
     finally:
         worker.close()
-    assert int(file.read_text()) not in reaper.segments()
+    assert int(file.read_text()) not in reaper.shared_segments()
 
 
 @pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
@@ -395,4 +395,4 @@ def test_segments_of_a_worker_go_when_its_parent_is_killed(tmp_path):
         "import os; os.kill(os.getpid(), 9)\n"
     )
     subprocess.run([sys.executable, "-c", asks, str(tmp_path / "log")])
-    assert soon(lambda: int(file.read_text()) not in reaper.segments())
+    assert soon(lambda: int(file.read_text()) not in reaper.shared_segments())

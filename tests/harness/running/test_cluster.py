@@ -272,11 +272,11 @@ def heeded():
 
 @pytest.mark.usefixtures("heeded")
 def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
-    from mortarbench.harness.running.cluster import _interrupted_later
+    from mortarbench.harness.running.cluster import _delay_interrupt
 
     start = multiprocessing.get_context("spawn").Process  # as Dask does
     child = start(target=time.sleep, args=(60,))
-    with pytest.raises(KeyboardInterrupt), _interrupted_later():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), _delay_interrupt():  # noqa: PT012
         os.kill(os.getpid(), signal.SIGINT)
         child.start()
 

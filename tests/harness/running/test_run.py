@@ -22,7 +22,7 @@ from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import measurement as remote
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
-from mortarbench.harness.results.faults import left, read_faults
+from mortarbench.harness.results.faults import read_faults, remaining_faults
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
@@ -657,8 +657,9 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
 ):
     hold = (
         "import sys; from pathlib import Path\n"
-        "from mortarbench.harness.results.folder import locked\n"
-        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        "from mortarbench.harness.results.folder import lock_folder\n"
+        "with lock_folder(Path(sys.argv[1])):\n"
+        "    print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-P", "-c", hold, str(tmp_path)],
@@ -786,9 +787,11 @@ def faults(monkeypatch):
         def measured(worker, qp, record, request, **limits):
             if prevented(record):
                 raise FaultError("the worker was killed before its solve")
-            return remote.measured(worker, qp, record, request, **limits)
+            return remote.measure_and_judge(worker, qp, record, request, **limits)
 
-        monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
+        monkeypatch.setattr(
+            "mortarbench.harness.running.executor.measure_and_judge", measured
+        )
 
     return faults
 
@@ -827,7 +830,12 @@ def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
     assert again.faults == []
     assert len(again.records) == 1
     once_each(tmp_path, 4)
-    assert left(read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]) == []
+    assert (
+        remaining_faults(
+            read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]
+        )
+        == []
+    )
 
 
 def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(

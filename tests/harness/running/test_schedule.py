@@ -9,7 +9,7 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.running.pairs import paired_ratio, widest
+from mortarbench.harness.running.pairs import largest_half_width, paired_ratio
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
 
@@ -61,7 +61,7 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
             seconds = {"a": 1.0, "b": 2.0, "c": 4.0}[record.solver]
             seconds *= float(np.exp(noise * rng.standard_normal()))
             record = record.but(verdict=verdict, total_seconds=seconds)
-            schedule.note(record)
+            schedule.add(record)
             made.append(record)
     assert len(made) + schedule.progress.skipped == schedule.cells
     return made
@@ -91,7 +91,7 @@ def test_of_a_sequence_the_whole_is_compared():
             part = whole * rng.uniform(0.2, 0.8)
             for record, seconds in zip(turn, (part, whole - part), strict=True):
                 timed = record.but(verdict=Verdict.VERIFIED, total_seconds=seconds)
-                schedule.note(timed)
+                schedule.add(timed)
 
         assert block.is_sequence
 
@@ -114,7 +114,7 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
     for done in range(len(every) + 1):
         resumed = planned(**suite)
         for record in every[:done]:
-            resumed.note(record)
+            resumed.add(record)
         left = records_of(resumed.blocks())
         assert {r.run_id for r in left} == {r.run_id for r in every[done:]}
         assert len(left) + resumed.progress.skipped == resumed.cells
@@ -130,7 +130,7 @@ def test_a_solver_that_declined_a_case_is_not_asked_again():
         for (record,) in block.turns:
             asked.append(record.solver)
             verdict = Verdict.DECLINED if record.solver == "a" else Verdict.VERIFIED
-            schedule.note(record.but(verdict=verdict, total_seconds=1.0))
+            schedule.add(record.but(verdict=verdict, total_seconds=1.0))
 
     assert (asked.count("a"), asked.count("b")) == (1, 3)
 
@@ -174,7 +174,7 @@ def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked(solvers):
     before = {s: {k: v for k, v in t.items() if k < max(t)} for s, t in times.items()}
 
     assert len(solvers) * 3 < len(made) < len(solvers) * 200
-    assert widest(times) <= 0.05 < widest(before)
+    assert largest_half_width(times) <= 0.05 < largest_half_width(before)
 
 
 def test_blocks_end_at_the_most_repeats_and_at_the_budget():
@@ -193,11 +193,11 @@ def test_what_has_no_time_spends_no_budget():
     for block in schedule.blocks():
         for (record,) in block.turns:
             if record.solver == "c":
-                schedule.note(record.but(verdict=Verdict.FAILED))
+                schedule.add(record.but(verdict=Verdict.FAILED))
                 continue
             seconds = float(rng.uniform(0.9, 1.1))
             spent += seconds
-            schedule.note(record.but(verdict=Verdict.VERIFIED, total_seconds=seconds))
+            schedule.add(record.but(verdict=Verdict.VERIFIED, total_seconds=seconds))
 
     assert 30 <= spent < 33
 
@@ -205,10 +205,10 @@ def test_what_has_no_time_spends_no_budget():
 def test_parts_of_a_block_keep_a_number_each():
     schedule = planned()
     first = next(schedule.blocks()).number
-    numbers = [schedule.number_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
+    numbers = [schedule.block_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
 
     assert len({first, *numbers}) == 4
-    assert schedule.number_of_part(0, 2) == numbers[1]
+    assert schedule.block_of_part(0, 2) == numbers[1]
     assert next(schedule.blocks()).number not in numbers
 
 

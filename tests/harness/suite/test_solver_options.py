@@ -10,10 +10,10 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.solver_options import (
-    as_given,
-    given_options,
+    options_as_texts,
     options_for,
-    swept,
+    parse_options,
+    sweep,
     without_options,
 )
 
@@ -101,7 +101,7 @@ def test_what_is_no_option_of_a_solver_is_refused(text, message):
 
 
 def labels(*texts, specs=SPECS):
-    return [spec.label for spec in swept(specs, given_options(texts), SOLVERS)]
+    return [spec.label for spec in sweep(specs, parse_options(texts), SOLVERS)]
 
 
 def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
@@ -120,7 +120,7 @@ def test_labels_say_the_value_however_it_is_written():
 
 def test_an_option_goes_before_that_of_the_suite():
     own = SolverSpec(name="method", label="mine", options={"max_iter": 9, "alpha": 2.0})
-    (changed,) = swept([own], {"max_iter": ["5"]}, SOLVERS)
+    (changed,) = sweep([own], {"max_iter": ["5"]}, SOLVERS)
 
     assert changed.label == "mine max_iter=5"
     assert resolve(changed, SOLVERS) == Method(max_iter=5, alpha=2.0)
@@ -128,7 +128,7 @@ def test_an_option_goes_before_that_of_the_suite():
 
 def test_a_null_arm_has_the_options_of_its_twin():
     null = SolverSpec(name="method", label="method (A/A)", role="null")
-    found = swept([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
+    found = sweep([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
 
     assert [(s.label, s.role) for s in found] == [
         ("method max_iter=5", ""), ("method max_iter=5 (A/A)", "null")
@@ -160,7 +160,7 @@ def test_a_sweep_that_makes_no_sense_is_refused(texts, message):
 def test_options_of_a_program_are_those_of_the_command_line():
     values = {"max_iter": [5, 6], "scaling": False, "mode": "exact", "seed": None}
 
-    assert as_given(values) == given_options(
+    assert options_as_texts(values) == parse_options(
         ["max_iter=5,6", "scaling=false", "mode=exact", "seed=none"]
     )
 
@@ -185,7 +185,7 @@ def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
     registry = {"sized": solver}
     specs = [SolverSpec(name="sized", label="sized")]
     one = options_for("sized", [f"rho={text}"], registry)
-    (spec,) = swept(specs, {"rho": [text]}, registry)
+    (spec,) = sweep(specs, {"rho": [text]}, registry)
 
     assert one == {"rho": value}
     assert resolve(spec, registry).rho == value

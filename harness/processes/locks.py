@@ -7,7 +7,7 @@ from contextlib import ContextDecorator
 from threading import RLock
 
 
-class Turn(ContextDecorator):
+class ForkSafeLock(ContextDecorator):
     """A lock that its thread may take again, as a context or around a function.
 
     In a process that was forked while another thread held it, it is free: that thread
