@@ -1,4 +1,4 @@
-"""Locks that keep threads of one process from disturbing one another."""
+"""Locks between threads of a process that may fork."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from threading import RLock
 
 
 class ForkSafeLock(ContextDecorator):
-    """A lock that its thread may take again, as a context or around a function.
+    """Reentrant lock, used as a context manager or as a decorator.
 
-    In a process that was forked while another thread held it, it is free: that thread
-    is not there.
+    It is released in a child forked while another thread held it: that thread does not
+    exist in the child and could never release it.
     """
 
     def __init__(self) -> None:
         self._lock = RLock()
-        os.register_at_fork(after_in_child=self._forget_others)
+        os.register_at_fork(after_in_child=self._release_in_child)
 
     def __enter__(self) -> None:
         self._lock.acquire()
@@ -24,8 +24,8 @@ class ForkSafeLock(ContextDecorator):
     def __exit__(self, *_: object) -> None:
         self._lock.release()
 
-    def _forget_others(self) -> None:
-        if self._lock.acquire(blocking=False):  # free, or of the thread that forked
+    def _release_in_child(self) -> None:
+        if self._lock.acquire(blocking=False):  # free, or held by the forking thread
             self._lock.release()
         else:
             self._lock = RLock()

@@ -1,4 +1,4 @@
-"""One measurement by a worker process, judged: what `run` and `solve` share."""
+"""A measurement by a worker process and its verdict, shared by `run` and `solve`."""
 
 from __future__ import annotations
 
@@ -43,24 +43,28 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-HARNESS_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
-#: 0.12 ms on a busy machine, so that none is accused of it
+#: CPU time of the harness between "start" and "timed", beside the worker's clock
+HARNESS_SECONDS = 0.005
+#: the same per repeat; 0.12 ms were seen on a busy machine, and no solver is to be
+#: suspected because of it
 HARNESS_SECONDS_PER_REPEAT = 3e-4
-MIN_SUSPICIOUS_SPEEDUP = 20.0  #: a repeat that is so many times faster …
-MIN_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
-MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
+#: A repeat is suspected of reusing results if it is faster than the first solve by this
+#: factor and also by the time below: the ratio of two tiny times alone proves nothing.
+MIN_SUSPICIOUS_SPEEDUP = 20.0
+MIN_GAIN_SECONDS = 1e-3  #: between the solves of one measurement
+MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: between two measurements
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 
 
 class JudgedMeasurement(NamedTuple):
-    """One measurement, judged."""
+    """A measurement with its verdict."""
 
     record: Record
-    solution: Solution | None  #: None where the worker ended
-    #: whether quantities or bounds are lacking, though there is a point: ranks that
-    #: evaluate an answer fill in what they can
+    solution: Solution | None  #: None if the worker ended without an answer
+    #: True if there is a point but quantities or error bounds are missing. Ranks that
+    #: evaluate their answer fill in what they can
     is_undescribed: bool = True
 
 
@@ -74,21 +78,21 @@ def measure_and_judge(
     memory_limit: float,
     prove: Proves,
 ) -> JudgedMeasurement:
-    """Fill in `record` by one measurement.
+    """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : gives the QP. Where ranks emit it themselves and evaluate the answer, it is
-        asked for only if they cannot
-    request : to the worker, see `harness.processes.worker`; less what stands in the
-        record. The worker writes the point to the file ``out``
+    whole : returns the entire QP. If ranks emit the QP and evaluate the answer, it is
+        called only for what they cannot evaluate
+    request : request to the worker, see `harness.processes.worker`, without the entries
+        that follow from the record. The worker writes the point to the file ``out``
     time_limit, memory_limit : s and MiB
-    prove : finds the optimum where residuals cannot decide, see
+    prove : computes a proven optimum if residuals cannot decide, see
         `harness.verify.optimum`
 
     Raises
     ------
     FaultError
-        When the measurement failed for a reason that is not the solver's: a worker that
-        was not started or was killed before its solve, a full disk, a lost file.
+        If the measurement failed for a reason other than the solver: a worker that
+        could not be started or was killed before its solve, a full disk, a lost file.
 
     """
     request = {**request, "tol": record.asked_tol}
@@ -132,13 +136,13 @@ def measure_and_judge(
     record, *notes = _with_cost(reply, record, worker.first_seconds)
     sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
     is_pointless = by_ranks and not has_point(solution)
-    found = reply.answer["evaluated"] if by_ranks else None
-    notes += found["notes"] if found is not None else []
-    if found is not None and found["values"] is not None:
-        record = judged(record, qp, solution, found=found["values"]).but(
-            quantities=found["quantities"] or {},
-            recover_seconds=found["recover_seconds"],
-            **(found["bounds"] or {}),
+    evaluation = reply.answer["evaluated"] if by_ranks else None
+    notes += evaluation["notes"] if evaluation is not None else []
+    if evaluation is not None and evaluation["values"] is not None:
+        record = judged(record, qp, solution, found=evaluation["values"]).but(
+            quantities=evaluation["quantities"] or {},
+            recover_seconds=evaluation["recover_seconds"],
+            **(evaluation["bounds"] or {}),
         )
     elif is_pointless:
         record = judged(record, qp, solution, found=_NO_POINT)
@@ -147,12 +151,14 @@ def measure_and_judge(
     record = _check_memory(memory_limit, noted(record, reply.message, *notes)).but(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
-    lacks = found is None or None in (found["quantities"], found["bounds"])
-    return JudgedMeasurement(record, solution, lacks and not is_pointless)
+    is_incomplete = evaluation is None or None in (
+        evaluation["quantities"], evaluation["bounds"]
+    )  # fmt: skip
+    return JudgedMeasurement(record, solution, is_incomplete and not is_pointless)
 
 
 def _as_tuples(data: Any) -> Any:
-    """Undo what JSON makes of tuples in a table."""
+    """Convert lists back to tuples: JSON has no tuples."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data
@@ -161,19 +167,19 @@ def _as_tuples(data: Any) -> Any:
 def _with_cost(
     reply: Reply, record: Record, first_seconds: dict[Hashable, float]
 ) -> tuple[Record, *tuple[str, ...]]:
-    """Fill in what the measurement cost; with notes on what cannot be believed."""
+    """Add the cost of a measurement to its record; return it with notes on times."""
     assert reply.answer is not None
     cost, *notes = _plausible_cost(reply)
-    if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
+    if record.ranks > 1:  # rank 0 measures its own memory, the parent that of all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
-        first, what = reply.answer["first_seconds"], (record.qp, record.asked_tol)
-        notes = _caching_notes(cost, first, first_seconds, what)
+        first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
+        notes = _caching_notes(cost, first, first_seconds, key)
     return record.but(**asdict(cost)), *notes
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Name the case of a record to ranks that make its QP."""
+    """Return the entry of a request that names the case to ranks that emit its QP."""
     case = {
         "family": record.family, "params": dict(record.params), "form": record.form
     }  # fmt: skip
@@ -183,7 +189,11 @@ def case_request(record: Record) -> dict[str, Any]:
 def sizes_from_ranks(
     emitted: Mapping[str, Any] | None, record: Record
 ) -> tuple[QP, Record]:
-    """Take what ranks tell of a QP that they have emitted; nothing, if they did not."""
+    """Complete a record by the sizes of the QP that its ranks emitted.
+
+    Return with it a QP of these sizes without content. If the ranks emitted none, the
+    record is unchanged and the sizes are zero.
+    """
     if emitted is None or not emitted["sizes"]:
         return qp_of_sizes(0, 0), record
     sizes = emitted["sizes"]
@@ -193,27 +203,31 @@ def sizes_from_ranks(
 
 
 def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
-    """Return the worker's times if the parent's clock allows them, else the parent's.
+    """Return the worker's times if they are possible, else the parent's and a note.
 
-    They may sum to no more time than passed between request and end, and to no less
-    than the CPU time that the kernel counted, but for our own work meanwhile.
+    Their sum T must satisfy  CPU time − harness overhead ≤ T ≤ wall time  between the
+    request and the end. Above, the worker's clock was wrong; below, work was done
+    outside its clock, in another thread say.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
-    told = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
-    if clock is None or told.total_seconds is None:
-        return (told,)
-    inner, first = told.inner_loops, answer["first_seconds"]
-    times = inner + (first is not None)
-    reported = (first or 0.0) + inner * told.total_seconds
+    cost = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
+    if clock is None or cost.total_seconds is None:
+        return (cost,)
+    inner, first = cost.inner_loops, answer["first_seconds"]
+    solves = inner + (first is not None)
+    reported = (first or 0.0) + inner * cost.total_seconds
     least = clock.least - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
     if max(0.0, least) <= reported <= clock.most:
-        return (told,)
-    seen = clock.seen / times
-    ours = replace(told, prepare_seconds=None, solve_seconds=None, total_seconds=seen)
-    return ours, (
-        f"the worker told of {reported:.3g} s of work; by our clock it was busy for "
-        f"{clock.least:.3g} s, and done after {clock.seen:.3g} s: the time is ours"
+        return (cost,)
+    mean = clock.seen / solves
+    corrected = replace(
+        cost, prepare_seconds=None, solve_seconds=None, total_seconds=mean
+    )
+    return corrected, (
+        f"the worker reported {reported:.3g} s of work; by the parent's clock it used "
+        f"{clock.least:.3g} s of CPU time and was done after {clock.seen:.3g} s; the "
+        "parent's time is recorded"
     )
 
 
@@ -221,17 +235,18 @@ def _caching_notes(
     m: Measurement,
     first: float | None,
     first_seconds: dict[Hashable, float],
-    what: Hashable,
+    key: Hashable,
 ) -> list[str]:
-    """Say so where a repeat took far less than the first time.
+    """Return notes on repeats that were much faster than the first solve.
 
-    first : what the first time took, where there were others
-    first_seconds : of each QP and tolerance, in the first measurement; `what` is added
+    first : time of the first solve of this measurement; None if there was only one
+    first_seconds : time of the first solve ever, by QP and tolerance; that of `key` is
+        added if it is missing
     """
     if m.total_seconds is None:
         return []
     first = first or m.total_seconds
-    before = first_seconds.setdefault(what, first)
+    before = first_seconds.setdefault(key, first)
     compared = [
         (first, m.total_seconds, MIN_GAIN_SECONDS, "solves"),
         (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
@@ -245,7 +260,7 @@ def _caching_notes(
 
 
 def _check_memory(limit: float, record: Record) -> Record:
-    """Say so where an answer went beyond the memory limit, or failed because of it."""
+    """Change the verdict if an answer exceeded the memory limit, or failed by it."""
     if record.verdict is Verdict.DECLINED:
         return record
     peak = record.peak_mib
@@ -262,11 +277,12 @@ def _check_memory(limit: float, record: Record) -> Record:
 def single_worker(
     command: list[str], serve: Serve | None = None
 ) -> Iterator[WorkerProcess]:
-    """Give a worker for one measurement, which ends with the context.
+    """Provide a worker for one measurement; it ends with the context.
 
     command : starts the worker; two file descriptors are appended to it
-    serve : what a fork of this process does in its place, if that is safe; now, before
-        anything is in memory that it has no use for
+    serve : main function of a fork of this process, which replaces the command if a
+        fork is safe. It is forked at once, before data that it does not need are in
+        memory
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")
@@ -286,17 +302,17 @@ def measure_once(
     *,
     source: Source = Source.FILE,
 ) -> tuple[Record, Solution | None]:
-    """Do as `measure_and_judge`, without limits, and say what the point means.
+    """Measure once without limits, judge the answer, and evaluate its quantities.
 
-    case : gives the case, built when it is first asked for
-    reference : solves the QP where residuals cannot decide
-    source : of the QP; ranks judge answers only where no code but ours runs in them,
-        and what is asked of the case is then what they cannot tell
+    case : returns the case, which is built by the first call
+    reference : solves the QP if residuals cannot decide
+    source : origin of the QP. Ranks judge their answers only if all code in them is
+        ours; the case then evaluates only what they cannot
 
     Raises
     ------
     FaultError
-        As `measure_and_judge`, after a second try.
+        If the measurement fails twice for a reason other than the solver.
 
     """
     with scratch_folder() as scratch:
@@ -332,10 +348,10 @@ def measure_once(
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make a folder for temporary files, which goes when it is left.
+    """Create a folder for temporary files, removed at the end of the context.
 
-    Those that a killed process could not remove go first: who uses one holds a lock in
-    it, which ends with the process.
+    Folders that killed processes left behind are removed first. They are recognised by
+    the lock in them: its owner holds it, and the kernel releases it with the process.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):
@@ -347,7 +363,9 @@ def scratch_folder() -> Iterator[Path]:
                 finally:
                     os.close(lock)
     is_ours = False
-    while not is_ours:  # until we lock it, somebody may take it for stale
+    # Between creation and lock another process may take the new folder for a stale one
+    # and remove it; then a new one is tried.
+    while not is_ours:
         with TemporaryDirectory(prefix=_SCRATCH) as name:
             path = Path(name) / _LOCK
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -52,7 +52,7 @@ CASE = assemble(TINY, {}, "plain")
 
 FOREIGN = "came, expected 'timed'"
 SUSPECT = "is kept between measurements"
-OURS = "the time is ours"
+PARENTS_TIME = "the parent's time is recorded"
 #: verdict, and a pattern of the message
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
@@ -66,7 +66,7 @@ OUTCOMES = {
     "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "sharespages": (Verdict.VERIFIED, "^$"),
     "hoardsinadaemon": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
-    "patchestheclock": (Verdict.VERIFIED, OURS),
+    "patchestheclock": (Verdict.VERIFIED, PARENTS_TIME),
     "stopsitself": (Verdict.TIME_LIMIT, "killed after 1 s"),
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
