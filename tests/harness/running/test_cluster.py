@@ -479,7 +479,7 @@ def meet():
     def meet(change):
         there = json.loads(json.dumps(here))
         change(there)
-        nodes.meet("node07", digest(there), there)
+        nodes.add("node07", digest(there), there)
         return kept, said
 
     return meet

@@ -1,8 +1,11 @@
 """Intervals of ratios of times, against Student's tables by hand."""
 
+import doctest
+
 import numpy as np
 import pytest
 
+from mortarbench.harness.running import pairs
 from mortarbench.harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 
 #: Student's t of 97.5 %, by degrees of freedom
@@ -62,3 +65,7 @@ def test_solvers_of_different_sessions_are_compared_as_samples():
 
     assert ratio_of(here, there) == unpaired_ratio(here.values(), there.values())
     assert ratio_of(here, here).paired
+
+
+def test_the_example_of_the_documentation_holds():
+    assert doctest.testmod(pairs).failed == 0
