@@ -1,4 +1,4 @@
-"""One measurement as a result folder keeps it: enough to make or build it again."""
+"""Stored measurements, with everything needed to repeat them or rebuild their case."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from mortarbench.harness.verify.verdicts import new_record, plain
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredRun:
-    """One stored measurement, and what it takes to repeat it."""
+    """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    repeats: list[Record]  #: of the same cell: other repeats, and itself
-    cases: tuple[CaseId, ...]  #: its own is the last; of a sequence those before
+    repeats: list[Record]  #: all repeats of its cell, including itself
+    cases: tuple[CaseId, ...]  #: its case; in a sequence, after the earlier steps
     spec: SolverSpec
     environment: Mapping[str, Any]
     time_limit: float  #: s
@@ -47,15 +47,15 @@ def open_stored_run(
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> StoredRun:
-    """Find one measurement and resolve its case and solver in today's registries.
+    """Find a measurement, and resolve its case and solver in the current registries.
 
-    run_id : or the beginning of one, if it is the only one to begin so
+    run_id : a run_id, or an unambiguous beginning of one
 
     Raises
     ------
     InputError
-        When there is no such measurement, or its family, solver or one of their keys
-        is not known, or not loaded, or a file that its case rests on has changed.
+        If there is no such measurement, if its family, its solver or one of their keys
+        is unknown or not loaded, or if a file of its case has changed.
 
     """
     records = read_journal(folder)
@@ -88,9 +88,9 @@ def work_unit_of(
     solvers: Mapping[str, Solver],
     environment: str,
 ) -> WorkUnit:
-    """Make the block that measures a stored run again; its last result is that.
+    """Return a block that repeats a stored measurement, as its last result.
 
-    environment : digest
+    environment : digest of the current environment
     """
     record = stored.record
     turn = tuple(
@@ -135,12 +135,16 @@ def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record
     raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
 
 
-def _find_solver(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
-    """Find the solver of a label: of the suite, or of the command line."""
+def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
+    """Return the solver of a record's label, from the suite or the command line.
+
+    specs : solvers of the suite by label; a label that is not among them came from
+        ``--solver``, and is a name
+    """
     name = record.solver
     for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):
-        if name in known:
-            spec = known[name]
+        if name in specs:
+            spec = specs[name]
             break
     else:
         spec = SolverSpec(name=name, label=name)
@@ -150,19 +154,19 @@ def _find_solver(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
 def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
-    """Ask for those stored options that are not today's defaults."""
-    asked = replace(spec, options={})
+    """Set the stored options that differ from the current defaults."""
+    default = replace(spec, options={})
     if spec.name not in solvers and f"{spec.name.rpartition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")
-    today = plain(options_of(resolve(asked, solvers)))
+    today = plain(options_of(resolve(default, solvers)))
     options = {k: v for k, v in record.options.items() if today.get(k, ...) != v}
-    changed = replace(spec, options=options)
-    resolve(changed, solvers)
-    return changed
+    configured = replace(spec, options=options)
+    resolve(configured, solvers)
+    return configured
 
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:
-    """Remind of the plug-ins that a measurement was made with."""
+    """Return the end of a message that names the plug-ins of a measurement, or ""."""
     plugins = environment.get("plugins")
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
@@ -177,8 +181,9 @@ def rebuild(
     Raises
     ------
     InputError
-        When its family is not known, or fails, or builds another QP than then. What
-        ranks have emitted is not compared: the whole has another digest.
+        If its family is unknown or fails, or if its QP differs from that of the record.
+        A QP that ranks emitted is not compared: the digest of its shares is not that of
+        the entire QP.
 
     """
     if r.family not in families:
@@ -194,9 +199,9 @@ def rebuild(
         raise InputError(unbuilt(r.case, e)) from None
     if r.qp is None or r.qp.startswith(EMITTED):
         return case
-    if (now := qp_digest(case.qp, serialised=True)) != r.qp:
+    if (digest := qp_digest(case.qp, serialised=True)) != r.qp:
         raise InputError(
-            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
-            "the same version of the code, of its libraries and of plug-ins"
+            f"its QP has the digest {digest} now, {r.qp} when it was measured; "
+            "expected the same version of the code, of its libraries and of plug-ins"
         )
     return case
