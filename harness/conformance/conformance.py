@@ -1,8 +1,9 @@
-"""What every solver must do: the checks of ``mortarbench test-solver``.
+"""Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
-Each check is named after what it shows. It passes, fails with what was wrong, or, where
-the solver declines its QP, is declined with the solver's reason. That an equivalent
-formulation changes the answer is told as a weakness; most solvers have one.
+The name of each check is a statement about the solver. A check passes, fails with a
+description of the violation, or is declined with the solver's reason if the solver
+declines the QP. If an equivalent formulation changes the answer, that is reported as a
+weakness, which most solvers have.
 """
 
 from __future__ import annotations
@@ -47,43 +48,45 @@ from mortarbench.harness.verify.measure import (
     reason_to_decline,
 )
 
-#: how the checks begin that need an answer
+#: beginning of the names of checks that need a solution
 SOLUTION_PREFIX = "finds the planted solution"
-#: how those begin that compare equivalent formulations
+#: beginning of the names of checks that compare equivalent formulations
 INVARIANCE_PREFIX = "keeps its answer"
-#: what a solver that needs the entries of P has to say
+#: advice for solvers that need the entries of P
 _DECLINE_OPERATORS = (
     "a solver that needs the entries of P has in declines(self, qp) the line "
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)  #: of a gradient's terms: rounding
-#: repeats may differ by; memory's alignment changes sums' order
+#: rounding of a gradient relative to its largest term, as in dual residuals
+GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
+#: difference between repeats that is neglected: the alignment of arrays in memory
+#: determines the order of sums
 REPEAT_ROUNDING = 1e-12
 
 
 class Grade(StrEnum):
-    """How a check ended."""
+    """Outcome of a check."""
 
     PASS = "pass"
-    DECLINE = "decline"  #: the solver says that it cannot
-    WEAK = "weak"  #: a weakness, reported; the solver conforms nevertheless
+    DECLINE = "decline"  #: the solver declines the QP
+    WEAK = "weak"  #: a weakness; the solver conforms nevertheless
     FAIL = "fail"
 
 
 class Result(NamedTuple):
-    """How a check ended; why where it did not pass, else a remark if there is one."""
+    """Result of a check: its grade, and the reason for it or a remark."""
 
     grade: Grade
     message: str = ""
-    work: float | None = None  #: iterations, relative to those before a change
+    work: float | None = None  #: iterations relative to those before a change
 
 
 class ContractError(Exception):
-    """What a solver did wrong."""
+    """Violation of the contract by a solver."""
 
 
-#: raises that, DeclinedError or WeaknessError; where there is a remark, returns it
+#: raises ContractError, DeclinedError or WeaknessError; may return a result with remark
 Check = Callable[[Solver], Result | None]
 
 
@@ -100,15 +103,15 @@ def run_check(name: str, solver: Solver) -> Result:
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by the harness's own clock, and insist on a point, right or wrong."""
-    s = _ended(solver, qp, tol)
+    """Solve by `measure`, and require a point, right or wrong."""
+    s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
         raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
     return s
 
 
-def _ended(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by the harness's own clock, which makes a status of whatever happens."""
+def _end(solver: Solver, qp: QP, tol: float) -> Solution:
+    """Solve by `measure`, which turns exceptions of the solver into a status."""
     s = measure(solver, qp, tol).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -116,7 +119,7 @@ def _ended(solver: Solver, qp: QP, tol: float) -> Solution:
 
 
 def _solved(solver: Solver, qp: QP, tol: float, factor: float) -> Solution:
-    """Solve, and insist on a claim of success that holds within `factor`·tol."""
+    """Solve, and require a claim of success with residuals of at most `factor`·tol."""
     s = _solve(solver, qp, tol)
     _judge(qp, s, factor * tol)
     return s
@@ -154,21 +157,22 @@ def _multipliers_have_our_signs(solver: Solver) -> None:
 
 
 def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
-    """Forgive multipliers of the size of rounding: the dual residual has room for them.
+    """Require zero multipliers on absent bounds, up to rounding.
 
-    That is 8·2⁻⁵² of the largest term of the gradient, as dual residuals forgive.
+    Multipliers of at most 8·2⁻⁵² times the largest term of the gradient pass with a
+    remark: the dual residual neglects as much.
     """
     qp, _ = manufactured("some bounds")
     s = _solve(solver, qp, 1e-3)
-    extra = s.z_box - qp.box.admissible(s.z_box)
-    worst = np.abs(extra).max(initial=0)
+    inadmissible = s.z_box - qp.box.admissible(s.z_box)
+    worst = np.abs(inadmissible).max(initial=0)
     if worst <= 0:
         return Result(Grade.PASS)
     size = max(np.abs(v).max(initial=0) for v in (qp.P @ s.x, qp.q, s.z_box))
-    what = f"a multiplier of {worst:.1e} on an absent bound"
+    remark = f"a multiplier of {worst:.1e} on an absent bound"
     if not worst <= GRADIENT_ROUNDING * size:
-        raise ContractError(f"{what}; expected 0")
-    return Result(Grade.PASS, f"{what}: rounding; 0 would be right")
+        raise ContractError(f"{remark}; expected 0")
+    return Result(Grade.PASS, f"{remark}: rounding; 0 would be right")
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
@@ -203,9 +207,9 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
     qp = problem()
-    s = _ended(solver, qp, 1e-9)
+    s = _end(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
-        raise ContractError("claims to have solved what has no solution")
+        raise ContractError("claims to have solved a QP without a solution")
     if not s.message:
         raise ContractError(f"ended as {s.status} without a message; expected a reason")
     if s.status is Status.INFEASIBLE and infeasibility_margin(qp, s) is not None:
@@ -222,17 +226,18 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Catch an optimum claimed at the start, as some do where there are no rows."""
+    """Require a solution where some solvers claim that their first point is optimal.
+
+    They do so for QPs without rows.
+    """
     _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Let no two threads compute: one cannot use more CPU time than passes.
-
-    The process may use all CPUs meanwhile, or two threads would take turns on one.
-    """
+    """Require that one thread computes: its CPU time cannot exceed the wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
+    # all CPUs: two threads on one would alternate, and not be seen
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()
@@ -247,7 +252,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Two QPs with the same matrices, one with others, one of another size."""
+    """Require solutions of two QPs with equal matrices, and of two other QPs."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
@@ -271,7 +276,8 @@ def _a_sequence_is_solved(solver: Solver) -> None:
 
 def _sequence() -> list[QP]:
     qp, point = manufactured("everything")
-    shift = 0.1 * np.cos(np.arange(qp.q.size))  # of the solution, the active set kept
+    # a translation of the solution and all constraints: the active set stays
+    shift = 0.1 * np.cos(np.arange(qp.q.size))
     moved = shift_unknowns(qp, -shift).qp
     softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))
     return [qp, moved, softer, manufactured("bounds", n=12)[0]]
@@ -285,10 +291,16 @@ def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
     return Result(Grade.PASS, message, after / max(before, 1))
 
 
-def _near(what: str, got: Vector | float, expected: Vector | float, by: float) -> None:
-    error = float(np.max(np.abs(np.subtract(got, expected)), initial=0.0))
-    if not error <= by:
-        raise ContractError(f"{what} is {error:.1e} off the known one; {by:.1e} is ok")
+def _near(
+    name: str, value: Vector | float, expected: Vector | float, tol: float
+) -> None:
+    """Require ‖value − expected‖∞ ≤ tol; NaN fails."""
+    error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
+    if not error <= tol:
+        raise ContractError(
+            f"{name} differs from the known one by {error:.1e}; expected at most "
+            f"{tol:.1e}"
+        )
 
 
 def _buffers(qp: QP) -> Iterator[Vector]:

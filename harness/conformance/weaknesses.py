@@ -1,4 +1,4 @@
-"""docs/weaknesses.md: what an equivalent formulation changes, solver by solver."""
+"""Page docs/weaknesses.md: effects of equivalent formulations, by solver."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mortarbench.harness.conformance.equivalence import (
 )
 from mortarbench.harness.conformance.manufactured import FORMS
 
-MIN_LISTED_WORK_RATIO = 2.0  #: times the iterations that are worth telling
+MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
 
 Results = Mapping[str, Result]  #: of one solver, by the name of the check
 
@@ -43,7 +43,7 @@ declines the changed QP. A blank: it solves no form that this changes.
 
 
 def weaknesses_page(results: Mapping[str, Results]) -> str:
-    """Tabulate how the checks of equivalent formulations ended, in Markdown."""
+    """Return a Markdown page with the results of the checks of equivalence."""
     heads = [change for change in CHANGES if change != UNCHANGED]
     lines = [
         *_units(),
@@ -58,11 +58,12 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
             *(_cell(checks, solved, change) for change in heads),
         ]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return HEAD + "\n".join([*lines, "", "## How", "", *_told(results)]) + "\n"
+    entries = _weaknesses(results)
+    return HEAD + "\n".join([*lines, "", "## How", "", *entries]) + "\n"
 
 
 def line_of(name: str, form: str, change: str) -> str:
-    """Begin the line that tells of a weakness."""
+    """Return the beginning of the line that describes a weakness."""
     return f"- `{name}`, {form}, {change}: "
 
 
@@ -84,17 +85,17 @@ def _cell(checks: Results, solved: list[str], change: str) -> str:
     grades = {f: _grade(checks, f, change) for f in solved if change in changes_of(f)}
     if not grades:
         return ""
-    told = [marks[g].format(f) for f, g in grades.items() if g in marks]
+    entries = [marks[g].format(f) for f, g in grades.items() if g in marks]
     work = max(
         checks[f"{INVARIANCE_PREFIX}: {f}, {change}"].work or 1.0 for f in grades
     )
     if work >= MIN_LISTED_WORK_RATIO:
-        told.append(f"×{work:.2g}")
-    return ", ".join(told) or "·"
+        entries.append(f"×{work:.2g}")
+    return ", ".join(entries) or "·"
 
 
-def _told(results: Mapping[str, Results]) -> Iterator[str]:
-    """List every weakness with its evidence."""
+def _weaknesses(results: Mapping[str, Results]) -> Iterator[str]:
+    """Yield a line for every weakness, with its evidence."""
     for name, checks in results.items():
         for form in FORMS:
             for change in changes_of(form):
