@@ -76,7 +76,7 @@ def in_words(faults: Iterable[Fault]) -> str:
         return ""
     reasons = some(dict.fromkeys(fault.what for fault in faults))
     count = f"{len(faults)} measurement{'s' * (len(faults) != 1)}"
-    return f"{count} could not be made, by no fault of a solver: {reasons}"
+    return f"{count} failed for reasons other than the solver: {reasons}"
 
 
 def _parsed(line: bytes, path: Path, number: int) -> Fault:

@@ -45,13 +45,8 @@ _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
 #: beginnings of the names of files that are written beside the folders
 _FILE_PREFIXES = (
-    _LOCK,
-    FAULTS,
-    "environment.",
-    "suite.",
-    "validation.",
-    "discretisation.",
-)
+    _LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.",
+)  # fmt: skip
 
 
 def refuse_links(folder: Path) -> None:
@@ -397,14 +392,14 @@ def _node_file(folder: Path, digest: str) -> Path:
 
 
 def differences(
-    then: Mapping[str, Any], now: Mapping[str, Any]
+    old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any, Any]]:
     """Yield the differences between the lasting parts of two environments.
 
-    Each is (dotted key, value then, value now); a missing value is None.
+    Each is (dotted key, old value, new value); a missing value is None.
     """
-    for key in sorted((then.keys() | now.keys()) - {"digest", *VOLATILE}):
-        a, b = then.get(key), now.get(key)
+    for key in sorted((old.keys() | new.keys()) - {"digest", *VOLATILE}):
+        a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
             yield from ((f"{key}.{k}", *pair) for k, *pair in differences(a, b))
         elif a != b:

@@ -294,7 +294,7 @@ def test_of_faults_the_last_of_each_measurement_that_is_missing_counts(tmp_path)
     assert remaining_faults(every, {"c"}) == [every[2], every[1]]
     assert in_words(remaining_faults(every, "abc")) == ""
     assert in_words(remaining_faults(every, "c")) == (
-        "2 measurements could not be made, by no fault of a solver: y, w"
+        "2 measurements failed for reasons other than the solver: y, w"
     )
     assert read_faults(tmp_path / "no such folder") == []
 
@@ -360,7 +360,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
         "mortarbench.harness.running.executor.measure_and_judge", measured
     )
     code, out, err = cli("run", "toy.toml", "--out", "d")
-    told = "2 measurements could not be made, by no fault of a solver: the worker could"
+    told = "2 measurements failed for reasons other than the solver: the worker could"
 
     assert code == 1
     assert f"{told} not be started; the same command tries again\n" in out
@@ -371,7 +371,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
     monkeypatch.chdir(tmp_path)
     code, out, _ = cli("run", "toy.toml", "--out", "d")
     assert code == 0
-    assert "could not be made" not in out
+    assert "failed for reasons other than the solver" not in out
     assert told not in (tmp_path / "d" / "said").read_text()
 
 
