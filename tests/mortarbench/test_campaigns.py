@@ -245,7 +245,7 @@ def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_pat
         ),
         (
             lambda a, b: (b / "suite.toml").write_text("time_limit = 5\n"),
-            r"time_limit is 60 in .*a, 5 in .*b; expected suites whose measurements",
+            r"time_limit is 60 in .*a, 5 in .*b; expected equal settings",
         ),
         (
             lambda a, b: (b / "suite.toml").write_text(

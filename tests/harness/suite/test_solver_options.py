@@ -85,7 +85,10 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
         ("scaling=1", "--option: method: scaling = '1'; expected true or false"),
         ("mode=slow", "--option: method: mode = 'slow'; expected fast or exact"),
         ("seed=x", "--option: method: seed = 'x'; expected an integer or none"),
-        ("shape=1", "--option: method: shape = '1'; expected what only a suite can"),
+        (
+            "shape=1",
+            "--option: method: shape = '1'; expected a value that only a suite can",
+        ),
         ("max_iter", "--option 'max_iter'; expected KEY=VALUE, such as max_iter=50"),
         ("max_iter=", "--option 'max_iter='; expected KEY=VALUE"),
         ("max_iter=5,", "--option 'max_iter=5,'; expected KEY=VALUE"),
