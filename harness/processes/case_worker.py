@@ -79,8 +79,8 @@ class CaseWorker:
         """Answer one request; a failure of the family's code is part of the reply."""
         if "solve" in request:
             return self._solve(Path(request["solve"]), Path(request["point"]))
-        asked = request.get("build") or request.get("describe") or request["shared"]
-        name = CaseId(**{**asked, "family": self.families[asked["family"]]})
+        fields = request.get("build") or request.get("describe") or request["shared"]
+        name = CaseId(**{**fields, "family": self.families[fields["family"]]})
         if "shared" in request:
             return {"shared": is_shared(name)}
         try:

@@ -73,7 +73,7 @@ def read_solver(path: Path) -> Any:
 
 def _modules_unknown_to_workers() -> Iterator[ModuleType]:
     """Yield the loaded modules that a worker would not find, or find elsewhere."""
-    known: dict[str, bool] = {}  # by top-level package
+    importable: dict[str, bool] = {}  # by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if not isinstance(module, ModuleType) or not str(file).endswith(".py"):
@@ -81,11 +81,11 @@ def _modules_unknown_to_workers() -> Iterator[ModuleType]:
         if name == "__main__" or module.__name__ != name:
             continue
         top = name.partition(".")[0]
-        if top not in known:
-            known[top] = top in sys.stdlib_module_names or _is_importable(
+        if top not in importable:
+            importable[top] = top in sys.stdlib_module_names or _is_importable(
                 sys.modules.get(top)
             )
-        if not known[top]:
+        if not importable[top]:
             yield module
 
 
