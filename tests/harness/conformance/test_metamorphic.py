@@ -1,4 +1,4 @@
-"""Equivalent formulations: each change is one, and its way back leads back."""
+"""Each change is an equivalent formulation, and its inverse map recovers solutions."""
 
 from dataclasses import replace
 
@@ -25,7 +25,7 @@ def drawn():
     return np.random.default_rng(161803)
 
 
-#: that leave every residual as it is, at any point: nothing but names and units
+#: changes that preserve every residual at every point
 NAMES_AND_UNITS = {
     "units": lambda qp: change_units(qp, unknown=2.0**-11, objective=2.0**28),
     "odd units": lambda qp: change_units(qp, unknown=0.0254, objective=4.448),
@@ -64,14 +64,14 @@ every_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
 def anywhere(qp):
-    """A point that is no solution: multipliers of any sign, on absent bounds too."""
+    """Return a random point, with multipliers of any sign, also on absent bounds."""
     rng = drawn()
     x, y, z, z_box = (rng.standard_normal(v.size) for v in (qp.q, qp.b, qp.h, qp.q))
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
 def lagrangian(qp, s):
-    """Objective + yᵀ(Ax − b) + zᵀ(Gx − h) + the box' part, with bounds that exist."""
+    """Return objective + yᵀ(Ax − b) + zᵀ(Gx − h) + the terms of finite bounds."""
     box = np.where(s.z_box > 0, s.x - qp.ub, s.x - qp.lb)
     box = s.z_box @ np.where(np.isfinite(box), box, 0)
     return (
@@ -85,7 +85,7 @@ def lagrangian(qp, s):
 def test_the_way_back_leads_from_a_solution_to_the_solution(
     manufactured, transform, shape, dense
 ):
-    """Solved anew, the changed QP has the planted minimiser and objective."""
+    """The solution of the changed QP is mapped to the planted minimiser."""
     qp, expected = manufactured(shape, dense=dense)
     new = TRANSFORMS[transform](qp)
     s = PIQP().prepare(new.qp, 1e-11)()
@@ -122,7 +122,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
 def test_what_is_violated_stays_violated(manufactured, transform, shape):
-    """Rows, bounds and signs of multipliers, at a point that is anything but good."""
+    """Rows, bounds and signs of multipliers, at a random point."""
 
     def violated(qp, s):
         z_lb, z_ub = s.z_box < 0, s.z_box > 0
@@ -142,7 +142,7 @@ def test_what_is_violated_stays_violated(manufactured, transform, shape):
 def test_names_and_units_change_no_residual_at_any_point(
     manufactured, transform, shape
 ):
-    """What `harness.verify.kkt` promises, at good and bad points, and at none."""
+    """Test the promise of `harness.verify.kkt` at good points, bad points and NaN."""
     qp, expected = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)
@@ -162,7 +162,7 @@ def test_names_and_units_change_no_residual_at_any_point(
 
 
 def preimage(qp, new):
-    """Invert a way back, which is linear but for a shift, by what it does to units."""
+    """Invert the map back, which is affine, from its images of unit vectors."""
     parts = ("x", "y", "z", "z_box")
     sizes = [new.qp.q.size, new.qp.b.size, new.qp.h.size, new.qp.q.size]
     cuts = np.cumsum(sizes)[:-1]
@@ -192,7 +192,7 @@ def preimage(qp, new):
 def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
     manufactured, shape
 ):
-    """With each multiplier halved nothing but z⁻ and zᵢ·slackᵢ can shrink, twofold."""
+    """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ can shrink, by two."""
     qp, _ = manufactured(shape, dense=True)
     new = duplicate_rows(qp, np.arange(qp.b.size), np.arange(qp.h.size))
     old = anywhere(qp)
@@ -234,7 +234,7 @@ def test_the_structure_of_a_dual_is_that_of_the_changed_dual(form, transform):
 
 
 def test_units_of_the_strings_are_those_of_textbooks():
-    """K in Pa, MPa and GPa, λ in N/m, N/mm and GN/m for one and the same body."""
+    """K is in Pa, MPa and GPa, λ in N/m, N/mm and GN/m, for the same body."""
     nd = strings("primal").P.toarray().max()
     pascal = nd * 2.0**26  # F₀/l
     for units, factor in [("N, m", 1), ("N, mm", 2.0**-20), ("GN, m", 2.0**-30)]:

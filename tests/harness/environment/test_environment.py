@@ -1,4 +1,4 @@
-"""The environment says what times depend on, and nothing about who measured."""
+"""The environment contains what times depend on, and nothing about the user."""
 
 import copy
 import json
@@ -42,7 +42,7 @@ def pool(library="libopenblas", owner="system", threads=1):
 
 @pytest.fixture
 def quiet():
-    """An environment with nothing to complain about."""
+    """Return an environment without any warning."""
     return {
         "machine": {
             "cpu": "Some CPU", "physical_cores": 4, "logical_cores": 8,
@@ -60,7 +60,7 @@ def quiet():
 
 
 def changed(environment, path, value):
-    """Copy with the entry at the dotted path replaced."""
+    """Return a copy with the entry at a dotted path replaced."""
     result = copy.deepcopy(environment)
     *parents, last = path.split(".")
     entry = result
@@ -135,7 +135,7 @@ def test_plugins_are_named_by_their_content(tmp_path):
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A repository with one commit."""
+    """Create a repository with one commit."""
     for who in ("AUTHOR", "COMMITTER"):
         monkeypatch.setenv(f"GIT_{who}_NAME", "A")
         monkeypatch.setenv(f"GIT_{who}_EMAIL", "a@example.org")
@@ -323,7 +323,7 @@ def test_a_perfect_clock_shows_no_noise_between_equal_arms():
 def test_a_steady_drift_hits_both_arms_alike():
     readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
     noise = noise_floor(30_000.0, clock=lambda: next(readings))
-    assert noise.one_pair > 0.003  # what pairs in one order would be off by
+    assert noise.one_pair > 0.003  # error of pairs that are all in one order
     assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of that
 
 

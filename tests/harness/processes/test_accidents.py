@@ -1,4 +1,4 @@
-"""Solvers that disturb a run by accident: their verdicts, and their neighbours'."""
+"""Solvers that disturb a run by accident, and the verdicts of their neighbours."""
 
 import fcntl
 import itertools
@@ -53,7 +53,7 @@ CASE = assemble(TINY, {}, "plain")
 FOREIGN = "came, expected 'timed'"
 SUSPECT = "is kept between measurements"
 PARENTS_TIME = "the parent's time is recorded"
-#: verdict, and a pattern of the message
+#: expected verdict, and a pattern of the message
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
     "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
@@ -71,7 +71,7 @@ OUTCOMES = {
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
 }
-#: each kind once; the others are slow tests
+#: one of each kind; the others are slow tests
 QUICK = {
     "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
     "hoardsinadaemon", "closesall", "sharespages",
@@ -82,7 +82,7 @@ RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchesthe
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Name this test to the processes that it starts."""
+    """Mark the processes that this test starts, by a variable of their environment."""
     name = secrets.token_hex(8)
     monkeypatch.setenv("WATCHED", name)
     return name
@@ -90,7 +90,7 @@ def watched(monkeypatch):
 
 @pytest.fixture(scope="module")
 def beside_a_witness(tmp_path_factory):
-    """Measure a solver beside one that lives on, and looks for what is left."""
+    """Measure a solver beside a witness, a worker that looks for leftover processes."""
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
@@ -117,7 +117,7 @@ def beside_a_witness(tmp_path_factory):
 
 
 def left(watched):
-    """List the processes of a test that live, except this one."""
+    """List the living processes of a test, except this one."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
@@ -129,7 +129,7 @@ def left(watched):
 
 
 class Bench:
-    """Measure solvers on the tiny QP, each by a worker of its own."""
+    """Measuring of solvers on a tiny QP, each by a worker of its own."""
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}
@@ -195,7 +195,7 @@ CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
     [
         (0.05, 0.06, None, 1, True),
         (0.001, 0.001, 0.1, 10, True),
-        (0.15, 0.06, None, 1, False),  # longer than from request to end
+        (0.15, 0.06, None, 1, False),  # longer than the wall time
         (0.05, 0.04, None, 1, False),  # shorter than the CPU time
         (0.001, 0.001, 0.01, 10, False),
         (-1e-6, -1e-6, 0.05, 10, False),
@@ -331,7 +331,7 @@ def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
 
     assert (tmp_path / "killed").exists()
     assert record.verdict is Verdict.VERIFIED
-    assert record.threads is not None  # told by the warm-up
+    assert record.threads is not None  # reported by the warm-up
 
 
 @pytest.mark.parametrize(("limit", "is_fault"), [(float("inf"), True), (1.0, False)])
@@ -403,7 +403,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     assert bench("honest").verdict is Verdict.VERIFIED
 
 
-#: it says what came of a measurement that ended early, and measures again
+#: reports on a measurement that ended early, and measures again
 RUNS = f"""
 import sys
 from pathlib import Path

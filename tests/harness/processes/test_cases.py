@@ -1,4 +1,4 @@
-"""Built cases on disk: found, shared, damaged."""
+"""Cache of built cases on disk: look-up, sharing and damage."""
 
 import json
 import time
@@ -15,7 +15,7 @@ def name(**params):
 
 @pytest.fixture
 def get(tmp_path):
-    """Ask for an entry; ``get.made`` lists what had to be built."""
+    """Return a function that looks up a case; its ``made`` lists those it built."""
 
     def get(case, *, environment="here", content=b"content", slowly=0.0):
         def make(path):

@@ -1,4 +1,4 @@
-"""Of ranks that die, the first one is named, whatever they print and the others do."""
+"""The first rank to end is named, whatever it prints and whatever the others do."""
 
 import json
 import os
@@ -15,7 +15,7 @@ BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]:
 
 
 def wrongly_named(tmp_path, count, trials, seed):
-    """Trials in which another rank was named; what ranks print is in the same file."""
+    """Return the trials that named another rank; the output of ranks is mixed in."""
     command = [sys.executable, str(SUPPORT / "dying_ranks.py")]
     with (tmp_path / "out").open("w+b") as out:
         subprocess.run(

@@ -1,4 +1,4 @@
-"""Workers that are forks: as alone as those that a command starts, and as mortal."""
+"""Forked workers: isolated and killed like those that a command starts."""
 
 import json
 import os
@@ -16,8 +16,8 @@ from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import soon
 
-#: asks workers that are forks of it, prints what came of each, and is killed; a process
-#: of its own, since what forks safely has one thread
+#: asks forked workers, prints each result, and is then killed. It is a process of its
+#: own, since only a process with one thread forks safely
 PARENT = '''
 import atexit, json, os, signal, subprocess, sys, threading, time
 from contextlib import suppress
@@ -96,7 +96,7 @@ def beside_a_thread():
     finally:
         sleeps.set()
         thread.join()
-        for _ in range(2000):  # the kernel lets it go a little after that
+        for _ in range(2000):  # the kernel lists a joined thread a little longer
             if is_safe():
                 break
             time.sleep(0.01)
@@ -123,7 +123,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(folder):
-    """What came of workers, by what they did: pairs of verdict, message and answer."""
+    """Return verdict, message and answer of workers, by their behaviour."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", PARENT, str(folder)],
         env=os.environ | {"SPECIAL": "known"}, stdout=subprocess.PIPE, text=True,
@@ -143,7 +143,7 @@ def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
     assert len(opened) == 5
     assert all(target.startswith("pipe:") for target in opened[3:])
     assert first["cpus"] == [max(os.sched_getaffinity(0))]
-    assert first["leads"] == [True, True]  # a session each, the sub-reaper and itself
+    assert first["leads"] == [True, True]  # sub-reaper and worker lead a session each
     assert first["signals"] == ["SIG_DFL", "SIG_IGN"]  # as in a new interpreter
     assert ONE_THREAD.items() <= first["environ"].items()
     assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")

@@ -1,4 +1,4 @@
-"""What becomes of a measurement where one of its ranks fails, stage by stage."""
+"""Measurements in which one rank fails, stage by stage."""
 
 import json
 import os
@@ -34,7 +34,7 @@ params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
 """
 MEASURING = ("emission", "prepare", "solve")
 EVALUATING = ("residuals", "certificate", "quantities")
-#: s that each stage may take: those before the planted one must come to their end
+#: s; limit of each stage, long enough for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
 RAISED = "rank 1 of 2: ValueError: planted"
@@ -42,7 +42,7 @@ RAISED = "rank 1 of 2: ValueError: planted"
 
 @pytest.fixture
 def measured(tmp_path, monkeypatch):
-    """Measure once where one rank fails; no process may be left."""
+    """Measure once with a failing rank; assert that no process remains."""
 
     def run(stage, kind, rank="1", limit=LIMIT):
         monkeypatch.setenv("FAULT", str(tmp_path))
@@ -64,7 +64,7 @@ def measured(tmp_path, monkeypatch):
 
 
 def left(mark):
-    """Processes with the mark of a test in their environment, but for this one."""
+    """List the other processes with the mark of a test in their environment."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -77,7 +77,7 @@ def left(mark):
 
 
 def test_records_of_ranks_do_not_mix(monkeypatch):
-    """Each is one line, written at once, and not longer than a pipe takes at once."""
+    """Each is one line, in one write of at most PIPE_BUF bytes, which is atomic."""
     written = []
     monkeypatch.setattr(os, "write", lambda fd, data: written.append((fd, data)))
     monkeypatch.setenv(failures.RECORD, "7")
@@ -153,7 +153,7 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage, rank):
     record = measured(stage, "raises", rank=rank)
 
-    if rank == "0" and stage in ("prepare", "solve"):  # the solver of the parent's rank
+    if rank == "0" and stage in ("prepare", "solve"):  # the solver on rank 0
         assert (record.verdict, record.claimed) == ("failed", "failed")
         assert "ValueError: planted" in record.message
     else:
@@ -227,7 +227,7 @@ def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
 
 
 def lines(folder):
-    """The lines of a journal."""
+    """Return the lines of a journal."""
     files = sorted((folder / "journal").glob("*.jsonl"))
     return [line for file in files for line in file.read_text().splitlines()]
 
@@ -240,7 +240,7 @@ def is_rank(process):
 
 
 def named(message, stage):
-    """Whether a message says in which stage it was, where the clock did not run."""
+    """Return True if the prefix of a message is that of the stage, or none."""
     if stage == "emission":
         return message.startswith("emission: ")
     return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

@@ -1,4 +1,4 @@
-"""One solve on several ranks of MPI: against one process, and when ranks end."""
+"""Solves on several MPI ranks: comparison with one process, and failing ranks."""
 
 import json
 import os
@@ -31,12 +31,12 @@ CASES = (
 CASE = "membranes/S=2/n=4/dual"
 SOLVE = ["solve", CASE, "--solver", "smalbe"]
 TOL = 1e-8
-LANCZOS = 8  #: products with F before the solve, at most
+LANCZOS = 8  #: largest number of products with F before the solve
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
 def found(request):
-    """What several ranks found, of vectors and of two duals."""
+    """Return results of several ranks on vectors and on two duals."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
@@ -88,7 +88,7 @@ def test_the_solution_on_ranks_is_that_of_one_process(found, case):
 
 @pytest.fixture(scope="module")
 def answers():
-    """Two solves on two ranks, and one on one."""
+    """Solve twice on two ranks, and once on one."""
     case = mb.build(CASE)
     return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
 
@@ -105,17 +105,17 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
 
 
 def test_faces_that_a_body_hardly_feels_have_a_factor_on_ranks():
-    """What free components leave of some rows is less than they cancel to."""
+    """On free components, some rows are smaller than the rounding of their sum."""
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
     assert answer.record.claimed in ("solved", "iteration_limit")
-    # no rank has the assembled K: the bound holds for any that rounding may store
+    # No rank has the assembled K, so the bound holds for every rounding of it.
     assert answer.energy_bound <= 1e-3
 
 
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
-    """Rows of node to segment do not feel it roll: equality rows are dependent."""
+    """Node-to-segment rows do not resist rolling, so equality rows are dependent."""
     description = described(tmp_path)
     text = description.read_text().replace('"mortar"', '"nts"')
     held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
@@ -226,7 +226,7 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_pat
     }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
     assert found["smalbe ranks=2"].qp.startswith(EMITTED)
-    # a copy does what one process alone does, to the last bit
+    # a copy computes the same bits as one process alone
     assert found["smalbe copies=2"].verdict == "verified"
     alone, copies = found["smalbe"], found["smalbe copies=2"]
     assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
@@ -234,7 +234,7 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_pat
 
 
 def test_ranks_tell_all_of_an_answer_and_nobody_builds_the_case(tmp_path, monkeypatch):
-    """In suites and alone; processes of ranks have the family as it is."""
+    """In suites and single solves; ranks use the original family."""
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
         SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
@@ -297,8 +297,8 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         mb.run(suite, out=tmp_path / "out")
 
 
-#: of two load steps, the first: one process emits it, so that a rank which has a share
-#: is preparing or solving
+#: first of two load steps; one process emits it, so a rank that has its share is
+#: preparing or solving
 LARGE = (
     SUITE.replace(
         "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"
@@ -306,7 +306,7 @@ LARGE = (
     .replace("ranks = [1, 2]", "ranks = [2]")
     .replace("membranes", "beam-ring")
 )
-WITH_A_SHARE = 110  #: MiB; a rank that waits for an order has 90
+WITH_A_SHARE = 110  #: MiB; a rank that waits for an order uses 90
 FAULTS = {
     "killed": (signal.SIGKILL, "", "crashed", r"rank 1 of 2 ranks ended: Killed"),
     "hung": (signal.SIGSTOP, "time_limit = 8", "time_limit", "killed after 8 s"),
@@ -342,7 +342,7 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
 
 
 def processes(mark):
-    """Processes of a test, but for this one, with their commands."""
+    """List the other processes of a test, with their commands."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -363,7 +363,7 @@ def resident_mib(pid):
 
 
 def busy(mark):
-    """Rank 1, once it holds its share of the QP; in a list, which is empty before."""
+    """Return [rank 1] once it has its share of the QP, [] before that."""
     return [
         pid
         for pid, command, environment in processes(mark)

@@ -27,7 +27,7 @@ from tests.support.waiting import soon
 
 PLUGIN = ADVERSARIES
 
-#: a worker that tells how it was started instead of measuring
+#: a worker that reports how it was started instead of measuring
 SHOWS = """
 import json, os, sys
 requests, replies = map(int, sys.argv[1:])
@@ -61,7 +61,7 @@ def command(solver):
 
 
 def running(process):
-    """Whether a process exists and is no zombie."""
+    """Return True if a process exists and is not a zombie."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except FileNotFoundError:
@@ -77,7 +77,7 @@ def ignores_sigterm(process):
 
 @pytest.fixture
 def ask(tmp_path):
-    """Start workers on demand and ask them to solve the tiny QP."""
+    """Return a function that starts a worker and lets it solve the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
     save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})

@@ -1,4 +1,4 @@
-"""Threads that solve at the same time, forks, closed streams, and numbers of others."""
+"""Concurrent threads, forks, closed streams, and reused process numbers."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from tests.support.waiting import soon
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
 CASE = "string/n=10/primal"
-#: solves by several threads in a session of its own, and prints what came of it
+#: solves in several threads, in a session of its own, and prints the results
 THREADS = """
 import gc, json, os, sys, tempfile
 from pathlib import Path
@@ -149,7 +149,7 @@ def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
 
 
 def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
-    """From the start of a worker to its end, stops of others included."""
+    """From the start of a worker to its end, including stops of other workers."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
     def refuse(*what):
@@ -167,7 +167,7 @@ def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
 
 
 def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
-    """Its number may have been that of one of ours a moment ago."""
+    """Its number may have belonged to one of ours a moment before."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
@@ -183,7 +183,7 @@ def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
     first = worker.ask({}, **LIMITS).answer["pid"]
     os.kill(first, signal.SIGKILL)
     with suppress(ChildProcessError):
-        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD does
+        os.waitpid(worker._process.pid, 0)  # a handler of SIGCHLD would do that
 
     second = worker.ask({}, **LIMITS)
     assert second.answer["pid"] != first
@@ -256,7 +256,7 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
          "--plugin", str(plugin)],
         env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
         stderr=subprocess.PIPE, text=True,
-        # a shell that runs the tests in the background has them ignore Ctrl-C
+        # a shell that runs the tests in the background makes them ignore Ctrl-C
         preexec_fn=partial(signal.signal, number, signal.SIG_DFL),
     )  # fmt: skip
     assert soon((tmp_path / "started").exists)
@@ -294,7 +294,7 @@ SOLVERS = {"hangs": Hangs()}
 
 
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
-    """As nohup does with SIGHUP."""
+    """Test with SIGHUP, which nohup ignores."""
     script = (
         "import os, signal; from mortarbench.harness.processes.termination import *\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
@@ -308,7 +308,7 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
 
 
 def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
-    """While its case is built."""
+    """The signal arrives while its case is built."""
     plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
     plugin.write_text(SLOW)
     out.mkdir()
@@ -346,8 +346,8 @@ PROBLEMS = {"slow": Slow()}
 """
 
 
-#: a worker that creates a System V segment of 64 MiB, fills it, and writes which it is:
-#: other programs of the machine create segments meanwhile
+#: a worker that creates and fills a System V segment of 64 MiB, and writes its number,
+#: since other programs create segments at the same time
 SEGMENT = SHOWS.replace(
     '    reply(event="start")\n',
     '    reply(event="start")\n'

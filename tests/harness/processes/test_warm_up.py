@@ -1,4 +1,4 @@
-"""Seconds of dualising are those of a process that has dualised before."""
+"""Times of dualising exclude first calls: the first dual case is built twice."""
 
 import time
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from mortarbench.harness.processes.case_worker import CaseWorker
 
 @dataclass(frozen=True)
 class Slow(Family):
-    """A family whose first dual case takes longer, as first calls do."""
+    """Family whose first dual case takes longer, because of first calls."""
 
     name: str = "slow"
     forms: tuple = ("primal", "dual")

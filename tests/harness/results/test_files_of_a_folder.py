@@ -1,4 +1,4 @@
-"""Every file of a result folder, in place of which something else lies."""
+"""Commands on result folders in which one file is replaced by something else."""
 
 import os
 import shutil
@@ -32,12 +32,12 @@ forms = ["dual"]
 family = "file"
 params = {{ path = "{}" }}
 """
-SPARSE = 3 * 2**30  #: bytes that a file declares, of which none is on the disk
+SPARSE = 3 * 2**30  #: size of a sparse file, which occupies no disk space
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory, svg_only):
-    """A folder that has every kind of file, and lacks one measurement of its suite."""
+    """Create a folder with every kind of file, without one measurement of its suite."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     suite = folder.with_name("s.toml")
     np.savez(folder.with_name("qp.npz"), P=np.eye(2), q=-np.ones(2), lb=np.zeros(2))
@@ -60,7 +60,7 @@ def whole(tmp_path_factory, svg_only):
 
 
 def kinds_of_files(folder):
-    """One path for each kind of file there is: by folder and ending; of reports one."""
+    """Return one path for each kind of file (folder and ending), and one report."""
     found = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
@@ -76,13 +76,13 @@ def sparse(path, _outside):
 
 
 def grown(path, _outside):
-    """What was there, and then zeros: by themselves the first lines are sound."""
+    """Append zeros to a file, whose first lines stay valid."""
     with path.open("r+b") as file:
         file.truncate(SPARSE)
 
 
 def lesser(path, _outside):
-    """Below the limit of data files, above that of a line."""
+    """Write a file below the limit of data files, but above that of a line."""
     with path.open("r+b") as file:
         file.truncate(2**31 - 2**20)
 
@@ -121,7 +121,7 @@ KINDS = (sparse, grown, lesser, pipe, a_folder, dangling, foreign, endless, empt
 
 @pytest.fixture
 def read_by_every_command(whole, tmp_path, capsys, monkeypatch, only_svg):
-    """Run every command that reads a folder, within bounds; none may raise."""
+    """Run every command that reads a folder, with resource limits; none may raise."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     suite = tmp_path / "s.toml"
@@ -200,7 +200,7 @@ def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
 
 @pytest.fixture
 def copied(whole, tmp_path):
-    """A copy that is removed by rm: pytest's own way of doing so recurses."""
+    """Copy a folder, and remove it by rm, because pytest's removal is recursive."""
     folder = tmp_path / "run"
     shutil.copytree(whole, folder)
     yield folder

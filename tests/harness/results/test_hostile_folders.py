@@ -1,4 +1,4 @@
-"""Result folders that somebody sent: they run nothing, and lead nowhere else."""
+"""Result folders from others execute no code and give no access to other files."""
 
 import os
 
@@ -30,7 +30,7 @@ FIELDS = {
 
 
 def record(path, **changes):
-    """A verified measurement of a QP from a file."""
+    """Return a verified measurement of a QP from a file."""
     given = dict(
         run_id="a1", case=f"file:{path}", family="file", params={"path": str(path)},
         form="qp", sizes={"variables": 2}, solver="clarabel", options={}, tol=1e-6,
@@ -74,7 +74,7 @@ def command(capsys, monkeypatch, tmp_path):
 
 
 def everything(folder):
-    """Names and content of all that lies in a folder, links as they are."""
+    """Return names and content of all files in a folder, without following links."""
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))

@@ -30,7 +30,7 @@ if find_spec("distributed") is None:
     pytest.skip("no distributed", allow_module_level=True)
 
 PLUGIN = load_plugin(TOY_PROBLEM)
-SOLVERS = 4  #: measurements of a whole block
+SOLVERS = 4  #: measurements per block
 SUITE = """
 name = "toy_problem"
 repeats = {repeats}
@@ -44,7 +44,7 @@ forms = ["dual"]
 
 
 class Cluster:
-    """A scheduler, and workers that can be killed."""
+    """Dask scheduler with workers that can be killed."""
 
     def __init__(self, folder, forks, *options):
         self.folder = folder
@@ -82,7 +82,7 @@ class Cluster:
         return self._forks.dask(arguments, self._env, serves)
 
     def started_solvers(self):
-        """The process of every start of a slow solve, in order."""
+        """Return the processes that started a slow solve, in order."""
         return [int(line.split()[0]) for line in self.starts.read_text().splitlines()]
 
     def close(self):
@@ -122,7 +122,7 @@ def cli(capsys, monkeypatch, tmp_path):
 
 
 def measured(folder):
-    """Every run_id in a journal with its verdict; fails on one that is there twice."""
+    """Return the verdicts in a journal by run_id; assert that none is there twice."""
     records = read_journal(Path(folder))
     found = {r.run_id: r.verdict for r in records}
     assert len(found) == len(records)
@@ -130,7 +130,7 @@ def measured(folder):
 
 
 def halved(folder):
-    """The numbers of blocks of which some measurements are in a journal, not all."""
+    """Return the numbers of blocks that are only partly in a journal."""
     with suppress(InputError):
         counts = Counter(r.block for r in read_journal(Path(folder)))
         return [number for number, count in counts.items() if count < SOLVERS]
@@ -138,13 +138,13 @@ def halved(folder):
 
 
 def node_of(solver):
-    """The Dask worker that a solver process works for: its sub-reaper's parent."""
+    """Return the Dask worker of a solver process, the parent of its sub-reaper."""
     reaper = parent(solver)
     return None if reaper is None else parent(reaper)
 
 
 def parent(process):
-    """The parent of a process; None when it has ended."""
+    """Return the parent of a process; None if the process has ended."""
     with suppress(OSError):
         return int(
             Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1]
@@ -161,7 +161,7 @@ def meanwhile(action):
 
 @pytest.fixture
 def all_cpus():
-    """Every CPU of the machine may be used, not only those of a worker of pytest."""
+    """Allow all CPUs of the machine, instead of those of a worker of pytest."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(os.cpu_count()))
     yield
@@ -210,7 +210,7 @@ def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
 
     def kill():
         assert soon(lambda: cut or cut.extend(halved("d")))
-        victim.kill()  # what it had given back of that block is in the journal
+        victim.kill()  # the turns that it returned are in the journal
         cluster.join()
 
     with meanwhile(kill):
@@ -251,7 +251,7 @@ def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
 
 
 def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeypatch):
-    """Not even with --fresh, which forgets what a folder holds."""
+    """Not even with --fresh, which deletes the content of a folder."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
@@ -264,7 +264,7 @@ def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeyp
 
 @pytest.fixture
 def heeded():
-    """Ctrl-C interrupts, although what a shell starts in the background ignores it."""
+    """Restore the effect of Ctrl-C, which is ignored in a shell's background jobs."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -345,7 +345,7 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
 
 
 def started(*arguments):
-    """Start a run of the toy problem in a process of its own."""
+    """Start a run of the toy problem in a separate process."""
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
@@ -382,7 +382,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
 
 @pytest.fixture
 def one_cpu():
-    """What is started may use one CPU, as a worker of pytest does."""
+    """Restrict processes started here to one CPU."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(before)})
     yield
@@ -469,7 +469,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 
 @pytest.fixture
 def meet():
-    """What a parent does with the environment of a node; what it keeps and says."""
+    """Pass the environment of a node to `Nodes`; record its files and warnings."""
     from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []

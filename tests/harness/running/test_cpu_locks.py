@@ -1,4 +1,4 @@
-"""Locks of CPUs lie where all users of a machine may write: nobody else plants them."""
+"""Locks of CPUs are in a folder that all users may write; others cannot plant them."""
 
 import os
 import tempfile
@@ -17,7 +17,7 @@ def claim_cpu(stack):
 
 @pytest.fixture
 def shared(tmp_path, monkeypatch):
-    """A folder of temporary files of this test alone."""
+    """Set a folder of temporary files that only this test uses."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 

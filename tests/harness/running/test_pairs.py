@@ -1,4 +1,4 @@
-"""Intervals of ratios of times, against Student's tables by hand."""
+"""Intervals of ratios of times, compared with Student's tables."""
 
 import doctest
 
@@ -8,7 +8,7 @@ import pytest
 from mortarbench.harness.running import pairs
 from mortarbench.harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 
-#: Student's t of 97.5 %, by degrees of freedom
+#: 97.5 % quantile of Student's t, by degrees of freedom
 STUDENT = {1: 12.706204736, 2: 4.302652730, 3: 3.182446305}
 
 

@@ -1,4 +1,4 @@
-"""Whole runs: of solvers that misbehave, interrupted, resumed, on shared folders."""
+"""Complete runs: misbehaving solvers, interruption, resumption, shared folders."""
 
 import errno
 import json
@@ -39,7 +39,7 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Watcher:
-    """A progress that remembers what it was told, and may act after some records."""
+    """Progress that records its calls, and may act after some records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None
@@ -86,7 +86,7 @@ def suite(*solvers, cases=({},), **changes):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite in worker processes and return what it told while doing so."""
+    """Run a suite in worker processes, and return the watcher of its progress."""
 
     def measure(
         suite,
@@ -273,7 +273,7 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
 def test_the_steps_of_a_sequence_that_tightens_are_solved_to_what_they_are_worth(
     measure, tmp_path
 ):
-    """max(tol, θ·unsettled), at most 1e-2: here unsettled is 1e-3·h."""
+    """The tolerance is max(tol, θ·δ), at most 1e-2; here δ is 1e-3·h."""
     names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (500, 1.0, 1e-3)]
     solvers = ("tightens", "chains", "honest")
     asked = suite(
@@ -760,7 +760,7 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
 
 @pytest.mark.parametrize("size", [600, 4000])
 def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, size):
-    """A point takes more than 600 bytes, a case more than 4000; the rest less."""
+    """A point needs more than 600 bytes, a case more than 4000; other files less."""
     whole = suite("honest", "prints")
     if size == 600:
         measure(suite("zero"))
@@ -781,7 +781,7 @@ def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, siz
 
 @pytest.fixture
 def faults(monkeypatch):
-    """Have the measurements of which `prevented` is true end by a fault of ours."""
+    """Let measurements for which `prevented` returns True fail by a fault."""
 
     def faults(prevented):
         def measured(worker, qp, record, request, **limits):
@@ -851,7 +851,7 @@ def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
 
 
 def family(process):
-    """A process, then those that it started, and those that these did."""
+    """Yield a process and all of its descendants."""
     yield process
     for tasks in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
@@ -861,12 +861,12 @@ def family(process):
 
 @pytest.fixture
 def own_interpreters(monkeypatch):
-    """Processes are started as a run does: forks show no command in /proc."""
+    """Start processes by their commands: forks show no command in /proc."""
     monkeypatch.setattr(supervisor, "subprocess", subprocess)
 
 
 def kill_worker(solver):
-    """Kill what serves a solver: our processes with its name as an argument."""
+    """Kill the worker of a solver, a process with its name as an argument."""
     for process in list(family(os.getpid()))[1:]:
         with suppress(OSError):
             words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")

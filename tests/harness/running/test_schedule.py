@@ -1,4 +1,4 @@
-"""When there are enough blocks, and how sure one is of a ratio of times."""
+"""Stopping rule of the schedule, and intervals of ratios of times."""
 
 from dataclasses import replace
 
@@ -38,7 +38,7 @@ class Quiet:
 
 
 def planned(**changes):
-    """Plan three repeats of one case by the solvers a and b, but for the changes."""
+    """Return a schedule of three repeats of one case by solvers a and b, or changed."""
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
@@ -52,7 +52,7 @@ def planned(**changes):
 
 
 def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Carry out a suite whose measured times are 1, 2 and 4 s but for some noise."""
+    """Execute a suite with measured times of 1, 2 and 4 s, up to some noise."""
     rng = np.random.default_rng(seed)
     schedule = planned(**changes)
     made = []
@@ -68,7 +68,7 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
 
 
 def test_who_was_first_in_a_block_is_last_in_the_next():
-    """So no place in a block favours anybody; pairs of blocks differ by chance."""
+    """No position in a block favours a solver; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
     blocks = list(planned(solvers=solvers, repeats=6).blocks())
     orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
@@ -79,7 +79,7 @@ def test_who_was_first_in_a_block_is_last_in_the_next():
 
 
 def test_of_a_sequence_the_whole_is_compared():
-    """Its steps are noisy, but what one takes longer the other takes less."""
+    """Its steps are noisy, but their errors cancel in the sum."""
     rng = np.random.default_rng(161803)
     steps = cases_of(1, 2)
     schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
@@ -103,7 +103,7 @@ def records_of(blocks):
 
 
 def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
-    """After every number of measurements; blocks keep their numbers apart."""
+    """For every number of measurements before; block numbers stay distinct."""
     suite = dict(
         tolerances=(1e-4, 1e-6), repeats=2,
         cases=cases_of(1, 2),
@@ -185,7 +185,7 @@ def test_blocks_end_at_the_most_repeats_and_at_the_budget():
 
 
 def test_what_has_no_time_spends_no_budget():
-    """One solver fails, and has none; the others are told apart after many blocks."""
+    """A failing solver has no time; the others are distinguished after many blocks."""
     specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
     schedule = planned(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
     rng = np.random.default_rng(271828)

@@ -1,4 +1,4 @@
-"""A suite may ask for more while its folder lasts, and for nothing else."""
+"""A suite with a result folder may only ask for more measurements."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Options of solvers from the command line: read by type, swept, told apart."""
+"""Options of solvers from the command line: types, sweeps and labels."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def labels(*texts, specs=SPECS):
 
 
 def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
-    """As a list, or given again; who has no such option is measured as it is."""
+    """Values as a list or repeated; a solver without the option stays unchanged."""
     assert labels("max_iter=5,6", "scaling=false") == [
         "method max_iter=5 scaling=false", "method max_iter=6 scaling=false", "plain"
     ]  # fmt: skip

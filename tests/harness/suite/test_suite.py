@@ -1,4 +1,4 @@
-"""Suites: what a TOML asks for, and what is wrong with it."""
+"""Suites: content of their TOML, and messages on mistakes."""
 
 import tomllib
 from dataclasses import dataclass
@@ -412,7 +412,7 @@ def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monke
 
 
 def folder_of_files(folder, monkeypatch, *, here=True):
-    """Write a suite beside some files; work there, or elsewhere."""
+    """Write a suite beside some files, and change to its folder or another one."""
     (folder / "set" / "more.qps").mkdir(parents=True)
     (folder / "elsewhere").mkdir()
     for name in ("b.qps", "a.qps", "c[1].qps", "d.txt", "more.qps/e.qps"):
@@ -489,7 +489,7 @@ def test_a_sequence_may_run_along_zipped_keys():
 
 @pytest.mark.parametrize("name", BEYOND)
 def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
-    """Six repeats are the fewest whose median has a 95 % interval."""
+    """Six is the smallest number of repeats whose median has a 95 % interval."""
     suite = shipped(name)
     narrowed = with_overrides(
         suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
