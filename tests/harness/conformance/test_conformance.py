@@ -170,7 +170,7 @@ def weaknesses(solver):
         for name in CONCRETE  # the others pass the same QPs to libraries of these
     ],
 )
-def test_what_an_equivalent_formulation_changes_is_in_the_documents(name):
+def test_weaknesses_are_documented(name):
     """`make weaknesses` writes the page; it may list weaknesses that are gone."""
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
@@ -397,14 +397,14 @@ def test_rounding_on_absent_bounds_passes_with_a_remark():
     assert run_check("puts none on absent bounds", Sound()).message == ""
 
 
-def test_a_right_claim_of_infeasibility_is_told_from_giving_up():
+def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
     message = run_check("claims no success: infeasible", Sound()).message
     assert message == "verified infeasible"
     message = run_check("claims no success: unbounded", Sound()).message
     assert message != "verified infeasible"
 
 
-def test_who_fails_on_an_operator_is_told_the_line_to_write():
+def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
     """The line of the message, inserted at its place, makes the check pass."""
     check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
@@ -424,12 +424,12 @@ def test_who_fails_on_an_operator_is_told_the_line_to_write():
         (MindsTheOrder, "keeps its answer: dual, unknowns permuted"),
     ],
 )
-def test_what_an_equivalent_formulation_changes_is_a_weakness(kind, check):
+def test_a_change_by_an_equivalent_formulation_is_a_weakness(kind, check):
     assert run_check(check, Sound()).grade is Grade.PASS
     assert run_check(check, kind()).grade is Grade.WEAK
 
 
-def test_what_was_not_solved_cannot_change():
+def test_a_form_that_is_not_solved_has_no_weakness():
     weak = run_check("keeps its answer: dual-bounds, as it is", MindsTheOrder())
     other = run_check("keeps its answer: dual-bounds, mirrored", MindsTheOrder())
     assert weak.grade is Grade.WEAK
@@ -437,7 +437,7 @@ def test_what_was_not_solved_cannot_change():
     assert other.message.startswith("not solved as it is: ended as failed")
 
 
-def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
+def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
     # a fake clock: real threads need idle cores to show
     monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
     slow = Slow()
@@ -446,7 +446,7 @@ def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
     assert run_check("computes in one thread", slow).grade is Grade.PASS
 
 
-def test_a_decline_of_all_is_no_pass():
+def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
     assert Grade.PASS in grades  # its options
@@ -487,7 +487,7 @@ def test_the_command_says_how_every_check_ended(plugin, capsys):
     assert {row["grade"] for row in rows} == {"pass", "decline"}
 
 
-def test_weaknesses_are_told_and_solvers_that_have_some_conform(
+def test_weaknesses_are_reported_and_solvers_with_some_conform(
     plugin, capsys, monkeypatch
 ):
     few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
@@ -548,7 +548,7 @@ def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
     assert "never on a Monday" in capsys.readouterr().out
 
 
-def test_what_fails_is_said_where_the_exit_code_is_1(plugin, capsys, monkeypatch):
+def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     few = [
         "finds the planted solution: bounds, sparse", "refuses a misspelt option",
         "gives multipliers our signs",

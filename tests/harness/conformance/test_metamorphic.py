@@ -82,9 +82,7 @@ def lagrangian(qp, s):
 @every_transform
 @every_shape
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-def test_the_way_back_leads_from_a_solution_to_the_solution(
-    manufactured, transform, shape, dense
-):
+def test_the_map_back_recovers_the_solution(manufactured, transform, shape, dense):
     """The solution of the changed QP is mapped to the planted minimiser."""
     qp, expected = manufactured(shape, dense=dense)
     new = TRANSFORMS[transform](qp)
@@ -121,7 +119,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
-def test_what_is_violated_stays_violated(manufactured, transform, shape):
+def test_violated_constraints_stay_violated(manufactured, transform, shape):
     """Rows, bounds and signs of multipliers, at a random point."""
 
     def violated(qp, s):
@@ -189,7 +187,7 @@ def preimage(qp, new):
 
 
 @every_shape
-def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
+def test_a_duplicated_row_changes_residuals_by_a_factor_of_two_at_most(
     manufactured, shape
 ):
     """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ can shrink, by two."""
@@ -207,7 +205,7 @@ def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
 
 
 @pytest.mark.parametrize("transform", ["units", "rows scaled", "mirrored"])
-def test_powers_of_two_lose_no_bit(manufactured, transform):
+def test_powers_of_two_are_exact(manufactured, transform):
     qp, _ = manufactured("everything")
     new = TRANSFORMS[transform](qp).qp
     for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):

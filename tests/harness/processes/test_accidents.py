@@ -175,7 +175,7 @@ def bench(tmp_path, watched):
     "solver",
     [a if a in QUICK else pytest.param(a, marks=pytest.mark.slow) for a in OUTCOMES],
 )
-def test_an_accident_costs_its_own_verdict_and_nothing_of_it_is_left(
+def test_an_accident_costs_its_own_verdict_and_leaves_no_process(
     beside_a_witness, solver
 ):
     verdict, message = OUTCOMES[solver]
@@ -201,7 +201,7 @@ CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
         (-1e-6, -1e-6, 0.05, 10, False),
     ],
 )
-def test_a_time_is_believed_within_what_the_parent_knows(
+def test_a_time_is_accepted_within_the_bounds_of_the_parent(
     prepare, solve, first, inner, is_believed
 ):
     seconds = dict(
@@ -294,14 +294,14 @@ def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
     assert bench.process("burns") == 0
 
 
-def test_a_time_that_the_clock_of_the_worker_denies_is_ours(bench):
+def test_a_time_that_the_parents_clock_contradicts_is_replaced(bench):
     record = bench("patchestheclock")
 
     assert record.total_seconds >= 0.002
     assert record.prepare_seconds is record.solve_seconds is None
 
 
-def test_what_is_done_in_declines_is_timed(bench):
+def test_work_in_declines_is_timed(bench):
     record = bench("worksindeclines")
 
     assert record.prepare_seconds >= 0.02
@@ -335,7 +335,7 @@ def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
 
 
 @pytest.mark.parametrize(("limit", "is_fault"), [(float("inf"), True), (1.0, False)])
-def test_a_kill_for_want_of_memory_is_the_solvers_where_it_held_the_memory(
+def test_a_kill_for_lack_of_memory_is_attributed_to_a_solver_that_used_it(
     bench, monkeypatch, limit, is_fault
 ):
     counts = itertools.count()
@@ -353,7 +353,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
         bench("honest", command=["no-such-python"])
 
 
-def test_a_plug_in_that_dies_of_its_import_fails_by_itself(bench):
+def test_a_plug_in_that_dies_in_its_import_fails_alone(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
     assert record.verdict is Verdict.CRASHED

@@ -46,7 +46,7 @@ def test_other_params_and_other_code_are_other_cases_of_maybe_equal_content(get)
     assert len({e.qp for e in entries}) == 1
 
 
-def test_of_many_that_ask_at_once_one_builds(get):
+def test_one_of_many_concurrent_callers_builds(get):
     with ThreadPoolExecutor(8) as pool:  # locks are between open files, not processes
         entries = list(pool.map(lambda _: get(name(n=1), slowly=0.1), range(8)))
 

@@ -154,11 +154,11 @@ def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
     assert (folder / "held").read_text() == ""
 
 
-def test_what_has_a_second_thread_does_not_fork(results):
+def test_a_process_with_a_second_thread_does_not_fork(results):
     assert results["thread"] == [[None, "", {"how": "command"}]]
 
 
-def test_what_a_fork_starts_ends_with_its_measurement(results, folder):
+def test_processes_that_a_fork_starts_end_with_its_measurement(results, folder):
     (verdict, _, first), after = results["daemon"]
 
     assert (verdict, first["how"]) == (None, "fork")
@@ -198,7 +198,7 @@ def test_the_command_forks_before_it_builds(monkeypatch, capsys):
     assert events == ["fork", "build"]
 
 
-def test_where_code_of_others_is_loaded_the_command_does_not_fork(monkeypatch, capsys):
+def test_the_command_does_not_fork_once_plug_ins_are_loaded(monkeypatch, capsys):
     forked = []
     monkeypatch.setattr(WorkerProcess, "fork", lambda *_: forked.append(True))
     plugin = ["--plugin", str(TOY_PROBLEM)]

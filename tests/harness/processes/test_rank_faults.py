@@ -98,7 +98,7 @@ def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
     assert record.message == "emission: killed after 2 s"
 
 
-def test_what_one_rank_cannot_certify_none_does_and_the_note_says_which(measured):
+def test_a_rank_that_cannot_certify_is_named_and_no_rank_certifies(measured):
     record = measured("certificate", "raises-after")
 
     assert record.verdict == "verified"
@@ -129,7 +129,7 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
 
 
 @pytest.mark.parametrize("stage", ["solve"])
-def test_what_a_rank_prints_is_not_taken_for_the_reason(measured, stage):
+def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured, stage):
     record = measured(stage, "prints")
 
     assert record.verdict == "crashed"

@@ -53,7 +53,7 @@ def test_reductions_of_distributed_vectors_are_those_of_the_whole(found):
         assert got == pytest.approx(known, abs=1e-12), name
 
 
-def test_what_would_see_a_slice_only_is_refused(found):
+def test_operations_on_a_slice_alone_are_refused(found):
     assert found["vectors"]["answered"] == []
     assert found["vectors"]["kept"]
 
@@ -104,7 +104,7 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
     assert first.record.run_id != alone.record.run_id
 
 
-def test_faces_that_a_body_hardly_feels_have_a_factor_on_ranks():
+def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
     """On free components, some rows are smaller than the rounding of their sum."""
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
@@ -128,7 +128,7 @@ def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts)
     assert ranks.record.objective == pytest.approx(alone.record.objective, rel=1e-8)
 
 
-def test_records_tell_what_ranks_spent_on_the_solve(answers):
+def test_records_contain_the_cost_of_each_rank(answers):
     first, *_ = answers
     seconds, counts = first.record.rank_seconds, first.record.rank_counts
 
@@ -171,7 +171,7 @@ def test_more_ranks_than_subdomains_are_declined():
         (CASE, "clarabel", "runs in one process only"),
     ],
 )
-def test_what_cannot_be_shared_is_declined(case, solver, message):
+def test_qps_that_cannot_be_distributed_are_declined(case, solver, message):
     answer = mb.solve(case, solver, ranks=2)
 
     assert answer.verdict == "declined"
@@ -179,14 +179,14 @@ def test_what_cannot_be_shared_is_declined(case, solver, message):
 
 
 @pytest.mark.parametrize("count", ["0", "-1", "5000"])
-def test_no_number_of_ranks_is_refused_in_a_line(capfd, count):
+def test_a_wrong_number_of_ranks_is_refused_in_one_line(capfd, count):
     assert (
         main(Registries(), ["solve", CASE, "--solver", "smalbe", "--mpi", count]) == 2
     )
     assert "expected a number of ranks, 1 to 4096" in capfd.readouterr().err
 
 
-def test_a_missing_mpi_is_said_before_anything_is_built(monkeypatch, capfd):
+def test_a_missing_mpi_is_reported_before_anything_is_built(monkeypatch, capfd):
     monkeypatch.setattr(mpi, "find_spec", lambda name: None)
 
     assert main(Registries(), [*SOLVE, "--mpi", "2"]) == 2
@@ -212,7 +212,7 @@ params = { S = 2, n = 4 }
 """
 
 
-def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_path):
+def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))
 
@@ -233,7 +233,9 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_pat
     assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
 
 
-def test_ranks_tell_all_of_an_answer_and_nobody_builds_the_case(tmp_path, monkeypatch):
+def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
+    tmp_path, monkeypatch
+):
     """In suites and single solves; ranks use the original family."""
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
@@ -373,7 +375,7 @@ def busy(mark):
     ]
 
 
-def test_ranks_tell_how_fast_they_talk_to_one_another(answers):
+def test_records_contain_the_speed_of_communication(answers):
     first, _, alone = answers
     network = first.record.rank_network
     assert network.keys() == {

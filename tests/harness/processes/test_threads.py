@@ -138,7 +138,7 @@ def test_threads_that_share_a_worker_or_close_it_get_an_answer_each(worker):
     assert [answer is not None for answer in answers] == [True] * 4
 
 
-def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
+def test_closing_twice_does_not_close_another_file(worker, tmp_path):
     worker.ask({}, **LIMITS)
     worker.close()
     others = [(tmp_path / f"{i}").open("w") for i in range(8)]
@@ -148,7 +148,7 @@ def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
         file.close()
 
 
-def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
+def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
     """From the start of a worker to its end, including stops of other workers."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
@@ -166,7 +166,7 @@ def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
     assert soon(lambda: not reaper.is_alive(pid))
 
 
-def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
+def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
     """Its number may have belonged to one of ours a moment before."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
@@ -206,7 +206,7 @@ def test_a_fork_of_a_process_leaves_its_workers_alone(worker):
     assert worker.ask({}, **LIMITS).answer["pid"] == pid
 
 
-def test_a_fork_does_not_wait_for_a_thread_that_is_not_in_it():
+def test_a_fork_does_not_wait_for_a_thread_of_its_parent():
     turn, taken, done = ForkSafeLock(), Event(), Event()
 
     def hold():
@@ -364,7 +364,7 @@ SEGMENT = SHOWS.replace(
 
 @pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
 @pytest.mark.parametrize("memory_limit", [2000.0, 60.0])
-def test_segments_of_a_worker_count_for_its_limit_and_go_with_it(
+def test_segments_of_a_worker_count_for_its_limit_and_are_removed_with_it(
     tmp_path, memory_limit
 ):
     file = tmp_path / "segment"

@@ -212,7 +212,7 @@ def test_a_damaged_copy_is_replaced_where_the_original_is_here(measured, here, c
     assert copy.read_bytes() == right
 
 
-def test_what_is_too_large_stays_and_is_named(tmp_path, monkeypatch):
+def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Path("large.npz").open("wb") as file:
         file.truncate(70 * 2**20)
@@ -367,7 +367,7 @@ def test_a_link_among_copies_is_refused(here, copy, cli):
         assert f"{copy.name} is not a regular file" in said
 
 
-def test_a_list_of_the_user_is_no_concern_of_a_run_without_files(tmp_path, monkeypatch):
+def test_a_list_of_the_user_does_not_affect_a_run_without_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "copies.json").write_text("mine")

@@ -119,7 +119,7 @@ def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path
     "digest",
     ["../../outside", "/etc/passwd", "a\0b", "", "A" * 16, "\ud800", "x" * 5000],
 )
-def test_what_is_no_digest_leads_nowhere(tmp_path, digest):
+def test_malformed_digests_open_no_file(tmp_path, digest):
     folder = tmp_path / "a" / "b"
     save(folder, FIELDS)
     np.savez(tmp_path / "outside.npz", **FIELDS)

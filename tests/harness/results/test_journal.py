@@ -28,7 +28,7 @@ def ids(folder):
     return [r.run_id for r in read_journal(folder)]
 
 
-def test_what_is_appended_is_read_back_in_order(tmp_path):
+def test_appended_records_are_read_back_in_order(tmp_path):
     first, second = record("a", gap=1e-9), record("b", verdict=Verdict.WRONG)
     with Journal(tmp_path, "here") as journal:
         journal.append(first)
@@ -93,7 +93,7 @@ def test_a_journal_cut_at_any_byte_loses_only_the_line_that_was_cut(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [b'{"schema', b"", b"\xff"])
-def test_of_a_damaged_line_it_is_said_what_would_be_right(tmp_path, bad):
+def test_the_message_on_a_damaged_line_contains_the_remedy(tmp_path, bad):
     file = tmp_path / "journal" / "here.jsonl"
     file.parent.mkdir()
     file.write_bytes(bad + b"\n")
@@ -182,7 +182,7 @@ def test_a_folder_without_journal_is_named(tmp_path):
         read_journal(tmp_path)
 
 
-def test_what_is_no_folder_is_said_to_be_missing_or_a_file(tmp_path):
+def test_a_path_that_is_not_a_folder_is_reported_as_missing_or_a_file(tmp_path):
     (tmp_path / "file").touch()
     for name, wrong in (("nowhere", "no such folder"), ("file", "a file")):
         with pytest.raises(InputError) as e:

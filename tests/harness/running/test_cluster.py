@@ -202,7 +202,7 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
         assert len({r.case for r in records if r.block == number}) == 1
 
 
-def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
+def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
     cli, cluster, tmp_path
 ):
     victim = cluster.join()
@@ -241,7 +241,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
     assert "--nthreads 1" in err.splitlines()[-1]
 
 
-def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
+def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
@@ -250,7 +250,7 @@ def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
         assert not Path("d").exists()
 
 
-def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeypatch):
+def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
     """Not even with --fresh, which deletes the content of a folder."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
@@ -425,7 +425,7 @@ except mb.InputError as e:
 """
 
 
-def test_a_script_that_would_run_in_the_workers_too_is_refused_in_a_line(tmp_path):
+def test_a_script_that_would_also_run_in_the_workers_is_refused_in_one_line(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
     text = (
         SUITE.format(repeats=1).replace("well", "string").replace('"dual"', '"primal"')
@@ -485,12 +485,12 @@ def meet():
     return meet
 
 
-def test_an_equal_node_is_kept_in_silence(meet):
+def test_an_equal_node_is_stored_without_a_warning(meet):
     kept, said = meet(lambda there: there["now"].update(load=3.0))
     assert (len(kept), said) == (1, [])
 
 
-def test_another_environment_is_kept_and_told_once(meet):
+def test_another_environment_is_stored_and_warned_of_once(meet):
     for _ in range(2):
         kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
     assert len(kept) == 1
@@ -502,7 +502,7 @@ def test_another_environment_is_kept_and_told_once(meet):
     )
 
 
-def test_workers_that_share_a_machine_are_told_in_words(meet):
+def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
     _, said = meet(lambda there: there["machine"].update(shared_by_workers=2))
     assert "(Dask workers that share the machine: none here, 2 there)" in said[0]
 

@@ -67,7 +67,7 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
     return made
 
 
-def test_who_was_first_in_a_block_is_last_in_the_next():
+def test_the_order_of_a_block_is_reversed_in_the_next():
     """No position in a block favours a solver; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
     blocks = list(planned(solvers=solvers, repeats=6).blocks())
@@ -78,7 +78,7 @@ def test_who_was_first_in_a_block_is_last_in_the_next():
     assert len(set(orders)) == 6
 
 
-def test_of_a_sequence_the_whole_is_compared():
+def test_sequences_are_compared_by_their_total_time():
     """Its steps are noisy, but their errors cancel in the sum."""
     rng = np.random.default_rng(161803)
     steps = cases_of(1, 2)
@@ -146,7 +146,7 @@ def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
-def test_each_block_says_what_it_is_before_it_starts():
+def test_each_block_is_announced_before_it_starts():
     schedule = planned(repeats=2)
     list(schedule.blocks())
 
@@ -156,7 +156,7 @@ def test_each_block_says_what_it_is_before_it_starts():
     ]
 
 
-def test_without_a_precision_there_are_the_repeats_of_the_suite():
+def test_without_a_precision_the_repeats_of_the_suite_are_measured():
     assert len(carried_out(0.5)) == 2 * 3
 
 
@@ -165,7 +165,7 @@ def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
 
 
 @pytest.mark.parametrize("solvers", ["ab", "abc"])
-def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked(solvers):
+def test_blocks_continue_until_the_ratio_has_the_requested_precision(solvers):
     specs = tuple(SolverSpec(name=s, label=s) for s in solvers)
     made = carried_out(0.1, solvers=specs, precision=0.05, max_repeats=200)
     times = {
@@ -177,14 +177,14 @@ def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked(solvers):
     assert largest_half_width(times) <= 0.05 < largest_half_width(before)
 
 
-def test_blocks_end_at_the_most_repeats_and_at_the_budget():
+def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
     assert len(carried_out(2.0, precision=0.01, max_repeats=7)) == 2 * 7
     spent = carried_out(0.1, precision=0.001, max_repeats=99, budget=30.0)
 
     assert 30 <= sum(r.total_seconds for r in spent) < 36
 
 
-def test_what_has_no_time_spends_no_budget():
+def test_records_without_a_time_spend_no_budget():
     """A failing solver has no time; the others are distinguished after many blocks."""
     specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
     schedule = planned(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
@@ -202,7 +202,7 @@ def test_what_has_no_time_spends_no_budget():
     assert 30 <= spent < 33
 
 
-def test_parts_of_a_block_keep_a_number_each():
+def test_each_part_of_a_block_has_its_own_number():
     schedule = planned()
     first = next(schedule.blocks()).number
     numbers = [schedule.block_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
@@ -212,11 +212,11 @@ def test_parts_of_a_block_keep_a_number_each():
     assert next(schedule.blocks()).number not in numbers
 
 
-def test_solvers_that_fail_are_no_reason_to_go_on():
+def test_failing_solvers_do_not_prolong_the_measurement():
     assert len(carried_out(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
 
 
-def test_the_paired_interval_covers_as_often_as_it_says():
+def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0
     for _ in range(2000):
@@ -228,7 +228,7 @@ def test_the_paired_interval_covers_as_often_as_it_says():
     assert hits / 2000 == pytest.approx(0.95, abs=0.015)
 
 
-def test_only_blocks_that_both_were_in_are_compared():
+def test_only_common_blocks_are_compared():
     r = paired_ratio({0: 2.0, 1: 8.0, 5: 1e9}, {0: 1.0, 1: 4.0, 7: 1e-9})
 
     assert (r.value, r.pairs) == (pytest.approx(2.0), 2)

@@ -42,7 +42,7 @@ def test_a_suite_that_asks_for_more_is_the_same(more):
         ),
     ],
 )
-def test_what_was_measured_may_not_become_something_else(change, said):
+def test_settings_of_past_measurements_may_not_change(change, said):
     assert incompatibility(SUITE, SUITE | change) == said
 
 

@@ -96,7 +96,7 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
         ("max_iter=5,6", "--option: max_iter has 2 values; expected one, only `run`"),
     ],
 )
-def test_what_is_no_option_of_a_solver_is_refused(text, message):
+def test_unknown_options_and_values_are_refused(text, message):
     with pytest.raises(InputError) as e:
         options_for("method", [text], SOLVERS)
 
@@ -117,7 +117,7 @@ def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
     assert labels() == ["method", "plain"]
 
 
-def test_labels_say_the_value_however_it_is_written():
+def test_labels_contain_the_value_in_canonical_form():
     assert labels("alpha=1e-3") == labels("alpha=0.001")
 
 
@@ -153,7 +153,7 @@ def test_a_null_arm_has_the_options_of_its_twin():
         ),
     ],
 )  # fmt: skip
-def test_a_sweep_that_makes_no_sense_is_refused(texts, message):
+def test_a_contradictory_sweep_is_refused(texts, message):
     with pytest.raises(InputError) as e:
         labels(*texts)
 
@@ -194,7 +194,7 @@ def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
     assert resolve(spec, registry).rho == value
 
 
-def test_a_default_decides_where_the_annotation_leaves_it_open():
+def test_the_default_determines_the_type_if_the_annotation_does_not():
     assert options_for("sized", ["start=3"], {"sized": Sized()}) == {"start": 3}
     with pytest.raises(InputError, match=r"start = '0\.5'; expected an integer"):
         options_for("sized", ["start=0.5"], {"sized": Sized()})

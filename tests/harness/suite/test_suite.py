@@ -65,7 +65,7 @@ def names(suite):
     return [case.name for case in suite.cases]
 
 
-def test_what_is_left_out_takes_its_default(load):
+def test_missing_keys_take_their_defaults(load):
     suite = load(MINIMAL)
 
     assert suite.name == "demo"
@@ -76,7 +76,7 @@ def test_what_is_left_out_takes_its_default(load):
     assert suite.text == MINIMAL
 
 
-def test_what_is_given_is_what_is_measured(load):
+def test_a_suite_contains_the_given_values(load):
     suite = load(
         """
         name = "demo"
@@ -219,7 +219,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ),
     ],
 )
-def test_what_is_wrong_is_said_with_file_place_and_remedy(
+def test_mistakes_are_reported_with_file_place_and_remedy(
     load, tmp_path, text, message
 ):
     with pytest.raises(InputError) as e:
@@ -248,7 +248,7 @@ def test_what_is_wrong_is_said_with_file_place_and_remedy(
         ),
     ],
 )
-def test_what_is_wrong_with_a_solver_is_said_with_its_place(load, entry, message):
+def test_mistakes_in_solvers_are_reported_with_their_place(load, entry, message):
     with pytest.raises(InputError) as e:
         load(f"name = 'a'\nsolvers = ['osqp', {entry}]\n{BLOCK}")
 
@@ -311,7 +311,7 @@ def test_a_case_may_be_named_in_any_way_that_parses(narrowed, written):
     assert names(narrowed(cases=[written])) == ["well/n=2/dual"]
 
 
-def test_a_pattern_in_vain_is_told_what_there_is(narrowed):
+def test_a_pattern_without_a_match_is_refused_with_the_cases(narrowed):
     with pytest.raises(InputError) as e:
         narrowed(cases=["well/n=3/dual"])
 
@@ -359,7 +359,7 @@ def test_a_limit_of_the_suite_is_no_option_of_a_solver(load, head):
         (dict(memory_limit=-1.0), "--memory-limit = -1.0; expected a positive number"),
     ],
 )
-def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
+def test_a_contradictory_override_is_refused(narrowed, changes, message):
     with pytest.raises(InputError, match=message):
         narrowed(**changes)
 
@@ -368,7 +368,7 @@ def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
     ("name", "cases"),
     [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6)],
 )
-def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
+def test_the_suites_of_the_checkout_keep_their_promises(name, cases):
     path = ROOT / "suites" / f"{name}.toml"
     suite = load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
 
@@ -488,7 +488,7 @@ def test_a_sequence_may_run_along_zipped_keys():
 
 
 @pytest.mark.parametrize("name", BEYOND)
-def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
+def test_suites_beyond_the_paper_can_be_narrowed(name):
     """Six is the smallest number of repeats whose median has a 95 % interval."""
     suite = shipped(name)
     narrowed = with_overrides(
@@ -519,7 +519,7 @@ def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():
     assert [s.label for s in kept.solvers] == ["smalbe", "smalbe (A/A)"]
 
 
-def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
+def test_a_pattern_keeps_all_steps_of_a_sequence_or_none():
     kept = with_overrides(
         shipped("path"), problems.PROBLEMS, solvers.SOLVERS, cases=["*/step=3/dual"]
     )
@@ -538,7 +538,7 @@ def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
         ("null_arm = 'smalb'", "unknown null_arm 'smalb'.*smalbe"),
     ],
 )
-def test_a_schedule_that_makes_no_sense_is_refused(tmp_path, line, message):
+def test_a_contradictory_schedule_is_refused(tmp_path, line, message):
     file = tmp_path / "s.toml"
     file.write_text(
         f"name = 's'\nsolvers = ['smalbe']\n{line}\n[[problems]]\nfamily = 'obstacle'\n"
@@ -560,7 +560,7 @@ SEQUENCE = "sequence = 'n'\nparams = { n = [4, 8] }"
         ("tighten = [0.1]\naccuracy = 1e-6", SEQUENCE, "only one of the two"),
     ],
 )
-def test_tightening_that_cannot_be_is_refused(tmp_path, line, block, message):
+def test_impossible_tightening_is_refused(tmp_path, line, block, message):
     file = tmp_path / "s.toml"
     file.write_text(
         f"name = 's'\nsolvers = ['smalbe']\n{line}\n"
