@@ -1,4 +1,4 @@
-"""Bodies in the subdomains that cells are labelled with, for tests."""
+"""Bodies decomposed into subdomains by labels of their cells, for tests."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -27,7 +27,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 
 def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
-    """Know the bodies by the labels (E,) of their cells; all nodes are listed."""
+    """Return bodies with labels (E,) of their cells; all nodes are listed."""
     every = np.arange(len(bodies.mesh.points))
     return mesh_in_parts(bodies.mesh, label, bodies.body, every)
 
@@ -39,7 +39,7 @@ def torn_by(
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> Torn:
-    """Tear bodies with a QP of theirs, with friction."""
+    """Decompose bodies with their QP, with friction."""
     return on_one_process(parts_by(bodies, layout, primal, friction, rows)).torn_bodies
 
 
@@ -50,7 +50,7 @@ def parts_by(
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> ProblemInParts:
-    """Pose a QP of the bodies, with friction, on their subdomains."""
+    """Return the QP of the bodies, with friction, on their subdomains."""
     of = stated(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
     contact = Contact(*contact_rows(primal, friction), friction.bound)
@@ -58,7 +58,7 @@ def parts_by(
 
 
 def parts_of(name: str) -> ProblemInParts:
-    """Describe the dual of a case; what comes before it is solved."""
+    """Describe the dual of a case; its earlier load steps are solved."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = case.family.stated(case.params), chosen("dual", case.params)
@@ -74,7 +74,7 @@ def parts_of(name: str) -> ProblemInParts:
 
 
 def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:
-    """Bodies of 32 × 4 and 36 × 6 cells, their QP, and both in subdomains."""
+    """Return bodies of 32 × 4 and 36 × 6 cells with their QP, and both decomposed."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
