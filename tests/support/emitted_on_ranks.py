@@ -23,7 +23,7 @@ from mortarbench.problems.feti.subdomains import OwnSubdomains, subdomains_of
 from mortarbench.problems.feti.torn import Kind
 from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.torn_bodies import parts_of
+from tests.support.decomposed_bodies import parts_of
 
 
 def probe(n):

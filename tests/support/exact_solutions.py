@@ -30,7 +30,7 @@ from mortarbench.harness.verify.active_set_refinement import (
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.held_by_contact import _eliminated, _loose, _substituted
+from tests.support.supported_by_contact import _eliminated, _loose, _substituted
 
 BITS = 500  #: after the binary point
 FINE = 330  #: bits, relative to the largest unknown, that refinement settles

@@ -25,9 +25,9 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.feti.emission import dual_on, emitted
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import parts_of
 from tests.support.disturbed import DISTURBANCES
-from tests.support.held_by_contact import disc_between_plates, disc_in_parts
-from tests.support.torn_bodies import parts_of
+from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
 #: of a disc between plates: what holds it but contact, and where all of it is
 DISCS = {

@@ -33,7 +33,7 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from tests.support.held_by_contact import disc_between_plates
+from tests.support.supported_by_contact import disc_between_plates
 
 PRESSURE = 1e7  #: mean pressure of the loads, Pa
 METHODS = (("nts", "dual"), ("mortar", "dual"), ("mortar", "standard"))

@@ -35,8 +35,8 @@ from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import labelled, parts_by
 from tests.support.disturbed import DISTURBANCES
-from tests.support.torn_bodies import labelled, parts_by
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",

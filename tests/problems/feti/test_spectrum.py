@@ -26,8 +26,8 @@ from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.membranes import Membranes
+from tests.support.decomposed_bodies import decompose_by_labels, decomposed_pair
 from tests.support.threads import on_threads, without_lock
-from tests.support.torn_bodies import torn_by, torn_pair
 
 
 def identity(x: Vector) -> Vector:
@@ -98,7 +98,7 @@ def test_both_errors_are_held_against_their_own_eigenvalue(
 
 @pytest.mark.parametrize("rows", ["orthonormal", "chain", "redundant"])
 def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
-    _, _, pair = torn_pair(rows)
+    _, _, pair = decomposed_pair(rows)
     B = pair.B[: pair.equalities]
     G = csr_array((B @ pair.domains.kernel).T)
     P, dense = projector(G, B), B.toarray()
@@ -120,7 +120,7 @@ def of_beam_ring(layers: int, cells: int) -> Spectrum:
     bodies, layout = of.assembled, of.shape.layout(cells)
     contact = linearisation(bodies, "nts", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
-    pieces = torn_by(bodies, layout, primal)
+    pieces = decompose_by_labels(bodies, layout, primal)
     (found,) = spectra_of_equations(pieces, tol=1e-3)
     return found
 

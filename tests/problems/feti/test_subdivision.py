@@ -9,8 +9,8 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
 from mortarbench.problems.feti.subdomains import subdomains_of
 from mortarbench.problems.feti.tearing import compact_blocks, labelled
+from tests.support.decomposed_bodies import parts_of
 from tests.support.glued import decompose, structured_bodies
-from tests.support.torn_bodies import parts_of
 
 pytestmark = pytest.mark.together
 

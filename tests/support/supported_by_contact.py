@@ -33,7 +33,7 @@ from mortarbench.problems.duality.undivided import primal_qp
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 from mortarbench.problems.feti.subdomains import ProblemInParts
-from tests.support.torn_bodies import parts_by, torn_by
+from tests.support.decomposed_bodies import decompose_by_labels, parts_by
 
 PRESSURE = 1e7  #: Pa
 
@@ -89,7 +89,7 @@ def disc_in_parts(
     return parts_by(bodies, stated(bodies).shape.layout(parts), primal)
 
 
-def torn_disc_between_plates(
+def dual_of_disc_between_plates(
     n: int = 4,
     *,
     parts: int = 6,
@@ -102,7 +102,7 @@ def torn_disc_between_plates(
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     layout = stated(bodies).shape.layout(parts)
-    return torn_dual(torn_by(bodies, layout, primal), primal)
+    return torn_dual(decompose_by_labels(bodies, layout, primal), primal)
 
 
 def _disc_and_plates(

@@ -32,7 +32,7 @@ def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
     return mesh_in_parts(bodies.mesh, label, bodies.body, every)
 
 
-def torn_by(
+def decompose_by_labels(
     bodies: Bodies,
     layout: Subdivision,
     primal: QP,
@@ -73,11 +73,17 @@ def parts_of(name: str) -> ProblemInParts:
     return found
 
 
-def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:
+def decomposed_pair(
+    rows: str = "orthonormal", most: int = 2
+) -> tuple[Bodies, Any, Torn]:
     """Return bodies of 32 × 4 and 36 × 6 cells with their QP, and both decomposed."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
     label = of_beam_ring(*geometry).shape.layout(most).label
-    return bodies, primal, torn_by(bodies, labelled(bodies, label), primal, rows=rows)
+    return (
+        bodies,
+        primal,
+        decompose_by_labels(bodies, labelled(bodies, label), primal, rows=rows),
+    )
