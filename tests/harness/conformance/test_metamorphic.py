@@ -21,7 +21,7 @@ from mortarbench.harness.conformance.metamorphic import (
 from mortarbench.solvers.adapters.piqp_ import PIQP
 
 
-def drawn():
+def generator():
     return np.random.default_rng(161803)
 
 
@@ -30,24 +30,24 @@ NAMES_AND_UNITS = {
     "units": lambda qp: change_units(qp, unknown=2.0**-11, objective=2.0**28),
     "odd units": lambda qp: change_units(qp, unknown=0.0254, objective=4.448),
     "unknowns permuted": lambda qp: permute_unknowns(
-        qp, drawn().permutation(qp.q.size)
+        qp, generator().permutation(qp.q.size)
     ),
     "rows permuted": lambda qp: permute_rows(
-        qp, drawn().permutation(qp.b.size), drawn().permutation(qp.h.size)
+        qp, generator().permutation(qp.b.size), generator().permutation(qp.h.size)
     ),
     "rows scaled": lambda qp: scale_rows(
         qp,
-        2.0 ** drawn().integers(-9, 9, qp.b.size),
-        2.0 ** drawn().integers(-9, 9, qp.h.size),
+        2.0 ** generator().integers(-9, 9, qp.b.size),
+        2.0 ** generator().integers(-9, 9, qp.h.size),
     ),
-    "mirrored": lambda qp: mirror(qp, drawn().random(qp.q.size) < 0.5),
+    "mirrored": lambda qp: mirror(qp, generator().random(qp.q.size) < 0.5),
 }
 TRANSFORMS = NAMES_AND_UNITS | {
     "rows twice": lambda qp: duplicate_rows(
-        qp, np.arange(0, qp.b.size, 2), drawn().random(qp.h.size) < 0.5
+        qp, np.arange(0, qp.b.size, 2), generator().random(qp.h.size) < 0.5
     ),
     "unknowns shifted": lambda qp: shift_unknowns(
-        qp, drawn().integers(-8, 8, qp.q.size) / 8
+        qp, generator().integers(-8, 8, qp.q.size) / 8
     ),
     "all": lambda qp: (
         TRANSFORMS["units"](qp)
@@ -63,9 +63,9 @@ every_transform = pytest.mark.parametrize("transform", TRANSFORMS)
 every_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
-def anywhere(qp):
+def random_point(qp):
     """Return a random point, with multipliers of any sign, also on absent bounds."""
-    rng = drawn()
+    rng = generator()
     x, y, z, z_box = (rng.standard_normal(v.size) for v in (qp.q, qp.b, qp.h, qp.q))
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
@@ -109,7 +109,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 ):
     qp, _ = manufactured(shape, dense=True)
     new = TRANSFORMS[transform](qp)
-    s = anywhere(new.qp)
+    s = random_point(new.qp)
     back = new.recover(s)
 
     for value in (lambda q, at: q.objective(at.x), lagrangian):
@@ -130,7 +130,7 @@ def test_violated_constraints_stay_violated(manufactured, transform, shape):
 
     qp, _ = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
-    s = anywhere(new.qp)
+    s = random_point(new.qp)
 
     assert violated(new.qp, s) == violated(qp, new.recover(s))
 
@@ -144,9 +144,11 @@ def test_names_and_units_change_no_residual_at_any_point(
     qp, expected = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)
-    near = replace(expected, x=expected.x + 1e-5 * drawn().standard_normal(qp.q.size))
+    near = replace(
+        expected, x=expected.x + 1e-5 * generator().standard_normal(qp.q.size)
+    )
     for old in (
-        anywhere(qp),
+        random_point(qp),
         near,
         expected,
         Solution.without_point(qp, Status.SOLVED),
@@ -193,7 +195,7 @@ def test_a_duplicated_row_changes_residuals_by_a_factor_of_two_at_most(
     """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ can shrink, by two."""
     qp, _ = manufactured(shape, dense=True)
     new = duplicate_rows(qp, np.arange(qp.b.size), np.arange(qp.h.size))
-    old = anywhere(qp)
+    old = random_point(qp)
     s = replace(old, y=np.tile(old.y / 2, 2), z=np.tile(old.z / 2, 2))
     got, before = kkt_residuals(new.qp, s), kkt_residuals(qp, old)
 

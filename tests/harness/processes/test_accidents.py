@@ -96,27 +96,30 @@ def beside_a_witness(tmp_path_factory):
         patch.setenv("WATCHED", name)
         bench = Bench(tmp_path_factory.mktemp("accidents"))
         assert bench("witness").verdict is Verdict.VERIFIED
-        alone = left(name)
+        alone = processes_of(name)
         assert len(alone) == 2  # worker, sub-reaper
 
         def measured_beside(solver, time_limit):
             patch.setenv("WATCHED", name)
             try:
                 record = bench(solver, time_limit=time_limit)
-                assert len(set(left(name)) - set(alone)) in (0, 2)  # worker, sub-reaper
+                assert len(set(processes_of(name)) - set(alone)) in (
+                    0,
+                    2,
+                )  # worker, sub-reaper
                 assert bench("witness").verdict is Verdict.VERIFIED
                 return record
             finally:
                 bench.workers.pop(solver).close()
-                assert left(name) == alone
+                assert processes_of(name) == alone
                 assert not list(Path("/dev/shm").glob(f"{name}*"))
 
         yield measured_beside
         bench.close()
-    assert left(name) == []
+    assert processes_of(name) == []
 
 
-def left(watched):
+def processes_of(watched):
     """List the living processes of a test, except this one."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
@@ -168,7 +171,7 @@ def bench(tmp_path, watched):
     bench = Bench(tmp_path)
     yield bench
     bench.close()
-    assert left(watched) == []
+    assert processes_of(watched) == []
 
 
 @pytest.mark.parametrize(
@@ -270,7 +273,7 @@ def check_neighbours(tmp_path, watched, careless):
         assert found == [(Verdict.VERIFIED, "")] * 2
     for solver in careless:
         assert {r.verdict for r in got[solver]} == {OUTCOMES[solver][0]}
-    assert left(watched) == []
+    assert processes_of(watched) == []
 
 
 def test_neighbours_of_careless_solvers_keep_their_measurements_and_are_alone(
@@ -420,17 +423,17 @@ def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, watched):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], cwd=ROOT)
     try:
         # run, sub-reaper, worker, daemon
-        assert soon(lambda: len(left(watched)) == 4), "\n".join(
+        assert soon(lambda: len(processes_of(watched)) == 4), "\n".join(
             f"{process} {state(process)} waits in "
             + Path(f"/proc/{process}/wchan").read_text()
             + f": {Path(f'/proc/{process}/cmdline').read_bytes()[-60:]!r}"
-            for process in left(watched)
+            for process in processes_of(watched)
         )
     finally:
         parent.kill()
         parent.wait()
 
-    assert soon(lambda: left(watched) == [])
+    assert soon(lambda: processes_of(watched) == [])
 
 
 def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatch):

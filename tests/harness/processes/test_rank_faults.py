@@ -55,7 +55,7 @@ def measured(tmp_path, monkeypatch):
         suite = tmp_path / "ranks.toml"
         suite.write_text(SUITE.format(limit=limit))
         results = mb.run(suite, out=tmp_path / "out")
-        assert soon(lambda: not left(tmp_path))
+        assert soon(lambda: not processes_of(tmp_path))
         (record,) = results.records
         assert mb.load(tmp_path / "out").records == results.records
         return record
@@ -63,7 +63,7 @@ def measured(tmp_path, monkeypatch):
     return run
 
 
-def left(mark):
+def processes_of(mark):
     """List the other processes with the mark of a test in their environment."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
@@ -114,7 +114,7 @@ def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, 
 
     assert record.verdict == "crashed"
     assert KILLED in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -125,7 +125,7 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
 
     assert record.verdict == "crashed"
     assert f"rank {rank} of 2 ranks ended: exit code 0" in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.parametrize("stage", ["solve"])
@@ -143,7 +143,7 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 
     assert record.verdict == "time_limit"
     assert f"killed after {LIMIT} s" in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -159,7 +159,7 @@ def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage,
     else:
         assert record.verdict == "crashed"
         assert f"rank {rank} of 2: ValueError: planted" in record.message
-        assert named(record.message, stage)
+        assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -211,22 +211,22 @@ def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
         command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )  # fmt: skip
-    assert soon(lambda: lines(out))
-    assert soon(lambda: any(is_rank(pid) for pid in left(tmp_path)))
+    assert soon(lambda: journal_lines(out))
+    assert soon(lambda: any(is_rank(pid) for pid in processes_of(tmp_path)))
     run.kill()
     run.wait()
-    assert soon(lambda: not left(tmp_path))
-    before = lines(out)
+    assert soon(lambda: not processes_of(tmp_path))
+    before = journal_lines(out)
 
     results = mb.run(suite, out=out)
 
-    assert lines(out)[: len(before)] == before
+    assert journal_lines(out)[: len(before)] == before
     assert sorted(r.repeat for r in results.records) == [0, 1, 2]
     assert {r.verdict for r in results.records} == {"verified"}
     assert len({r.qp for r in results.records}) == 1
 
 
-def lines(folder):
+def journal_lines(folder):
     """Return the lines of a journal."""
     files = sorted((folder / "journal").glob("*.jsonl"))
     return [line for file in files for line in file.read_text().splitlines()]
@@ -239,7 +239,7 @@ def is_rank(process):
     return False
 
 
-def named(message, stage):
+def names_stage(message, stage):
     """Return True if the prefix of a message is that of the stage, or none."""
     if stage == "emission":
         return message.startswith("emission: ")

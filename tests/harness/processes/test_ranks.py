@@ -35,7 +35,7 @@ LANCZOS = 8  #: largest number of products with F before the solve
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
-def found(request):
+def rank_results(request):
     """Return results of several ranks on vectors and on two duals."""
     done = subprocess.run(
         [
@@ -48,39 +48,41 @@ def found(request):
     return json.loads(done.stdout)
 
 
-def test_reductions_of_distributed_vectors_are_those_of_the_whole(found):
-    for name, (got, known) in found["vectors"]["pairs"].items():
+def test_reductions_of_distributed_vectors_are_those_of_the_whole(rank_results):
+    for name, (got, known) in rank_results["vectors"]["pairs"].items():
         assert got == pytest.approx(known, abs=1e-12), name
 
 
-def test_operations_on_a_slice_alone_are_refused(found):
-    assert found["vectors"]["answered"] == []
-    assert found["vectors"]["kept"]
+def test_operations_on_a_slice_alone_are_refused(rank_results):
+    assert rank_results["vectors"]["answered"] == []
+    assert rank_results["vectors"]["kept"]
 
 
-def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(found):
-    for error, refused, shared in found["factors"]:
+def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(rank_results):
+    for error, refused, shared in rank_results["factors"]:
         assert error < 1e-12
         assert refused  # on all ranks, though one alone has dependent rows
         assert shared == list(range(0, 24, 3))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_ranks_multiply_and_precondition_as_one_process_does(found, case):
-    for errors in found[case]["errors"]:
+def test_ranks_multiply_and_precondition_as_one_process_does(rank_results, case):
+    for errors in rank_results[case]["errors"]:
         assert max(errors.values()) < 1e-13, errors
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(found, case):
-    of = found[case]
+def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(
+    rank_results, case
+):
+    of = rank_results[case]
     assert sum(of["rows"]) == of["size"]
     assert max(of["subdomains"]) <= 1.5 * np.mean(of["subdomains"])
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_solution_on_ranks_is_that_of_one_process(found, case):
-    of = found[case]
+def test_the_solution_on_ranks_is_that_of_one_process(rank_results, case):
+    of = rank_results[case]
     assert of["status"] == ["solved", "solved"]
     assert of["difference"] < 10 * TOL
     assert of["same_active"]
@@ -333,8 +335,8 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     if sent is not None:
-        assert soon(lambda: busy(tmp_path) or run.poll() is not None)
-        os.kill(busy(tmp_path)[-1], sent)
+        assert soon(lambda: busy_rank(tmp_path) or run.poll() is not None)
+        os.kill(busy_rank(tmp_path)[-1], sent)
     assert run.wait() == 0
 
     (record,) = mb.load(tmp_path / "out").records
@@ -364,7 +366,7 @@ def resident_mib(pid):
     return 0.0
 
 
-def busy(mark):
+def busy_rank(mark):
     """Return [rank 1] once it has its share of the QP, [] before that."""
     return [
         pid

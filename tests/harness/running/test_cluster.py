@@ -129,7 +129,7 @@ def measured(folder):
     return found
 
 
-def halved(folder):
+def partial_blocks(folder):
     """Return the numbers of blocks that are only partly in a journal."""
     with suppress(InputError):
         counts = Counter(r.block for r in read_journal(Path(folder)))
@@ -209,7 +209,7 @@ def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
     cut = []
 
     def kill():
-        assert soon(lambda: cut or cut.extend(halved("d")))
+        assert soon(lambda: cut or cut.extend(partial_blocks("d")))
         victim.kill()  # the turns that it returned are in the journal
         cluster.join()
 
@@ -263,14 +263,14 @@ def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeyp
 
 
 @pytest.fixture
-def heeded():
+def ctrl_c_enabled():
     """Restore the effect of Ctrl-C, which is ignored in a shell's background jobs."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.usefixtures("heeded")
+@pytest.mark.usefixtures("ctrl_c_enabled")
 def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
     from mortarbench.harness.running.cluster import _delay_interrupt
 
@@ -304,7 +304,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
     cluster.join()
 
     def kill():
-        assert soon(lambda: halved("d"))  # a worker is in the middle of a block
+        assert soon(lambda: partial_blocks("d"))  # a worker is in the middle of a block
         cluster.scheduler.kill()
 
     with meanwhile(kill):
@@ -344,7 +344,7 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     assert soon(lambda: set(descendants(worker.pid)) == before)
 
 
-def started(*arguments):
+def start(*arguments):
     """Start a run of the toy problem in a separate process."""
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
@@ -366,8 +366,8 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     cli, cluster, tmp_path
 ):
     worker = cluster.join(serves=False)
-    run = started("--out", "d", "--dask", cluster.address)
-    assert soon(lambda: halved("d"))  # the worker is in the middle of a block
+    run = start("--out", "d", "--dask", cluster.address)
+    assert soon(lambda: partial_blocks("d"))  # the worker is in the middle of a block
     run.kill()
     run.wait()
     before = measured("d")
@@ -399,8 +399,8 @@ def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_misse
     A parent that stands still looks the same to it.
     """
     worker = cluster.join(serves=False)
-    run = started("--out", "d", "--dask", cluster.address)
-    assert soon(lambda: halved("d"))
+    run = start("--out", "d", "--dask", cluster.address)
+    assert soon(lambda: partial_blocks("d"))
     run.send_signal(signal.SIGSTOP)
     try:
         code, _, err = cli("run", "toy.toml", "--out", "e", "--dask", cluster.address)

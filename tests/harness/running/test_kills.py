@@ -70,7 +70,7 @@ ASKED = {
 }
 
 
-def started(suite, out):
+def start(suite, out):
     """Start a run; its first child is the server that forks its processes."""
     return subprocess.Popen(
         [sys.executable, "-P", "-c", RUNS, str(suite), str(out), INSTALL],
@@ -78,7 +78,7 @@ def started(suite, out):
     )  # fmt: skip
 
 
-def ended(run):
+def end_of(run):
     """Return the exit code of a run, and its last line."""
     said = run.communicate()[1].splitlines()
     return run.returncode, said[-1] if said else ""
@@ -112,7 +112,7 @@ def ask_to_end(run, rng, out):
     """Send what Ctrl-C or a batch system sends."""
     number = rng.choice(list(ASKED))
     run.send_signal(number)
-    assert ended(run)[0] in ASKED[number]
+    assert end_of(run)[0] in ASKED[number]
 
 
 def fill_by_limit(run, rng, out):
@@ -138,15 +138,15 @@ def fill_by_files(run, rng, out):
 
 def assert_told(run):
     """Assert that a run on a full disk ends with one line, or had nothing to write."""
-    code, said = ended(run)
+    code, said = end_of(run)
     assert code in (0, 2), (code, said)
     if code == 2:
         assert said.endswith("free some space, and the same command continues")
 
 
-def disturbed(suite, out, events, rng, longest):
+def disturb(suite, out, events, rng, longest):
     """Apply all `events` to runs at random instants, then let one run finish."""
-    run = started(suite, out)
+    run = start(suite, out)
     for event in events:
         with suppress(subprocess.TimeoutExpired):
             run.wait(rng.uniform(0.0, longest))
@@ -155,17 +155,17 @@ def disturbed(suite, out, events, rng, longest):
         if run.poll() is None:
             continue
         if not run.stderr.closed:  # it ended by itself
-            assert ended(run) == (0, ANY)
-        run = started(suite, out)
-    assert ended(run)[0] == 0
-    assert ended(started(suite, out))[0] == 0  # what could not be built, again
+            assert end_of(run) == (0, ANY)
+        run = start(suite, out)
+    assert end_of(run)[0] == 0
+    assert end_of(start(suite, out))[0] == 0  # what could not be built, again
 
 
 def check(tmp_path, events, seed, out=None, repeats=4):
     suite = tmp_path / "suite.toml"
     suite.write_text(SUITE.format(repeats=repeats))
     begin = time.monotonic()
-    assert ended(started(suite, tmp_path / "whole"))[0] == 0
+    assert end_of(start(suite, tmp_path / "whole"))[0] == 0
     longest = (time.monotonic() - begin) / 2
     whole = read_journal(tmp_path / "whole")
     assert len(whole) == 5 * (4 * repeats + 1)
@@ -173,7 +173,7 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     rng = random.Random(seed)
     rng.shuffle(events)
     out = out or tmp_path / "disturbed"
-    disturbed(suite, out, events, rng, longest)
+    disturb(suite, out, events, rng, longest)
     got = read_journal(out)
 
     assert len({r.run_id for r in got}) == len(got)  # exactly once

@@ -37,7 +37,7 @@ class Quiet:
         self.said.append(text)
 
 
-def planned(**changes):
+def schedule_of(**changes):
     """Return a schedule of three repeats of one case by solvers a and b, or changed."""
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
@@ -51,10 +51,10 @@ def planned(**changes):
     )  # fmt: skip
 
 
-def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
+def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
     """Execute a suite with measured times of 1, 2 and 4 s, up to some noise."""
     rng = np.random.default_rng(seed)
-    schedule = planned(**changes)
+    schedule = schedule_of(**changes)
     made = []
     for block in schedule.blocks():
         for (record,) in block.turns:
@@ -70,7 +70,7 @@ def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
 def test_the_order_of_a_block_is_reversed_in_the_next():
     """No position in a block favours a solver; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
-    blocks = list(planned(solvers=solvers, repeats=6).blocks())
+    blocks = list(schedule_of(solvers=solvers, repeats=6).blocks())
     orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
 
     assert [order[::-1] for order in orders[::2]] == orders[1::2]
@@ -82,7 +82,7 @@ def test_sequences_are_compared_by_their_total_time():
     """Its steps are noisy, but their errors cancel in the sum."""
     rng = np.random.default_rng(161803)
     steps = cases_of(1, 2)
-    schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
+    schedule = schedule_of(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
     blocks = 0
     for block in schedule.blocks():
         blocks += 1
@@ -108,11 +108,11 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
         tolerances=(1e-4, 1e-6), repeats=2,
         cases=cases_of(1, 2),
     )  # fmt: skip
-    every = records_of(planned(**suite).blocks())
-    assert len({r.run_id for r in every}) == planned(**suite).cells == 2 * 2 * 2 * 2
+    every = records_of(schedule_of(**suite).blocks())
+    assert len({r.run_id for r in every}) == schedule_of(**suite).cells == 2 * 2 * 2 * 2
 
     for done in range(len(every) + 1):
-        resumed = planned(**suite)
+        resumed = schedule_of(**suite)
         for record in every[:done]:
             resumed.add(record)
         left = records_of(resumed.blocks())
@@ -124,7 +124,7 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
 
 
 def test_a_solver_that_declined_a_case_is_not_asked_again():
-    schedule = planned()
+    schedule = schedule_of()
     asked = []
     for block in schedule.blocks():
         for (record,) in block.turns:
@@ -137,7 +137,7 @@ def test_a_solver_that_declined_a_case_is_not_asked_again():
 
 def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     cases = cases_of(1, 2)
-    schedule = planned(cases=cases)
+    schedule = schedule_of(cases=cases)
     blocks = schedule.blocks()
     failed = next(blocks)
 
@@ -147,7 +147,7 @@ def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
 
 
 def test_each_block_is_announced_before_it_starts():
-    schedule = planned(repeats=2)
+    schedule = schedule_of(repeats=2)
     list(schedule.blocks())
 
     assert schedule.progress.said == [
@@ -157,17 +157,17 @@ def test_each_block_is_announced_before_it_starts():
 
 
 def test_without_a_precision_the_repeats_of_the_suite_are_measured():
-    assert len(carried_out(0.5)) == 2 * 3
+    assert len(records_after(0.5)) == 2 * 3
 
 
 def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
-    assert len(carried_out(1e-4, precision=0.05)) == 2 * 3
+    assert len(records_after(1e-4, precision=0.05)) == 2 * 3
 
 
 @pytest.mark.parametrize("solvers", ["ab", "abc"])
 def test_blocks_continue_until_the_ratio_has_the_requested_precision(solvers):
     specs = tuple(SolverSpec(name=s, label=s) for s in solvers)
-    made = carried_out(0.1, solvers=specs, precision=0.05, max_repeats=200)
+    made = records_after(0.1, solvers=specs, precision=0.05, max_repeats=200)
     times = {
         s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in solvers
     }
@@ -178,8 +178,8 @@ def test_blocks_continue_until_the_ratio_has_the_requested_precision(solvers):
 
 
 def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
-    assert len(carried_out(2.0, precision=0.01, max_repeats=7)) == 2 * 7
-    spent = carried_out(0.1, precision=0.001, max_repeats=99, budget=30.0)
+    assert len(records_after(2.0, precision=0.01, max_repeats=7)) == 2 * 7
+    spent = records_after(0.1, precision=0.001, max_repeats=99, budget=30.0)
 
     assert 30 <= sum(r.total_seconds for r in spent) < 36
 
@@ -187,7 +187,7 @@ def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
 def test_records_without_a_time_spend_no_budget():
     """A failing solver has no time; the others are distinguished after many blocks."""
     specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
-    schedule = planned(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
+    schedule = schedule_of(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
     rng = np.random.default_rng(271828)
     spent = 0.0
     for block in schedule.blocks():
@@ -203,7 +203,7 @@ def test_records_without_a_time_spend_no_budget():
 
 
 def test_each_part_of_a_block_has_its_own_number():
-    schedule = planned()
+    schedule = schedule_of()
     first = next(schedule.blocks()).number
     numbers = [schedule.block_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
 
@@ -213,7 +213,7 @@ def test_each_part_of_a_block_has_its_own_number():
 
 
 def test_failing_solvers_do_not_prolong_the_measurement():
-    assert len(carried_out(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
+    assert len(records_after(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
 
 
 def test_the_paired_interval_has_its_nominal_coverage():
