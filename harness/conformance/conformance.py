@@ -190,6 +190,7 @@ def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
+    # the arrays are read-only, which a solver can undo: both are checked
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
             raise ContractError("changed the QP that it was given")

@@ -63,6 +63,7 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
+    # multipliers of active rows are at least 0.5: strict complementarity
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
     # of four variables, one is at its lower bound, one at its upper, two are inside
     at_lb = lower & (np.arange(n) % 4 == 0)

@@ -186,6 +186,7 @@ def source(root: Path) -> dict[str, Any] | None:
         commit = git("rev-parse", "HEAD").decode().strip()
         if not git("status", "--porcelain", "--", *_CODE):
             return {"commit": commit, "dirty": False, "changes": None}
+        # an external diff tool of the user's would change the digest
         changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]
         listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
         for name in sorted(listed.split(b"\0")):

@@ -215,7 +215,7 @@ def _text(value: object) -> str:
     match value:
         case None | bool():
             return str(value).lower()
-        case str():
+        case str():  # labels are split at blanks, see `without_options`
             return "_".join(value.split())
         case Integral():  # numpy's as well
             return repr(int(value))

@@ -254,10 +254,13 @@ def _toml_value(where: str, value: Any) -> str:
     if hasattr(value, "tolist"):
         value = value.tolist()
     match value:
-        case bool():
+        case bool():  # before int, of which bool is a subclass
             return str(value).lower()
         case int() | float():
             return repr(value)
+        # A TOML string is a JSON string except for two things: it must not contain DEL,
+        # which JSON leaves as it is, nor surrogate pairs, into which JSON in ASCII
+        # splits characters beyond 16 bits.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
