@@ -26,7 +26,7 @@ FAULTS = {
 
 @dataclass(frozen=True)
 class Well:
-    """Parabolas over half lines."""
+    """A parabola over a half line. Nothing more."""
 
     name: str = "well"
     defaults: dict = field(default_factory=lambda: {"n": 3, "depth": 1})
@@ -69,7 +69,7 @@ class Well:
 
 @dataclass(frozen=True)
 class Exact:
-    """Divides by the diagonal of P; for toy problems only."""
+    """Divides by a diagonal. Only for toy problems."""
 
     factor: float = 1.0
     reason: str | None = None
