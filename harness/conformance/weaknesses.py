@@ -19,26 +19,29 @@ MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
 Results = Mapping[str, Result]  #: of one solver, by the name of the check
 
 HEAD = f"""\
-# What an equivalent formulation changes
+# Effects of equivalent formulations
 
-Measured by `make weaknesses`, which writes this page; versions are those of
-`constraints.txt`. `mortarbench test-solver NAME` does the same for one solver.
+Measured by `make weaknesses`, which writes this page, with the versions in
+`constraints.txt`. `mortarbench test-solver NAME` measures one solver.
 
-Two strings in contact (`harness.conformance.manufactured.strings`: 42 unknowns, 4
-equality and 23 inequality rows; its dual; its dual with bounds only) are solved at tol
-{TOL:g} without dimensions, then written differently: in other units, in another order,
-with rows scaled by powers of two from 2⁻¹⁰ to 2¹⁰ or written twice, with unknowns
-counted from elsewhere or with the opposite sign. Each is an exact equivalence
-(`harness.conformance.metamorphic`), so verdict and answer should stay.
+The test problem is two strings in contact (`harness.conformance.manufactured.strings`):
+the primal QP with 42 unknowns, 4 equality and 23 inequality rows; its dual; and its
+dual with bounds only. Each is solved at tolerance {TOL:g} in non-dimensional form, and
+then in equivalent formulations: in other units, in another order, with rows scaled by
+powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
+opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
+verdict nor answer should change.
 
-Units are those of the paper's benchmark, as powers of two. What they multiply:
+The units are those of the paper's benchmark, as powers of two. They multiply the
+non-dimensional quantities by these factors:
 
 """
 
 KEY = """
-"·": every form keeps verdict and answer. ×k: at k times the iterations, at least twice,
-in the worst form. **form**: changed; how, is said below the table. (form): the solver
-declines the changed QP. A blank: it solves no form that this changes.
+"·": verdict and answer are the same in every form. ×k: in the worst form, k times as
+many iterations (for k ≥ 2). **form**: verdict or answer change; the evidence is below
+the table. (form): the solver declines the changed QP. Blank: the change applies to no
+form that the solver solves.
 """
 
 
@@ -59,7 +62,7 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
         ]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
     entries = _weaknesses(results)
-    return HEAD + "\n".join([*lines, "", "## How", "", *entries]) + "\n"
+    return HEAD + "\n".join([*lines, "", "## Evidence", "", *entries]) + "\n"
 
 
 def line_of(name: str, form: str, change: str) -> str:
