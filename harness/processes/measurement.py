@@ -65,7 +65,7 @@ class JudgedMeasurement(NamedTuple):
     solution: Solution | None  #: None if the worker ended without an answer
     #: True if there is a point but quantities or error bounds are missing. Ranks that
     #: evaluate their answer fill in what they can
-    is_undescribed: bool = True
+    needs_evaluation: bool = True
 
 
 def measure_and_judge(
@@ -206,8 +206,8 @@ def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     """Return the worker's times if they are possible, else the parent's and a note.
 
     Their sum T must satisfy  CPU time − harness overhead ≤ T ≤ wall time  between the
-    request and the end. Above, the worker's clock was wrong; below, work was done
-    outside its clock, in another thread say.
+    request and the end. If T is larger, the worker's clock was wrong; if it is smaller,
+    work was done outside of it.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
@@ -217,17 +217,17 @@ def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
     inner, first = cost.inner_loops, answer["first_seconds"]
     solves = inner + (first is not None)
     reported = (first or 0.0) + inner * cost.total_seconds
-    least = clock.least - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
-    if max(0.0, least) <= reported <= clock.most:
+    least = clock.min_seconds - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
+    if max(0.0, least) <= reported <= clock.max_seconds:
         return (cost,)
-    mean = clock.seen / solves
+    mean = clock.elapsed_seconds / solves
     corrected = replace(
         cost, prepare_seconds=None, solve_seconds=None, total_seconds=mean
     )
     return corrected, (
         f"the worker reported {reported:.3g} s of work; by the parent's clock it used "
-        f"{clock.least:.3g} s of CPU time and was done after {clock.seen:.3g} s; the "
-        "parent's time is recorded"
+        f"{clock.min_seconds:.3g} s of CPU time and was done after "
+        f"{clock.elapsed_seconds:.3g} s; the parent's time is recorded"
     )
 
 
@@ -331,11 +331,11 @@ def measure_once(
             time_limit=inf, memory_limit=inf, prove=proves(reference),
         )  # fmt: skip
         try:
-            record, solution, is_undescribed = once()
+            record, solution, needs_evaluation = once()
         except FaultError:
-            record, solution, is_undescribed = once()
+            record, solution, needs_evaluation = once()
     declined = record.verdict is Verdict.DECLINED
-    if solution is None or declined or not is_undescribed:
+    if solution is None or declined or not needs_evaluation:
         return record, solution
     if not record.quantities:
         quantities, note = quantities_of(case(), solution)

@@ -88,9 +88,9 @@ _MACHINE_FAILURE = re.compile(
 class Clock:
     """Bounds of the time that a worker may report, in seconds."""
 
-    least: float  #: CPU time that the kernel counted between "start" and "timed"
-    seen: float  #: wall time between the receipts of "start" and "timed"
-    most: float  #: wall time from the request to "timed"
+    min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
+    elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
+    max_seconds: float  #: wall time from the request to "timed"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,9 +259,9 @@ class WorkerProcess:
                 self._await("timed", time_limit, memory_limit)
                 ended = time.monotonic()
                 clock = Clock(
-                    least=min(self._cpu_seconds() - used, ended - started),
-                    seen=ended - started,
-                    most=ended - sent,
+                    min_seconds=min(self._cpu_seconds() - used, ended - started),
+                    elapsed_seconds=ended - started,
+                    max_seconds=ended - sent,
                 )
                 # The worker waits, so no file in shared memory escapes notice.
                 self._footprint.notice(self._tree())

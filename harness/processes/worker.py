@@ -98,7 +98,7 @@ class _SolverHost:
         self._solver = solver
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
-        self._at = -1  # last step of the sequence
+        self._last_step = -1  # last step of the sequence
         # inode, size and time of the file, by the digest that its content was found to
         # have
         self._verified_files: dict[str, tuple[int, ...]] = {}
@@ -210,9 +210,9 @@ class _SolverHost:
         step = request.get("step")
         if step is None or not hasattr(self._solver, "chain"):
             return None
-        if step and self._at != step - 1:
+        if step and self._last_step != step - 1:
             raise LookupError("the process with the earlier steps has ended")
-        self._at, tol = step, request["tol"]
+        self._last_step, tol = step, request["tol"]
         if step == 0:
             self._chain = None
         begin = partial(

@@ -182,11 +182,11 @@ class _ActiveBlock:
     """A block in progress; one of its turns at a time is a Dask task."""
 
     block: WorkUnit
-    left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
+    turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
     worker: str = ""  #: address of the Dask worker that measures it
     part: int = 0  #: incremented when a worker is lost after it has returned a turn
     is_measured: bool = False  #: True if the current worker has returned a turn
-    lost: int = 0  #: number of workers that were lost while they had this block
+    lost_workers: int = 0  #: number of workers that were lost while they had this block
 
 
 @dataclass(eq=False)
@@ -203,11 +203,9 @@ class _Cluster:
     nodes: Nodes
     address: str
     warn: Callable[[str], None]
-    _done: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
-    _under_way: dict[Any, _ActiveBlock] = field(
-        default_factory=dict
-    )  # by their futures
-    _left: deque[_ActiveBlock] = field(default_factory=deque)
+    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
+    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # by their futures
+    _queue: deque[_ActiveBlock] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
         """Execute all of `blocks`."""
@@ -215,7 +213,7 @@ class _Cluster:
             while self._top_up(blocks):
                 try:
                     yield from self._measured(
-                        self._done.get(timeout=CLUSTER_POLL_SECONDS)
+                        self._finished.get(timeout=CLUSTER_POLL_SECONDS)
                     )
                 except Empty:
                     if self.client.status != "running":
@@ -225,23 +223,25 @@ class _Cluster:
                     _end_orphaned_runs(self.client)
                 yield from self._recovered()
         finally:
-            for future in self._under_way:
+            for future in self._active:
                 future.cancel()
 
     def _top_up(self, blocks: Iterator[WorkUnit]) -> bool:
         """Submit a block to every idle worker; return False if all blocks are done."""
-        idle = self._workers() - {active.worker for active in self._under_way.values()}
-        while idle or not self._under_way:
-            if not self._left and (block := next(blocks, None)) is not None:
-                self._left.append(_ActiveBlock(block=block, left=list(block.turns)))
-            if not self._left:
-                return bool(self._under_way)
+        idle = self._workers() - {active.worker for active in self._active.values()}
+        while idle or not self._active:
+            if not self._queue and (block := next(blocks, None)) is not None:
+                self._queue.append(
+                    _ActiveBlock(block=block, turns_left=list(block.turns))
+                )
+            if not self._queue:
+                return bool(self._active)
             if not idle:
                 self.warn(f"waiting for Dask workers to join {self.address}")
                 self.client.wait_for_workers(1)
                 idle = self._workers()
             if idle:
-                active = self._left.popleft()
+                active = self._queue.popleft()
                 active.worker = idle.pop()
                 self._submit(active)
         return True
@@ -257,27 +257,27 @@ class _Cluster:
         """Submit the next turn of a block to its worker."""
         from mortarbench.harness.running.dask_worker import execute
 
-        turn = replace(active.block, turns=(active.left[0],))
+        turn = replace(active.block, turns=(active.turns_left[0],))
         future = self.client.submit(
             execute, self.name, turn, workers=[active.worker], pure=False
         )
-        self._under_way[future] = active
-        future.add_done_callback(self._done.put)
+        self._active[future] = active
+        future.add_done_callback(self._finished.put)
 
     def _measured(self, future: Any) -> Iterator[Outcome]:
         """Yield the outcomes of a turn, then submit the next turn of its block."""
         from distributed import CancelledError
 
-        if (active := self._under_way.get(future)) is None:  # its worker was lost
+        if (active := self._active.get(future)) is None:  # its worker was lost
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
         except CancelledError as e:  # together with the connection
             raise _SchedulerGoneError from e
         except TimeoutError:  # the worker is lost; `_recovered` will find that
-            self._done.put(future)
+            self._finished.put(future)
             return
-        del self._under_way[future], active.left[0]
+        del self._active[future], active.turns_left[0]
         active.is_measured = True
         self.nodes.add(delivery.node, delivery.digest, delivery.environment)
         for outcome in delivery.outcomes:
@@ -289,21 +289,21 @@ class _Cluster:
                     yield replace(outcome, part=active.part)
                 case MeasurementFault():
                     yield outcome
-        if active.left:
+        if active.turns_left:
             self._submit(active)
 
     def _recovered(self) -> Iterator[Outcome]:
         """Return the blocks of lost workers to the queue, or give them up."""
         workers = self._workers()
-        lost = {f: b for f, b in self._under_way.items() if b.worker not in workers}
+        lost = {f: b for f, b in self._active.items() if b.worker not in workers}
         for future, active in lost.items():
-            del self._under_way[future]
+            del self._active[future]
             future.cancel()
-            active.lost += 1
+            active.lost_workers += 1
             active.part += active.is_measured
             active.is_measured = False
-            if active.lost < MAX_LOST_WORKERS:
-                self._left.append(active)
+            if active.lost_workers < MAX_LOST_WORKERS:
+                self._queue.append(active)
             else:
                 case = active.block.turns[0][0].case
                 reason = f"{case} was given up: every Dask worker that took it was lost"

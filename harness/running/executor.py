@@ -58,7 +58,7 @@ class Executor:
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
     _number: int = -1  # of the last block
     _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
-    _end: str = ""  # why there are fewer cases than steps of its sequence
+    _end_reason: str = ""  # why there are fewer cases than steps of its sequence
     _loaded: dict[str, QP] = field(default_factory=dict)  # their QPs, by digest
     # proven optima of small QPs, by digest
     _optima: dict[str, Optimum | None] = field(default_factory=dict)
@@ -150,7 +150,7 @@ class Executor:
             def proven(qp: QP, step: int = step) -> Optimum | None:
                 return self._optimum(self._entries[step], qp)
 
-            record, solution, is_undescribed = measure_and_judge(
+            record, solution, needs_evaluation = measure_and_judge(
                 self._worker(turn[0].solver), whole, record, request,
                 time_limit=block.time_limit, memory_limit=block.memory_limit,
                 prove=proven,
@@ -158,7 +158,7 @@ class Executor:
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self.scratch, "")  # the likely cause, if it is full
             is_pointless = solution is None or not has_point(solution)
-            if solution is None or is_pointless or is_undescribed:
+            if solution is None or is_pointless or needs_evaluation:
                 yield self._describe(block, record, solution)
             else:
                 yield Result(record=record, point=point_arrays(solution))
@@ -169,7 +169,7 @@ class Executor:
                 yield from _unreached_steps(available[step + 1 :], record)
                 break
         for record in turn[len(available) :]:
-            declined = record.but(verdict=Verdict.DECLINED, message=self._end)
+            declined = record.but(verdict=Verdict.DECLINED, message=self._end_reason)
             yield Result(record=declined)
 
     def _request(
@@ -213,14 +213,14 @@ class Executor:
         if self._entries:
             return
         entries: list[StoredCase] = []
-        self._end = ""
+        self._end_reason = ""
         for record in turn:
             try:
                 entries.append(self._entry(record, block))
             except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
-                self._end = e.reason
+                self._end_reason = e.reason
                 break
         self._entries = tuple(entries)
         self._loaded = {e.digest: self._qp(e) for e in entries}

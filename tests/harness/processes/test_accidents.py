@@ -190,7 +190,7 @@ def test_an_accident_costs_its_own_verdict_and_leaves_no_process(
     assert len(record.message) < 500
 
 
-CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
+CLOCK = Clock(min_seconds=0.1, elapsed_seconds=0.15, max_seconds=0.2)
 
 
 @pytest.mark.parametrize(
