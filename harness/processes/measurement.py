@@ -252,8 +252,8 @@ def _caching_notes(
         (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
     ]
     return [
-        f"took {slow:.3g} s the first time and {fast:.3g} s later: something is kept "
-        f"between {these}, or was loaded at the first"
+        f"took {slow:.3g} s the first time and {fast:.3g} s later: results are cached "
+        f"between {these}, or something was loaded the first time"
         for slow, fast, gain, these in compared
         if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
     ]

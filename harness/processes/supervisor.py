@@ -69,7 +69,7 @@ MEMORY_LIMIT_SHARE = 0.9
 
 _LOCK = ForkSafeLock()  #: held while a thread starts, asks, stops or ends a worker
 
-REPLACEMENT_NOTE = "the worker was busy while idle, and was replaced"
+REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
 _CPUCLOCK_SCHED = 2  #: part of the id of a process's CPU clock, see clock_getcpuclockid
 #: Signals by which solvers do not end themselves. A worker that one of them ends before

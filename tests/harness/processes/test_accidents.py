@@ -51,7 +51,7 @@ TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
 FOREIGN = "came, expected 'timed'"
-SUSPECT = "is kept between measurements"
+SUSPECT = "results are cached between measurements"
 PARENTS_TIME = "the parent's time is recorded"
 #: expected verdict, and a pattern of the message
 OUTCOMES = {
