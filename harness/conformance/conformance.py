@@ -132,7 +132,7 @@ def _judge(qp: QP, s: Solution, allowed: float) -> None:
     if not residuals.worst <= allowed:
         values = ", ".join(f"{k} {v:.1e}" for k, v in residuals._asdict().items())
         raise ContractError(
-            f"claimed solved, but residuals are {values}; {allowed:g} ok"
+            f"claimed solved, but residuals are {values}; expected at most {allowed:g}"
         )
 
 
@@ -203,7 +203,7 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
         type(solver)(**{"no_such_option": 1})
     except TypeError:
         return
-    raise ContractError("takes any option; expected TypeError for no_such_option")
+    raise ContractError("accepts any option; expected TypeError for no_such_option")
 
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
@@ -249,7 +249,9 @@ def _runs_in_one_thread(solver: Solver) -> None:
     if s.status is not Status.SOLVED:
         raise ContractError(f"ended as {s.status}: {s.message}")
     if used > 1.2 * passed + 0.02:
-        raise ContractError(f"used {used:.2f} s CPU within {passed:.2f} s; one thread?")
+        raise ContractError(
+            f"used {used:.2f} s of CPU time in {passed:.2f} s; expected one thread"
+        )
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:

@@ -120,7 +120,7 @@ def _compare(quantity: str, change: float) -> None:
     if not change <= MAX_ENERGY_CHANGE:
         raise WeaknessError(
             f"verified, but {quantity} changed by {change:.1e} of the energy; "
-            f"{MAX_ENERGY_CHANGE:g} is ok"
+            f"expected at most {MAX_ENERGY_CHANGE:g}"
         )
 
 

@@ -379,7 +379,7 @@ class WorkerProcess:
             if worker in self._tree():
                 self._worker = worker
         if not self._worker:
-            raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
+            raise OSError(f"/proc lists no process below {self._process.pid}")
 
     def _send(self, request: Mapping[str, Any]) -> None:
         with suppress(BrokenPipeError):  # it has died; `_await` diagnoses that

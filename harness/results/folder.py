@@ -155,8 +155,8 @@ def refuse_foreign(folder: Path) -> None:
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
-            f"{folder} holds {some(taken)} but is no result folder (no suite.toml with "
-            "environment.json, no journal/*.jsonl); choose another --out"
+            f"{folder} holds {some(taken)} but is not a result folder (no suite.toml "
+            "with environment.json, no journal/*.jsonl); choose another --out"
         )
 
 
@@ -375,7 +375,9 @@ def environment_of(folder: Path, digest: str) -> dict[str, Any]:
 
     """
     if not _DIGEST.fullmatch(digest):  # as a path it could lead out of the folder
-        raise InputError(f"{folder}: {shortened(digest)!r} is no environment's digest")
+        raise InputError(
+            f"{folder}: {shortened(digest)!r} is not the digest of an environment"
+        )
     for path in (folder / "environment.json", _node_file(folder, digest)):
         if path.is_file() and (environment := _environment(path))["digest"] == digest:
             return environment

@@ -143,8 +143,8 @@ def run(
                         journal.restore()
                         raise InputError(
                             f"{out} was deleted while the run wrote to it; its journal "
-                            "is there again, solutions stored before are lost; the "
-                            "same command continues"
+                            "was restored, solutions stored before are lost; the same "
+                            "command continues"
                         )
         return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
 
@@ -264,8 +264,8 @@ def _check_same(
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} holds {record.case}, which the suite has no longer; cases may "
-                f"be added, and --case narrows a run; {REMEDY}"
+                f"{out} holds {record.case}, which is no longer in the suite; cases "
+                f"may be added, and --case narrows a run; {REMEDY}"
             )
         today = configured.get(record.solver, record.options)
         for key in today.keys() | record.options.keys():
@@ -299,6 +299,6 @@ def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
             common = [case for case in cases if case in steps]
             if common != steps[: len(common)]:
                 raise InputError(
-                    f"{out} holds a sequence that came to {common[-1]} by other steps; "
+                    f"{out} holds a sequence that reached {common[-1]} by other steps; "
                     f"steps may be added at its end; {REMEDY}"
                 )

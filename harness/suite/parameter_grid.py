@@ -177,7 +177,7 @@ def _along(key: object, params: Mapping[str, Any]) -> str | None:
         lists = [k for k, v in params.items() if isinstance(v, list)]
         hint = f"; there are {some(lists)}" if lists else ""
         raise InputError(
-            f"sequence = {shown(key)} is no list in params; expected the key whose "
+            f"sequence = {shown(key)} is not a list in params; expected the key whose "
             f"values are the steps{hint}"
         )
     return str(key)
@@ -197,7 +197,7 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
                 or key in zipped
             ):
                 raise InputError(
-                    f"zip: {shown(key)} is no list in params, or is paired twice; "
+                    f"zip: {shown(key)} is not a list in params, or is paired twice; "
                     'expected groups of such keys, like [["Nr", "Nh"]]'
                 )
             zipped[key] = group

@@ -74,7 +74,7 @@ def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
     for key, value in options.items():
         if not isinstance(key, str) or not _KEY.fullmatch(key):
             raise InputError(
-                f"options: {shown(key)} is no name; expected one such as max_iter"
+                f"options: {shown(key)} is not a name; expected one such as max_iter"
             )
         values = value if isinstance(value, list | tuple) else [value]
         if not values or not all(isinstance(v, _PLAIN) for v in values):
@@ -147,7 +147,7 @@ def sweep(
             label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
             if label in variants:
                 raise InputError(
-                    f"--option: {label!r} is asked for twice; expected distinct values"
+                    f"--option: {label!r} occurs twice; expected distinct values"
                 )
             changed = replace(spec, label=label, options={**spec.options, **options})
             with located("--option"):

@@ -157,7 +157,7 @@ def parse_suite(
                 raise InputError(f"{key} is missing")
         if not _NAME.fullmatch(checked.text("name", table["name"])):
             raise InputError(
-                f"name = {shown(table['name'])} is no name of a folder; "
+                f"name = {shown(table['name'])} is not a valid folder name; "
                 "expected letters, digits, '.', '-' and '_'"
             )
         cases, sequences = expand_problems(
@@ -218,7 +218,7 @@ def read_stored(path: Path) -> dict[str, Any]:
         for block in checked.any_list("problems", table.get("problems", [])):
             checked.table("problems", block, instead="tables")
     except InputError as e:
-        raise InputError(f"{path} is no suite that a run wrote: {e}") from None
+        raise InputError(f"{path} is not a suite that a run wrote: {e}") from None
     return table
 
 
@@ -347,20 +347,20 @@ def _on_ranks(
         raise InputError(f"copies = {shown(copies)}; expected true or false")
     if copies and counts == [1]:
         raise InputError(
-            "copies = true: what copies reach is compared with ranks; expected several "
-            "of these, such as ranks = [1, 2]"
+            "copies = true: copies are compared with ranks; expected several ranks, "
+            "such as ranks = [1, 2]"
         )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
     if counts != [1] and sequences:
         raise InputError(
-            f"ranks = {shown(counts)}: one process drives a sequence; expected "
+            f"ranks = {shown(counts)}: a sequence runs in one process; expected "
             "problems without sequence, or no ranks"
         )
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
     if counts != [1] and not any(able.values()):
         raise InputError(
-            f"ranks = {shown(counts)}: none of the solvers runs on several; expected "
+            f"ranks = {shown(counts)}: no solver runs on several ranks; expected "
             "one that does, or no ranks"
         )
     on_ranks = []
@@ -409,8 +409,8 @@ def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...
         )
     if any(thetas) and not sequences:
         raise InputError(
-            f"tighten = {shown(thetas)}: no problems are a sequence; expected sequence "
-            "= KEY in one of them"
+            f"tighten = {shown(thetas)}: there is no sequence; expected sequence = KEY "
+            "in one of the problems"
         )
     if any(thetas) and table["accuracy"] is not None:
         raise InputError(

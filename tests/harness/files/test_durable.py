@@ -278,7 +278,7 @@ def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
     refuse_foreign(tmp_path)
 
     (tmp_path / ".lock").write_text("somebody else's")
-    with pytest.raises(InputError, match="is no result folder"):
+    with pytest.raises(InputError, match="is not a result folder"):
         refuse_foreign(tmp_path)
 
 

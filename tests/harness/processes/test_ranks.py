@@ -268,7 +268,7 @@ def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
-        ("ranks = [1]\ncopies = true", "copies = true: what copies reach is compared"),
+        ("ranks = [1]\ncopies = true", "copies = true: copies are compared with ranks"),
         ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )
@@ -284,7 +284,7 @@ def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace('["smalbe", "clarabel"]', '["clarabel"]'))
 
-    with pytest.raises(InputError, match="none of the solvers runs on several"):
+    with pytest.raises(InputError, match="no solver runs on several ranks"):
         mb.run(suite, out=tmp_path / "out")
 
 
@@ -297,7 +297,7 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         ).replace("membranes", "beam-ring")
     )
 
-    with pytest.raises(InputError, match="one process drives a sequence"):
+    with pytest.raises(InputError, match="a sequence runs in one process"):
         mb.run(suite, out=tmp_path / "out")
 
 

@@ -130,10 +130,10 @@ def test_malformed_digests_open_no_file(tmp_path, digest):
 
 
 @pytest.mark.parametrize("digest", ["../environment", "/etc/x", "a\0b", "", "x" * 5000])
-def test_an_environment_lies_in_the_folder(tmp_path, digest):
+def test_malformed_digests_lead_to_no_environment(tmp_path, digest):
     (tmp_path / "environment.json").write_text('{"digest": "e1"}')
 
-    with pytest.raises(InputError, match="no environment's digest"):
+    with pytest.raises(InputError, match="is not the digest of an environment"):
         environment_of(tmp_path, digest)
 
 

@@ -610,7 +610,7 @@ def test_a_folder_with_other_things_under_our_names_is_left_alone(
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
 
-    with pytest.raises(InputError, match="but is no result folder"):
+    with pytest.raises(InputError, match="but is not a result folder"):
         measure(suite("honest"), out=tmp_path / "home", fresh=fresh)
 
     files = [p for p in (tmp_path / "home").rglob("*") if p.is_file()]

@@ -142,8 +142,8 @@ def test_a_null_arm_has_the_options_of_its_twin():
     ("texts", "message"),
     [
         (["max_itr=5"], "--option: unknown option 'max_itr'; did you mean 'max_iter'?"),
-        (["max_iter=5,5"], "--option: 'method max_iter=5' is asked for twice"),
-        (["alpha=1,1.0"], "--option: 'method alpha=1.0' is asked for twice"),
+        (["max_iter=5,5"], "--option: 'method max_iter=5' occurs twice"),
+        (["alpha=1,1.0"], "--option: 'method alpha=1.0' occurs twice"),
         (["max_iter=0"], "--option: method: max_iter must be positive"),
         (["mode=fast,slow"], "--option: method: mode = 'slow'; expected fast or exact"),
         (

@@ -163,9 +163,12 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ("name = 3\nsolvers = ['osqp']\n" + BLOCK, "name = 3; expected a text"),
         (
             "name = 'a/b'\nsolvers = ['osqp']\n" + BLOCK,
-            "name = 'a/b' is no name of a f",
+            "name = 'a/b' is not a valid folder n",
         ),
-        ("name = '..'\nsolvers = ['osqp']\n" + BLOCK, "name = '..' is no name of a fo"),
+        (
+            "name = '..'\nsolvers = ['osqp']\n" + BLOCK,
+            "name = '..' is not a valid folder na",
+        ),
         ("name = 'a'\n" + BLOCK, "solvers is missing"),
         ("name = 'a'\nsolvers = []\n" + BLOCK, "solvers is empty; expected at least"),
         ("name = 'a'\nsolvers = 'osqp'\n" + BLOCK, "solvers = 'osqp'; expected a list"),
@@ -204,10 +207,14 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
         (MINIMAL + "zip = ['n']", "problems[0]: zip = 'n'; expected a list"),
-        (MINIMAL + "zip = [['n', 'm']]", "problems[0]: zip: 'n' is no list in params"),
+        (
+            MINIMAL + "zip = [['n', 'm']]",
+            "problems[0]: zip: 'n' is not a list in params",
+        ),
         (
             MINIMAL + "zip = [['n', 'n']]\nparams = { n = [2, 3] }",
-            "problems[0]: zip: 'n' is no list in params, or is paired twice; expected",
+            "problems[0]: zip: 'n' is not a list in params, or is paired twice; "
+            "expected",
         ),
         (
             MINIMAL + "zip = [['n', 'm']]\nparams = { n = [2, 3], m = [2, 3, 4] }",
@@ -556,7 +563,7 @@ SEQUENCE = "sequence = 'n'\nparams = { n = [4, 8] }"
         ("tighten = 0.1", SEQUENCE, "tighten = 0.1; expected a list"),
         ("tighten = [1]", SEQUENCE, r"tighten = \[1\]; expected distinct numbers"),
         ("tighten = [0.1, 0.1]", SEQUENCE, "expected distinct numbers"),
-        ("tighten = [0.1]", "", "no problems are a sequence; expected sequence"),
+        ("tighten = [0.1]", "", "there is no sequence; expected sequence"),
         ("tighten = [0.1]\naccuracy = 1e-6", SEQUENCE, "only one of the two"),
     ],
 )
