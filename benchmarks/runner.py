@@ -23,7 +23,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.run import run
-from mortarbench.harness.suite.suite import NULL, Suite
+from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
@@ -76,7 +76,7 @@ def measure(out, *solvers, repeats, plugin=PLUGIN):
     start = [sys.executable, "-P", str(plugin)]
     plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
-    specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", role="null")]
+    specs += [replace(specs[0], label=f"{solvers[0]}{NULL_SUFFIX}", role="null")]
     tiny = plugin.problems["tiny"]
     suite = Suite(
         name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,

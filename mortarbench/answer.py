@@ -30,7 +30,7 @@ from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.names import assemble, is_shared
 from mortarbench.harness.processes.measurement import (
-    measured_once,
+    measure_once,
     scratch_folder,
     single_worker,
 )
@@ -393,7 +393,7 @@ def answers_of(
             ours = registries.hold_own_code_only()
             source = Source.RANKS if ours else Source.SHARES
         with one_thread(), redirect_stdout(stderr):  # whatever the family prints
-            record, solution = measured_once(
+            record, solution = measure_once(
                 worker, lambda: case.made, record, registries.reference,
                 source=source,
             )  # fmt: skip

@@ -16,7 +16,7 @@ from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver, as_family
-from mortarbench.harness.processes.turns import Turn
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.registry import (
     COPIES,
     Plugin,
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 #: of the thread that loads plug-ins, builds, solves, runs or validates: these set
 #: numbers of threads, standard output and modules of the whole process
-TURN = Turn()
+TURN = ForkSafeLock()
 
 #: Python files that define SOLVERS or PROBLEMS; a text may be LABEL=FILE.py
 Plugins = Sequence[str | Path | PluginFile]

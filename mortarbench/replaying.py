@@ -29,8 +29,8 @@ from mortarbench.harness.results.stored_run import (
     open_stored_run,
     work_unit_of,
 )
-from mortarbench.harness.results.work_unit import Result, Unbuilt, Unmade
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault, Result
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.solution import Status
 from mortarbench.registries import TURN, Plugins, Registries, known
 from mortarbench.text import aligned
@@ -113,7 +113,7 @@ def replay(
     commands = registries.commands([stored.spec], path)
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
-        one_by_one(
+        local_engine(
             commands,
             Path(scratch),
             Path(scratch) / "cases",
@@ -121,9 +121,9 @@ def replay(
         ) as execute,
     ):
         *_, result = execute(iter([unit]))
-    if isinstance(result, Unbuilt):
+    if isinstance(result, BuildFailure):
         raise InputError(f"{stored.record.run_id}: {result.reason}")
-    if isinstance(result, Unmade):
+    if isinstance(result, MeasurementFault):
         raise FaultError(f"{stored.record.run_id}: {result.reason}")
     return compared(path, stored, result, environment)
 

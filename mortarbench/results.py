@@ -26,12 +26,12 @@ from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.merge import merge as merge_folders
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.run import Missing
 from mortarbench.harness.running.run import run as run_suite
 from mortarbench.harness.suite.overrides import with_overrides
-from mortarbench.harness.suite.solver_options import as_given
+from mortarbench.harness.suite.solver_options import options_as_texts
 from mortarbench.harness.suite.suite import load_suite, name_in, parse_suite, suite_text
 from mortarbench.progress import Callback, ignore, shown
 from mortarbench.registries import TURN, Plugins, Registries, known
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from mortarbench.harness.results.work_unit import Opens
+    from mortarbench.harness.results.work_unit import EngineFactory
 
 
 #: the solver said something of its answer that is not so
@@ -326,7 +326,7 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
-        options=as_given({} if options is None else options),
+        options=options_as_texts({} if options is None else options),
     )
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
@@ -335,9 +335,9 @@ def run(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less certain"
             )
-        engine: Opens
+        engine: EngineFactory
         if dask is None:
-            engine = partial(one_by_one, operators=registries.operators)
+            engine = partial(local_engine, operators=registries.operators)
         else:
             from mortarbench.harness.running.cluster import on_cluster
 

@@ -15,8 +15,8 @@ from mortarbench.arguments import budget as checked_budget
 from mortarbench.harness import checked
 from mortarbench.harness.conformance.conformance import (
     CHECKS,
-    FINDS,
-    KEEPS,
+    INVARIANCE_PREFIX,
+    SOLUTION_PREFIX,
     Grade,
     Result,
 )
@@ -259,10 +259,10 @@ class Conformance:
         if self.failed:
             return f"fails {some(map(repr, self.failed))}"
         if not any(
-            r.grade is Grade.PASS and name.startswith(FINDS)
+            r.grade is Grade.PASS and name.startswith(SOLUTION_PREFIX)
             for name, r in self.results.items()
         ):
-            return f"passes no check {FINDS!r}: it solved nothing"
+            return f"passes no check {SOLUTION_PREFIX!r}: it solved nothing"
         return ""
 
     @property
@@ -340,7 +340,7 @@ def _checked(worker: WorkerProcess, check: str) -> Result:
         {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
     )
     if reply.answer is None:
-        is_weakness = check.startswith(KEEPS)
+        is_weakness = check.startswith(INVARIANCE_PREFIX)
         return Result(Grade.WEAK if is_weakness else Grade.FAIL, reply.message)
     grade, *others = (reply.answer[field] for field in Result._fields)
     return Result(Grade(grade), *others)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mortarbench.harness.errors import some
 from mortarbench.harness.files.durable import report_full_disk
-from mortarbench.harness.suite.solver_options import given_options
+from mortarbench.harness.suite.solver_options import parse_options
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def run(registries: Registries, options: Namespace) -> int:
     """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)
-    changed = given_options(options.option)
+    changed = parse_options(options.option)
 
     from mortarbench import results
     from mortarbench.progress import quiet_on, shown_on

@@ -22,13 +22,15 @@ def run(registries: Registries, options: Namespace) -> int:
     ]
     for spec in specs:
         check_name(spec.name, registries.solvers)
-    from mortarbench.harness.conformance.conformance import CHECKS, KEEPS
+    from mortarbench.harness.conformance.conformance import CHECKS, INVARIANCE_PREFIX
     from mortarbench.harness.conformance.weaknesses import weaknesses_page
     from mortarbench.validation import test_solver
 
     for spec in specs:
         resolve(spec, registries.solvers)
-    checks = [c for c in CHECKS if c.startswith(KEEPS) or not options.markdown]
+    checks = [
+        c for c in CHECKS if c.startswith(INVARIANCE_PREFIX) or not options.markdown
+    ]
     found = []
     for spec in specs:
         found.append(test_solver(spec.name, checks=checks, registries=registries))

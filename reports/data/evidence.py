@@ -14,7 +14,7 @@ from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.harness.results.faults import Fault, left, read_faults
+from mortarbench.harness.results.faults import Fault, read_faults, remaining_faults
 from mortarbench.harness.results.folder import environment_of, times_compare
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.running.pairs import Block
@@ -288,7 +288,9 @@ def read_evidence(
         marks=marks,
         suite=read_stored(suite) if os.path.lexists(suite) else {},
         factor=factor,
-        faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
+        faults=tuple(
+            remaining_faults(read_faults(directory), {r.run_id for r in records})
+        ),
     )
 
 

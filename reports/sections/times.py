@@ -15,7 +15,7 @@ import numpy as np
 
 from mortarbench.harness import Record
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
-from mortarbench.harness.suite.suite import NULL
+from mortarbench.harness.suite.suite import NULL_SUFFIX
 from mortarbench.reports.data.cells import (
     BY_OPTIMUM,
     case_cells,
@@ -221,7 +221,7 @@ def _null_ratios(evidence: Evidence) -> list[_Twins]:
     found = []
     for row in evidence.outcomes.values():
         for null in (o for o in row.values() if o.first.role == "null"):
-            twin = row.get(null.solver.replace(NULL, "", 1))
+            twin = row.get(null.solver.replace(NULL_SUFFIX, "", 1))
             if twin is not None and null.verified and twin.verified:
                 ratio = paired_ratio(null.by_block, twin.by_block)
                 found += [_Twins(twin, null, ratio)] if ratio is not None else []

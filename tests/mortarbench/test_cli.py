@@ -20,7 +20,7 @@ from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.names import parse
-from mortarbench.harness.processes.reaper import lives
+from mortarbench.harness.processes.reaper import is_alive
 from mortarbench.harness.registry import SolverSpec, load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.verdicts import new_record
@@ -344,7 +344,7 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
-    assert not lives(int(started.read_text()))
+    assert not is_alive(int(started.read_text()))
 
 
 def test_what_a_plugin_prints_is_no_result(cli, pit):
