@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -21,7 +22,7 @@ from mortarbench.solvers.common.conversion import (
     one_sided,
     positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "PrimalInfeasible"  #: it comes with a certificate
 CLAIMS = {
@@ -72,7 +73,7 @@ class Clarabel:
         return self._begin(qp, tol, presolve=True).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol, presolve=False))
+        return chain(partial(self._begin, presolve=False), tol)
 
     def _begin(self, qp: QP, tol: float, *, presolve: bool) -> Session:
         import clarabel

@@ -20,7 +20,7 @@ from mortarbench.solvers.common.conversion import (
     objective_factor,
     positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 CLAIMS = {
     1: Status.SOLVED,
@@ -81,7 +81,7 @@ class DAQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import daqp

@@ -23,7 +23,7 @@ from mortarbench.solvers.common.conversion import (
     one_of,
     positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {
@@ -66,7 +66,7 @@ class PIQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import piqp

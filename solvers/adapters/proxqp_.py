@@ -26,7 +26,7 @@ from mortarbench.solvers.common.conversion import (
     positive,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, tightening
+from mortarbench.solvers.common.sequence import Session, chain, tightening
 
 PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {
@@ -90,8 +90,7 @@ class ProxQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        prepare = self.tightening()
-        return lambda qp: prepare(qp, tol)
+        return chain(self._begin, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         return tightening(self._begin)

@@ -22,7 +22,7 @@ from mortarbench.solvers.common.conversion import (
     one_sided,
     positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
@@ -68,7 +68,7 @@ class QOCO:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qoco

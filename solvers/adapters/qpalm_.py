@@ -21,7 +21,7 @@ from mortarbench.solvers.common.conversion import (
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "PRIMAL_INFEASIBLE"  #: it comes with a certificate
 CLAIMS = {
@@ -69,7 +69,7 @@ class QPALM:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qpalm

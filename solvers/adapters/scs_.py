@@ -10,20 +10,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    conic_point,
     csc,
     from_one_sided,
     one_of,
     one_sided,
     positive,
-    to_one_sided,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = -2  #: it comes with a certificate
 CLAIMS = {
@@ -73,7 +72,7 @@ class SCS:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import scs
@@ -91,7 +90,7 @@ class SCS:
 
         def solve() -> Solution:
             point = warm.pop() if warm else None
-            x, y, s = _start(qp, point) if point else (None, None, None)
+            x, y, s = conic_point(qp, point) if point else (None, None, None)
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
             status = CLAIMS.get(info["status_val"], Status.FAILED)
@@ -117,8 +116,3 @@ class SCS:
             solver.update(b=one_sided(new)[1], c=new.q.copy())
 
         return Session(solve, update, warm.append)
-
-
-def _start(qp: QP, s: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows, rhs = one_sided(qp)
-    return s.x.copy(), to_one_sided(qp, s), np.maximum(rhs - rows @ s.x, 0.0)

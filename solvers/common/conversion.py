@@ -118,6 +118,12 @@ def to_one_sided(qp: QP, s: Solution) -> Vector:
     return np.concatenate([s.y, s.z, z_up, z_low])
 
 
+def conic_point(qp: QP, s: Solution) -> tuple[Vector, Vector, Vector]:
+    """Return x, the multipliers and the slack max(r − Rx, 0) of `one_sided` rows."""
+    rows, rhs = one_sided(qp)
+    return s.x.copy(), to_one_sided(qp, s), np.maximum(rhs - rows @ s.x, 0.0)
+
+
 def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
     """Give the factor of the objective that makes ‖q‖∞ equal to `size`."""
     return float(size / (np.abs(qp.q).max(initial=0.0) or size))
