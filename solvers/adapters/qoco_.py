@@ -51,7 +51,8 @@ class QOCO:
         package="qoco",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update_vector_data` keeps the analysis; it cannot start warm",
+        sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
+        "takes no starting point",
         limits=(
             "No certificates of infeasibility; unbounded QPs are claimed solved with "
             "‖x‖∞ of 1e16 (conformance check 'unbounded'), which the adapter catches.",

@@ -278,7 +278,7 @@ def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
         assert warm < SOLVERS[name].prepare(moved, 1e-6)().iterations <= 2 * first
 
 
-@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse"])
+@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse", "qtqp"])
 def test_a_rebuilt_session_starts_where_the_last_one_ended(manufactured, name):
     qp, _ = manufactured("everything", n=40)
     other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update
