@@ -14,13 +14,13 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Matrix, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_positive,
     csc,
     dense,
     from_one_sided,
     needs_independent_rows,
     objective_factor,
     one_sided,
-    positive,
 )
 
 
@@ -54,7 +54,7 @@ class CVXOPT:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp) or needs_independent_rows(qp)

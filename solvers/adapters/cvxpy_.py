@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
-from mortarbench.solvers.common.backends import Call, adapter_files, why_not
+from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
@@ -99,7 +99,7 @@ class CVXPY:
         return tuple(_files())
 
     def declines(self, qp: QP) -> str | None:
-        if reason := why_not("cvxpy", self.backend, _files()):
+        if reason := reason_unavailable("cvxpy", self.backend, _files()):
             return reason
         if self.backend == "SCS" and sum(qp.sizes.values()) == qp.q.size:
             return "needs a constraint"

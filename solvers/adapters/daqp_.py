@@ -15,10 +15,10 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import (
+    check_positive,
     dense,
     needs_dense,
     objective_factor,
-    positive,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -72,7 +72,7 @@ class DAQP:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 3)

@@ -15,12 +15,12 @@ from scipy.sparse import csc_matrix, tril, vstack
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_choice,
+    check_positive,
     csc,
     needs_dense,
     objective_factor,
     on_present_bounds,
-    one_of,
-    positive,
 )
 
 PRIMAL = "kInfeasible"  #: it may come with a certificate
@@ -82,8 +82,8 @@ class HiGHS:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("method", self.method, ("qpasm", "hipo"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("method", self.method, ("qpasm", "hipo"))
 
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 1) if self.method == "qpasm" else needs_matrices(qp)

@@ -15,10 +15,10 @@ from scipy.sparse import triu
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_two_sided,
     objective_factor,
-    positive,
     to_two_sided,
     two_sided,
 )
@@ -69,7 +69,7 @@ class OSQP:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

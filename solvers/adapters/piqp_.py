@@ -15,13 +15,13 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    as_stored,
+    check_choice,
+    check_positive,
     csc,
     dense,
     needs_dense,
     objective_factor,
-    one_of,
-    positive,
+    resolve_backend,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -55,11 +55,11 @@ class PIQP:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("backend", self.backend, ("auto", "dense", "sparse"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
-        as_dense = as_stored(self.backend, qp) == "dense"
+        as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -71,7 +71,7 @@ class PIQP:
     def _begin(self, qp: QP, tol: float) -> Session:
         import piqp
 
-        is_dense = as_stored(self.backend, qp) == "dense"
+        is_dense = resolve_backend(self.backend, qp) == "dense"
         convert = (lambda M: np.asfortranarray(dense(M))) if is_dense else csc
         solver = piqp.DenseSolver() if is_dense else piqp.SparseSolver()
         s = solver.settings

@@ -15,15 +15,15 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    as_stored,
-    boxed,
+    check_choice,
+    check_positive,
     csc,
     dense,
     from_two_sided,
+    has_bound,
     needs_dense,
     on_present_bounds,
-    one_of,
-    positive,
+    resolve_backend,
     two_sided,
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
@@ -79,11 +79,11 @@ class ProxQP:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("backend", self.backend, ("auto", "dense", "sparse"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
-        as_dense = as_stored(self.backend, qp) == "dense"
+        as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -98,7 +98,7 @@ class ProxQP:
     def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
 
-        backend = as_stored(self.backend, qp)
+        backend = resolve_backend(self.backend, qp)
         form = _Dense(qp) if backend == "dense" else _Sparse(qp)
         solver = form.made(proxqp)
         settings = solver.settings
@@ -152,7 +152,7 @@ class _Dense:
     """The dense backend, which knows bounds: multipliers of all n follow those of G."""
 
     def __init__(self, qp: QP) -> None:
-        self.qp, self.boxed = qp, bool(boxed(qp).any())
+        self.qp, self.boxed = qp, bool(has_bound(qp).any())
 
     def made(self, proxqp: Any) -> Any:
         qp = self.qp
@@ -196,4 +196,4 @@ class _Sparse:
         return {"z": parts["z"], "z_box": parts["z_box"]}
 
     def stacked(self, s: Solution) -> Vector:
-        return np.concatenate([s.z, s.z_box[boxed(self.qp)]])
+        return np.concatenate([s.z, s.z_box[has_bound(self.qp)]])

@@ -16,11 +16,11 @@ from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_one_sided,
     objective_factor,
     one_sided,
-    positive,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -60,7 +60,7 @@ class QOCO:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

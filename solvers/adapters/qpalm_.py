@@ -15,9 +15,9 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_two_sided,
-    positive,
     to_two_sided,
     two_sided,
 )
@@ -60,7 +60,7 @@ class QPALM:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

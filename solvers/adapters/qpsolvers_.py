@@ -24,7 +24,7 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.solvers.common.backends import Call, adapter_files, why_not
+from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
@@ -124,7 +124,7 @@ class QPSolvers:
         return tuple(_files())
 
     def declines(self, qp: QP) -> str | None:
-        if reason := why_not("qpsolvers", self.backend, _files()):
+        if reason := reason_unavailable("qpsolvers", self.backend, _files()):
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:

@@ -13,13 +13,13 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_choice,
+    check_positive,
     conic_point,
     csc,
     from_one_sided,
     objective_factor,
-    one_of,
     one_sided,
-    positive,
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
@@ -71,8 +71,8 @@ class QTQP:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("linear_solver", self.linear_solver, LINEAR_SOLVERS)
+        check_positive(max_iter=self.max_iter)
+        check_choice("linear_solver", self.linear_solver, LINEAR_SOLVERS)
 
     def declines(self, qp: QP) -> str | None:
         if not qp.sizes["inequalities"] + qp.sizes["bounds"]:

@@ -15,12 +15,12 @@ from scipy.sparse import triu
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_choice,
+    check_positive,
     conic_point,
     csc,
     from_one_sided,
-    one_of,
     one_sided,
-    positive,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -60,8 +60,8 @@ class SCS:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
 
     def declines(self, qp: QP) -> str | None:
         if not any(qp.sizes[k] for k in ("equalities", "inequalities", "bounds")):

@@ -24,7 +24,7 @@ from mortarbench.harness import (
     kkt_residuals,
     needs_matrices,
 )
-from mortarbench.solvers.common.conversion import dense, positive
+from mortarbench.solvers.common.conversion import check_positive, dense
 
 MAX_COMPONENTS = 5_000  #: P is converted to a dense matrix
 CLAIM_FACTOR = (
@@ -53,7 +53,7 @@ class BVLS:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         if qp.b.size or qp.h.size:

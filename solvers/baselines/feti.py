@@ -39,7 +39,11 @@ from mortarbench.harness import (
     too_large,
 )
 from mortarbench.harness.operators import Preconditioned, Product, SerialisableOperator
-from mortarbench.solvers.common.conversion import boxed, one_of, positive
+from mortarbench.solvers.common.conversion import (
+    check_choice,
+    check_positive,
+    has_bound,
+)
 
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
@@ -81,13 +85,13 @@ class FETI:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("preconditioner", self.preconditioner, get_args(Kind))
-        one_of("scaling", self.scaling, get_args(Scaling))
-        one_of("Q", self.Q, get_args(Weight))
+        check_positive(max_iter=self.max_iter)
+        check_choice("preconditioner", self.preconditioner, get_args(Kind))
+        check_choice("scaling", self.scaling, get_args(Scaling))
+        check_choice("Q", self.Q, get_args(Weight))
 
     def declines(self, qp: QP) -> str | None:
-        if qp.h.size or boxed(qp).any():
+        if qp.h.size or has_bound(qp).any():
             return "takes equality rows only: it solves linear problems"
         if preconditioner_source(qp) is None:
             if self.preconditioner in ("lumped", "dirichlet"):

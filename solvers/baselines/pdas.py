@@ -61,7 +61,7 @@ from mortarbench.solvers.baselines.infeasibility_certificate import (
     proves_infeasible,
     proves_unbounded,
 )
-from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.common.conversion import check_positive
 
 #: factor of ρ when two moves of the centre have not halved the residuals. Without it
 #: 522 instead of 600 of 600 random QPs were solved
@@ -102,7 +102,7 @@ class PDAS:
         title="PDAS (ours)", licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="preparing assembles the penalised matrix; solving factorises every face",
+        phases="preparing assembles the penalised matrix; solving factorises faces",
         sequence="active set and point",
         limits=(
             "on one-dimensional obstacles the contact front moves by one node a step: "
@@ -113,7 +113,7 @@ class PDAS:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)

@@ -23,7 +23,7 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
 from mortarbench.solvers.baselines.infeasibility_certificate import proves_unbounded
-from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.common.conversion import check_positive
 
 SUFFICIENT_DECREASE = 1e-4  #: share of the linear decrease that a step must achieve
 CLAIM_FACTOR = (
@@ -54,7 +54,7 @@ class ProjectedGradient:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(memory=self.memory, max_iter=self.max_iter)
+        check_positive(memory=self.memory, max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return "takes bounds only" if qp.b.size or qp.h.size else None

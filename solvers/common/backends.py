@@ -53,29 +53,31 @@ def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
     }
 
 
-def why_not(library: str, backend: str, files: Mapping[str, Path]) -> str | None:
+def reason_unavailable(
+    library: str, backend: str, files: Mapping[str, Path]
+) -> str | None:
     """Say why a backend cannot be used, or None; `files` as from `adapter_files`.
 
     A library that is not installed is no reason: importing it will say so.
     """
     if not files:
         return None
-    lacking = _not_installed(files[backend]) if backend in files else []
+    lacking = _missing_packages(files[backend]) if backend in files else []
     if backend in files and not lacking:
         return None
-    installed = ", ".join(name for name in files if not _not_installed(files[name]))
+    installed = ", ".join(name for name in files if not _missing_packages(files[name]))
     if lacking:
         return f"not installed: {', '.join(lacking)}; {library} finds {installed}"
     return f"{library} has no backend {backend!r}; installed: {installed}"
 
 
-def _not_installed(adapter: Path) -> list[str]:
+def _missing_packages(adapter: Path) -> list[str]:
     """List the top-level packages that an adapter's file imports and we lack."""
-    return [root for root in _imported(adapter) if find_spec(root) is None]
+    return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 
 @cache
-def _imported(adapter: Path) -> tuple[str, ...]:
+def _imported_packages(adapter: Path) -> tuple[str, ...]:
     """List the top-level packages that an adapter's file imports."""
     roots: dict[str, None] = {}
     for node in ast.walk(ast.parse(adapter.read_text(encoding="utf-8"))):

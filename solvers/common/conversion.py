@@ -51,21 +51,21 @@ def dense(M: Matrix) -> Vector:
     return np.array(M.toarray() if hasattr(M, "toarray") else M, dtype=np.float64)
 
 
-def as_stored(backend: str, qp: QP) -> str:
+def resolve_backend(backend: str, qp: QP) -> str:
     """Choose between "dense" and "sparse", as P is stored, where `backend` is auto."""
     if backend != "auto":
         return backend
     return "dense" if isinstance(qp.P, np.ndarray) else "sparse"
 
 
-def boxed(qp: QP) -> NDArray[np.bool_]:
+def has_bound(qp: QP) -> NDArray[np.bool_]:
     """Mark the variables that have a bound."""
     return np.isfinite(qp.lb) | np.isfinite(qp.ub)
 
 
 def two_sided(qp: QP) -> tuple[csc_matrix, Vector, Vector]:
     """Give all constraints as low ≤ Rx ≤ high: A, G, then rows of bounded variables."""
-    box = boxed(qp)
+    box = has_bound(qp)
     rows = vstack([csc(qp.A), csc(qp.G), eye_array(qp.q.size, format="csr")[box]])
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf), qp.lb[box]])
     return csc(rows), low, np.concatenate([qp.b, qp.h, qp.ub[box]])
@@ -75,7 +75,7 @@ def from_two_sided(qp: QP, v: Vector) -> dict[str, Any]:
     """Split the multipliers of `two_sided` rows, ≥ 0 at `high`, into y, z and z_box."""
     m, p = qp.b.size, qp.h.size
     z_box = np.zeros(qp.q.size)
-    z_box[boxed(qp)] = v[m + p :]
+    z_box[has_bound(qp)] = v[m + p :]
     return {
         "y": np.array(v[:m]),
         "z": np.array(v[m : m + p]),
@@ -85,7 +85,7 @@ def from_two_sided(qp: QP, v: Vector) -> dict[str, Any]:
 
 def to_two_sided(qp: QP, s: Solution) -> Vector:
     """Stack the multipliers of a point as `from_two_sided` takes them apart."""
-    return np.concatenate([s.y, s.z, s.z_box[boxed(qp)]])
+    return np.concatenate([s.y, s.z, s.z_box[has_bound(qp)]])
 
 
 def one_sided(qp: QP) -> tuple[csc_matrix, Vector]:
@@ -137,14 +137,14 @@ def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
     return admissible(qp.sets, z_box)
 
 
-def one_of(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
+def check_choice(name: str, value: Any, allowed: tuple[Any, ...]) -> None:
     """Raise ValueError unless the value of an option is one of those allowed."""
     if value not in allowed:
         choices = ", ".join(map(repr, allowed[:-1]))
         raise ValueError(f"{name} = {value!r}; expected {choices} or {allowed[-1]!r}")
 
 
-def positive(**options: float) -> None:
+def check_positive(**options: float) -> None:
     """Raise ValueError unless every option of a solver is positive and finite."""
     for name, value in options.items():
         if not 0 < value < np.inf:
