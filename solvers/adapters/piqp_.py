@@ -40,7 +40,7 @@ class PIQP:
 
     PIQP stops when the max norms of the residuals and the duality gap are below eps_abs
     *or* below eps_rel·max(1, their largest term). So eps_abs is negligible, eps_rel =
-    tol, and the objective is multiplied until ‖q‖∞ = 1e4, where the 1 no longer counts.
+    tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -90,7 +90,7 @@ class PIQP:
                 y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
             )
             if status is Status.INFEASIBLE:
-                # its multipliers diverge along a certificate
+                # the multipliers diverge along a certificate of infeasibility
                 ray = multipliers if info.status.name == PRIMAL else {}
                 return Solution.without_point(qp, status, info.status.name, **ray)
             return Solution(

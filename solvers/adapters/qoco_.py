@@ -36,9 +36,9 @@ class QOCO:
 
     QOCO stops when the max norms of the residuals are below abstol + reltol·(their
     largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
-    negligible, reltol = tol, and the objective is multiplied until ‖q‖∞ = 1e4, where
-    the 1 no longer counts. QOCO has no certificates: on an unbounded QP its iterates
-    grow until every relative residual is small, which it calls solved; a claim with
+    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
+    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
+    every relative residual is small, which it claims as solved. So a claim with
     ‖x‖∞ > 1e12 counts as failed.
     """
 

@@ -23,7 +23,7 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "infeasible"  #: it comes with a certificate
+PRIMAL = "infeasible"  #: the status that has a certificate
 CLAIMS = {
     "solved": Status.SOLVED,
     "hit_max_iter": Status.ITERATION_LIMIT,
@@ -37,14 +37,13 @@ LINEAR_SOLVERS = ("pardiso", "scipy", "scipy_dense")
 class QTQP:
     """https://github.com/google-deepmind/qtqp.
 
-    QTQP compares its residuals with max(1, size of their terms) and takes the gap as
-    closed when it is below tol absolutely or relative to max(1, |objective|), as
-    Clarabel does. So tol is passed on and the objective multiplied until ‖q‖∞ = 1e4,
-    where the 1 no longer counts.
+    QTQP compares its residuals with max(1, size of their terms) and accepts a gap below
+    tol, absolute or relative to max(1, |objective|), like Clarabel. So tol is passed on
+    and the objective scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
 
-    In sequences it starts from the last point, moved into the interior by QTQP itself,
-    which falls back to a cold start if the residuals there are too large. Such a solve
-    counts `accepted_starts`, 1 or 0.
+    In sequences it starts from the last point. QTQP moves that point into the interior
+    and falls back to a cold start if the residuals there are too large. The count
+    `accepted_starts` is 1 or 0 accordingly.
     """
 
     linear_solver: str = "pardiso"  #: "pardiso" (MKL), "scipy" (SuperLU), "scipy_dense"
@@ -105,15 +104,15 @@ class QTQP:
                 max_iter=self.max_iter, collect_stats=True, verbose=False,
                 warm_start=start,
             )  # fmt: skip
-            words = r.status.value
-            status = CLAIMS.get(words, Status.FAILED)
+            message = r.status.value
+            status = CLAIMS.get(message, Status.FAILED)
             if status is Status.INFEASIBLE:
-                ray = from_one_sided(qp, np.array(r.y)) if words == PRIMAL else {}
-                return Solution.without_point(qp, status, words, **ray)
+                ray = from_one_sided(qp, np.array(r.y)) if message == PRIMAL else {}
+                return Solution.without_point(qp, status, message, **ray)
             return Solution(
                 status=status,
                 x=np.array(r.x), **from_one_sided(qp, np.array(r.y) / scale),
-                iterations=len(r.stats) - 1, message=words,
+                iterations=len(r.stats) - 1, message=message,
                 counts={"accepted_starts": int(solver.warm_accepted)} if start else {},
                 reported={"linear_solver": self.linear_solver},
             )  # fmt: skip

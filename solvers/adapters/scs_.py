@@ -24,7 +24,7 @@ from mortarbench.solvers.common.conversion import (
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = -2  #: it comes with a certificate
+PRIMAL = -2  #: the status that has a certificate
 CLAIMS = {
     1: Status.SOLVED,
     2: Status.ITERATION_LIMIT,  # inaccurate, as at the limit
@@ -40,8 +40,8 @@ class SCS:
 
     SCS stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
-    negligible eps_abs. It looks every 25 iterations only. Equalities go to the zero
-    cone; inequalities and finite bounds, one row each, to the nonnegative cone.
+    negligible eps_abs. The test is evaluated every 25 iterations. Equalities go to the
+    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
@@ -56,7 +56,7 @@ class SCS:
         "of scale",
         phases="preparing equilibrates and factorises; solving iterates",
         sequence="`update` of vectors keeps the factor; starts from the last point",
-        limits=("Needs a row or a bound: it has no cone for none.",),
+        limits=("Needs a row or a bound: its cone must not be empty.",),
     )
 
     def __post_init__(self) -> None:
@@ -65,7 +65,7 @@ class SCS:
 
     def declines(self, qp: QP) -> str | None:
         if not any(qp.sizes[k] for k in ("equalities", "inequalities", "bounds")):
-            return "needs a constraint: it has no cone for none"
+            return "needs a row or a bound: its cone must not be empty"
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -86,10 +86,10 @@ class SCS:
             eps_abs=NEGLIGIBLE, eps_rel=tol, eps_infeas=CERTIFICATE,
             max_iters=self.max_iter, verbose=False,
         )  # fmt: skip
-        warm: list[Solution] = []
+        starts: list[Solution] = []
 
         def solve() -> Solution:
-            point = warm.pop() if warm else None
+            point = starts.pop() if starts else None
             x, y, s = conic_point(qp, point) if point else (None, None, None)
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
@@ -115,4 +115,4 @@ class SCS:
         def update(new: QP) -> None:
             solver.update(b=one_sided(new)[1], c=new.q.copy())
 
-        return Session(solve, update, warm.append)
+        return Session(solve, update, starts.append)
