@@ -59,7 +59,9 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
     assert found["residual"] < 1e-8
     # at the end of Newton's method the model of the QP is the potential itself
     s = answer.solution
-    objective = case.made.scale * case.qp.objective(s.x) + case.made.constant
+    objective = (
+        case.family_case.scale * case.qp.objective(s.x) + case.family_case.constant
+    )
     assert objective == pytest.approx(found["energy"], rel=1e-9)
 
 
@@ -121,7 +123,9 @@ def test_forms_pose_the_same_iteration():
     name = "cantilever/slenderness=4/ny=2/load=2/newton=2"
     primal, dual = (emitted(f"{name}/{form}") for form in ("primal", "dual"))
 
-    u, v = (case.made.recover(answer.solution) for case, answer in (primal, dual))
+    u, v = (
+        case.family_case.recover(answer.solution) for case, answer in (primal, dual)
+    )
 
     assert np.abs(u - v).max() < 1e-6 * np.abs(u).max()
     assert primal[1].quantities["newton"] == 2
