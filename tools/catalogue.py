@@ -1,4 +1,4 @@
-"""Write mortarbench/catalogue.json: what `list solvers` says of our own solvers."""
+"""Write mortarbench/catalogue.json, the data of our solvers for `list solvers`."""
 
 import json
 
