@@ -1,10 +1,10 @@
-"""Write mortarbench/catalogue.json: what `list solvers` says of our own solvers."""
+"""Write mortarbench/catalogue.json, the data of our solvers for `list solvers`."""
 
 import json
 
-from mortarbench.listing import CATALOGUE, described
+from mortarbench.listing import CATALOGUE, describe
 from mortarbench.solvers import SOLVERS
 
 CATALOGUE.write_text(
-    json.dumps({name: described(s) for name, s in SOLVERS.items()}, indent=1) + "\n"
+    json.dumps({name: describe(s) for name, s in SOLVERS.items()}, indent=1) + "\n"
 )

@@ -1,4 +1,4 @@
-"""The command `list`: what there is, and docs/solvers.md of a registry."""
+"""The command `list`: list problems, solvers or suites; write docs/solvers.md."""
 
 from __future__ import annotations
 
@@ -24,39 +24,39 @@ HEAD = """\
 
 Written by `make docs` from the adapters in `solvers/`; change those, not this file.
 
-Every solver is asked for the same thing: `tol`, the relative KKT accuracy of the
-non-dimensional QP. How each one maps that to its own stopping test is said below. What
-it then claims is recorded beside our own verdict and never believed.
+Every solver receives the same `tol`, the relative KKT accuracy of the non-dimensional
+QP. The sections below state how each one maps it to its own stopping test. Its claim is
+recorded beside our own verdict, which does not depend on it.
 
-`mortarbench test-solver NAME` runs the conformance suite on any of them, and on one of
+`mortarbench test-solver NAME` runs the conformance suite on a solver, and on one of
 your own with `--plugin FILE.py`. A solver whose library is missing declines, and names
 the command that installs it; `make setup` installs all of them (the extra `fleet`).
 
-Whether units, order, scaled or repeated rows, an offset or a mirror change what each
-answers is measured in [weaknesses.md](weaknesses.md).
+[weaknesses.md](weaknesses.md) measures whether units, the order of variables, scaled or
+repeated rows, an offset or a reflection change the answers of a solver.
 """
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """List what there is, one line each or as one JSON array."""
+    """Print problems, solvers or suites, one line each or as one JSON array."""
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
             raise InputError("--markdown is for list solvers only")
         print(solvers_page(registries.solvers), end="")
         return 0
-    found = {
+    functions = {
         "problems": listing.problems,
         "solvers": listing.solvers,
         "suites": listing.suites,
     }
-    rows = found[options.what](registries=registries)
+    rows = functions[options.what](registries=registries)
     print(json.dumps(list(rows)) if options.json else rows)
     return 0
 
 
 def solvers_page(solvers: Mapping[str, Solver]) -> str:
-    """Describe the solvers of a registry in Markdown, one section per class."""
+    """Return the solvers of a registry as Markdown, one section per class."""
     groups: dict[type, list[str]] = {}
     for name, solver in solvers.items():
         groups.setdefault(type(solver), []).append(name)
@@ -101,15 +101,14 @@ def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str
 
 
 def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
-    """Tabulate the options: a column of values per name in the registry."""
+    """Return the table of options, with a column of values per name of a solver."""
     columns = {name: options_of(solvers[name]) for name in names}
     options = list(columns[names[0]])
     if not options:
         return []
-    known: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for base in kind.__mro__:
-        known = {**_own_meanings(base), **known}
-    meanings = known
+        meanings = {**_own_meanings(base), **meanings}
     heads = [f"`{name}`" for name in names]
     lines = [
         f"| option | {' | '.join(heads)} | |",

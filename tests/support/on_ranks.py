@@ -150,7 +150,7 @@ def projected(qp, most):
 
 def operator(name, ranks):
     """Compare products with F, its rows and its preconditioners with one process's."""
-    qp = mb.build(name).made.qp
+    qp = mb.build(name).family_case.qp
     whole = qp.P.build()
     share = whole.share(qp, ranks)
     P, x = share.qp.P, np.random.default_rng(1).standard_normal(qp.q.size)
