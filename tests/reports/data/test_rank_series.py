@@ -201,7 +201,9 @@ def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
 ):
     section = ranks(Analysis(manufactured))
     (model,) = (p for p in section.pictures if p.name == "ranks-model")
-    assert model.caption.startswith("Model, not measured")
+    assert model.caption.startswith(
+        "Predicted speed-up of the solve on more ranks (dashed; not m"
+    )
     for panel in model.figure.panels:
         assert any(t.text == "model, not measured" for t in panel.texts)
         (edge,) = panel.rules
