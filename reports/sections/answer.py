@@ -57,17 +57,17 @@ _TRENDS = {
 
 
 def _title(a: Analysis) -> str:
-    if a.ways.found:
+    if a.ways.comparisons:
         return "From mesh to answer"
     return "Results" if any(own_results(a)) else "Fastest solver"
 
 
 @section(1, "answer", _title)
 def answer(a: Analysis) -> Iterator[Part]:
-    """Name the best way over all forms, or the best solver of each form."""
-    if a.ways.found:
-        found = _by_subject(a.ways.found)
-        for subject, mine in found.items():
+    """Name the fastest way over all forms, or the fastest solver of each form."""
+    if a.ways.comparisons:
+        comparisons = _by_subject(a.ways.comparisons)
+        for subject, mine in comparisons.items():
             remarks = (*_faster_elsewhere(mine[0]), *_reservations(mine))
             yield Statement(
                 subject=subject,
@@ -78,7 +78,7 @@ def answer(a: Analysis) -> Iterator[Part]:
                 evidence=("forms", "verdicts", "times"),
             )
         yield from _picture(
-            "answer", [mine[0] for mine in found.values()][:1], a, FIRST_ROWS
+            "answer", [mine[0] for mine in comparisons.values()][:1], a, FIRST_ROWS
         )
     else:
         yield from _form_statements(a)
@@ -91,12 +91,12 @@ def answer(a: Analysis) -> Iterator[Part]:
 
 @section(2, "forms", "Solver times, form by form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare the solvers of each form, where the first section compares ways."""
-    if a.ways.found:
+    """Compare the solvers of each form, if the first section compares ways."""
+    if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED
         yield from _picture("forms", shown(a.fastest), a, SOLVERS)
-    del a.ways  # copies of all records
+    del a.ways  # its copies of all records take memory
 
 
 def _within(text: str, f: FastestSolver) -> str:
@@ -128,11 +128,11 @@ def _picture(
 
 def _by_subject(found: Sequence[FastestSolver]) -> dict[str, list[FastestSolver]]:
     """Group by form and mode, cold solves first; tightest accuracy first."""
-    order = sorted(found, key=lambda f: (f.kind.mode != "cold", f.kind.mode))
+    order = sorted(found, key=lambda f: (f.key.mode != "cold", f.key.mode))
     grouped: dict[str, list[FastestSolver]] = {}
     for f in order:
-        grouped.setdefault(f.kind.subject or "all forms", []).append(f)
-    return {s: sorted(fs, key=lambda f: f.kind.at) for s, fs in grouped.items()}
+        grouped.setdefault(f.key.subject or "all forms", []).append(f)
+    return {s: sorted(fs, key=lambda f: f.key.at) for s, fs in grouped.items()}
 
 
 def _selected(found: list[FastestSolver]) -> list[FastestSolver]:
@@ -150,7 +150,7 @@ def _form_statements(a: Analysis) -> Iterator[Statement]:
     """
     own = [part for part in own_results(a) if isinstance(part, Statement)]
     yield from own
-    alone = {f.kind.subject for f in a.fastest if f.finding is Finding.ALONE}
+    alone = {f.key.subject for f in a.fastest if f.finding is Finding.ALONE}
     certified = certified_sweeps(a.evidence)
     for subject, found in _by_subject(a.fastest).items():
         statement = _statement(subject, found, a, certified)
@@ -162,7 +162,7 @@ def _statement(
     subject: str, found: list[FastestSolver], a: Analysis, certified: Sweeps
 ) -> Statement:
     selected = _selected(found)
-    answers = [a.answers[f.kind] for f in found]
+    answers = [a.answers[f.key] for f in found]
     ended = unverified(row for of in answers for row in of.values())
     failed = [one for one in ended if one.verdict is not Verdict.DECLINED]
     declined = [one for one in ended if one.verdict is Verdict.DECLINED]
@@ -178,7 +178,7 @@ def _statement(
     ]
     evidence = {"verdicts", *["accuracy"] * bool(at_error)}
     for f in found:
-        evidence |= {"accuracy"} if f.kind.sweep else set()
+        evidence |= {"accuracy"} if f.key.sweep else set()
         evidence |= {"means", "ranking"} if f.over_cases else {"times", "ratios"}
     remarks = (
         *_faster_elsewhere(found[0]),

@@ -201,7 +201,7 @@ def _model_tables(
 
     def row(s: StrongSeries, m: CostModel) -> tuple[Cell, ...]:
         runs = source(*(s.answers[n] for n in m.measured))
-        terms = (m.work, m.alike, m.slowdown, *m.communication)
+        terms = (m.work, m.repeated, m.slowdown, *m.communication)
         return (
             *_series(s),
             Cell(text=", ".join(map(str, m.measured)), title=runs),

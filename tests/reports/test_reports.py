@@ -117,7 +117,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
         measured("both", dual=3e-1, **off),
     ]
     page = compose(evidence(records))
-    legend = "⋆: decided by the proven optimum of a small QP, against the residuals."
+    legend = "⋆: the proven optimum of a small QP overrules the residuals."
     texts = {
         "residuals": "verified", "agreed": "verified", "optimum": "verified ⋆",
         "refuted": "wrong ⋆", "both": "wrong",

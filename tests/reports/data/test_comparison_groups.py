@@ -123,7 +123,7 @@ def test_pooled_forms_are_cases_of_one_group(record, evidence):
         assert len(section.tables) == 1
     table = over_cases(page)[0].tables[0]
     assert "all forms, tol 1e-6: 6 cases" in table.caption
-    assert "Forms together: dual 3 cases, primal 3 cases." in table.legend
+    assert "Pooled forms: dual 3 cases, primal 3 cases." in table.legend
     assert [row[3].value for row in table.rows] == pytest.approx([0.1, 0.3])
     assert not any("--pool-forms" in text for s in page.sections for text in s.prose)
 
@@ -208,7 +208,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     (found,) = comparison_groups(evidence(records))
     assert found.solvers == ("s00", "s01", "some")
     assert np.isinf(found.times[:2, 2]).all()
-    assert found.notes == ("Declined all of them: never.",)
+    assert found.notes == ("All cases declined by: never.",)
 
 
 def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
@@ -220,8 +220,8 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
     assert len(found.cases) == 6
     assert found.solvers == ("late", "s00", "s01")
     assert found.notes == (
-        "Measured on fewer than half of them: rare.",
-        "Not measured by all, left out: 2 cases.",
+        "Left out, measured on less than half of the cases: rare.",
+        "Left out, not measured with all solvers: 2 cases.",
     )
 
 
@@ -660,7 +660,7 @@ def test_who_was_measured_in_another_session_is_named_and_marked(evidence, recor
     said = markdown(compose(evidence(of_two_sessions(record, 1.1))))
 
     assert (
-        "told apart only where the unpaired interval excludes 1 on every case: c"
+        "is significant only if the unpaired interval excludes 1 on every case: c"
         in (" ".join(said.split()))
     )
     assert "n = 8, other session" in said

@@ -91,7 +91,7 @@ def test_one_run_has_a_value_and_no_interval():
 def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
     model = strong.model
     assert model.work == pytest.approx(WORK * DOFS)
-    assert model.alike == pytest.approx(ALIKE)
+    assert model.repeated == pytest.approx(ALIKE)
     assert model.slowdown == pytest.approx(SLOWDOWN)
     on_four = 2 * REDUCTIONS * REDUCTION, 3 * MESSAGES * MESSAGE, BYTES * BYTE
     assert model.communication == pytest.approx(on_four)

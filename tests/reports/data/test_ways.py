@@ -125,7 +125,7 @@ def test_equal_ways_are_a_tie_with_its_interval_and_the_remedy(record, evidence)
     records = list(problems(record, a_dual=1e-3, b_primal=2e-3, c_primal=9e-3))
     made = evidence(records)
     claim = first_sentence(made)
-    (found,) = compare_ways(made).found
+    (found,) = compare_ways(made).comparisons
     assert found.finding is Finding.TIE
     assert "dualisation: a tie over 8 problems" in claim
     assert "do not differ significantly" in claim
@@ -145,7 +145,7 @@ def test_no_tie_has_an_interval_beside_it_that_excludes_1(record, evidence):
                 for s in "abc" for form in ("dual", "primal")
             }  # fmt: skip
             records = problems(record, count, scatter=0.2, seed=seed, **ways)
-            (found,) = compare_ways(evidence(list(records))).found
+            (found,) = compare_ways(evidence(list(records))).comparisons
             for c in found.competitors[1:]:
                 assert c.slower is (c.ratio.low > 1)
 
@@ -237,13 +237,13 @@ def test_a_single_dual_form_is_charged_for_dualising(record, evidence):
 
 def test_a_single_primal_form_needs_no_comparison_of_ways(record, evidence):
     made = evidence(list(problems(record, a_primal=1e-4, b_primal=1e-3)))
-    assert compare_ways(made).found == ()
+    assert compare_ways(made).comparisons == ()
     assert first_sentence(made).startswith("a was the fastest over 8 cases")
 
 
 def test_a_single_way_is_compared_with_nothing(record, evidence):
     made = evidence(list(problems(record, a_dual=1e-4)))
-    assert compare_ways(made).found == ()
+    assert compare_ways(made).comparisons == ()
 
 
 def test_tolerances_are_compared_apart_the_tightest_first(record, evidence):
