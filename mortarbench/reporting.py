@@ -73,7 +73,7 @@ def report(
     formats : of html, md, tex, csv, parquet
     factor : verified means every residual within factor·tol
     fail_on : what `Report.failed_on` tells of: ``worse``, a verdict became worse;
-        ``slower``, an interval lies wholly above 1, see docs/statistics.md
+        ``slower``, an interval lies wholly above 1, see docs/statistics-growth.md
     pool_forms : means, ranks and profiles compare the cases of all forms together, not
         form by form; a form that a solver declines is unsolved by it
     registries : whose way to report is used, instead of ours

@@ -32,7 +32,7 @@ from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
+LARGEST = 2000  #: unknowns; docs/performance-smalbe.md compares it with `smalbe`
 RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
 MOST_RHO = 1e9  #: where ‖Cν‖ falls slowly, ρ grows to this
 DELTA = 1e-10  #: δ

@@ -146,7 +146,7 @@ cdef class MPRGP:
     Every step but projcg's lessens the cost, and by the model τI as much as the rate of
     the book needs. Expansion never frees a component that the half step left on the
     boundary, but for the first expansion by a model of directions: from one
-    proportioning to the next the active set only grows. docs/smalbe.md: what follows.
+    proportioning to the next the active set only grows. See docs/smalbe-theory.md.
     """
 
     cdef Product F

@@ -83,7 +83,7 @@ class SMALBE(Options):
         return prepare
 
 
-#: PERMON's constants and step rules (notes in docs/performance.md): MPRGP with its
+#: PERMON's constants and step rules (notes in docs/smalbe-options.md): MPRGP with its
 #: standard expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
 PERMON = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,
