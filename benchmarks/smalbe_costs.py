@@ -1,4 +1,4 @@
-"""Costs of a solve of SMALBE besides its products: tables of docs/performance.md.
+"""Costs of SMALBE besides its products: tables of docs/performance-smalbe.md.
 
     python -m benchmarks.smalbe_costs dense|sparse|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]

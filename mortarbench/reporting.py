@@ -77,7 +77,7 @@ def report(
     factor : verified means that every residual is within factor·tol
     fail_on : conditions listed in `Report.failed_on` if they are met: ``worse``, a
         verdict became worse; ``slower``, the interval of a ratio of times lies above
-        1, see docs/statistics.md
+        1, see docs/statistics-growth.md
     pool_forms : compare solvers over the cases of all forms together in means, ranks
         and profiles, instead of form by form; a declined form counts as unsolved
     registries : replaces our registries, whose report function is used

@@ -309,7 +309,7 @@ def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
         representatives.setdefault(united[digest], environment)
     return [
         r if united[r.environment] == r.environment
-        else r.but(environment=united[r.environment])
+        else r.replace(environment=united[r.environment])
         for r in records
     ]  # fmt: skip
 

@@ -54,7 +54,9 @@ def _as_journalled(record: Record) -> Record:
     """Remove the suffix that the report gives to a solver that drove a sequence."""
     mode = f" ({record.mode})"
     suffixed = record.mode != "cold" and record.solver.endswith(mode)
-    return record.but(solver=record.solver.removesuffix(mode)) if suffixed else record
+    return (
+        record.replace(solver=record.solver.removesuffix(mode)) if suffixed else record
+    )
 
 
 def script(content: Any) -> str:

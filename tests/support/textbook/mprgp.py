@@ -23,7 +23,7 @@ before and along which the cost falls.
 Every step but projcg's lessens the cost, and by the model τI as much as the rate of the
 book needs. Expansion never frees a component that the
 half step left at a bound, but for the first expansion by a model of directions: from
-one proportioning to the next the active set only grows. docs/smalbe.md: what follows.
+one proportioning to the next the active set only grows. See docs/smalbe-theory.md.
 """
 
 from __future__ import annotations
