@@ -16,7 +16,7 @@ from mortarbench.harness.verify import certificate
 from mortarbench.harness.verify.admissible import (
     _newton,
     admissible,
-    balanced_partition,
+    balanced,
 )
 from mortarbench.harness.verify.certificate import Certificate, _charge, _Reach
 from mortarbench.harness.verify.kkt import kkt_residuals
@@ -322,7 +322,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
     rng, motions = np.random.default_rng(1), mechanics.motions
     for size in (1e-12, 1e-3):
         start = np.maximum(lam * (1 + size * rng.standard_normal(lam.size)), 0)
-        found = balanced_partition(mechanics, start, u)
+        found = balanced(mechanics, start, u)
         left = (
             motions.felt.T @ mechanics.exact.f - motions.KR.T @ u - motions.G.T @ found
         )

@@ -35,7 +35,7 @@ from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.decomposed_bodies import labelled_subdivision, parts_by
+from tests.support.decomposed_bodies import labelled, parts_by
 from tests.support.disturbed import DISTURBANCES
 
 CASES = (
@@ -108,7 +108,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
     whole, bodies = case.mechanics, bodies_of(name)
     assert whole is not None
-    layout = labelled_subdivision(bodies, boxes(bodies, parts))
+    layout = labelled(bodies, boxes(bodies, parts))
 
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")

@@ -35,9 +35,7 @@ def posed(law):
 def dual_of(primal, friction, rows):
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 2))
-    pair = decompose_by_labels(
-        BODIES, labelled_subdivision(BODIES, label), primal, friction, rows
-    )
+    pair = decompose_by_labels(BODIES, labelled(BODIES, label), primal, friction, rows)
     return pair, feti_dual(pair, primal, friction)
 
 

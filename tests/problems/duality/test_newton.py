@@ -165,8 +165,8 @@ def test_the_residual_holds_the_largest_penetration(equilibrium):
     gap[open_row] = -0.25
     free = lam.copy()
     free[at.rows.place[open_row]] = 0.0  # no multiplier: it is no gap under one
-    balanced_partition = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
-    assert path.residual(balanced_partition, free, 1.0) == pytest.approx(0.25, rel=1e-9)
+    balanced = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
+    assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
 
 
 def test_the_residual_holds_gaps_under_multipliers_by_their_share(equilibrium):

@@ -39,9 +39,7 @@ def beam_and_ring(rows="orthonormal"):
     )
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
-    return decompose_by_labels(
-        bodies, labelled_subdivision(bodies, label), primal, rows=rows
-    )
+    return decompose_by_labels(bodies, labelled(bodies, label), primal, rows=rows)
 
 
 def membranes(rows="orthonormal"):

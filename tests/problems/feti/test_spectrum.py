@@ -31,7 +31,7 @@ from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.membranes import Membranes
 from tests.support.decomposed_bodies import (
     decomposed_pair,
-    labelled_subdivision,
+    labelled,
     parts_by,
 )
 from tests.support.threads import on_threads, without_lock
@@ -114,7 +114,7 @@ def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
     bodies, primal, _ = decomposed_pair(rows)
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
-    parts = parts_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)
+    parts = parts_by(bodies, labelled(bodies, label), primal, rows=rows)
     dual = LocalDual(on_one_process(parts))
     P, B, G = projector_of(dual), dual.subdomains.rows.B, dual.G
     dense = B.toarray()

@@ -21,7 +21,7 @@ from mortarbench.harness.files.experiment import (
 from mortarbench.harness.results.journal import Journal
 from mortarbench.problems.experiments import QUICK, paper_experiment
 from mortarbench.problems.experiments.analysis import WAYS, analyse
-from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, whole
+from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.physics import stepping
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
 from mortarbench.problems.fem.inverse import CholeskyInverse
@@ -506,7 +506,9 @@ def test_triplets_give_the_same_matrix_as_the_compiled_loops():
 
 def test_contestants_take_turns_and_every_lap_is_a_row():
     calls = []
-    entrants = {name: whole(lambda name=name: calls.append(name)) for name in "ab"}
+    entrants = {
+        name: timed_as_one(lambda name=name: calls.append(name)) for name in "ab"
+    }
     rows = race(entrants, Rounds(most=3))
 
     assert calls == list("abababab")  # the first two warm up
@@ -518,7 +520,7 @@ def test_contestants_take_turns_and_every_lap_is_a_row():
 
 def test_rounds_end_when_time_is_spent_but_not_before_the_least():
     calls = []
-    race({"a": whole(lambda: calls.append(1))}, Rounds(most=9, least=4, seconds=-1),
+    race({"a": timed_as_one(lambda: calls.append(1))}, Rounds(most=9, least=4, seconds=-1),
          warm=False)  # fmt: skip
 
     assert len(calls) == 4
