@@ -28,6 +28,7 @@ from mortarbench.solvers.smalbe.projected import (
     projected_problem,
     times_projected,
 )
+from mortarbench.solvers.smalbe.scaled import Scaled
 from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
@@ -63,6 +64,7 @@ class _Task(NamedTuple):
     qp: QP
     inner: QP  #: without the variables that were eliminated
     eliminated: Eliminated | None
+    scaled: Scaled | None
     problem: Projected
     options: Options
     rho: float  #: penalty ρ
@@ -78,12 +80,18 @@ def prepared(
     rho = options.rho or (TORN_RHO if offered(qp) else RHO)
     history = History() if options.history else None
     eliminated = None
-    if eliminate and chosen(qp, options.preconditioner) in WITHOUT_P:
+    kind = chosen(qp, options.preconditioner)
+    automatic = kind == "incomplete" and options.preconditioner == "auto"
+    if eliminate and (kind in WITHOUT_P or automatic):
         eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
+    scaled = None
+    if eliminated is None and kind == "incomplete":
+        scaled = Scaled.of(qp)
     inner = qp if eliminated is None else eliminated.qp
+    inner = inner if scaled is None else scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
-    problem = _projected(inner, options, carry)
+    problem = _projected(inner, options, carry, scaled)
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
@@ -93,9 +101,9 @@ def prepared(
         problem.counts["factorised_columns"] += eliminated.columns
     loop = outer_loop(problem, inner, options, history)
     task = _Task(
-        qp=qp, inner=inner, eliminated=eliminated, problem=problem, options=options,
-        rho=rho, loop=loop, history=history,
-        start=_start(problem, loop, options.M, _penalty(rho, tol), carry),
+        qp=qp, inner=inner, eliminated=eliminated, scaled=scaled, problem=problem,
+        options=options, rho=rho, loop=loop, history=history,
+        start=_start(problem, loop, options.M, _penalty(rho, tol), carry, scaled),
     )  # fmt: skip
     return lambda: _certified(task, tol)
 
@@ -112,8 +120,17 @@ def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | No
     return None if found is None or found.columns else found
 
 
-def _projected(qp: QP, options: Options, carry: Carry | None) -> Projected:
+def _projected(
+    qp: QP, options: Options, carry: Carry | None, scaled: Scaled | None
+) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
+    if scaled is not None:
+        problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
+        problem.factor = scaled.factor()
+        problem.judge = compiled.Judge(
+            scaled.given, qp, scaled.root, problem.spectrum.norm
+        )
+        return problem
     steps = _lanczos_steps(options, qp)
     return projected_problem(qp, partial(_find, options, steps, carry))
 
@@ -153,7 +170,12 @@ def _lanczos_steps(options: Options, qp: QP) -> int:
 
 
 def _start(
-    problem: Projected, loop: OuterLoop, M: float, rho: float, carry: Carry | None
+    problem: Projected,
+    loop: OuterLoop,
+    M: float,
+    rho: float,
+    carry: Carry | None,
+    scaled: Scaled | None,
 ) -> Iterate:
     """Start from zero, or from where the problem before ended.
 
@@ -164,8 +186,9 @@ def _start(
     x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
-        x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, carry.x))
-        x = np.where(np.isfinite(x), x, carry.x)
+        at = carry.x if scaled is None else carry.x * scaled.root
+        x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, at))
+        x = np.where(np.isfinite(x), x, at)
         mu = C @ carry.force / problem.spectrum.norm
     return loop.first(x, mu, M=M, rho=rho)
 
@@ -209,9 +232,11 @@ def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
     """Prepare the outer loop, with the preconditioner that is asked for."""
-    kind = chosen(qp, options.preconditioner)
-    M = structural(qp, kind)
-    solver = compiled.SMALBE(problem, options, kind != "none", M)
+    if problem.factor is not None:
+        solver = compiled.SMALBE(problem, options, False, None)
+    else:
+        kind = chosen(qp, options.preconditioner)
+        solver = compiled.SMALBE(problem, options, kind != "none", structural(qp, kind))
     watch = None if history is None else partial(history.watch, problem)
     return OuterLoop(solver, problem, options, watch)
 
@@ -264,8 +289,9 @@ def _carry(task: _Task, at: Iterate) -> Carry:
     side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
     held = lower == upper
     side[held] = -np.sign(at.g[held])  # where it would go
+    x = problem.rows.x_tilde + at.nu
     return Carry(
-        x=problem.rows.x_tilde + at.nu,
+        x=x if task.scaled is None else x / task.scaled.root,
         side=side,
         force=problem.spectrum.norm * (problem.rows.C.T @ at.mu),
         spectrum=problem.spectrum,
@@ -287,6 +313,8 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
         },
         message="converged", history=task.history.columns if task.history else {},
     )  # fmt: skip
+    if task.scaled is not None:
+        return task.scaled.recovered(point), Fx * task.scaled.root
     return point if task.eliminated is None else task.eliminated.recover(point), Fx
 
 
@@ -321,6 +349,8 @@ def recovered(
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
     """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
+    if task.scaled is not None:
+        diagonal = task.scaled.root**2
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()

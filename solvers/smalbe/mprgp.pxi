@@ -24,6 +24,10 @@ cdef enum:
     # Steps of a run after which its progress is looked at first, ten times what a
     # preconditioned dual takes. `test_a_solve_that_rounding_stops_ends` fails without it.
     FIRST_LOOK = 500
+    # CG steps on a face before a factor is brought to it that has components besides. A
+    # factor costs as much as two or three steps; with 2, as with a factor for every face,
+    # bearings and torsion with n = 100 to 300 take up to a quarter more time.
+    SETTLED = 5
     STD = 0
     PROJCG = 1
     MIXED = 2
@@ -191,6 +195,8 @@ cdef class MPRGP:
     cdef object M  # v → Mv of a structural preconditioner; None for none
     cdef double M_scale  # ‖𝒫F𝒫‖, for M is one of F
     cdef object counts  # of its products
+    cdef IncompleteFactor factor  # of the free part of a sparse P; None for none
+    cdef long layers  # of neighbours that a proportioning lets go as well
     cdef Directions directions
 
     cdef int make_room(self) except -1:
@@ -240,6 +246,7 @@ cdef class MPRGP:
         self.split()
         self.minimise_along_directions()
         began, self.at_drift = self.parts.phi_square, INFINITY
+        self.layers = 0
         self.first_direction()
         self.expected_slope = self.directions.conjugate(self.phi, self.p)
         while True:
@@ -279,9 +286,12 @@ cdef class MPRGP:
                     gamma = self.minimise_along_p()
                     self.tell(b"c", trace, note)
                     inside += 1
+                    if inside == SETTLED and self.factor is not None:
+                        self.settle()
                     continue
                 # 6. Expansion: the face has a boundary in the way.
                 letter = self.expand(not has_expanded, max(inside, 1), began, trace)
+                self.layers = 0
                 has_expanded = True
             if not letter:
                 return 0
@@ -291,6 +301,13 @@ cdef class MPRGP:
             self.at_drift = INFINITY
             self.first_direction()
             self.tell(letter, trace, note)
+
+    cdef int settle(self) except -1:
+        """Begin CG anew on this face if the factor has components besides."""
+        if self.factor.idle:
+            self.factor.enter(self.free)
+            memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
+        return 0
 
     cdef bint stops(self) except -1:
         """Return whether the present point is precise enough."""
@@ -325,7 +342,7 @@ cdef class MPRGP:
         return 0
 
     cdef bint is_preconditioned(self) noexcept:
-        if self.M is not None:
+        if self.M is not None or self.factor is not None:
             return True
         # B = τI would only change the lengths of directions
         return self.preconditioner is not None and self.preconditioner.basis is not None
@@ -335,7 +352,9 @@ cdef class MPRGP:
         if self.in_two:
             memset(self.p, 0, self.n * sizeof(double))  # φ is added with the product
             return 0
-        if self.is_preconditioned():
+        if self.factor is not None:
+            self.factor.enter(self.free, True)
+        elif self.is_preconditioned():
             self.preconditioner.enter(self.free)
         memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))
         return 0
@@ -351,6 +370,9 @@ cdef class MPRGP:
         cdef double *again = self.s
         if not self.is_preconditioned():
             return self.phi
+        if self.factor is not None:
+            self.z_Hp = self.factor.inverse(self.phi, self.Hp, self.z)
+            return self.z
         self.z_Hp = self.preconditioner.inverse(self.free, self.phi, self.Hp, self.z)
         if self.M is not None:
             self.counts["preconditioner_applies"] += 1
@@ -370,6 +392,8 @@ cdef class MPRGP:
         """
         cdef double *beta = self.s
         cdef double length
+        if by_model and self.factor is not None:
+            return b"p" if step_by_factor(self) else 0
         if by_model:
             return b"p" if self.step_by_model() else 0
         self.set.chop(self.x, self.g, beta)
@@ -621,6 +645,9 @@ cdef class MPRGP:
         for step in range(most):
             if self.sums[0] <= enough:
                 break
+            if self.factor is not None:
+                masked(self.free, self.g2, self.phi, n)
+                self.sums[1] = self.factor.inverse(self.phi, self.Hp, self.t)
             self.turn_beyond(self.sums[1] / curvature)
             slope, curvature = self.sums[0], self.sums[1]
             trace.append(c'b')
@@ -633,6 +660,12 @@ cdef class MPRGP:
 
     cdef int turn_beyond(self, double gamma) except -1:
         """p ← φ − γp at z, Hp ← H p; `sums` are φᵀp and pᵀHp; one product."""
+        if self.factor is not None:
+            turn(self.t, gamma, self.p, self.n)
+            self.H(self.p, self.Hp)
+            self.sums[0] = dot(self.phi, self.p, self.n)
+            self.sums[1] = dot(self.p, self.Hp, self.n)
+            return 0
         if self.rows.exist or not self.F.rows.data:
             self.sums[0] = turn_freely(self.g2, self.free, gamma, self.p, self.n)
             self.H(self.p, self.Hp)

@@ -1,7 +1,9 @@
 """Preconditioners of the CG steps in a face F of the box.
 
 All are masked: z_F = (M φ_F)_F with one M for every face, but for `model`, which is
-inverted in the face (model.pxi). The structural ones, for a dual with F = BK⁺Bᵀ, are
+inverted in the face (model.pxi), and `incomplete`, which is factorised there
+(incomplete.pxi; `solvers.smalbe.scaled`). The structural ones, for a dual with
+F = BK⁺Bᵀ, are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
@@ -28,17 +30,23 @@ from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from scipy.sparse import csc_matrix, diags_array
+from scipy.sparse import csc_matrix, diags_array, issparse
 
 from mortarbench.harness import QP, Structure, Vector
+from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
 from mortarbench.solvers.smalbe.rows import Mask
 
 Operator = Callable[[Vector], Vector]
-Preconditioner = Literal["auto", "model", "diagonal", "lumped", "dirichlet", "none"]
+Preconditioner = Literal[
+    "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
+]
 PRECONDITIONERS = get_args(Preconditioner)
 #: those with a matrix M of their own
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
+#: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
+#: takes them one by one, so that a factor costs about as much as this many products.
+MAX_PAIRS = 4
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 
@@ -51,14 +59,41 @@ def offered(qp: QP) -> Preconditioned | None:
 
 
 def chosen(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Choose, where asked to: Dirichlet's where P offers it, else the model."""
+    """Choose for `auto`: Dirichlet's where offered, a cheap factor, else the model."""
     if kind != "auto":
         return kind
-    return "dirichlet" if offered(qp) else "model"
+    if offered(qp):
+        return "dirichlet"
+    return "incomplete" if has_sparse_factor(qp) else "model"
+
+
+def has_sparse_factor(qp: QP) -> bool:
+    """Return whether an incomplete factor of the free part of P is worth its while.
+
+    P is a sparse matrix with a positive diagonal, held by this process, whose columns
+    have so few entries that a factor costs no more than some products; and there are
+    bounds only, for a factor would have to know the penalty of rows.
+    """
+    P = qp.P
+    if not issparse(P) or qp.b.size or qp.h.size or not qp.q.size:
+        return False
+    if len(qp.sets) > 1 or isinstance(qp.q, DistributedVector) or P.nnz >= 2**31:
+        return False
+    diagonal = P.diagonal()
+    if not np.all((diagonal > 0) & (diagonal < np.inf)):
+        return False
+    stored = P if P.format in ("csr", "csc") else csc_matrix(P)
+    below = (np.diff(stored.indptr) - 1) / 2
+    return bool(float(below @ (below - 1)) / 2 <= MAX_PAIRS * P.nnz)
 
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:
     """Say what `qp` lacks for this preconditioner, or None."""
+    if kind == "incomplete" and not has_sparse_factor(qp):
+        return (
+            "preconditioner 'incomplete' needs a sparse P with a positive diagonal and "
+            "few entries per row, and bounds only"
+        )
     if kind == "diagonal" and qp.diagonal() is None:
         return "preconditioner 'diagonal' needs a P that tells its diagonal"
     if kind in ("lumped", "dirichlet") and qp.structure is None and not offered(qp):
