@@ -154,15 +154,17 @@ cdef extern from "vectors.h" nogil:
 cdef extern from "incomplete.h" nogil:
     int RUN
     ctypedef struct incomplete:
-        Py_ssize_t n, runs, count
+        Py_ssize_t n, half, reach, count
         const int *start
         const int *row
+        const Py_ssize_t *pair
         const int *target
         const double *below
         const double *diagonal
         const double *scale
+        Py_ssize_t width
         const Py_ssize_t *offset
-        const int *place
+        const int *between
         int *from_ "from"
         int *to
         double *L
@@ -171,8 +173,8 @@ cdef extern from "incomplete.h" nogil:
         double *bands
         double *y
     void find_runs(incomplete *F, const double *free, Py_ssize_t most)
-    Py_ssize_t factorise_incompletely(incomplete *F, const double *free, double keep,
-                                      double shift, double least)
+    bint factorise_incompletely(incomplete *F, const double *free, double keep,
+                                double shift, double least)
     double solve_incompletely(const incomplete *F, const double *v, const double *along,
                               double *z)
     double projected_step(const double *x, const double *z, const double *g,

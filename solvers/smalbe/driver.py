@@ -128,11 +128,17 @@ def _projected(
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
         problem.factor = scaled.factor()
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, problem.spectrum.norm
+            scaled.given, qp, scaled.root, scaled.root**2, problem.spectrum.norm
         )
         return problem
     steps = _lanczos_steps(options, qp)
-    return projected_problem(qp, partial(_find, options, steps, carry))
+    problem = projected_problem(qp, partial(_find, options, steps, carry))
+    if options.expansion == "model" and problem.diagonal.size and not qp.b.size:
+        if not isinstance(qp.q, DistributedVector) and not problem.rows.C.shape[0]:
+            problem.judge = compiled.Judge(
+                qp, qp, np.ones(qp.q.size), problem.diagonal, problem.spectrum.norm
+            )
+    return problem
 
 
 def _find(

@@ -21,6 +21,40 @@ cdef enum:
     LEAST_OFFSET = 8
 
 
+cdef inline bint is_later(Py_ssize_t i, Py_ssize_t j, Py_ssize_t half) noexcept nogil:
+    """Return whether i is eliminated after j: up to `half`, then down from the last."""
+    return i > j if j < half else half <= i < j
+
+
+cdef inline Py_ssize_t distance(Py_ssize_t i, Py_ssize_t j) noexcept nogil:
+    return i - j if i > j else j - i
+
+
+def pairs_of_columns(matrix):
+    """Count the pairs of entries below the diagonal in the columns of a symmetric P.
+
+    The work of an incomplete factor is one step for each. inf where a diagonal entry is
+    not a positive number.
+
+    matrix : P in SciPy's csr or csc format
+    """
+    cdef Py_ssize_t i, k, n = matrix.shape[0], below
+    cdef double pairs = 0.0, diagonal
+    cdef list held = []
+    cdef int[::1] indptr = _integers(matrix.indptr), indices = _integers(matrix.indices)
+    cdef const double *data = read(matrix.data, held)
+    for i in range(n):
+        below, diagonal = 0, 0.0
+        for k in range(indptr[i], indptr[i + 1]):
+            below += indices[k] > i
+            if indices[k] == i:
+                diagonal += data[k]
+        if not 0 < diagonal < INFINITY:
+            return INFINITY
+        pairs += below * (below - 1) // 2
+    return pairs
+
+
 def scaled_by_diagonal(matrix, scale):
     """Return the entries of SPS, and what is known of its rows.
 
@@ -68,6 +102,7 @@ cdef class IncompleteFactor:
     cdef Room room
     cdef Room values
     cdef int *integers
+    cdef Py_ssize_t *first_pairs
     cdef double *face  # (n,) 1 where a component is free in the present factor
     cdef double *wanted  # (n,) a face that is being tried
     cdef int *queue  # (n,)
@@ -80,103 +115,123 @@ cdef class IncompleteFactor:
     def __init__(self, matrix, weights, scale, bint keep=True):
         cdef Py_ssize_t n = matrix.shape[0], i, k, m, entries = 0, pairs = 0, near, used
         cdef Py_ssize_t offset[16]  # MOST_DIAGONALS
-        cdef Py_ssize_t count = 0
-        cdef int first, last, middle, which
+        cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
+        cdef int first, last
+        cdef bint by_bands
         self.n, self.held, self.keep = n, [], KEEP if keep else 0.0
         cdef int[::1] indptr = _integers(matrix.indptr)
         cdef int[::1] indices = _integers(matrix.indices)
         self.indptr, self.indices = &indptr[0], &indices[0]
         cdef const double *data = read(matrix.data, self.held)
         cdef const double *w = read(weights, self.held)
-        # 1. The lower triangle by columns, as the upper one by rows of a symmetric P.
+        # 1. The order of elimination, and the distances of entries from the diagonal.
+        for i in range(n):
+            for k in range(indptr[i], indptr[i + 1]):
+                far = distance(indices[k], i)
+                reach = far if far > reach else reach
+                m = 0
+                while m < count and offset[m] != far:
+                    m += 1
+                if far and m == count:
+                    if count == MOST_DIAGONALS:
+                        count = n + 1  # too many
+                    else:
+                        offset[count] = far
+                        count += 1
+        half = n // 2 if n >= 4 * reach and n > 1 else n
+        # 2. How many later rows, and pairs of them, there are in all columns.
         for i in range(n):
             used = 0
             for k in range(indptr[i], indptr[i + 1]):
-                used += indices[k] > i
+                used += is_later(indices[k], i, half)
             entries += used
             pairs += used * (used - 1) // 2
-        self.integers = <int *> calloc(5 * n + 3 + 2 * entries + pairs, sizeof(int))
-        if not self.integers:
+        offsets = np.array(sorted([offset[m] for m in range(count)]) if count <= n else [])
+        near = 1 if len(offsets) and offsets[0] == 1 else 0
+        count = len(offsets)
+        if count * n > 2 * entries + n or count > near and offsets[near] < LEAST_OFFSET:
+            count = 0
+        by_bands = count > 0
+        self.most = n
+        if by_bands:
+            self.most = min(RUN, offsets[near] if count > near else n)
+            pairs, stored = 0, count * (n + reach)
+        else:
+            stored = entries
+        cdef Py_ssize_t[::1] at_offset = np.array(offsets if by_bands else [0], dtype=np.intp)
+        # 3. Room.
+        self.integers = <int *> calloc(
+            5 * n + 3 + (0 if by_bands else entries) + pairs
+            + MOST_DIAGONALS * MOST_DIAGONALS, sizeof(int)
+        )
+        self.first_pairs = <Py_ssize_t *> calloc(n + 1, sizeof(Py_ssize_t))
+        if not self.integers or not self.first_pairs:
             raise MemoryError
         cdef int *start = self.integers
         cdef int *row = start + n + 1
-        cdef int *place = row + entries
-        cdef int *target = place + entries
-        self.F.from_ = target + pairs
+        cdef int *target = row + (0 if by_bands else entries)
+        cdef int *between = target + pairs
+        self.F.from_ = between + MOST_DIAGONALS * MOST_DIAGONALS
         self.F.to, self.queue = self.F.from_ + n, self.F.from_ + 2 * n
         self.besides = self.F.from_ + 3 * n
-        self.values = Room(2 * n + entries)
-        cdef double *below = self.values.at
-        cdef double *diagonal = below + entries
+        self.values, self.room = Room(n + stored), Room(stored + 5 * n + reach)
+        cdef double *diagonal = self.values.at
+        cdef double *below = diagonal + n
+        # 4. The matrix.
         entries = 0
         for i in range(n):
             for k in range(indptr[i], indptr[i + 1]):
                 if indices[k] == i:
                     diagonal[i] = data[k] * w[i] * w[i]
-                elif indices[k] > i:
-                    row[entries], below[entries] = indices[k], data[k] * w[i] * w[indices[k]]
-                    entries += 1
+                elif is_later(indices[k], i, half):
+                    if by_bands:
+                        m = 0
+                        while at_offset[m] != distance(indices[k], i):
+                            m += 1
+                        m = m * (n + reach) + i
+                    else:
+                        m, row[entries] = entries, indices[k]
+                        entries += 1
+                    below[m] = data[k] * w[i] * w[indices[k]]
             start[i + 1] = <int> entries
-        # 2. Its diagonals, if they are few and full.
-        used = 0
-        for i in range(n):
-            for k in range(start[i], start[i + 1]):
-                m = 0
-                while m < count and offset[m] != row[k] - i:
-                    m += 1
-                if m == count:
-                    if count == MOST_DIAGONALS:
-                        count = -1
-                        break
-                    offset[count] = row[k] - i
-                    count += 1
-            if count < 0:
-                break
-        count = max(count, 0)
-        offsets = np.array(sorted([offset[m] for m in range(count)]) or [0], dtype=np.intp)
-        cdef Py_ssize_t[::1] distance = offsets
-        near = 1 if count and distance[0] == 1 else 0
-        if count * n > 2 * entries + n or count > near and distance[near] < LEAST_OFFSET:
-            count = 0
-        self.most = n
-        if count:
-            self.most = min(RUN, distance[near] if count > near else n)
-        for i in range(n if count else 0):
-            for k in range(start[i], start[i + 1]):
-                m = 0
-                while distance[m] != row[k] - i:
-                    m += 1
-                place[k] = <int> (m * n + i)
-        # 3. Where the entries j > i of a column meet: the entry (j, i), if there is one.
+        # 5. The entry between two later rows of a column, if there is one: it is in the
+        #    column of the one that is eliminated first.
+        for m in range(count):
+            for k in range(count):
+                between[m * MOST_DIAGONALS + k] = -1
+                for i in range(count):
+                    if at_offset[i] == distance(at_offset[m], at_offset[k]):
+                        between[m * MOST_DIAGONALS + k] = <int> i
         pairs = 0
-        for i in range(n):
+        for i in range(0 if by_bands else n):
+            self.first_pairs[i] = pairs
             for k in range(start[i], start[i + 1]):
                 for m in range(k + 1, start[i + 1]):
-                    which = row[m]
-                    first, last = start[row[k]], start[row[k] + 1]
-                    while first < last:
-                        middle = (first + last) // 2
-                        if row[middle] < which:
-                            first = middle + 1
-                        else:
-                            last = middle
-                    if first == start[row[k] + 1] or row[first] != which:
-                        first = -1
-                    target[pairs] = first
+                    column, other = row[k], row[m]
+                    if not is_later(other, column, half):
+                        column, other = other, column
+                    first, last = start[column], start[column + 1]
+                    while first < last and row[first] < other:
+                        first += 1
+                    target[pairs] = -1
+                    if first < last and row[first] == other:
+                        target[pairs] = first
                     pairs += 1
-        self.held += [indptr, indices, distance]
-        self.room = Room(entries + (count + 5) * n)
-        self.F.n, self.F.count, self.F.offset = n, count, &distance[0]
-        self.F.start, self.F.row, self.F.place, self.F.target = start, row, place, target
-        self.F.below, self.F.diagonal = below, diagonal
-        self.F.scale, self.F.L = read(scale, self.held), self.room.at
-        self.F.bands = self.F.L + entries
-        self.F.pivot = self.F.bands + count * n
-        self.F.inverse, self.F.y = self.F.pivot + n, self.F.pivot + 2 * n
-        self.face, self.wanted = self.F.pivot + 3 * n, self.F.pivot + 4 * n
+        self.held += [indptr, indices, at_offset]
+        self.F.n, self.F.half, self.F.reach, self.F.count = n, half, reach, count
+        self.F.width, self.F.offset, self.F.between = n + reach, &at_offset[0], between
+        self.F.start, self.F.row, self.F.target = start, row, target
+        self.F.pair, self.F.below, self.F.diagonal = self.first_pairs, below, diagonal
+        self.F.scale = read(scale, self.held)
+        self.F.L = self.F.bands = self.room.at
+        self.F.pivot = self.F.L + stored
+        self.F.inverse = self.F.pivot + n + reach
+        self.F.y, self.face = self.F.inverse + n, self.F.inverse + 2 * n
+        self.wanted = self.F.inverse + 3 * n
 
     def __dealloc__(self):
         give_back(self.integers)
+        give_back(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
         """Factorise on the face of the components where `free` (n,) is 1, unless the
@@ -201,9 +256,9 @@ cdef class IncompleteFactor:
         self.is_ready = True
         self.factorisations += 1
         find_runs(&self.F, free, self.most)
-        while factorise_incompletely(
+        while not factorise_incompletely(
             &self.F, free, self.keep, self.shift, LEAST_PIVOT
-        ) >= 0:
+        ):
             if self.keep:
                 self.keep = 0.0
             else:

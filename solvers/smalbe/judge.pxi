@@ -12,6 +12,7 @@ cdef class Judge:
     qp : as given
     scaled : the QP in y = d x
     root : d (n,)
+    diagonal : of P (n,), as given
     norm : ‖H‖, by which the scaled one is divided
     """
 
@@ -23,7 +24,7 @@ cdef class Judge:
     cdef const double *low
     cdef const double *high
     cdef const double *root
-    cdef double *diagonal
+    cdef const double *diagonal
     cdef double *x
     cdef double *Px
     cdef double *forces
@@ -32,18 +33,16 @@ cdef class Judge:
     cdef Room room
     cdef list held
 
-    def __init__(self, qp, scaled, root, double norm):
-        cdef Py_ssize_t i, n = len(root)
+    def __init__(self, qp, scaled, root, diagonal, double norm):
+        cdef Py_ssize_t n = len(root)
         self.n, self.norm, self.held = n, norm, []
         self.q, self.lb = read(qp.q, self.held), read(qp.lb, self.held)
         self.ub, self.root = read(qp.ub, self.held), read(root, self.held)
         self.low, self.high = read(scaled.lb, self.held), read(scaled.ub, self.held)
-        self.room = Room(6 * n)
-        self.diagonal, self.x = self.room.at, self.room.at + n
+        self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
+        self.x = self.room.at
         self.Px, self.forces = self.x + n, self.x + 2 * n
         self.size, self.z = self.x + 3 * n, self.x + 4 * n
-        for i in range(n):
-            self.diagonal[i] = self.root[i] * self.root[i]
 
     cdef double residual(self, const double *y, const double *g) noexcept:
         """Return the bound at y (n,) with its gradient g (n,); inf without an energy."""

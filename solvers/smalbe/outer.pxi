@@ -15,7 +15,7 @@ cdef double FOR_ENERGY = 1.25
 cdef double TAIL = 1e-4
 # ‖g^P‖ at which the KKT residual is asked for first and from which on it no longer counts,
 # in units of tol‖b‖. At a residual of 1e-6 strings have 1e-4, and bearings 1e-5.
-cdef double FIRST_JUDGED = 1e4
+cdef double FIRST_JUDGED = 1e3
 cdef double MOST_JUDGED = 1e-2
 
 
@@ -343,7 +343,7 @@ cdef class SMALBE(MPRGP):
             return self.is_accurate()
         if isinf(residual):
             return size <= self.small_gradient and self.is_accurate()
-        self.next_judged = size * fmin(fmax(2 * self.tol / residual, 0.1), 0.9)
+        self.next_judged = size * fmin(fmax(2 * self.tol / residual, 0.03), 0.9)
         return False
 
     cdef bint is_accurate(self) except -1:
@@ -410,7 +410,7 @@ cdef class SMALBE(MPRGP):
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
         cdef list held = []
-        if not self.rows.C:
+        if not self.rows.C and (self.rows.exist or self.over.ranks is not None):
             return None
         result, multipliers = np.zeros((3, n)), np.zeros(r)
         cdef Room room = Room(r * r)

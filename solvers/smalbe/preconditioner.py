@@ -35,6 +35,7 @@ from scipy.sparse import csc_matrix, diags_array, issparse
 from mortarbench.harness import QP, Structure, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
+from mortarbench.solvers.smalbe.compiled import pairs_of_columns
 from mortarbench.solvers.smalbe.rows import Mask
 
 Operator = Callable[[Vector], Vector]
@@ -79,12 +80,8 @@ def has_sparse_factor(qp: QP) -> bool:
         return False
     if len(qp.sets) > 1 or isinstance(qp.q, DistributedVector) or P.nnz >= 2**31:
         return False
-    diagonal = P.diagonal()
-    if not np.all((diagonal > 0) & (diagonal < np.inf)):
-        return False
     stored = P if P.format in ("csr", "csc") else csc_matrix(P)
-    below = (np.diff(stored.indptr) - 1) / 2
-    return bool(float(below @ (below - 1)) / 2 <= MAX_PAIRS * P.nnz)
+    return bool(pairs_of_columns(stored) <= MAX_PAIRS * P.nnz)
 
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:

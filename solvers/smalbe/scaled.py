@@ -26,7 +26,7 @@ class Scaled:
     """A QP in scaled variables, factors of its matrix, and the way back."""
 
     given: QP
-    P: csr_array  #: of that, sorted
+    P: Matrix  #: of that, sorted, by rows or columns
     qp: QP  #: in y = D¹ᐟ²x
     root: Vector  #: (n,) D¹ᐟ²
     norm: float  #: the largest sum Σⱼ|Hᵢⱼ| of a row: an upper bound for ‖H‖
@@ -66,10 +66,8 @@ class Scaled:
 
 
 def _canonical(P: Matrix) -> Matrix:
-    """Return a symmetric P by rows, sorted and without repetitions."""
-    if P.format == "csc":
-        P = csr_array((P.data, P.indices, P.indptr), shape=P.shape)
-    elif P.format != "csr":
+    """Return a symmetric P by rows or columns, sorted and without repetitions."""
+    if P.format not in ("csc", "csr"):
         P = csr_array(P)
     if not P.has_canonical_format:
         P = P.copy()

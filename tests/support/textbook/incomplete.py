@@ -8,6 +8,30 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+def order_of_elimination(P: Array) -> NDArray[np.intp]:
+    """Return the order (n,): from both ends to the middle, if entries reach so little.
+
+    Each end has half of the components. There is one end only where an entry is farther
+    than n/4 from the diagonal.
+    """
+    n = len(P)
+    i, j = np.nonzero(P)
+    reach = np.abs(i - j).max(initial=0)
+    half = n // 2 if n >= 4 * reach and n > 1 else n
+    return np.r_[np.arange(half), np.arange(half, n)[::-1]]
+
+
+def incomplete_inverse(P: Array, free: Mask, keep: float) -> Array:
+    """Return M⁻¹ (n, n) of M ≈ P_FF, zero where a row or column is not free."""
+    order = order_of_elimination(P)
+    order = order[free[order]]
+    L, D = incomplete_cholesky(P[np.ix_(order, order)], keep)
+    inverse = np.zeros_like(P)
+    inverse[np.ix_(order, order)] = np.linalg.inv((L * D) @ L.T)
+    return inverse
 
 
 def incomplete_cholesky(A: Array, keep: float) -> tuple[Array, Vector]:
