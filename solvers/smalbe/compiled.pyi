@@ -47,7 +47,12 @@ class IncompleteFactor:
 
 class Judge:
     def __init__(
-        self, qp: QP, scaled: QP, root: Vector, diagonal: Vector, norm: float
+        self,
+        qp: QP,
+        scaled: QP,
+        root: Vector | None,
+        diagonal: Vector,
+        norm: float,
     ) -> None: ...
 
 class SMALBE:

@@ -35,6 +35,10 @@ STEPS = {
     "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
 }  # fmt: skip
 CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+#: Factors of the tolerance, less than a residual demands, for one that exceeds it. The
+#: first is enough on four in five of the bodies where it does: the residual falls with
+#: ‖g^P‖, though not in proportion.
+IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
 LEAST_LANCZOS = 5  #: steps, however few unknowns there are
 RHO = 1e4  #: penalty where none is given
@@ -135,9 +139,8 @@ def _projected(
     problem = projected_problem(qp, partial(_find, options, steps, carry))
     whole = problem.diagonal.size and not isinstance(qp.q, DistributedVector)
     if options.expansion == "model" and whole and not qp.b.size:
-        problem.judge = compiled.Judge(
-            qp, qp, np.ones(qp.q.size), problem.diagonal, problem.spectrum.norm
-        )
+        norm = problem.spectrum.norm
+        problem.judge = compiled.Judge(qp, qp, None, problem.diagonal, norm)
     return problem
 
 
@@ -169,9 +172,10 @@ def _lanczos_steps(options: Options, qp: QP) -> int:
     """Take few of them for few unknowns, where they would outweigh the CG steps.
 
     And where P offers a preconditioner: the spectrum of torn bodies is flat, so that
-    only its norm is found.
+    only its norm is found. With bounds alone fewer are enough: seven or eight for 73 to
+    85 unknowns save as many products as they cost, of which CG takes about ten.
     """
-    few = LEAST_LANCZOS if offered(qp) else qp.q.size // 6
+    few = LEAST_LANCZOS if offered(qp) else qp.q.size // (6 if qp.b.size else 10)
     return min(options.lanczos_steps, max(LEAST_LANCZOS, few))
 
 
@@ -251,16 +255,21 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
     """Return a point whose KKT residuals on the original problem are within `tol`.
 
     They may be CLAIM times that; where they exceed it at all, the tolerance is
-    tightened once more, and the better of the two points is returned.
+    tightened once or twice more, and the best of the points is returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
-    if at is None or worst <= tol or task.options.expansion != "model":
+    if at is None or task.options.expansion != "model":
         return result
-    at = task.loop.solve(tighter * 0.8 * tol / worst * tol, at)
-    if at.status is Status.SOLVED and at.nu @ at.nu < np.inf:
+    for share in IMPROVEMENTS:
+        if worst <= tol:
+            break
+        at = task.loop.solve(tighter * share * tol / worst * tol, at)
+        if at.status is not Status.SOLVED or not at.nu @ at.nu < np.inf:
+            break
         point, Fx = _point(task, at)
-        if _worst_residual(task, point, Fx, CLAIM * tol) < worst:
-            return _counted(task, point), partial(_carry, task, at)
+        residual = _worst_residual(task, point, Fx, CLAIM * tol)
+        if residual < worst:
+            result, worst = (point, partial(_carry, task, at)), residual
     return _counted(task, result[0]), result[1]
 
 

@@ -11,7 +11,7 @@ cdef class Judge:
 
     qp : as given
     scaled : the QP in y = d x
-    root : d (n,)
+    root : d (n,), None for ones
     diagonal : of P (n,), as given
     norm : ‖H‖, by which the scaled one is divided
     """
@@ -34,10 +34,12 @@ cdef class Judge:
     cdef list held
 
     def __init__(self, qp, scaled, root, diagonal, double norm):
-        cdef Py_ssize_t n = len(root)
+        cdef Py_ssize_t n = len(diagonal)
         self.n, self.norm, self.held = n, norm, []
         self.q, self.lb = read(qp.q, self.held), read(qp.lb, self.held)
-        self.ub, self.root = read(qp.ub, self.held), read(root, self.held)
+        self.ub = read(qp.ub, self.held)
+        if root is not None:
+            self.root = read(root, self.held)
         self.low, self.high = read(scaled.lb, self.held), read(scaled.ub, self.held)
         self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
         self.x = self.room.at
@@ -49,11 +51,12 @@ cdef class Judge:
         cdef Py_ssize_t i, n = self.n
         cdef double sums[3]
         cdef double most[2]
-        cdef double least, energy, worst, r, x, z
+        cdef double least, energy, worst, r, d, x, z
         for i in range(n):
-            r = self.norm * self.root[i] * g[i]
+            d = self.root[i] if self.root else 1.0
+            r = self.norm * d * g[i]
             self.Px[i] = r - self.q[i]
-            x = y[i] / self.root[i]
+            x = y[i] / d
             x = x if x > self.lb[i] else self.lb[i]
             x = x if x < self.ub[i] else self.ub[i]
             z = 0.0

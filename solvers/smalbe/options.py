@@ -45,7 +45,9 @@ class Options:
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖
-    lanczos_steps: int = 12  #: products spent on it; at most n/6, or 5
+    lanczos_steps: int = (
+        12  #: products spent on it; at most n/6 (n/10 without rows), or 5
+    )
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
     energy: float = 50.0  #: estimated energy error/tol to reach, too; 0: whatever
