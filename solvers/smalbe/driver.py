@@ -17,7 +17,12 @@ from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.options import Options
-from mortarbench.solvers.smalbe.preconditioner import chosen, offered, structural
+from mortarbench.solvers.smalbe.preconditioner import (
+    chosen,
+    offered,
+    scalable,
+    structural,
+)
 from mortarbench.solvers.smalbe.projected import (
     Iterate,
     OuterIteration,
@@ -85,12 +90,13 @@ def prepared(
     history = History() if options.history else None
     eliminated = None
     kind = chosen(qp, options.preconditioner)
-    automatic = kind == "incomplete" and options.preconditioner == "auto"
-    if eliminate and (kind in WITHOUT_P or automatic):
+    chosen_freely = kind == "incomplete" and options.preconditioner == "auto"
+    if eliminate and (kind in WITHOUT_P or chosen_freely):
         eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
     scaled = None
-    if eliminated is None and kind == "incomplete":
-        scaled = Scaled.of(qp)
+    automatic = options.preconditioner == "auto" and scalable(qp)
+    if eliminated is None and (kind == "incomplete" or automatic):
+        scaled = Scaled.of(qp, with_factor=kind == "incomplete")
     inner = qp if eliminated is None else eliminated.qp
     inner = inner if scaled is None else scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
@@ -128,20 +134,26 @@ def _projected(
     qp: QP, options: Options, carry: Carry | None, scaled: Scaled | None
 ) -> Projected:
     """Homogenise, project, normalise, and look at the spectrum."""
-    if scaled is not None:
+    steps = _lanczos_steps(options, qp)
+    find = partial(_find, options, steps, carry)
+    if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
         problem.factor = scaled.factor()
+    else:
+        problem = projected_problem(qp, find)
+    norm, bounds_only = problem.spectrum.norm, not qp.b.size
+    if scaled is not None:
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, scaled.root**2, problem.spectrum.norm
+            scaled.given, qp, scaled.root, scaled.root**2, norm
         )
-        return problem
-    steps = _lanczos_steps(options, qp)
-    problem = projected_problem(qp, partial(_find, options, steps, carry))
-    whole = problem.diagonal.size and not isinstance(qp.q, DistributedVector)
-    if options.expansion == "model" and whole and not qp.b.size:
-        norm = problem.spectrum.norm
+    elif options.expansion == "model" and bounds_only and _is_whole(qp, problem):
         problem.judge = compiled.Judge(qp, qp, None, problem.diagonal, norm)
     return problem
+
+
+def _is_whole(qp: QP, problem: Projected) -> bool:
+    """Return whether this process has all of the QP, and P tells its diagonal."""
+    return problem.diagonal.size > 0 and not isinstance(qp.q, DistributedVector)
 
 
 def _find(

@@ -32,7 +32,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array, issparse
 
-from mortarbench.harness import QP, Structure, Vector
+from mortarbench.harness import QP, Matrix, Structure, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
 from mortarbench.solvers.smalbe.compiled import pairs_of_columns
@@ -46,8 +46,9 @@ PRECONDITIONERS = get_args(Preconditioner)
 #: those with a matrix M of their own
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
-#: takes them one by one, so that a factor costs about as much as this many products.
-MAX_PAIRS = 4
+#: takes them one by one. Trilinear elements on a grid have 2 to 3, and their factors cost
+#: twice as much time as they save.
+MAX_PAIRS = 1.5
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 
@@ -71,17 +72,28 @@ def chosen(qp: QP, kind: Preconditioner) -> Preconditioner:
 def has_sparse_factor(qp: QP) -> bool:
     """Return whether an incomplete factor of the free part of P is worth its while.
 
-    P is a sparse matrix with a positive diagonal, held by this process, whose columns
-    have so few entries that a factor costs no more than some products; and there are
-    bounds only, for a factor would have to know the penalty of rows.
+    The variables are `scalable`, and the columns of P have so few entries that a factor
+    costs no more than some products.
+    """
+    return scalable(qp) and pairs_of_columns(_by_columns(qp.P)) <= MAX_PAIRS * qp.P.nnz
+
+
+def scalable(qp: QP) -> bool:
+    """Return whether the variables can be scaled by the roots of P's diagonal.
+
+    P is a sparse matrix with a positive diagonal, held by this process, and there are
+    bounds only: a factor of P would have to know the penalty of rows.
     """
     P = qp.P
     if not issparse(P) or qp.b.size or qp.h.size or not qp.q.size:
         return False
     if len(qp.sets) > 1 or isinstance(qp.q, DistributedVector) or P.nnz >= 2**31:
         return False
-    stored = P if P.format in ("csr", "csc") else csc_matrix(P)
-    return bool(pairs_of_columns(stored) <= MAX_PAIRS * P.nnz)
+    return bool(pairs_of_columns(_by_columns(P)) < np.inf)
+
+
+def _by_columns(P: Matrix) -> Matrix:
+    return P if P.format in ("csr", "csc") else csc_matrix(P)
 
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:

@@ -32,10 +32,11 @@ class Scaled:
     norm: float  #: the largest sum Σⱼ|Hᵢⱼ| of a row: an upper bound for ‖H‖
     weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
     has_weights: bool
+    with_factor: bool  #: whether to precondition by a factor
 
     @classmethod
-    def of(cls, qp: QP) -> Scaled:
-        """Scale a QP that `solvers.smalbe.preconditioner.has_sparse_factor` accepts."""
+    def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
+        """Scale a QP for which `solvers.smalbe.preconditioner.scalable` holds."""
         P = _canonical(qp.P)
         root = np.sqrt(P.diagonal())
         inverse = 1 / root
@@ -44,9 +45,10 @@ class Scaled:
             P=csr_array((data, P.indices, P.indptr), shape=P.shape), q=qp.q * inverse,
             A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=qp.lb * root, ub=qp.ub * root,
         )  # fmt: skip
-        if least >= -ROUNDING:
-            return cls(qp, P, scaled, root, norm, np.ones(root.size), True)
-        return cls(qp, P, scaled, root, norm, inverse, least_scaled >= -ROUNDING)
+        weights, has_weights = np.ones(root.size), True
+        if least < -ROUNDING:
+            weights, has_weights = inverse, least_scaled >= -ROUNDING
+        return cls(qp, P, scaled, root, norm, weights, has_weights, with_factor)
 
     def spectrum(self) -> Spectrum:
         """Bound the norm of the matrix by Gershgorin's theorem, without a product."""

@@ -194,6 +194,28 @@ def test_where_a_factor_would_not_do_there_is_none(reason):
     assert not has_sparse_factor(qp)
 
 
+def test_trilinear_elements_are_scaled_without_a_factor():
+    """Units of neighbours three orders apart: 30 000 products without scaling."""
+    n, rng = 12, np.random.default_rng(1)
+    T = diags_array(
+        [-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1]
+    )
+    M = diags_array(
+        [np.ones(n - 1), 4 * np.ones(n), np.ones(n - 1)], offsets=[-1, 0, 1]
+    )
+    P = kron(kron(T, M), M) + kron(kron(M, T), M) + kron(kron(M, M), T)
+    unit = diags_array(10 ** rng.uniform(-1.5, 1.5, n**3))
+    P = csr_array(unit @ P @ unit)
+    q = -np.sin(np.linspace(0, 9, n**3)) * unit.diagonal()
+    qp = boxed(P, q, np.zeros(n**3), np.full(n**3, np.inf))
+    s = SOLVERS["smalbe"].prepare(qp, 1e-8)()
+
+    assert not has_sparse_factor(qp)
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 1e-8
+    assert s.counts["P_products"] <= 200
+
+
 def test_who_asks_for_a_factor_that_is_not_there_is_told_why():
     solver = replace(SOLVERS["smalbe"], preconditioner="incomplete")
     qp = primal("journal-bearing/n=5")
