@@ -1,6 +1,6 @@
 """What a solve of SMALBE costs beside its products: tables of docs/performance.md.
 
-    python -m benchmarks.smalbe_costs dense|sparse|kept
+    python -m benchmarks.smalbe_costs dense|sparse|incomplete|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
 * dense: preparing and solving duals, in units of their products with F. The bound of a
@@ -8,6 +8,7 @@
   faster, and 100 µs.
 * sparse: a product with all work shared out, in units of one product and five passes
   w += v over vectors.
+* incomplete: sparse problems with and without incomplete factors.
 * kept: the same solves with and without keeping directions of CG.
 * race: solvers on a case, preparing and solving; answers are verified.
 
@@ -46,6 +47,18 @@ LARGE = {
     "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
     "torsion": {"n": 100},
 }
+INCOMPLETE = {
+    "journal-bearing": [
+        {"n": 50, "eccentricity": 0.9}, {"n": 100, "eccentricity": 0.9},
+        {"n": 200, "eccentricity": 0.9}, {"n": 300},
+    ],
+    "string": [{"n": 1000}, {"n": 1000, "half": True}, {"n": 10_000}],
+    "obstacle": [
+        {"dim": 2, "n": 40, "shape": "flat"},
+        {"dim": 2, "n": 257, "shape": "hemisphere"},
+    ],
+    "torsion": [{"n": 30}, {"n": 100}, {"n": 200}],
+}  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
 REPEATS = 20  #: of a product, which is too short to be timed alone
 
@@ -168,6 +181,48 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
         )
 
 
+def incomplete(tol: float = 1e-6) -> None:
+    """Solve sparse problems with bounds, preconditioned by factors and not."""
+    print("case | products, factors, ms | without: products, ms | ratio of times")
+    for name, several in INCOMPLETE.items():
+        for params in several:
+            given = {key: value for key, value in params.items() if key != "half"}
+            family = PROBLEMS[name]
+            qp = family.build("primal", family.complete(given), reference_solution).qp
+            if "half" in params:
+                qp = _on_half(qp)
+            _incomplete(f"{name} {params}", qp, tol)
+
+
+def _on_half(qp: QP) -> QP:
+    """Leave out the lower bounds of the second half of the variables."""
+    lb = qp.lb.copy()
+    lb[qp.q.size // 2 :] = -np.inf
+    return QP(P=qp.P, q=qp.q, A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=lb, ub=qp.ub)
+
+
+def _incomplete(name: str, qp: QP, tol: float) -> None:
+    solvers = {
+        "factors": SOLVERS["smalbe"],
+        "without": replace(SOLVERS["smalbe"], preconditioner="model"),
+    }
+    counts = {name: s.prepare(qp, tol)().counts for name, s in solvers.items()}
+    told = in_turn(
+        5 if qp.q.size > 20_000 else 30,
+        **{
+            name: timed(lambda s=s: s.prepare(qp, tol)()) for name, s in solvers.items()
+        },
+    )
+    (ms, _), (before, _) = told["factors"], told["without"]
+    with_factors, without = counts["factors"], counts["without"]
+    print(
+        f"{name} | {with_factors['P_products']}, {with_factors['factorisations']}, "
+        f"{1e3 * ms:.3g} | {without['P_products']}, {1e3 * before:.3g} | "
+        f"{ms / before:.2f}",
+        flush=True,
+    )
+
+
 def kept() -> None:
     """Solve duals with and without keeping directions."""
     for form, *size in KEPT:
@@ -249,7 +304,7 @@ def main() -> None:
     """Read the command line, and do what it says."""
     parser = ArgumentParser(description="What a solve of SMALBE costs.")
     tables = parser.add_subparsers(dest="table", required=True)
-    for name in ("dense", "sparse", "kept"):
+    for name in ("dense", "sparse", "incomplete", "kept"):
         tables.add_parser(name)
     of_race = tables.add_parser("race", help="solve a case by several solvers in turn")
     of_race.add_argument("case")
@@ -257,7 +312,10 @@ def main() -> None:
     of_race.add_argument("rounds", type=int)
     of_race.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
     given = vars(parser.parse_args())
-    chosen = {"dense": dense, "sparse": sparse, "kept": kept, "race": race}
+    chosen = {
+        "dense": dense, "sparse": sparse, "incomplete": incomplete, "kept": kept,
+        "race": race,
+    }  # fmt: skip
     try:
         chosen[given.pop("table")](**given)
     except InputError as e:

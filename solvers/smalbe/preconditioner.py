@@ -46,7 +46,7 @@ PRECONDITIONERS = get_args(Preconditioner)
 #: those with a matrix M of their own
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
-#: takes them one by one. Trilinear elements on a grid have 2 to 3, and their factors cost
+#: takes them one by one. Trilinear elements have 2 to 3, and their factors cost
 #: twice as much time as they save.
 MAX_PAIRS = 1.5
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
