@@ -50,7 +50,7 @@ cdef bint step_by_factor(MPRGP at) except -1:
             for i in range(released, count):
                 freed += at.free[factor.queue[i]] != 0
             if 2 * freed >= count - released:
-                at.layers = 2 * at.layers if at.layers else 1
+                at.layers = min(2 * at.layers, n) if at.layers else 1
             else:
                 at.layers //= 2
             return 1
