@@ -94,9 +94,9 @@ def prepared(
     if eliminate and (kind in WITHOUT_P or chosen_freely):
         eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
     scaled = None
-    automatic = options.preconditioner == "auto" and scalable(qp)
-    if eliminated is None and (kind == "incomplete" or automatic):
-        scaled = Scaled.of(qp, with_factor=kind == "incomplete")
+    with_factor, automatic = kind == "incomplete", options.preconditioner == "auto"
+    if eliminated is None and (with_factor or (automatic and scalable(qp))):
+        scaled = Scaled.of(qp, with_factor=with_factor)
     inner = qp if eliminated is None else eliminated.qp
     inner = inner if scaled is None else scaled.qp
     if carry is not None and carry.x.size != inner.q.size:

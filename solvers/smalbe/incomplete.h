@@ -107,7 +107,9 @@ INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t coun
         l[c] = F->bands[c * n + j];
         taken[c] = l[c] * l[c];
     }
+#pragma GCC unroll 4
     for (Py_ssize_t c = 0; c < count; c++)
+#pragma GCC unroll 4
         for (Py_ssize_t d = c + 1; d < count; d++) {
             double fill = l[c] * l[d];
             int e = F->between[c * MOST_DIAGONALS + d];

@@ -32,7 +32,7 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array, issparse
 
-from mortarbench.harness import QP, Matrix, Structure, Vector
+from mortarbench.harness import QP, Structure, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
 from mortarbench.solvers.smalbe.compiled import pairs_of_columns
@@ -76,7 +76,7 @@ def has_sparse_factor(qp: QP) -> bool:
     The variables are `scalable`, and the columns of P have so few entries that a factor
     costs no more than some products.
     """
-    return scalable(qp) and pairs_of_columns(_by_columns(qp.P)) <= MAX_PAIRS * qp.P.nnz
+    return _is_sparse(qp) and _pairs(qp) <= MAX_PAIRS * qp.P.nnz
 
 
 def scalable(qp: QP) -> bool:
@@ -85,16 +85,19 @@ def scalable(qp: QP) -> bool:
     P is a sparse matrix with a positive diagonal, held by this process, and there are
     bounds only: a factor of P would have to know the penalty of rows.
     """
+    return _is_sparse(qp) and _pairs(qp) < np.inf
+
+
+def _is_sparse(qp: QP) -> bool:
+    if not issparse(qp.P) or qp.b.size or qp.h.size or not qp.q.size:
+        return False
+    whole = not isinstance(qp.q, DistributedVector)
+    return whole and len(qp.sets) == 1 and bool(qp.P.nnz < 2**31)
+
+
+def _pairs(qp: QP) -> float:
     P = qp.P
-    if not issparse(P) or qp.b.size or qp.h.size or not qp.q.size:
-        return False
-    if len(qp.sets) > 1 or isinstance(qp.q, DistributedVector) or P.nnz >= 2**31:
-        return False
-    return bool(pairs_of_columns(_by_columns(P)) < np.inf)
-
-
-def _by_columns(P: Matrix) -> Matrix:
-    return P if P.format in ("csr", "csc") else csc_matrix(P)
+    return pairs_of_columns(P if P.format in ("csr", "csc") else csc_matrix(P))
 
 
 def lacking(qp: QP, kind: Preconditioner) -> str | None:
