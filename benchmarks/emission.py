@@ -40,12 +40,12 @@ def emitted(name: str = CASE) -> None:
     from mpi4py import MPI
 
     from mortarbench.harness.distributed.vectors import Ranks
-    from mortarbench.problems.feti import emission
+    from mortarbench.problems.feti import distributed_dual
     from mortarbench.problems.models import beam_ring, membranes, patch, plate
     from mortarbench.solvers.reference.over_ranks import reference_over_ranks
     from mortarbench.solvers.smalbe.solver import SMALBE
 
-    del emission, beam_ring, membranes, patch, plate
+    del distributed_dual, beam_ring, membranes, patch, plate
     ranks, case = Ranks(MPI.COMM_WORLD), parse(name, PROBLEMS)
     before = memory_mib("VmHWM")
 

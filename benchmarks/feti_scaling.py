@@ -28,16 +28,17 @@ import numpy as np
 from scipy.stats import linregress, t
 
 from mortarbench.harness import Mechanics, certify, no_rows
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import described
+from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
-from mortarbench.problems.feti.own_bodies import certified_by
-from mortarbench.problems.feti.spectrum import spectra_of_equations
-from mortarbench.problems.feti.stored import dual_operator
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import certifier
+from mortarbench.problems.feti.operator_arrays import dual_operator
+from mortarbench.problems.feti.spectrum import spectra_over_ranks
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as bodies_of
 from mortarbench.problems.models.beam_ring import model
@@ -61,17 +62,18 @@ def one(way, Nr, cells):
     u = np.zeros(bodies.mesh.dofs)
     primal = primal_qp(bodies, node_to_segment(bodies.mesh.points, u, *bodies.pairs[0]))
     lap()
-    pieces = in_parts = None
+    pieces = certify_by_subdomains = parts = None
     if way == "feti":
         of = bodies_of(Nr, Nr // 2, Nr, "strain")
         (stage,) = load_steps(1, 1, of.forces, of.fixed)
         contact = Contact(primal.G, primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
-        own = on_one_process(described(of, layout, "orthonormal", stage, contact))
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
-        dual = torn_dual(pieces, primal)
+        parts = decompose(of, layout, "orthonormal", stage, contact)
+        own = on_one_process(parts)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, primal.P)
+        dual = feti_dual(pieces, primal)
     else:
-        dual = dualise(primal, floating(bodies))
+        dual = dualise(primal, factorise_floating(bodies))
     lap()
     run = SMALBE().prepare(dual.qp, TOL[way])
     lap()
@@ -80,8 +82,8 @@ def one(way, Nr, cells):
     back = dual.recover(s)
     lap()
     mechanics = Mechanics(
-        primal=primal, back=dual.recover, factorise=lambda: clamped(bodies),
-        in_parts=in_parts,
+        primal=primal, back=dual.recover, factorise=lambda: factorise_clamped(bodies),
+        certify_by_subdomains=certify_by_subdomains,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound
@@ -95,14 +97,18 @@ def one(way, Nr, cells):
         "total": marks[-1] - marks[0], "cpu": cpu, "peak_mib": int(peak_kib) / 1024,
         **s.counts,
     }  # fmt: skip
-    return found | (known_face(pieces, dual.qp, s) if pieces is not None else {})
+    if parts is None:
+        return found
+    empty = Contact(no_rows(bodies.mesh.dofs), np.zeros(0), np.zeros(0))
+    bare = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
+    return found | known_face(pieces, bare, dual.qp, s)
 
 
-def known_face(pieces, qp, s):
+def known_face(pieces, bare, qp, s):
     """Measure κ without contact, and CG steps with the final active rows known."""
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    (alone,) = spectra_of_equations(pieces, tol=1e-3)
+    (alone,) = spectra_over_ranks(bare.P, bare.A, tol=1e-3)
     m = int(active.sum())
     F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
     face = replace(

@@ -15,14 +15,17 @@ from time import perf_counter
 import numpy as np
 from scipy.stats import linregress, t
 
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
+WAYS = {
+    "dual": (factorise_floating, dualise),
+    "dual-bounds": (factorise_clamped, dual_bounds),
+}
 
 
 def one(form, Nr):

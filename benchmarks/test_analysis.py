@@ -14,14 +14,17 @@ import pytest
 from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-WAYS = {"dual": (floating, dualise), "dual-bounds": (clamped, dual_bounds)}
+WAYS = {
+    "dual": (factorise_floating, dualise),
+    "dual-bounds": (factorise_clamped, dual_bounds),
+}
 TIP = [0.04101815, -0.29791196]  #: m, see tests/problems/families/test_beam_ring.py
 
 
@@ -54,7 +57,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
         assert s.status == "solved"
         return s
 
-    path = path_of(
+    path = load_path(
         bodies, linearise, lambda: inverse, solve, steps, transform=transform
     )
     u = path.solution(steps) * bodies.length

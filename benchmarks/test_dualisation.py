@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mortarbench.problems.contact.bodies import floating
+from mortarbench.problems.contact.bodies import factorise_floating
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.models.beam_ring import model
@@ -21,13 +21,16 @@ def steps():
 
 def test_dualisation_of_ten_steps(race, steps):
     bodies = model(30, 15, 30, "strain")
-    factor, condensed = floating(bodies, condense=False), floating(bodies)
+    factor, condensed = (
+        factorise_floating(bodies, condense=False),
+        factorise_floating(bodies),
+    )
 
     def all_steps(inverse):
         return [dualise(primal, inverse).qp for primal in steps]
 
     race(
-        condensed_with_setup=lambda: all_steps(floating(bodies)),
+        condensed_with_setup=lambda: all_steps(factorise_floating(bodies)),
         condensed_without_setup=lambda: all_steps(condensed),
         blocked_solves_factor_given=lambda: all_steps(factor),
         rounds=5,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.families.beam_ring import BeamRing
@@ -40,13 +40,13 @@ def test_linearisation(benchmark, Nr, Nh):
 
 
 @SIZES
-@pytest.mark.parametrize("factorise", [clamped, floating])
+@pytest.mark.parametrize("factorise", [factorise_clamped, factorise_floating])
 def test_factorisation(benchmark, factorise, Nr, Nh):
     bodies = bodies_of(Nr, Nh)
 
     inverse = benchmark(factorise, bodies)
 
-    assert inverse.kernel.shape[1] == (6 if factorise is floating else 0)
+    assert inverse.kernel.shape[1] == (6 if factorise is factorise_floating else 0)
 
 
 @SIZES
@@ -54,7 +54,7 @@ def test_dualisation(benchmark, Nr, Nh):
     family = BeamRing()
     params = family.complete({"Nr": Nr, "Nh": Nh, "steps": 1})
     primal = family.build("primal", params, reference_solution).qp
-    inverse = floating(bodies_of(Nr, Nh))
+    inverse = factorise_floating(bodies_of(Nr, Nh))
 
     dual = benchmark(dualise, primal, inverse)
 

@@ -1,11 +1,10 @@
-"""The contract between problems, solvers and reports, and the clock.
+"""The contract between problems, solvers and reports; measuring and judging.
 
-A name is imported when it is asked for: what only reads names of cases and solvers
-needs neither numpy nor scipy, and a refusal should not wait for them. The names are
-listed in `__init__.pyi`.
+Names are imported at their first access, so that commands that only read names of cases
+and solvers do not load NumPy and SciPy. They are listed in `__init__.pyi`.
 """
 
 from lazy_loader import attach_stub
 
-# under its full name even where Python runs the folder as `python -m harness`
+# the full name, also if Python runs the folder as `python -m harness`
 __getattr__, __dir__, __all__ = attach_stub("mortarbench.harness", __file__)

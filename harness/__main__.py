@@ -1,4 +1,4 @@
-"""An alias: `python -m harness` is `python -m mortarbench`."""
+"""Alias: `python -m harness` runs `python -m mortarbench`."""
 
 from mortarbench.__main__ import main
 

@@ -1,7 +1,6 @@
-"""Plain data that a user wrote, checked: what is wrong, where, what would be right.
+"""Checks of plain data from users: entries of files, and arguments in Python.
 
-The data are of a file, or arguments of a Python program. All functions raise
-`InputError`; `where` names the value as the user knows it.
+All functions raise `InputError`; `where` is the user's name for the value.
 """
 
 from __future__ import annotations
@@ -15,12 +14,12 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown, unknown
 
-MOST_REPEATS = 1_000_000  #: of anything
+MAX_COUNT = 1_000_000  #: default limit of an integer
 
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Put the place in the user's input before what is wrong there."""
+    """Prefix the messages of errors in the block with a place in the input."""
     try:
         yield
     except InputError as e:
@@ -28,14 +27,14 @@ def located(where: str) -> Iterator[None]:
 
 
 def only_keys(table: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Refuse a key that means nothing to us."""
+    """Raise for a key that is not in `known`."""
     for key in table:
         if key not in known:
             raise unknown("key", key, known)
 
 
-def at_least_one(where: str, value: object, most: int = MOST_REPEATS) -> int:
-    """Take a positive integer up to `most`; neither 2.0 nor true is one."""
+def at_least_one(where: str, value: object, most: int = MAX_COUNT) -> int:
+    """Return a positive integer up to `most`; 2.0 and True are refused."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise InputError(f"{where} = {shown(value)}; expected an integer of at least 1")
     if value > most:
@@ -46,19 +45,19 @@ def at_least_one(where: str, value: object, most: int = MOST_REPEATS) -> int:
 
 
 def positive(where: str, value: Any) -> float:
-    """Take a positive finite number."""
+    """Return a positive finite number as a float."""
     if not is_number(value) or not 0 < value <= sys.float_info.max:
         raise InputError(f"{where} = {shown(value)}; expected a positive number")
     return float(value)
 
 
 def is_number(value: object) -> bool:
-    """Whether `value` is a number; a bool is none."""
+    """Return True for an int or a float, False for a bool."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def text(where: str, value: object) -> str:
-    """Take a text that is not empty."""
+    """Return a nonempty text without control characters."""
     if not isinstance(value, str) or not value:
         raise InputError(f"{where} = {shown(value)}; expected a text, not empty")
     if has_control(value):
@@ -69,19 +68,19 @@ def text(where: str, value: object) -> str:
 
 
 def has_control(text: str) -> bool:
-    """Whether a text holds a control character, which no name and no path should."""
+    """Return True if a text contains a control character."""
     return any(c < " " or c == "\x7f" for c in text)
 
 
 def any_list(where: str, value: object) -> list[Any]:
-    """Take a list, empty or not."""
+    """Return a list, empty or not."""
     if not isinstance(value, list):
         raise InputError(f"{where} = {shown(value)}; expected a list")
     return value
 
 
 def filled_list(where: str, value: object) -> list[Any]:
-    """Take a list with entries."""
+    """Return a nonempty list."""
     entries = any_list(where, value)
     if not entries:
         raise InputError(f"{where} is empty; expected at least one entry")
@@ -89,14 +88,17 @@ def filled_list(where: str, value: object) -> list[Any]:
 
 
 def table(where: str, value: object, *, instead: str = "a table") -> dict[str, Any]:
-    """Take a table."""
+    """Return a table.
+
+    instead : description of the expected value, for the message
+    """
     if not isinstance(value, dict):
         raise InputError(f"{where} = {shown(value)}; expected {instead}")
     return value
 
 
 def path(where: str, value: object) -> Path:
-    """Take a path, as a text or a path of Python, that a file system can have."""
+    """Return a path, from a str or PathLike, that is valid in the file system."""
     if not isinstance(value, str | os.PathLike) or not isinstance(
         text := os.fspath(value), str
     ):
@@ -107,29 +109,29 @@ def path(where: str, value: object) -> Path:
         os.stat(text)
     except (FileNotFoundError, NotADirectoryError):
         pass
-    except (OSError, ValueError) as e:  # a NUL or a lone surrogate
+    except (OSError, ValueError) as e:  # ValueError: a NUL or a lone surrogate
         why = e.strerror if isinstance(e, OSError) else "no name of a file"
         raise InputError(f"{where} = {shown(text)}: {why}; expected a path") from None
     return Path(text)
 
 
 def texts(where: str, value: object) -> tuple[str, ...]:
-    """Take several texts; one by itself is a list of its characters by mistake."""
+    """Return a tuple of texts; a single text is refused, being a sequence itself."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
-        found = tuple(value)
-        if all(isinstance(each, str) for each in found):
-            return found
+        entries = tuple(value)
+        if all(isinstance(each, str) for each in entries):
+            return entries
     raise InputError(f"{where} = {shown(value)}; expected a list of texts")
 
 
 def flag(where: str, value: object) -> bool:
-    """Take True or False; 0 and 1 stand for them."""
+    """Return True or False; 0 and 1 are accepted."""
     if not isinstance(value, int) or value not in (0, 1):
         raise InputError(f"{where} = {shown(value)}; expected True or False")
     return bool(value)
 
 
 def function(where: str, value: object) -> None:
-    """Refuse what cannot be called."""
+    """Raise unless `value` is callable."""
     if not callable(value):
         raise InputError(f"{where} = {shown(value)}; expected a function")

@@ -1,4 +1,4 @@
-"""The digest that names content: of files, arrays, environments, measurements."""
+"""Digests that identify files, arrays, environments and measurements."""
 
 from __future__ import annotations
 
@@ -9,21 +9,25 @@ from typing import IO, TYPE_CHECKING, TypeAlias
 if TYPE_CHECKING:
     from hashlib import _Hash
 
-Digest: TypeAlias = "_Hash"  #: of parts so far; ``update`` takes another one
+Digest: TypeAlias = "_Hash"  #: a SHA-256 in progress; ``update`` adds another part
 
-_PIECE = 2**20  #: bytes that are read at once
+_PIECE_BYTES = 2**20  #: that are read at a time
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
-    """Give the first hexadecimal digits of the SHA-256 of `parts`, one after another.
+    """Return the first hexadecimal digits of the SHA-256 of concatenated parts.
 
-    digits : 64 at most; each has 4 bits
+    digits : at most 64, with 4 bits each
+
+    >>> from mortarbench.harness.digest import hex_digest
+    >>> hex_digest([b"a", b"b"]) == hex_digest([b"ab"])
+    True
     """
     return running_digest(parts).hexdigest()[:digits]
 
 
 def running_digest(parts: Iterable[bytes]) -> Digest:
-    """Hash `parts`, one after another, so that more can follow by ``update``."""
+    """Return the SHA-256 of concatenated parts, to which ``update`` adds more."""
     content = sha256()
     for part in parts:
         content.update(part)
@@ -31,6 +35,6 @@ def running_digest(parts: Iterable[bytes]) -> Digest:
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:
-    """Read what is left of a file, piece by piece."""
-    while piece := file.read(_PIECE):
+    """Yield the rest of a file in pieces."""
+    while piece := file.read(_PIECE_BYTES):
         yield piece

@@ -1,4 +1,4 @@
-"""What a user is told: errors of the input, faults, remarks beside the results."""
+"""Exceptions and messages for users: input errors, faults, remarks on stderr."""
 
 from __future__ import annotations
 
@@ -9,85 +9,98 @@ from collections.abc import Iterable
 from contextlib import suppress
 from difflib import get_close_matches
 
-MOST_SHOWN = 200  #: characters of somebody's input that a message repeats
-_MOST_WORDS = 600  #: characters of a message without the paths in it
+MAX_SHOWN = 200  #: characters of a user's input that a message repeats
+_MAX_MESSAGE = 600  #: characters of a message, not counting paths
+#: quotations and words; possessive quantifiers, since input may be adversarial
 _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 
 
 class InputError(Exception):
-    """Bad input: one line that says what was wrong, where, and what would be right.
+    """Wrong input: one line that says what was wrong, where, and what would be right.
 
     The command line prints it without a traceback and exits with code 2.
     """
 
     def __str__(self) -> str:
-        return " ".join(super().__str__().splitlines())  # of names, too
+        return " ".join(super().__str__().splitlines())  # names may contain newlines
 
 
 class PastEndError(InputError):
-    """There are fewer problems than that, as of a fixed point that has settled before.
+    """A step beyond the end of a sequence, such as a fixed point that has converged.
 
-    A sequence that asks for more ends at the last one there is.
+    A sequence with more steps ends at the last existing one.
     """
 
 
 class FaultError(Exception):
-    """A fault of ours or of the machine, never a solver's: a full disk, a lost file.
+    """A fault of the harness or the machine, such as a full disk; never of a solver.
 
-    One line says what failed. It costs no solver a verdict: what was being measured is
-    tried once more, and counts as not measured if that fails, too.
+    The message is one line. A fault yields no verdict: the measurement is retried once,
+    and counts as not measured if it fails again.
     """
 
 
 def shown(value: object) -> str:
-    """Show a value of somebody's input in a message, the middle left out if need be."""
+    """Return the repr of a value for a message, without its middle if it is long."""
     try:
         return shortened(repr(value))
-    except (RecursionError, ValueError):  # nested for ever; an integer of many digits
+    except (
+        RecursionError,
+        ValueError,
+    ):  # nested too deeply; an integer of too many digits
         return f"a {type(value).__name__} too long to show"
 
 
-def shortened(text: str, most: int = MOST_SHOWN) -> str:
-    """Leave the middle out of what is too long; names differ at their ends."""
+def shortened(text: str, most: int = MAX_SHOWN) -> str:
+    """Replace the middle of a long text by …, since names differ at their ends.
+
+    >>> from mortarbench.harness.errors import shortened
+    >>> shortened("beam-ring/Nr=30/Nh=15/dual", 16)
+    'beam-ring/N…dual'
+    """
     tail = most // 4
     return text if len(text) <= most else f"{text[: most - tail - 1]}…{text[-tail:]}"
 
 
 def one_line(message: str) -> str:
-    """Bring a message to one line that repeats little of a long input.
+    """Return a message as one line that repeats little of a long input.
 
-    Every word or quotation is cut, and the middle of what is left; paths that exist are
-    not, since one needs them whole.
+    Long words and quotations are shortened, then the whole line. Paths that exist are
+    not shortened, since users copy them.
     """
     line = " ".join(message.splitlines())
-    if len(line) <= MOST_SHOWN:
+    if len(line) <= MAX_SHOWN:
         return line
     paths: list[str] = []
 
     def brief(piece: re.Match[str]) -> str:
         text = piece[0]
-        if len(text) > MOST_SHOWN and os.path.lexists(text.strip("'\"").rstrip(":,;")):
+        if len(text) > MAX_SHOWN and os.path.lexists(text.strip("'\"").rstrip(":,;")):
             paths.append(text)
             return text
         return shortened(text)
 
     line = _PIECES.sub(brief, line)
-    return shortened(line, _MOST_WORDS + sum(map(len, paths)))
+    return shortened(line, _MAX_MESSAGE + sum(map(len, paths)))
 
 
-PLUGINS = "; others come with --plugin FILE.py"  #: after the names that are known
+PLUGINS = "; others come with --plugin FILE.py"  #: follows a list of known names
 
 
 def unknown(
     what: str, got: str, known: Iterable[str], where: str = "", more: str = ""
 ) -> InputError:
-    """Build the error for a name that is not among `known`, with the nearest one.
+    """Return the error for an unknown name, with the known names and the nearest.
 
-    more : what follows the known names
+    more : text after the known names
+
+    >>> from mortarbench.harness.errors import unknown
+    >>> print(unknown("form", "duel", ["primal", "dual"], where="beam-ring"))
+    beam-ring: unknown form 'duel'; did you mean 'dual'? known: dual, primal
     """
     names = sorted(known)
     folded = {name.casefold(): name for name in names}
-    got = shortened(got)  # also because the search takes a time ~ length²
+    got = shortened(got)  # the search below takes O(length²)
     near = get_close_matches(got.casefold(), folded, n=1, cutoff=0.6)
     hint = f"did you mean {folded[near[0]]!r}? " if near else ""
     prefix = f"{where}: " if where else ""
@@ -96,12 +109,17 @@ def unknown(
 
 
 def some(names: Iterable[str], most: int = 3) -> str:
-    """Enumerate the first few of `names`, and say how many more there are."""
+    """Return the first few names, and the number of the others.
+
+    >>> from mortarbench.harness.errors import some
+    >>> some(["a", "b", "c", "d", "e"])
+    'a, b, c and 2 more'
+    """
     first, rest = (listed := list(names))[:most], len(listed) - most
     return ", ".join(map(shortened, first)) + (f" and {rest} more" if rest > 0 else "")
 
 
 def say(text: str) -> None:
-    """Say something on stderr, beside the results."""
-    with suppress(BrokenPipeError):  # nobody listens: no reason to stop
+    """Print a remark on stderr; results go to stdout."""
+    with suppress(BrokenPipeError):  # a closed stderr must not end the program
         print(f"mortarbench: {text}", file=sys.stderr)

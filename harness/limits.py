@@ -1,4 +1,4 @@
-"""How many threads and how much memory a solver may use, and a case."""
+"""Limits of threads and memory for solvers and for building cases."""
 
 from __future__ import annotations
 
@@ -6,28 +6,28 @@ import os
 
 from mortarbench.harness.errors import InputError, shown
 
-#: environment variables that keep libraries to one thread, read when they load
+#: Environment variables that limit libraries to one thread; read when these load.
 ONE_THREAD = {
     f"{library}_NUM_THREADS": "1"
     for library in ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
 }
-CASE_VARIABLE = "MORTARBENCH_CASE_MIB"  #: what building a case may take, see `fits`
-VARIABLE = "MORTARBENCH_MEMORY_MIB"  #: set for a worker to the limit of its suite
+CASE_VARIABLE = "MORTARBENCH_CASE_MIB"  #: limit for building a case, MiB
+VARIABLE = "MORTARBENCH_MEMORY_MIB"  #: limit of the suite, MiB, set for its workers
 
 
 def memory_limit_mib() -> float:
-    """Give the memory limit of this process; that of the machine where none is set."""
+    """Return the memory limit of this process in MiB, at most the machine's memory."""
     machine = _machine_mib()
     return min(float(os.environ.get(VARIABLE, machine)), machine)
 
 
 def case_limit_mib() -> float:
-    """Give the memory that building a case may take: the machine's, if none is set.
+    """Return the memory limit for building a case in MiB; default: the machine's.
 
     Raises
     ------
     InputError
-        When the environment variable is no positive number.
+        When the environment variable is not a positive number.
 
     """
     text = os.environ.get(CASE_VARIABLE)
@@ -49,9 +49,9 @@ def _machine_mib() -> float:
 
 
 def too_large(n: int, copies: float = 1.0) -> str | None:
-    """Give the reason to decline where dense (n, n) matrices would not fit, or None.
+    """Return the reason to decline if dense (n, n) matrices exceed the limit, or None.
 
-    copies : how many of them the solver holds at a time
+    copies : number of such matrices that the solver stores at the same time
     """
     needed, limit = copies * 8 * n**2 / 2**20, memory_limit_mib()
     if needed <= limit:

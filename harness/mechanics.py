@@ -1,7 +1,7 @@
-"""The elastic problem behind a QP of any form: what a certificate of errors needs.
+"""The elastic contact problem behind a QP, for certificates of errors.
 
-A family that gives it with its case (`harness.plugin.Case`) has every answer certified,
-whatever form of the problem the solver was handed; see `harness.verify.certificate`.
+If a family attaches it to its case (`harness.plugin.Case`), the error of every answer
+is bounded in the energy norm, in any form of the QP; see `harness.verify.certificate`.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
 from mortarbench.harness.solution import Solution
 
-#: extended where the machine has it (x86: 64-bit mantissa), so that residuals near the
-#: rounding of doubles are known to some digits
+#: Extended precision if the machine has it (x86: 64-bit mantissa), so that residuals of
+#: the size of double rounding have some correct digits.
 Real = np.longdouble
 Extended = NDArray[np.longdouble]
-#: up to which part of its terms what a rigid motion does to the gaps, or a load along
-#: it, is taken for the rounding of coordinates, normals and tractions
-UNFELT = 1e-10
+#: Change of the gaps by a rigid motion, or load along it, that counts as rounding of
+#: coordinates, normals and tractions, relative to the sum of its absolute terms.
+MOTION_ROUNDING = 1e-10
 
 
 class Inverse(Protocol):
-    """A symmetric K⁺ that is zero on the prescribed components and inverts K beyond.
+    """A symmetric K⁺, zero on prescribed components and the inverse of K on the others.
 
-    Where the supports leave rigid motions R of some body,  K K⁺ b = b  for Rᵀb = 0.
+    If the supports leave rigid motions R,  K K⁺ b = b  holds for Rᵀb = 0.
     """
 
     @property
     def kernel(self) -> NDArray[np.float64]:
-        """Orthonormal basis R (n, r) of the rigid motions left; often r = 0."""
+        """Orthonormal basis R (n, r) of the remaining rigid motions; often r = 0."""
 
     def __call__(self, b: Vector) -> Vector:
         """Apply K⁺ to a vector (n,)."""
@@ -45,31 +45,31 @@ class Inverse(Protocol):
 
 
 class Substructures(Protocol):
-    """The stiffness as a sum over subdomains that float:  K = Tᵀ diag(K_1 … K_S) T.
+    """The stiffness as a sum over floating subdomains:  K = Tᵀ diag(K_1 … K_S) T.
 
-    Torn unknowns v (N,) have a copy of each component in every subdomain around it, in
-    axes of that subdomain. The rigid motions R_s of a subdomain are exactly the kernel
-    of what is meant by K_s, that is of P_s K_s P_s with P_s = I − R_sR_sᵀ: what
-    rounding left of K_s R_s is no part of the problem.
+    The unknowns v (N,) of subdomains contain a copy of each component for every
+    subdomain around it, in the axes of that subdomain. K_s stands for P_s K_s P_s with
+    P_s = I − R_sR_sᵀ, so that its kernel is exactly the rigid motions R_s: the rounding
+    in K_s R_s is not part of the problem.
     """
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n): copies a displacement u of the whole into the subdomains."""
+        """T (N, n), which copies a displacement u into the subdomains."""
 
     @property
     def kernel(self) -> csr_array:
-        """Orthonormal rigid motions R (N, r), each of one subdomain."""
+        """Orthonormal rigid motions R (N, r), each of a single subdomain."""
 
     @property
     def weight(self) -> Vector:
-        """Relative stiffness (N,) of the copies, one for all components of a node."""
+        """Relative stiffness (N,) of the copies, equal for all components of a node."""
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
-        """Return the diagonal of K at components `at` (k,) of the whole."""
+        """Return the diagonal of K at global components `at` (k,)."""
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP to v (N,), in its precision."""
+        """Apply PKP to v (N,), in the precision of v."""
 
     def squared_product(self, v: Vector) -> Vector:
         """Apply K∘K, the squares of the entries of K, to v (N,)."""
@@ -80,52 +80,53 @@ class Substructures(Protocol):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Friction:
-    """Friction with a given bound, as Tresca's law has it; none without rows.
+    """Friction with a given bound (Tresca); zero rows without friction.
 
     ::
 
-        Σ gᵢ|Tᵢu − sᵢ|  joins the energy;  its multipliers are  |λᵢ| ≤ gᵢ
+        Σ gᵢ|Tᵢu − sᵢ|  is added to the energy;  its multipliers satisfy  |λᵢ| ≤ gᵢ
 
-    T u is the tangential motion of the slave against the master, and s is where it
-    began: zero for one static load, and T u of the step before for slip increments. A
-    contact row may have several rows, one for each tangential direction, in turn.
+    T u is the tangential motion of the slave relative to the master, and s its initial
+    value: zero for a single static load, and T u of the previous step for slip
+    increments. A contact row may have several friction rows, one for each tangential
+    direction in turn.
 
-    The law of the row says what the bound should be, g = cohesion + mu·λ_n with the
-    multiplier λ_n of its contact row: Tresca's has no mu, Coulomb's no cohesion.
+    By the law of friction the bound should be g = cohesion + mu·λ_n, with the
+    multiplier λ_n of the contact row: mu = 0 for Tresca, cohesion = 0 for Coulomb.
     """
 
     T: csr_array  #: (k, n) tangential rows
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, a length
-    row: NDArray[np.int64]  #: (k,) the contact row of each
+    row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
-    unsettled: float = 0.0  #: `residual` at the solution with this bound, where known
+    unsettled: float = 0.0  #: `residual` at the solution with this bound; 0 if unknown
 
     def demanded(self, normal: Vector) -> Vector:
-        """Return cohesion + mu·λ_n (k,), never negative, for normal forces (m,)."""
+        """Return cohesion + mu·max(λ_n, 0) (k,) for normal forces (m,)."""
         return np.asarray(self.cohesion + self.mu * np.maximum(normal[self.row], 0.0))
 
     def residual(self, normal: Vector) -> float:
-        """Return ‖g − (cohesion + mu·λ_n)‖/‖g‖, absolute where g vanishes."""
+        """Return ‖g − demanded‖/‖g‖ for normal forces (m,); absolute if g = 0."""
         off = float(np.linalg.norm(self.bound - self.demanded(normal)))
         return off / (float(np.linalg.norm(self.bound)) or 1.0)
 
-    def __getitem__(self, kept: NDArray[Any]) -> Friction:
-        """Keep some of the rows."""
-        rows = {k: v[kept] for k, v in vars(self).items() if k != "unsettled"}
+    def __getitem__(self, selected: NDArray[Any]) -> Friction:
+        """Return the selected rows (an index array or a mask)."""
+        rows = {k: v[selected] for k, v in vars(self).items() if k != "unsettled"}
         return replace(self, **rows)
 
 
-_NOTHING = np.zeros(0)
+_EMPTY = np.zeros(0)
 NO_FRICTION = Friction(
-    T=no_rows(0), bound=_NOTHING, start=_NOTHING, row=np.zeros(0, dtype=np.int64),
-    cohesion=_NOTHING, mu=_NOTHING,
+    T=no_rows(0), bound=_EMPTY, start=_EMPTY, row=np.zeros(0, dtype=np.int64),
+    cohesion=_EMPTY, mu=_EMPTY,
 )  # fmt: skip
 
 
 def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
-    """Stack the rows of contact and friction:  B (m + k, n)  and  c (m + k,)."""
+    """Return the rows of contact, then of friction:  B (m + k, n)  and  c (m + k,)."""
     B = csr_array(primal.G)
     if not friction.bound.size:
         return B, primal.h
@@ -133,15 +134,16 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 
 
 def with_friction(primal: QP, friction: Friction) -> QP:
-    """Emit the problem with friction as a QP: of each |·| one more variable.
+    """Return the problem with friction as a QP, with one more variable per |·|.
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    of the rows with g > 0; the point is (u, t), and λ_t is the difference of the
-    multipliers of the last two rows. Without such rows it is `primal` itself.
+    for the friction rows with g > 0. The unknown is (u, t), and the multiplier of a
+    friction row is the difference of those of its two rows. Without friction rows,
+    `primal` itself is returned.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
@@ -162,58 +164,59 @@ def with_friction(primal: QP, friction: Friction) -> QP:
 
 
 class Exact(NamedTuple):
-    """The data of the contact problem but K, in extended precision.
+    """The data of the contact problem except K, in extended precision.
 
-    The rows are those of the contact and, below them, those of the friction. With
-    v = Bu − c all have one law: the multiplier is between its bounds, v = 0 where it is
-    strictly between them, v ≤ 0 at the lower and v ≥ 0 at the upper one.
+    The rows are those of contact, then those of friction. With v = Bu − c, all satisfy
+    the same law: the multiplier is within its bounds, v = 0 if it is strictly between
+    them, v ≤ 0 at the lower and v ≥ 0 at the upper bound.
     """
 
     f: Extended  #: (n,)
     B: Any  #: (m, n) sparse, contact and friction
     c: Extended  #: (m,)
-    lower: Extended  #: (m,) 0 of contact, −g of friction
-    upper: Extended  #: (m,) ∞ of contact, g of friction
-    held: NDArray[np.int64]  #: prescribed components
-    loose: Extended  #: (m,) estimate of the compliance of each row, B_i diag(K)⁻¹B_iᵀ
+    lower: Extended  #: (m,) 0 for contact, −g for friction
+    upper: Extended  #: (m,) ∞ for contact, g for friction
+    fixed: NDArray[np.int64]  #: prescribed components
+    compliance: Extended  #: (m,) estimate for each row, B_i diag(K)⁻¹B_iᵀ
 
     @property
     def contact(self) -> NDArray[np.bool_]:
-        """Which rows are of the contact, (m,)."""
+        """Mask (m,) of the contact rows, whose multipliers have no upper bound."""
         return np.asarray(np.isinf(self.upper))
 
     def motion(self, u: Extended) -> Extended:
-        """Return v = Bu − c (m,): penetration, and slip of the friction rows."""
+        """Return v = Bu − c (m,), the penetration or the slip of each row."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
-        """Return g|v| (m,); zero of contact rows, whose v must not be positive."""
+        """Return g|v| (m,), zero for contact rows."""
         bound = np.where(self.contact, 0, self.upper)
         return np.asarray(bound * np.abs(self.motion(u)))
 
     def interior(self, multipliers: Extended) -> Extended:
-        """Return the distance (m,) of multipliers from their bounds; λ of contact."""
+        """Return the distance (m,) of multipliers from their bounds, λ for contact."""
         return np.asarray(
             np.minimum(multipliers - self.lower, self.upper - multipliers)
         )
 
 
 class RigidMotions(NamedTuple):
-    """The rigid motions that the supports leave, split by whether contact feels them.
+    """Rigid motions that the supports leave: felt by contact, or free.
 
-    Columns are orthonormal in extended precision. K·felt would be zero without
-    rounding; what there is instead matters where bodies move far, see
-    `harness.verify.certificate`.
+    Columns are orthonormal in extended precision. K·felt is zero up to rounding, which
+    matters if bodies move far; see `harness.verify.certificate`.
     """
 
-    felt: Any  #: (n, p) sparse; contact rows open or close
-    free: Any  #: (n, q) sparse; no gap changes but for rounding
+    felt: Any  #: (n, p) sparse; contact rows open or close along these
+    free: Any  #: (n, q) sparse; gaps change by rounding only
     G: Extended  #: (m, p)  B·felt
-    largest: Any  #: (n, p) sparse: where felt is not zero, its largest entry
-    KR: Extended  #: (n, p)  K·felt on the components that no support holds
+    largest: (
+        Any  #: (n, p) sparse: the pattern of felt with each column's largest |entry|
+    )
+    KR: Extended  #: (n, p)  K·felt, zero on prescribed components
 
 
-#: meshio's names of cells of first order, by their dimension and number of corners
+#: Meshio's names of first-order cells, by dimension and number of corners.
 KINDS = {
     (0, 1): "vertex",
     (1, 2): "line",
@@ -226,20 +229,30 @@ KINDS = {
 
 
 class CellBlock(NamedTuple):
-    """The cells of one kind."""
+    """Cells of one kind."""
 
-    kind: str  #: as meshio calls it
+    kind: str  #: its name in meshio
     nodes: NDArray[np.int64]  #: (k, corners)
-    cells: NDArray[np.int64]  #: (k,) rows of the table that they are
+    cells: NDArray[np.int64]  #: (k,) their rows in the table
 
 
 def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
-    """Sort a table of cells (E, c) by kinds, those with the fewest corners first.
+    """Split a table of cells (E, c) by kind, those with the fewest corners first.
 
-    Where kinds are mixed, a cell with fewer corners than the table has columns repeats
-    its last one: a triangle among quadrilaterals is (a, b, c, c).
+    In a mixed table, a cell with fewer than c corners repeats its last one: a triangle
+    among quadrilaterals is (a, b, c, c).
 
-    dim : of the cells, which is that of the points of bodies
+    dim : dimension of the cells
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench.harness.mechanics import cell_blocks
+    >>> for block in cell_blocks(np.array([[0, 1, 2, 3], [1, 4, 2, 2]]), dim=2):
+    ...     print(block.kind, block.nodes.tolist(), block.cells.tolist())
+    triangle [[1, 4, 2]] [1]
+    quad [[0, 1, 2, 3]] [0]
+
     """
     differs = np.ones(table.shape, dtype=bool)
     differs[:, 1:] = table[:, 1:] != table[:, :-1]
@@ -254,49 +267,52 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
 
 
 class Grid(NamedTuple):
-    """The mesh behind the unknowns, which are numbered node by node."""
+    """The mesh of the unknowns, which are numbered node by node."""
 
     points: NDArray[np.float64]  #: (N, d)
-    #: (E, 2) segments, or (E, 4) corners in turn; a triangle repeats its last one
+    #: (E, 2) segments, or (E, 4) corners in order; a triangle repeats its last corner
     cells: NDArray[np.int64]
-    bodies: NDArray[np.int64]  #: (E,) body of each cell
-    lift: Vector  #: (n,) physical unknown − u, where boundary values are not zero
+    bodies: NDArray[np.int64]  #: (E,) body number of each cell
+    lift: Vector  #: (n,) physical unknown − u, from nonzero boundary values
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Mechanics:
-    """Elastic bodies in contact, without dimensions, and the way back to them.
+    """Non-dimensional elastic contact problem, and the map of solutions to it.
 
     ::
 
         min ½uᵀKu − fᵀu    subject to   u = 0 on the prescribed components,  B u ≤ c
 
-    and with friction, what its rows add to the energy.
+    `Friction` adds its terms to the energy.
     """
 
     #: P = K, q = −f, A has one unit entry per prescribed component, b = 0, G = B, h = c
     primal: QP
-    #: of the emitted QP → x = u, y of the supports, z of contact and friction rows
-    back: Callable[[Solution], Solution]
-    factorise: Callable[[], Inverse]  #: called once, if at all
-    mesh_size: float  #: of the contact side, in the lengths of `primal`
-    #: rigid motions of single bodies (n, r), supports or not: to balance forces with
+    #: maps a solution of the emitted QP to x = u, y of the supports, and z of the
+    #: contact and friction rows
+    to_primal: Callable[[Solution], Solution]
+    factorise: Callable[[], Inverse]  #: returns K⁺; called at most once
+    mesh_size: float  #: of the contact side, in the unit of length of `primal`
+    #: (n, r) rigid motions of each body, regardless of supports, to measure the balance
+    #: of forces
     rigid: NDArray[np.float64]
-    names: tuple[str, ...] = ()  #: of the bodies; the columns of `rigid` are in turn
+    names: tuple[
+        str, ...
+    ] = ()  #: of the bodies, in the order of the columns of `rigid`
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
-    grid: Grid | None = (
-        None  #: to compare meshes, see `harness.crossval.discretisation`
-    )
+    #: needed to compare meshes, see `harness.crossval.discretisation`
+    grid: Grid | None = None
     friction: Friction = NO_FRICTION
-    #: bounds the error of a displacement (n,) with multipliers (m,) of `rows` by
-    #: subdomains, as a `Certificate`; no factor of the whole K is needed then
-    in_parts: Callable[[Vector, Vector], Any] | None = None
+    #: returns the `Certificate` of a displacement (n,) with multipliers (m,) of `rows`,
+    #: computed by subdomains without a factor of the assembled K
+    certify_by_subdomains: Callable[[Vector, Vector], Any] | None = None
 
     @cached_property
     def rows(self) -> csr_array:
-        """All rows B (m, n): of the contact, then of the friction."""
-        return contact_rows(self.primal, self._carrying)[0]
+        """All rows B (m, n): of contact, then of friction."""
+        return contact_rows(self.primal, self._active_friction)[0]
 
     @cached_property
     def program(self) -> QP:
@@ -304,35 +320,35 @@ class Mechanics:
         return with_friction(self.primal, self.friction)
 
     def multipliers(self, s: Solution) -> Vector:
-        """Return λ (m,) of `rows` from a solution that `back` gives."""
+        """Return λ (m,) of `rows` from a solution returned by `to_primal`."""
         contact = self.primal.h.size
         return np.append(s.z[:contact], s.z[contact:][self.friction.bound > 0])
 
     @cached_property
-    def _carrying(self) -> Friction:
-        """The friction that there is: rows of bound zero neither carry nor cost."""
+    def _active_friction(self) -> Friction:
+        """The friction rows with a positive bound."""
         return self.friction[self.friction.bound > 0]
 
     @cached_property
     def inverse(self) -> Inverse:
-        """K⁺, factorised at the first use."""
+        """K⁺, factorised at the first access."""
         return self.factorise()
 
     @cached_property
     def exact(self) -> Exact:
         """The data in extended precision."""
         diagonal, B = self.primal.P.diagonal(), self.rows
-        c = contact_rows(self.primal, self._carrying)[1]
-        bound, contact = self._carrying.bound.astype(Real), self.primal.h.size
-        held = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
+        c = contact_rows(self.primal, self._active_friction)[1]
+        bound, contact = self._active_friction.bound.astype(Real), self.primal.h.size
+        fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
-        softness[held] = 0
+        softness[fixed] = 0
         return Exact(
             f=-self.primal.q.astype(Real), B=B.astype(Real),
-            c=c.astype(Real), held=held,
+            c=c.astype(Real), fixed=fixed,
             lower=np.append(np.zeros(contact, dtype=Real), -bound),
             upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
-            loose=(B.multiply(B) @ softness).astype(Real),
+            compliance=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 
     @cached_property
@@ -342,13 +358,17 @@ class Mechanics:
 
     @cached_property
     def whole(self) -> Mechanics:
-        """The same without subdomains: for what needs K⁺, or u_λ without jumps."""
-        return self if self.in_parts is None else replace(self, in_parts=None)
+        """The same problem without subdomains, for K⁺ or a u_λ without jumps."""
+        return (
+            self
+            if self.certify_by_subdomains is None
+            else replace(self, certify_by_subdomains=None)
+        )
 
     def energy(self, u: Extended) -> float:
-        """Return the potential energy of `u` (n,), SI, summed in extended precision.
+        """Return the potential energy of `u` (n,) with the work of friction, SI.
 
-        The work of friction is a part of it.
+        It is summed in extended precision.
         """
         objective = 0.5 * (u @ (self.stiffness @ u)) - self.exact.f @ u
         objective = objective + self.exact.friction_work(u).sum()
@@ -356,12 +376,12 @@ class Mechanics:
 
     @cached_property
     def kernel(self) -> Any:
-        """All rigid motions that the supports leave (n, r), sparse, in extended."""
+        """Rigid motions (n, r) that the supports leave, in extended precision."""
         return _orthonormal(self.inverse.kernel)
 
     @cached_property
     def motions(self) -> RigidMotions:
-        """These motions, split by whether contact feels them."""
+        """The same motions, split into those that contact feels and free ones."""
         exact, B, R = self.exact, self.rows, self.inverse.kernel
         turn, p = felt_first(B, R)
         turned = self.kernel if p == R.shape[1] else _orthonormal(R @ turn)
@@ -369,51 +389,57 @@ class Mechanics:
         KR = np.zeros(felt.shape, dtype=Real)
         if p:
             KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
-            KR[exact.held] = 0
+            KR[exact.fixed] = 0
         return RigidMotions(
             felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
             largest=_largest(felt), KR=KR,
         )  # fmt: skip
 
-    def still(self, v: Extended) -> Extended:
-        """Take the rigid motions out of `v` (n,):  v − R Rᵀv."""
-        if not self.kernel.shape[1]:  # sparse matrices take long over nothing
+    def without_rigid_motion(self, v: Extended) -> Extended:
+        """Return v − R Rᵀv (n,), without rigid motion."""
+        if not self.kernel.shape[1]:  # products with empty sparse matrices are slow
             return v
         return np.asarray(v - self.kernel @ (self.kernel.T @ v))
 
-    def relaxed(self, force: Extended) -> Extended:
+    def apply_inverse(self, force: Extended) -> Extended:
         """Apply  P K⁺P,  P = I − RRᵀ,  to a force (n,)."""
-        bent = self.inverse(self.still(force).astype(np.float64))
-        return self.still(bent.astype(Real))
+        u = self.inverse(self.without_rigid_motion(force).astype(np.float64))
+        return self.without_rigid_motion(u.astype(Real))
 
     def norm(self, v: Extended) -> float:
-        """Return the energy norm ‖v‖_K; a seminorm where bodies can move rigidly.
+        """Return the energy norm ‖v‖_K, a seminorm if bodies can move rigidly.
 
-        There, the motion is taken out first: KR = 0 but for the rounding of K, which a
-        motion that is large beside the deformation would show.
+        The rigid motion is subtracted first: KR = 0 holds up to rounding only, which
+        would dominate the result for a motion much larger than the deformation.
         """
-        v = self.still(v)
+        v = self.without_rigid_motion(v)
         return float(np.sqrt(max(v @ (self.stiffness @ v), Real(0))))
 
 
 def _orthonormal(R: NDArray[np.float64]) -> Any:
-    """Orthonormalise columns (n, r) that are so to double precision; sparse."""
-    found = csr_array(R.astype(Real))
-    return csr_array(found + found @ (0.5 * (eye_array(R.shape[1]) - found.T @ found)))
+    """Orthonormalise columns (n, r) that are orthonormal to double precision; sparse.
+
+    One step of R + R(I − RᵀR)/2 squares their error.
+    """
+    Q = csr_array(R.astype(Real))
+    return csr_array(Q + Q @ (0.5 * (eye_array(R.shape[1]) - Q.T @ Q)))
 
 
 def _largest(R: Any) -> Any:
-    """Replace the entries of each column by the largest of their sizes."""
-    found = csc_array(abs(R))
-    sizes = found.max(axis=0).toarray().ravel() if found.nnz else np.zeros(R.shape[1])
-    found.data = np.repeat(sizes, np.diff(found.indptr))
-    return found
+    """Replace the entries of each column by the largest absolute value in it."""
+    columns = csc_array(abs(R))
+    empty = np.zeros(R.shape[1])
+    sizes = columns.max(axis=0).toarray().ravel() if columns.nnz else empty
+    columns.data = np.repeat(sizes, np.diff(columns.indptr))
+    return columns
 
 
 def cancelling(K: csr_array, R: Extended) -> Extended:
-    """Return KR (n, r) to twice the digits of doubles, though its terms cancel.
+    """Return KR (n, r) to about twice the digits of doubles, in spite of cancellation.
 
-    The leading parts of both have so few bits that their products add up exactly.
+    K and R are split into leading parts, with 26 and 24 bits relative to the largest
+    entry of a row and of R, and rests. In extended precision (64 bits) the products of
+    the leading parts are exact, and so are their sums over a row of K.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))
@@ -425,17 +451,17 @@ def cancelling(K: csr_array, R: Extended) -> Extended:
 
 
 def _leading(v: Any, size: Any, bits: int) -> Any:
-    """Round to multiples of 2^−bits of `size`, itself rounded up to a power of two."""
+    """Round to multiples of 2^−bits·`size`, with size rounded up to a power of two."""
     unit = np.exp2(np.ceil(np.log2(np.where(size > 0, size, 1))) - bits)
     return np.round(v / unit) * unit
 
 
 def felt_first(B: Matrix, R: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Turn the basis R such that its first p columns are felt by B, the others not."""
+    """Return a rotation V (r, r) and p: B feels the first p columns of RV only."""
     r = R.shape[1]
     length = np.sqrt(np.asarray(B.multiply(B).sum(axis=1)).ravel())
     per = 1 / np.where(length > 0, length, np.inf)
     G, terms = per[:, None] * (B @ R), per[:, None] * (abs(B) @ np.abs(R))
-    _, sizes, turn = np.linalg.svd(G, full_matrices=len(per) < r)
-    felt = int((sizes > UNFELT * terms.max(initial=0.0)).sum())
-    return turn.T, felt
+    _, sizes, Vt = np.linalg.svd(G, full_matrices=len(per) < r)
+    felt = int((sizes > MOTION_ROUNDING * terms.max(initial=0.0)).sum())
+    return Vt.T, felt

@@ -1,11 +1,12 @@
-"""Cases by name: ``FAMILY/key=value/…/FORM``, parsed strictly, written canonically.
+"""Case names ``FAMILY/key=value/…/FORM``: strict parsing, and canonical names.
 
-Keys left out take the value that the family's ``complete`` gives them, which may derive
-a default from other keys (a number of layers from another one).
+Missing keys are filled in by the family's ``complete``, which may derive a default from
+other keys (a number of layers from another one).
 
-A family whose problems lie in files has the key ``path`` and says in ``path_suffix``
-how paths end. Its names are ``FAMILY:PATH/key=value/…/FORM``, where PATH is the first
-part that ends so; or ``FAMILY:PATH`` if the suffix is empty and there is one form.
+A family that reads problems from files has the key ``path``, and ``path_suffix`` is the
+ending of its paths. Its names are ``FAMILY:PATH/key=value/…/FORM``, where PATH ends at
+the first part with that suffix; or ``FAMILY:PATH`` if the suffix is empty and there is
+one form.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ from mortarbench.harness.plugin import Case, Family, Reference, Value
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _FILE = re.compile(r"[^=:]*\.[A-Za-z]\w*(/|$)")  #: a path that ends in a suffix
-_TOO_LARGE = 2**63  #: integers from here on fit into no array
-_CALLED = {
+_INTEGER_LIMIT = 2**63  #: least integer that exceeds 64 bits
+_TYPE_NAMES = {
     int: "an integer, such as 4",
     float: "a finite number, such as 0.5",
     str: "text",
@@ -36,25 +37,25 @@ _CALLED = {
 
 @dataclass(frozen=True, kw_only=True)
 class CaseId:
-    """One case of a family, checked; as a text it is its canonical name."""
+    """A checked case of a family; its str is the canonical name."""
 
     family: Family = field(compare=False, repr=False)
-    name: str  #: canonical: it has only those keys that the others do not imply
-    params: Mapping[str, Value]  #: every key, in the family's order
+    name: str  #: canonical: without keys that the others imply
+    params: Mapping[str, Value]  #: all keys, in the order of the family
     form: str
 
     def __str__(self) -> str:
         return self.name
 
     def build(self, reference: Reference) -> Case:
-        """Build the case; what its family prints goes to stderr.
+        """Build the case; output of the family is redirected to stderr.
 
-        What the family raises comes through.
+        Exceptions of the family are not caught.
 
         Raises
         ------
         TypeError
-            When the family returns something else.
+            When the family does not return a `Case`.
 
         """
         with redirect_stdout(sys.stderr):
@@ -65,13 +66,23 @@ class CaseId:
 
 
 def parse(text: str, families: Mapping[str, Family]) -> CaseId:
-    """Parse ``beam-ring/Nr=30/dual``; keys left out take the family's defaults.
+    """Parse a name such as ``beam-ring/Nr=30/dual``.
 
     Raises
     ------
     InputError
-        For an unknown family, key or form, a key set twice, a part that is no
-        key=value, a value of the wrong type, and whatever ``family.check`` refuses.
+        For an unknown family, key or form, a key set twice, a part that is not
+        key=value, a value of the wrong type, and values that ``family.check`` refuses.
+
+    Examples
+    --------
+    Keys with the default of the family are not part of the canonical name:
+
+    >>> from mortarbench.harness.names import parse
+    >>> from mortarbench.problems import PROBLEMS
+    >>> case = parse("beam-ring/Nh=15/Nr=4/steps=10/dual", PROBLEMS)
+    >>> str(case), case.params["steps"]
+    ('beam-ring/Nr=4/Nh=15/dual', 10)
 
     """
     if not isinstance(text, str):
@@ -112,7 +123,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
 
 
 def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
-    """Say how the case of a bare path is called; None where it looks like no path."""
+    """Return the case name for a bare path, or None if the text is not a path."""
     if not _FILE.match(text) and not (text and os.path.isfile(text)):
         return None
     takers = [
@@ -130,14 +141,14 @@ def _as_file(text: str, families: Mapping[str, Family]) -> str | None:
 def assemble(
     family: Family, given: Mapping[str, object], form: str, *, texts: bool = False
 ) -> CaseId:
-    """Make the checked case with the keys `given`.
+    """Return the checked case with the keys `given`.
 
-    texts : whether texts stand for numbers, as in a name
+    texts : convert texts to numbers, as in a name
 
     Raises
     ------
     InputError
-        As `parse`.
+        For the same reasons as `parse`.
 
     """
     if form not in family.forms:
@@ -157,7 +168,7 @@ def assemble(
 
 
 def _canonical(family: Family, params: Mapping[str, Value], form: str) -> str:
-    """Write the name with only those keys that the other keys do not imply."""
+    """Return the name without the keys that the other keys imply."""
     needed, head = dict(params), family.name
     if (path := needed.pop(_path_key(family), None)) is not None:
         head = f"{head}:{path}"
@@ -173,7 +184,7 @@ def _canonical(family: Family, params: Mapping[str, Value], form: str) -> str:
 
 
 def unbuilt(name: object, e: BaseException) -> str:
-    """Say in one line why the case of that name could not be built."""
+    """Return a message of one line for a case that could not be built."""
     match e:
         case InputError():
             why = str(e)
@@ -185,9 +196,9 @@ def unbuilt(name: object, e: BaseException) -> str:
 
 
 def is_shared(name: CaseId) -> bool:
-    """Return True if ranks can make the QP of a case, see `Family.emission`.
+    """Return True if ranks can assemble the QP of a case, see `Family.emission`.
 
-    A family that fails to say so does it when it builds, too.
+    An exception of the family counts as False: the same one will occur in `build`.
     """
     try:
         return name.family.emission(name.form, name.params) is not None
@@ -196,23 +207,28 @@ def is_shared(name: CaseId) -> bool:
 
 
 def match(pattern: str, names: Iterable[str]) -> list[str]:
-    """Keep the canonical names that the shell glob `pattern` matches."""
+    """Return the canonical names that match a shell glob.
+
+    >>> from mortarbench.harness.names import match
+    >>> match("*/dual", ["beam-ring/dual", "beam-ring/primal"])
+    ['beam-ring/dual']
+    """
     return [name for name in names if fnmatchcase(name, pattern)]
 
 
 def completed(family: Family, given: Mapping[str, Value]) -> dict[str, Value]:
-    """Fill in the keys that are not given, in the family's order."""
+    """Return all keys in the order of the family, with defaults filled in."""
     params = family.complete(given)
     return {key: params[key] for key in family.defaults}
 
 
 def _path_key(family: Family) -> str:
-    """Name the key that holds a path; empty where the family takes none."""
+    """Return the key of the path, or "" if the family reads no file."""
     return "" if family.path_suffix is None else "path"
 
 
 def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
-    """Split what follows ``FAMILY:`` into the path and the other parts."""
+    """Split the text after ``FAMILY:`` into the path and the other parts."""
     path = text[len(head) + 1 :]
     if text[len(head) : len(head) + 1] != ":" or not path:
         raise InputError(f"{shortened(text)}: no file; expected {head}:PATH{suffix}")
@@ -228,9 +244,9 @@ def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
 
 
 def _number(text: str, kind: type) -> object:
-    """Read a finite number; what is none, or absurdly long, stays a text."""
+    """Convert a text to a finite number; return any other text unchanged."""
     if not (_INTEGER if kind is int else _REAL).fullmatch(text):
-        return text  # 1_0 and digits of other scripts are numbers to Python alone
+        return text  # Python alone accepts 1_0 and digits of other scripts
     try:
         number = kind(text)
         return number if math.isfinite(number) else text
@@ -239,9 +255,9 @@ def _number(text: str, kind: type) -> object:
 
 
 def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
-    """Check that a value has the type of the key's default, or convert it.
+    """Return a value with the type of the key's default.
 
-    free : whether a text may hold the signs that separate the parts of a name
+    free : allow the characters / and =, which separate the parts of a name
     """
     match value:
         case str() if kind is str and value and (free or not set("/=") & set(value)):
@@ -249,8 +265,8 @@ def _typed(where: str, value: object, kind: type, *, free: bool) -> Value:
                 return value
         case bool():
             pass
-        case int() if kind is int and abs(value) < _TOO_LARGE:
+        case int() if kind is int and abs(value) < _INTEGER_LIMIT:
             return value
         case int() | float() if kind is float and abs(value) <= sys.float_info.max:
-            return float(value) + 0.0  # not -0
-    raise InputError(f"{where}={shown(value)}; expected {_CALLED[kind]}")
+            return float(value) + 0.0  # −0.0 becomes 0.0: equal values need equal names
+    raise InputError(f"{where}={shown(value)}; expected {_TYPE_NAMES[kind]}")

@@ -1,13 +1,12 @@
-"""Operators P that can be written: plain arrays, and the name of what multiplies.
+"""Serialisable operators P: plain arrays, and the name of a function that builds P.
 
-A matrix-free P cannot be written to a file, but what it is made from can. It travels to
-workers as these arrays and is put together there, on the clock: whatever an operator
-needs before its first product (a factor, say) is part of what the solver is charged to
-prepare.
+A matrix-free P cannot be written to a file, but the arrays that it is built from can.
+Workers receive these arrays and build the operator on the clock: work before the first
+product, such as a factorisation, counts as preparation of the solver.
 
-What is put together by is looked up by name in a table of *makers* that code fills: the
-``OPERATORS`` of a plug-in, or a package's own. A file can name one of them and nothing
-else; it never says what is imported.
+The function is looked up by name in a table of *makers*: the ``OPERATORS`` of a
+plug-in, or that of a package. A file contains the name only. It cannot specify a module
+to import.
 """
 
 from __future__ import annotations
@@ -22,61 +21,75 @@ from scipy.sparse.linalg import LinearOperator
 
 Arrays = Mapping[str, NDArray[Any]]
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
-#: takes plain arrays and returns x ↦ Px, which must also take (n, k) matrices
+#: Maps plain arrays to x ↦ Px, for vectors (n,) and matrices (n, k).
 Maker = Callable[[Arrays], Product]
 NO_MAKERS: Mapping[str, Maker] = MappingProxyType({})
 
 
 @runtime_checkable
 class Preconditioned(Protocol):
-    """A product x ↦ Px that also knows approximate inverses of P.
+    """A product x ↦ Px that also offers approximate inverses of P.
 
-    A maker may return one; solvers find it by `SerialisableOperator.build`.
+    A maker may return one; solvers get it from `SerialisableOperator.build`.
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply (n,) or (n, k) with P."""
+        """Multiply P by (n,) or (n, k)."""
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Make x ↦ Mx, symmetric positive semidefinite, for (n,) and (n, k).
+        """Return x ↦ Mx, symmetric positive semidefinite, for (n,) and (n, k).
 
-        kind, scaling : names of its own
+        kind, scaling : names that the operator defines
 
         Raises
         ------
         ValueError
-            When there is none of these names; the message lists what there is.
+            When a name is unknown; the message lists the known ones.
 
         """
 
 
 @runtime_checkable
 class WithDiagonal(Protocol):
-    """A product x ↦ Px that also knows the diagonal of P; a maker may return one.
+    """A product x ↦ Px that also offers the diagonal of P; a maker may return one.
 
-    The size of Pᵢᵢ tells how much a residual matters: without it an operator is held
-    to a stricter measure than a matrix (`harness.verify.kkt`).
+    Pᵢᵢ scales the residual of component i. Without it, an operator is judged more
+    strictly than a matrix (`harness.verify.kkt`).
     """
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Multiply (n,) or (n, k) with P."""
+        """Multiply P by (n,) or (n, k)."""
 
     def diagonal(self) -> NDArray[np.float64]:
-        """Give Pᵢᵢ (n,)."""
+        """Return Pᵢᵢ (n,)."""
 
 
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
-    maker : what puts it together, a name in `makers`
-    arrays : plain arrays under names of your own
-    makers : the table; workers look the name up in theirs, which has the ``OPERATORS``
-        of the same plug-ins
+    maker : name of a function in `makers`
+    arrays : its argument, plain arrays by name
+    makers : functions by name; workers have the same table, with the ``OPERATORS`` of
+        the same plug-ins
 
     Raises
     ------
     ValueError
-        When `makers` has no such name.
+        When `maker` is not in `makers`.
+
+    Examples
+    --------
+    A rank-one P = vvᵀ that is never stored as a matrix:
+
+    >>> import numpy as np
+    >>> from mortarbench.harness.operators import SerialisableOperator
+    >>> def rank_one(arrays):
+    ...     v = arrays["v"]
+    ...     return lambda x: v * (v @ x)
+    >>> v = np.array([1.0, 2.0])
+    >>> P = SerialisableOperator(2, "rank-one", {"v": v}, {"rank-one": rank_one})
+    >>> P @ np.array([1.0, 1.0])
+    array([3., 6.])
 
     """
 
@@ -93,18 +106,18 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         self._product: Product | None = None
 
     def build(self) -> Product:
-        """Put the operator together, unless it is."""
+        """Return the product, built at the first call."""
         if self._product is None:
             self._product = self._make(self.arrays)
         return self._product
 
     def diagonal(self) -> NDArray[np.float64] | None:
-        """Give Pᵢᵢ (n,); None where what was put together does not tell."""
+        """Return Pᵢᵢ (n,), or None if the product is not a `WithDiagonal`."""
         product = self.build()
         return product.diagonal() if isinstance(product, WithDiagonal) else None
 
     def forget(self) -> None:
-        """Drop what was built, so that the next one is charged with it again."""
+        """Drop the product, so that the next solver is charged for building it."""
         self._product = None
 
     def _matvec(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -118,8 +131,8 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
 
 def assembled(P: LinearOperator) -> NDArray[np.float64]:
-    """Multiply an operator out: the symmetric part of P·1, (n, n)."""
+    """Return an operator as a matrix (n, n), the symmetric part of P·I."""
     M = np.asarray(P @ np.eye(P.shape[0]))
-    M += M.T.copy()
+    M += M.T.copy()  # rounding of products makes P·I slightly asymmetric
     M /= 2
     return M

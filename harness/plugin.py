@@ -1,4 +1,4 @@
-"""What one can plug in: solvers, and families of problems that build cases."""
+"""Protocols for plug-ins: solvers, and families of problems that build cases."""
 
 from __future__ import annotations
 
@@ -13,131 +13,168 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
     from mortarbench.harness.mechanics import CellBlock, Mechanics
     from mortarbench.harness.qp import QP, Vector
     from mortarbench.harness.solution import Solution
 
-Value = int | float | str  #: of one key of a case name
-#: the injected high-accuracy solve
+Value = int | float | str  #: value of a key in a case name
+#: The injected high-accuracy solve.
 Reference: TypeAlias = "Callable[[QP], Solution]"
 
 
 class ReferenceOverRanks(Protocol):
-    """The injected high-accuracy solve of shares of a QP; called by all ranks."""
+    """The injected high-accuracy solve of a distributed QP; called by all ranks."""
 
     def __call__(self, qp: QP, start: Solution | None = None, /) -> Solution:
-        """Solve; `start` is a solution of a QP that differs in its bounds alone."""
+        """Solve a QP.
+
+        start : a solution of a QP that differs only in its bounds
+        """
 
 
 class Solver(Protocol):
     """A QP solver; in practice a frozen dataclass whose fields are its options.
 
-    A class attribute ``accepts``, a tuple of classes of `harness.sets`,
-    declares the convex sets that it can take. Without it a solver accepts bounds alone
-    (``(Box,)``), and declines QPs with other sets before `declines` is called.
+    The class attribute ``accepts``, a tuple of classes of `harness.sets`, declares the
+    convex sets that the solver supports. Without it a solver accepts bounds only
+    (``(Box,)``). QPs with other sets are declined before `declines` is called.
+
+    Examples
+    --------
+    A solver for QPs without constraints other than equations:
+
+    >>> from dataclasses import dataclass
+    >>> import numpy as np
+    >>> import mortarbench as mb
+    >>> @dataclass(frozen=True)
+    ... class Saddle:
+    ...     def declines(self, qp):
+    ...         has_bounds = qp.h.size or np.isfinite([qp.lb, qp.ub]).any()
+    ...         return "needs equations only" if has_bounds else None
+    ...
+    ...     def prepare(self, qp, tol):
+    ...         n, m = qp.q.size, qp.b.size
+    ...         M = np.block([[qp.P, qp.A.T], [qp.A, np.zeros((m, m))]])
+    ...         inverse = np.linalg.inv(M)  # timed as preparation
+    ...
+    ...         def solve():
+    ...             x, y = np.split(inverse @ np.append(-qp.q, qp.b), [n])
+    ...             return mb.Solution(
+    ...                 status=mb.Status.SOLVED, x=x, y=y, z=np.zeros(0),
+    ...                 z_box=np.zeros(n),
+    ...             )
+    ...
+    ...         return solve
+    >>> qp = mb.QP.from_arrays(np.eye(2), [-1, 0], A=[1, 1], b=1)
+    >>> mb.solve(qp, Saddle()).verdict.value
+    'verified'
+
     """
 
     def declines(self, qp: QP) -> str | None:
-        """Give the reason why this solver cannot take `qp`, or None if it can."""
+        """Return the reason why this solver does not accept `qp`, or None."""
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert and factorise; return the call that solves. Both are timed.
+        """Convert and factorise; return a function that solves. Both are timed.
 
-        `tol` is the relative KKT accuracy asked for; the adapter maps it to the
-        solver's own test. The returned call is made once: repeats prepare afresh.
+        `tol` is the requested relative accuracy of the KKT residuals; the adapter
+        translates it to the stopping test of the solver. The returned function is
+        called once: every repeat starts with `prepare`.
         """
 
 
 class Chained(Solver, Protocol):
-    """A solver that can carry work from one QP to the next, as of load steps."""
+    """A solver that can reuse work from one QP to the next, such as load steps."""
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         """Begin a sequence: return the `prepare` for its QPs, called in their order.
 
-        Each call may use whatever the earlier ones left (points, multipliers, factors,
-        norms), on its own responsibility: the QPs of a sequence need not have a single
-        coefficient in common. Sequences are independent of each other.
+        Each call may reuse results of earlier ones (points, multipliers, factors,
+        norms). The solver has to check that they still apply: the QPs of a sequence
+        need not have a single coefficient in common. Sequences are independent.
         """
 
 
 class Tightening(Chained, Protocol):
-    """A solver that can carry work on where each QP comes with its own tolerance."""
+    """A solver that can reuse work if each QP has its own tolerance."""
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         """Begin a sequence: return the `prepare` for its QPs and their tolerances.
 
-        As `chain`, which has one tolerance for all: the early QPs of a fixed point are
-        not worth solving as accurately as the last.
+        It differs from `chain` in the tolerances: the early QPs of a fixed point
+        iteration need not be solved as accurately as the last.
         """
 
 
 @dataclass(frozen=True, kw_only=True)
 class About:
-    """The descriptive facts of a solver, kept with its adapter.
+    """Description of a solver, for lists and reports.
 
     A solver may have one as its attribute ``about``. Texts are Markdown, a sentence or
-    two each. The tolerance mapping is no part of it: it is in the class's docstring.
+    two each. The translation of the tolerance belongs in the docstring of the class.
     """
 
     title: str
-    method: str  #: the class of methods, e.g. "interior point"
+    method: str  #: class of methods, e.g. "interior point"
     licence: str
-    linear_solver: str  #: what solves its linear systems
-    phases: str  #: what is timed as preparing and what as solving
-    package: str = ""  #: to install, with a module of the same name unless given below
-    module: str = ""  #: to import, where its name differs
-    sequence: str = ""  #: what it carries from one QP to the next; empty: nothing
-    limits: tuple[str, ...] = ()  #: known limits found here, each with its evidence
+    linear_solver: str  #: solver of its linear systems
+    phases: str  #: work timed as preparing, and work timed as solving
+    package: str = (
+        ""  #: to install; its module has the same name unless `module` is set
+    )
+    module: str = ""  #: to import, if its name differs
+    sequence: str = ""  #: work reused from one QP to the next; empty for none
+    limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
     @property
     def missing(self) -> str | None:
-        """Say what to install, or None if the library can be imported."""
+        """The package to install, or None if the library can be imported."""
         module = self.module or self.package
         if not module or find_spec(module) is not None:
             return None
         return f"not installed: {module} (pip install {self.package})"
 
 
-#: state of a node whose bound of Tresca's law carries shear where nothing presses
+#: State of a node without pressure that carries shear by the bound of Tresca's law.
 SLIDING = "sliding without contact"
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSide:
-    """What a contact does along its slave side, node by node; SI units."""
+    """Results of a contact along its slave side, node by node; SI units."""
 
     name: str  #: of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) along the side
-    length: Vector  #: (s,) of the undeformed side that belongs to each node, m
-    force: NDArray[Any]  #: (s, dim) on each node by this contact, N/m; in space N
-    pressure: Vector  #: (s,) Pa; positive where the bodies press on each other
-    gap: Vector  #: (s,) m; positive: open; NaN where nothing is opposite
-    #: (s,) force on each node against the normal of its own contact row, N/m
+    length: Vector  #: (s,) share of the undeformed side of each node, m
+    force: NDArray[Any]  #: (s, dim) on each node from this contact, N/m; N in space
+    pressure: Vector  #: (s,) Pa, positive in compression
+    gap: Vector  #: (s,) m, positive if open; NaN without an opposite side
+    #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
     shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
-    #: (s,) "open", "stick", "slip" or `SLIDING`; files of old say "open" for the last
+    #: (s,) "open", "stick", "slip" or `SLIDING`; old files have "open" for the last
     friction: NDArray[Any] | None = None
-    #: (k, 3) of the exact solution, where it is known: distance along the side from its
-    #: middle, m, pressure and shear, Pa
+    #: (k, 3) exact solution, if known: distance along the side from its middle, m,
+    #: pressure and shear, Pa
     exact: NDArray[Any] | None = None
 
     def pressed(self, least: float) -> NDArray[Any]:
-        """Tell which nodes (s,) press on the other side.
+        """Return the mask (s,) of the nodes in contact.
 
-        Those with a push, or where it is not known a force, of more than `least`, N/m:
-        a mortar row of a curved side also pulls along the side at the neighbours of its
-        node. With friction it is those that stick or slip: Tresca's law lets friction
-        act where nothing presses, too.
+        With friction, these stick or slip: under Tresca's law, forces also act without
+        contact. Without friction, they have a `push`, or if that is unknown a force,
+        of more than `least`, N/m. Forces alone are misleading: a mortar row of a curved
+        side also has tangential forces at the neighbours of its node.
         """
-        told: NDArray[Any]
+        mask: NDArray[Any]
         if self.friction is not None:
-            told = (self.friction == "stick") | (self.friction == "slip")
+            mask = (self.friction == "stick") | (self.friction == "slip")
         elif self.push is not None:
-            told = self.push > least
+            mask = self.push > least
         else:
-            told = (self.force**2).sum(axis=1) > least**2
-        return told
+            mask = (self.force**2).sum(axis=1) > least**2
+        return mask
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -153,18 +190,18 @@ class Fields:
     contact_nodes: NDArray[Any] | None = None  #: (c,) slave nodes of the contact rows
     #: (c, dim) force on each slave node: N/m in the plane, N in space
     contact_forces: NDArray[Any] | None = None
-    contacts: tuple[ContactSide, ...] = ()  #: each pair on its own
-    #: (E,) subdomain of each cell, from 0; None for bodies that are not torn
+    contacts: tuple[ContactSide, ...] = ()  #: one for each pair of bodies
+    #: (E,) subdomain of each cell, from 0; None for undivided bodies
     subdomains: NDArray[Any] | None = None
 
     @property
     def dim(self) -> int:
-        """Number of coordinates of a point."""
+        """Dimension of space."""
         return int(self.points.shape[1])
 
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
-        """Cells by their kinds, in the vocabulary of meshio."""
+        """Cells by kind, with the names of meshio."""
         from mortarbench.harness.mechanics import cell_blocks  # late: loads numpy
 
         return cell_blocks(self.cells, self.dim)
@@ -172,49 +209,75 @@ class Fields:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Case:
-    """One QP together with its way back to the physical problem.
+    """A QP, and the maps from its solution to physical results.
 
-    `scale` and `constant` turn the objective of the emitted QP into the potential
-    energy of the physical problem:  energy = scale·objective + constant.
+    `scale` and `constant` convert the objective of the QP to the potential energy of
+    the physical problem:  energy = scale·objective + constant.
     """
 
     qp: QP
-    recover: Callable[[Solution], Vector]  #: point of the QP → physical unknown u, SI
-    quantities: Callable[[Solution], Mapping[str, Any]]  #: physical results, SI
-    fields: Callable[[Solution], Fields] | None = None  #: for pictures, where there are
+    recover: Callable[
+        [Solution], Vector
+    ]  #: solution of the QP ↦ physical unknown u, SI
+    quantities: Callable[
+        [Solution], Mapping[str, Any]
+    ]  #: solution of the QP ↦ physical results, SI
+    fields: Callable[[Solution], Fields] | None = None  #: deformed state, for pictures
     scale: float = 1.0
     constant: float = 0.0
-    matrices: Mapping[str, Any] = field(default_factory=dict)  #: to export with the QP
-    dualise_seconds: float | None = (
-        None  #: what a dual form took to come by, factor too
-    )
-    mechanics: Mechanics | None = None  #: to certify errors with, where there are any
-    remarks: tuple[str, ...] = ()  #: what may be wrong with the input, a line each
-    #: how far the QP itself is from the fixed point that it leads to, relative: no
-    #: solution of it comes nearer; 0 where it leads to none, or is there
+    matrices: Mapping[str, Any] = field(default_factory=dict)  #: exported with the QP
+    #: time of forming a dual, with the factorisation; None for other forms
+    dualise_seconds: float | None = None
+    mechanics: Mechanics | None = None  #: needed to certify errors
+    remarks: tuple[str, ...] = ()  #: doubts about the input, a line each
+    #: relative distance of the QP from the fixed point that it is an iterate of, which
+    #: no solution of this QP can reduce; 0 at the fixed point, or without one
     unsettled: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFile:
-    """A file that a case is read from, with the content that it had when named."""
+    """A file that a case is read from, identified by its content."""
 
-    path: str  #: as the case names it
+    path: str  #: in the name of the case
     sha256: str  #: first 12 hexadecimal digits
-    suffix: str  #: of its format, for the name of a copy; never taken from the path
+    suffix: str  #: of its format, for the name of a copy; not taken from the path
 
 
 class Family(ABC):
     """A parametrised family of problems; in practice a frozen dataclass.
 
     All methods raise `InputError` for values outside the family's range.
+
+    Examples
+    --------
+    >>> from collections.abc import Mapping
+    >>> from dataclasses import dataclass, field
+    >>> import numpy as np
+    >>> import mortarbench as mb
+    >>> @dataclass(frozen=True)
+    ... class Spring(mb.Family):
+    ...     name: str = "spring"
+    ...     defaults: Mapping = field(default_factory=lambda: {"k": 2.0})
+    ...     forms: tuple = ("primal",)
+    ...
+    ...     def build(self, form, params, reference):
+    ...         qp = mb.QP.from_arrays([[params["k"]]], [-1])
+    ...         return mb.Case(
+    ...             qp=qp, recover=lambda s: s.x,
+    ...             quantities=lambda s: {"u": float(s.x[0])},
+    ...         )
+    >>> Spring().complete({})
+    {'k': 2.0}
+
     """
 
-    name: str  #: the first component of its case names
-    defaults: Mapping[str, Value]  #: every key, in the order of canonical names
-    forms: tuple[str, ...]  #: that it can emit
-    path_suffix: str | None = None  #: where it takes a file; see `harness.names`
-    singular: str = ""  #: why refinement has no limit of finite energy, if it has none
+    name: str  #: first component of its case names
+    defaults: Mapping[str, Value]  #: all keys, in the order of canonical names
+    forms: tuple[str, ...]  #: of its QPs
+    path_suffix: str | None = None  #: of its input files; see `harness.names`
+    #: reason why refinement has no limit of finite energy; empty if it has one
+    singular: str = ""
 
     @abstractmethod
     def build(
@@ -223,66 +286,70 @@ class Family(ABC):
         """Build one case from complete params."""
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Add the keys that are not given; a default may depend on another key."""
+        """Return params with the missing keys; a default may depend on another key."""
         return {**self.defaults, **given}
 
     def check(self, params: Mapping[str, Value]) -> None:  # noqa: B027  # may be none
-        """Refuse complete params out of range; called before a run starts."""
+        """Raise InputError for complete params out of range; called before a run."""
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Give the case whose mesh has every cell halved; None where there is none.
+        """Return the params of the case with every cell halved, or None.
 
-        The mechanics of both have a grid, for `harness.crossval.discretisation`.
+        The mechanics of both cases need a grid, see `harness.crossval.discretisation`.
         """
         return None
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Describe the part of the geometry that `refined` leaves coarse, or "".
+        """Describe the part of the geometry that `refined` does not refine, or "".
 
-        The words follow an error of the mesh: "of the bodies as they are meshed".
+        The text follows an error of the mesh: "of the bodies as they are meshed".
         """
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file that a case is read from, to be copied with its results."""
+        """Return the file that a case is read from, which results keep a copy of."""
         return None
 
     def with_copies(self, folder: Path) -> Family:
-        """Return the family that takes the copies of a result folder.
+        """Return the family with the copied files of a result folder.
 
-        They stand for files that are missing here, or have another content.
+        These replace files that are missing here, or have another content.
         """
         return self
 
     def copied_paths(self) -> list[str]:
-        """List the paths of files that the result folder knows; see `with_copies`."""
+        """List the paths of the copied files, see `with_copies`."""
         return []
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
-        """Say how ranks make their shares of what `build` would emit, complete params.
+    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
+        """Return a function that assembles the QP of `build` on ranks, or None.
 
-        All ranks call what is returned, with a reference that solves shares of a QP on
-        all of them together. None where that is not built: one process emits
-        the whole then. Neither needs MPI to be there, nor builds anything yet.
+        It is called by all ranks, with a reference for distributed QPs. None means that
+        one process builds the QP. This method itself builds nothing and does not need
+        MPI.
+
+        params : complete
         """
         return None
 
 
 def as_family(offered: Any) -> Family:
-    """Give what somebody offers as a family, wrapped if its class does not inherit.
+    """Return an object as a `Family`, wrapped if its class does not inherit from that.
 
-    offered : has `name`, `defaults`, `forms` and `build`, and may have what else
-        `Family` has
+    offered : has `name`, `defaults`, `forms` and `build`, and optionally the other
+        members of `Family`
     """
     if isinstance(offered, Family):
         return offered
     kind = type(offered)
     parts = [name for name in dir(Family) if not name.startswith("_")]
-    own = {name: getattr(offered, name) for name in parts if hasattr(offered, name)}
+    members = {name: getattr(offered, name) for name in parts if hasattr(offered, name)}
     required = ("name", "defaults", "forms", "build")
-    own |= {name: getattr(offered, name, None) for name in required}
-    own = {k: staticmethod(v) if callable(v) else v for k, v in own.items()}
-    wrapped: Family = type(kind.__name__, (Family,), {"__doc__": kind.__doc__, **own})()
+    members |= {name: getattr(offered, name, None) for name in required}
+    members = {k: staticmethod(v) if callable(v) else v for k, v in members.items()}
+    wrapped: Family = type(
+        kind.__name__, (Family,), {"__doc__": kind.__doc__, **members}
+    )()
     return wrapped

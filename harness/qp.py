@@ -1,4 +1,4 @@
-"""The convex quadratic program that every solver in this repository is handed."""
+"""The convex quadratic program that all solvers take."""
 
 from __future__ import annotations
 
@@ -18,20 +18,24 @@ from mortarbench.harness.sets.convex import Vector as Vector
 
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
-SYMMETRIC = 1e-12  #: of P − Pᵀ, relative to the largest entry of P: rounding
-_MOST_FACTORED = 2000  #: rows of a P whose eigenvalues are bounded: a quarter second
-_NEGATIVE = 1e-6  #: curvature relative to the diagonal; texts may have six digits
-_FLAT = 1e-4  #: of the largest entry: below, rounding may have made most of Pᵢᵢ
-_STRIP = 256  #: rows of a dense matrix that are compared at once
+#: Largest entry of P − Pᵀ, relative to that of P, that counts as rounding.
+SYMMETRY_TOLERANCE = 1e-12
+_MAX_FACTORED_ROWS = 2000  #: of a P that is checked by a Cholesky factor: 0.25 s
+#: Least eigenvalue of the scaled P: text formats may store no more than six digits.
+_MIN_CURVATURE = -1e-6
+#: Least diagonal entry for scaling, relative to the largest entry of P: smaller ones
+#: may be mostly rounding.
+_MIN_DIAGONAL = 1e-4
+_STRIP_ROWS = 256  #: of a dense matrix that are compared at a time, to save memory
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Structure:
-    """What P = B K⁺ Bᵀ, the matrix of a dual, came from; in the dual's units."""
+    """Factors of the matrix P = B K⁺ Bᵀ of a dual, in the units of the dual."""
 
     K: Matrix  #: (N, N) sparse stiffness, positive semidefinite
     B: Matrix  #: (n, N) sparse constraint rows
-    fixed: NDArray[np.int64]  #: components that K⁺ leaves at zero
+    fixed: NDArray[np.int64]  #: (k,) components on which K⁺ is zero
 
 
 @dataclass(frozen=True, eq=False, kw_only=True, init=False)
@@ -49,20 +53,34 @@ class QP:
     Blocks of variables may have further convex sets, to which z_box is normal.
 
     Absent constraints have zero rows, absent bounds are ±inf; nothing is None. All
-    arrays are made read-only: a solver that scales its input in place fails loudly.
+    arrays become read-only, so that a solver that scales its input in place raises.
+    `from_arrays` accepts more kinds of input, and copies it.
 
     Parameters
     ----------
-    P, q, A, b, G, h, structure : the attributes of these names
-    lb, ub : (n,) bounds, -inf and inf where there are none
-    sets : sets of further blocks; in place of lb and ub, the first may be a `Box`
+    P, q, A, b, G, h, structure : see the attributes
+    lb, ub : (n,) bounds, -inf and inf for absent ones; None for no bounds
+    sets : sets of further blocks; the first may be a `Box` in place of lb and ub
 
     Raises
     ------
     ValueError
-        When shapes disagree, bounds cross, a vector holds NaN (or inf where none may
-        be), or sets share a variable; the message gives what was got and what was
-        expected.
+        When shapes disagree, bounds cross, a vector holds NaN (or inf, except in
+        bounds), or two sets share a variable.
+
+    Examples
+    --------
+    Minimise x₁² + x₂² − 2x₁ subject to x₁ + x₂ = 1 and x ≥ 0:
+
+    >>> import numpy as np
+    >>> from mortarbench import QP
+    >>> qp = QP.from_arrays(
+    ...     2 * np.eye(2), [-2, 0], A=[1, 1], b=1, lb=0
+    ... )
+    >>> qp
+    <QP: 2 variables, 1 equalities, 0 inequalities, 2 bounds>
+    >>> qp.objective(np.array([1.0, 0.0]))
+    -1.0
 
     """
 
@@ -72,8 +90,8 @@ class QP:
     b: Vector  #: (m,)
     G: Matrix  #: (p, n)
     h: Vector  #: (p,)
-    sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then those of other blocks
-    structure: Structure | None = None  #: what a solver may use and none must need
+    sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then sets of other blocks
+    structure: Structure | None = None  #: that a solver may use, but must not require
 
     def __init__(
         self,
@@ -89,14 +107,14 @@ class QP:
         sets: Sequence[ConvexSet] = (),
         structure: Structure | None = None,
     ) -> None:
-        given = tuple(sets)
-        has_box = bool(given) and isinstance(given[0], Box)
-        box = given[0] if has_box else Box.unbounded(q.size)
+        further = tuple(sets)
+        has_box = bool(further) and isinstance(further[0], Box)
+        box = further[0] if has_box else Box.unbounded(q.size)
         assert isinstance(box, Box)
         if lb is not None or ub is not None:
             box = Box(box.lower if lb is None else lb, box.upper if ub is None else ub)
         arrays = {"P": P, "q": q, "A": A, "b": b, "G": G, "h": h}
-        values = {**arrays, "sets": (box, *given[has_box:]), "structure": structure}
+        values = {**arrays, "sets": (box, *further[has_box:]), "structure": structure}
         for name, value in values.items():
             object.__setattr__(self, name, value)
         n, m, p = q.size, b.size, h.size
@@ -108,8 +126,8 @@ class QP:
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
         _check_sets(self.sets, n)
-        of_sets = [array for one in self.sets for array in one.arrays().values()]
-        for array in (*arrays.values(), *of_sets):
+        set_arrays = [array for one in self.sets for array in one.arrays().values()]
+        for array in (*arrays.values(), *set_arrays):
             _freeze(array)
 
     @property
@@ -121,12 +139,12 @@ class QP:
 
     @property
     def lb(self) -> Vector:
-        """Lower bounds (n,), may hold -inf."""
+        """Lower bounds (n,), -inf where absent."""
         return self.box.lower
 
     @property
     def ub(self) -> Vector:
-        """Upper bounds (n,), may hold +inf."""
+        """Upper bounds (n,), inf where absent."""
         return self.box.upper
 
     @classmethod
@@ -142,19 +160,20 @@ class QP:
         ub: ArrayLike | None = None,
         sets: Sequence[ConvexSet] = (),
     ) -> QP:
-        """Check and copy the arrays of a QP; the arguments stay as they are.
+        """Create a QP from copies of arrays, after checking them.
 
-        Matrices are dense or sparse; sparse ones are stored by columns. A vector with
-        one row or column, a single row of G or A as a vector with a scalar beside it,
-        and a scalar for equal bounds are accepted. None stands for an absent part.
+        Matrices are dense or sparse; sparse ones are stored by columns. These
+        abbreviations are accepted: a matrix with one row or column for a vector, a
+        vector with a scalar right-hand side for a single row of G or A, and a scalar
+        for equal bounds. None stands for an absent part.
 
         Parameters
         ----------
-        P : (n, n) symmetric, whole; not a triangle
+        P : (n, n) symmetric, both triangles
         q : (n,)
         G, h : (p, n) and (p,) of G x ≤ h
         A, b : (m, n) and (m,) of A x = b
-        lb, ub : (n,) bounds, -inf and inf where there are none
+        lb, ub : (n,) bounds, -inf and inf for absent ones
         sets : convex sets of further blocks of variables
 
         Raises
@@ -162,6 +181,17 @@ class QP:
         InputError
             When a part is missing, is not numeric, has the wrong shape or holds NaN,
             bounds cross, or P is not symmetric or not convex (see `check_convex`).
+
+        Examples
+        --------
+        >>> from mortarbench import QP
+        >>> qp = QP.from_arrays([[2, 0], [0, 1]], [-1, -1], G=[[1, 1]], h=[1], lb=0)
+        >>> qp.sizes
+        {'variables': 2, 'equalities': 0, 'inequalities': 1, 'bounds': 2}
+        >>> QP.from_arrays([[1, 2], [0, 1]], [0, 0])
+        Traceback (most recent call last):
+            ...
+        mortarbench.harness.errors.InputError: P is not symmetric: ...
 
         """
         if not isinstance(sets, tuple | list) or not all(
@@ -179,7 +209,7 @@ class QP:
         if not (n := vector.size):
             raise InputError("q is empty; expected at least one variable")
         try:
-            found = cls(
+            qp = cls(
                 P=_matrix("P", P, n, n),
                 q=vector,
                 **_rows("A", A, "b", b, n),
@@ -188,11 +218,11 @@ class QP:
                 ub=_bound("ub", ub, np.inf, n),
                 sets=sets,
             )
-            check_symmetric(found.P)
+            check_symmetric(qp.P)
         except ValueError as e:
             raise InputError(str(e)) from None
-        check_convex(found.P)
-        return found
+        check_convex(qp.P)
+        return qp
 
     def __repr__(self) -> str:
         sizes = ", ".join(f"{count} {name}" for name, count in self.sizes.items())
@@ -200,21 +230,21 @@ class QP:
 
     @property
     def is_explicit(self) -> bool:
-        """Whether P is a matrix (dense or sparse), not an operator."""
+        """True if P is a dense or sparse matrix, False for an operator."""
         return isinstance(self.P, np.ndarray) or issparse(self.P)
 
     def diagonal(self) -> Vector | None:
-        """Give Pᵢᵢ (n,); None where P is an operator that does not tell it."""
+        """Return Pᵢᵢ (n,), or None if P is an operator without a diagonal."""
         if self.is_explicit:
             return np.asarray(self.P.diagonal(), dtype=float)
         if not hasattr(self.P, "diagonal"):
             return None
-        told: Vector | None = self.P.diagonal()
-        return told
+        diagonal: Vector | None = self.P.diagonal()
+        return diagonal
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Variables, equality rows, inequality rows, finite bounds."""
+        """Numbers of variables, equality rows, inequality rows and finite bounds."""
         bounds = np.isfinite(self.lb).sum() + np.isfinite(self.ub).sum()
         return {
             "variables": self.q.size,
@@ -224,13 +254,14 @@ class QP:
         }
 
     def with_bounds(self, lb: Vector, ub: Vector) -> QP:
-        """Exchange the bounds (n,)."""
+        """Return the same QP with other bounds (n,)."""
         return replace(self, sets=(Box(lb, ub), *self.sets[1:]))
 
     def with_matrices(self, convert: Callable[[Matrix], Matrix]) -> QP:
-        """Convert the sparse matrices among P, A and G; dense ones and operators stay.
+        """Return the same QP with its sparse matrices converted.
 
-        convert : maps a sparse matrix to an equal one of another type
+        convert : maps a sparse matrix to an equal one of another type; dense matrices
+            and operators are not converted
         """
         matrices = {name: getattr(self, name) for name in ("P", "A", "G")}
         sparse = {name: convert(M) for name, M in matrices.items() if issparse(M)}
@@ -242,7 +273,7 @@ class QP:
 
 
 def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
-    """Raise ValueError where a set does not fit n variables, or two share one."""
+    """Raise ValueError if a set does not fit n variables, or two sets share one."""
     taken = np.zeros(n, dtype=bool)
     for one in sets:
         one.check(n)
@@ -258,31 +289,43 @@ def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
 
 
 def no_rows(n: int) -> Matrix:
-    """Make the (0, n) matrix of an absent constraint block."""
+    """Return the (0, n) matrix of an absent constraint block."""
     return csr_array((0, n))
 
 
 def needs_matrices(qp: QP) -> str | None:
-    """Give the reason to decline a `qp` whose P is an operator, else None.
+    """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    For `declines` of a solver that reads entries of P, and does not only multiply. A
-    run that hears this reason multiplies a small P out, on the clock, and asks again.
+    For `declines` of a solver that reads entries of P. If a solver declines for this
+    reason, a run assembles a small P, on the clock, and calls `declines` again.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import QP
+    >>> from mortarbench.harness import needs_matrices
+    >>> needs_matrices(QP.from_arrays(np.eye(2), [0, 0])) is None
+    True
+
     """
     return None if qp.is_explicit else NEEDS_MATRICES
 
 
 def check_symmetric(P: Matrix) -> None:
-    """Refuse a P that is not symmetric up to rounding: solvers would read another one.
+    """Raise unless P is symmetric up to rounding.
+
+    Solvers that read one triangle would solve another problem than the others.
 
     Raises
     ------
     ValueError
-        With the entries that differ most, and a hint where P is a triangle.
+        For an asymmetric P, with the entries that differ most, and a hint if P is a
+        triangle.
 
     """
     where, worst = _asymmetry(P)
     largest = abs(P).max() if prod(P.shape) else 0.0
-    if worst > SYMMETRIC * largest:
+    if worst > SYMMETRY_TOLERANCE * largest:
         i, j = where
         raise ValueError(
             f"P is not symmetric: P[{i}, {j}] and P[{j}, {i}] differ by {worst:.3g}"
@@ -291,16 +334,16 @@ def check_symmetric(P: Matrix) -> None:
 
 
 def check_convex(P: Matrix) -> None:
-    """Refuse a P with negative curvature: a KKT point of it may be a maximum.
+    """Raise if P has negative curvature, since a KKT point may then be a maximum.
 
-    With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to be above −1e-6:
-    D⁻½PD⁻½ + 1e-6 needs a Cholesky factor. What is closer to semidefinite may be so but
-    for rounding. Of more than 2000 rows only Pᵢᵢ is looked at.
+    With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to exceed −1e-6:
+    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues above that may be
+    negative because of rounding. For more than 2000 rows, only the diagonal is checked.
 
     Raises
     ------
     InputError
-        Where curvature is negative.
+        When curvature is negative.
 
     """
     largest = float(abs(P).max()) if P.shape[0] else 0.0
@@ -308,17 +351,17 @@ def check_convex(P: Matrix) -> None:
         return
     diagonal = P.diagonal() / largest
     i = int(diagonal.argmin())
-    if diagonal[i] < -_NEGATIVE * _FLAT:
+    if diagonal[i] < _MIN_CURVATURE * _MIN_DIAGONAL:
         raise InputError(
             f"P is not positive semidefinite: P[{i}, {i}] = {P.diagonal()[i]:.3g}; "
             "expected a convex QP"
         )
-    if P.shape[0] > _MOST_FACTORED:
+    if P.shape[0] > _MAX_FACTORED_ROWS:
         return
-    root = np.sqrt(np.maximum(diagonal, _FLAT))
+    root = np.sqrt(np.maximum(diagonal, _MIN_DIAGONAL))
     scaled = (P.toarray() if issparse(P) else P) / largest / root / root[:, None]
     try:
-        np.linalg.cholesky(scaled + _NEGATIVE * np.eye(len(root)))
+        np.linalg.cholesky(scaled - _MIN_CURVATURE * np.eye(len(root)))
     except np.linalg.LinAlgError:
         raise InputError(
             "P is not positive semidefinite: it has a negative eigenvalue; expected a "
@@ -327,7 +370,7 @@ def check_convex(P: Matrix) -> None:
 
 
 def _triangle(P: Matrix) -> str:
-    """Return a hint where one strict triangle of an asymmetric P is empty."""
+    """Return a hint if one strict triangle of an asymmetric P is zero, else ""."""
     lower, upper = (tril, triu) if issparse(P) else (np.tril, np.triu)
     for name, other in (("upper", lower(P, -1)), ("lower", upper(P, 1))):
         if not abs(other).max():
@@ -339,7 +382,7 @@ def _triangle(P: Matrix) -> str:
 
 
 def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
-    """Find the largest entry of |P − Pᵀ|; of a dense one in strips."""
+    """Return place and size of the largest entry of |P − Pᵀ|."""
     if issparse(P):
         difference = coo_array(abs(P - P.T))
         if not difference.nnz:
@@ -347,20 +390,20 @@ def _asymmetry(P: Matrix) -> tuple[tuple[int, int], float]:
         at = int(difference.data.argmax())
         i, j = (int(k[at]) for k in difference.coords)
         return (i, j), float(difference.data[at])
-    found = (0, 0), 0.0
-    for begin in range(0, len(P), _STRIP):
-        strip = slice(begin, begin + _STRIP)
+    place, worst = (0, 0), 0.0
+    for begin in range(0, len(P), _STRIP_ROWS):
+        strip = slice(begin, begin + _STRIP_ROWS)
         difference = abs(P[strip] - P[:, strip].T)
         i, j = np.unravel_index(difference.argmax(), difference.shape)
-        if difference[i, j] > found[1]:
-            found = (begin + int(i), int(j)), float(difference[i, j])
-    return found
+        if difference[i, j] > worst:
+            place, worst = (begin + int(i), int(j)), float(difference[i, j])
+    return place, worst
 
 
 def canonical(M: Matrix) -> Matrix:
-    """Sort the entries of a sparse matrix and add up those of one place.
+    """Return a sparse matrix with sorted indices and without duplicate entries.
 
-    Somebody else's need not be so, and what is frozen cannot be made so later.
+    It has to happen before the arrays become read-only, since SciPy sorts in place.
     """
     if M.has_canonical_format:
         return M
@@ -370,7 +413,7 @@ def canonical(M: Matrix) -> Matrix:
 
 
 def _numbers(name: str, value: Any) -> NDArray[np.float64]:
-    """Copy an array of finite or infinite numbers, a sparse one as dense."""
+    """Return a dense copy of an array of numbers; inf and NaN are not checked."""
     expected = "expected an array of numbers"
     if value is None:
         raise InputError(f"{name} is missing; {expected}")
@@ -381,20 +424,20 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
     if array.dtype.kind not in "biuf":
         kind = type(value).__name__ if array.dtype.kind == "O" else array.dtype
         raise InputError(f"{name} is of type {kind}; {expected}")
-    with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
+    with np.errstate(over="ignore"):  # inf beyond double precision, which callers check
         return np.array(array, dtype=float)
 
 
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
-    """Copy a vector; a matrix of one row or column is one.
+    """Return a copy of a vector, also from a matrix with one row or column.
 
     name : of the vector in messages
-    n : expected number of entries; None: any
+    n : expected number of entries; None for any
 
     Raises
     ------
     InputError
-        When it is not numeric or has another shape; NaN and inf are not looked for.
+        When it is not numeric or has another shape; NaN and inf are not checked.
 
     """
     array = _numbers(name, value)
@@ -406,7 +449,7 @@ def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
 
 
 def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
-    """Return a bound (n,); a scalar holds for every variable."""
+    """Return a bound (n,), the same for all variables from a scalar."""
     value = absent if value is None else value
     if np.ndim(value) == 0 and not issparse(value):
         return np.full(n, _numbers(name, value))
@@ -414,7 +457,10 @@ def _bound(name: str, value: ArrayLike | None, absent: float, n: int) -> Vector:
 
 
 def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
-    """Copy a matrix with n columns and, unless None, that number of rows."""
+    """Return a copy of a matrix with n columns.
+
+    rows : expected number of rows; None for any
+    """
     if issparse(value):
         if value.dtype.kind not in "biuf":
             raise InputError(
@@ -442,7 +488,7 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
 def _rows(
     name: str, M: Any, side: str, rhs: ArrayLike | None, n: int
 ) -> dict[str, Matrix]:
-    """Return a matrix of constraint rows and its right-hand side; no rows for None."""
+    """Return constraint rows and their right-hand side by name; no rows for None."""
     if M is None:
         return {name: no_rows(n), side: np.zeros(0)}
     matrix = _matrix(name, M, None, n)
@@ -457,7 +503,7 @@ def _rows(
 
 
 def _freeze(M: Matrix) -> None:
-    """Forbid writing to the buffers of a dense or sparse matrix."""
+    """Set the buffers of a dense or sparse matrix read-only."""
     buffers = [M] if isinstance(M, np.ndarray) else [getattr(M, "data", None)]
     for buffer in buffers:
         if isinstance(buffer, np.ndarray):

@@ -1,4 +1,4 @@
-"""One line of evidence: a measurement as plain data."""
+"""The record of a measurement: plain data, one line of the journal."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from msgspec import Struct
     from msgspec.json import Decoder
 
-#: version of the journal line; raised whenever a field changes its meaning.
-#: 2: the four residuals have other scales (docs/verdicts.md)
+#: Version of a journal line, increased whenever a field changes its meaning.
+#: 2: the four residuals have other scales (docs/verdicts.md).
 SCHEMA = 2
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
-READABLE = (1, 2)  #: the versions that `Record.from_json` takes, each as it was meant
-TIGHTENING = "sequence, tighten="  #: begins the mode of a sequence that tightens
-LARGEST_INTEGER = 2**63 - 1  #: what arrays, Parquet and other readers can hold
-SECONDS = (1e-12, 1e10)  #: between these is every time that is measured and not 0
-MOST_LEVELS = 20  #: of what is nested in a field
+READABLE = (1, 2)  #: versions that `Record.from_json` accepts
+TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
+LARGEST_INTEGER = 2**63 - 1  #: of 64-bit readers such as Parquet
+SECONDS = (1e-12, 1e10)  #: limits of measured times other than 0
+MAX_LEVELS = 20  #: of nesting in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
-#: fields that many lines share
+#: fields whose values many lines have in common
 _TEXTS = (
     "case", "family", "form", "solver", "claimed", "mode", "qp", "environment",
     "session",
@@ -39,48 +39,53 @@ _TABLES = ("params", "sizes", "options", "counts", "certificate", "quantities")
 
 
 class Verdict(StrEnum):
-    """Our judgement of a measurement, whatever the solver claimed."""
+    """Judgement of a measurement, independent of the solver's claim."""
 
-    VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` where known
-    #: claimed infeasible, and proven by a certificate: `harness.verify.infeasibility`
+    VERIFIED = "verified"  #: every residual ≤ 10·tol, or `optimum_error` if known
+    #: claimed infeasible and proven, see `harness.verify.infeasibility`
     VERIFIED_INFEASIBLE = "verified_infeasible"
-    INACCURATE = "inaccurate"  #: claimed solved; at least half the digits are there
-    WRONG = "wrong"  #: claimed solved, refuted
-    INFEASIBLE_CLAIM = "infeasible_claim"  #: not proven
+    INACCURATE = "inaccurate"  #: claimed solved; at least half of the digits are right
+    WRONG = "wrong"  #: claimed solved and refuted
+    INFEASIBLE_CLAIM = "infeasible_claim"  #: claimed infeasible, not proven
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
     MEMORY_LIMIT = "memory_limit"
     CRASHED = "crashed"  #: the process died
-    FAILED = "failed"  #: it raised or gave up
-    DECLINED = "declined"  #: it said beforehand why it cannot
+    FAILED = "failed"  #: the solver raised or gave up
+    DECLINED = "declined"  #: the solver does not accept the QP
 
     @property
     def words(self) -> str:
-        """The verdict as text."""
+        """The verdict as text with spaces."""
         return self.value.replace("_", " ")
 
     @property
     def is_verified(self) -> bool:
-        """True for a right answer: a solution, or a proof that there is none."""
+        """True for a verified solution or a proof of infeasibility.
+
+        >>> from mortarbench import Verdict
+        >>> [v.value for v in Verdict if v.is_verified]
+        ['verified', 'verified_infeasible']
+        """
         return self in (Verdict.VERIFIED, Verdict.VERIFIED_INFEASIBLE)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Measurement:
-    """What preparing and solving cost; None where nothing was measured.
+    """Costs of preparing and solving; None if not measured.
 
-    Every field is one of the journal, too: what is added here, and filled in by
-    `harness.verify.measure`, is carried from the worker to the record as it is. It is
-    no negative number.
+    Every field is also a field of the journal. A field that is added here, and set by
+    `harness.verify.measure`, is transferred from the worker to the record unchanged.
+    Values must not be negative.
     """
 
     prepare_seconds: float | None = None
     solve_seconds: float | None = None
     total_seconds: float | None = None  #: prepare + solve
-    peak_mib: float | None = None  #: resident memory of the worker, peak
+    peak_mib: float | None = None  #: peak resident memory of the worker
     prepare_peak_mib: float | None = None
     solve_peak_mib: float | None = None
-    inner_loops: int = 1  #: prepared and solved so often; the seconds are the mean
+    inner_loops: int = 1  #: repetitions within a sample; seconds are means over these
 
 
 MEASURED = tuple(f.name for f in fields(Measurement))
@@ -88,123 +93,124 @@ MEASURED = tuple(f.name for f in fields(Measurement))
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Record(Measurement):
-    """One solver on one case at one tolerance, once: plain scalars, one JSON line.
+    """A single run of one solver on one case at one tolerance; one JSON line.
 
-    It is a measurement together with what was asked for, what the solver said of its
-    answer, and what we find of it.
-
-    None stands for what was not or cannot be measured (NaN has no place in JSON).
+    It contains the measurement, the task, the claims of the solver and the verdict.
+    None stands for values that were not, or cannot be, measured (JSON has no NaN).
     """
 
     schema: int = SCHEMA
-    run_id: str  #: names the measurement; equal cells of equal suites have equal ids
+    run_id: str  #: digest of the task: the same in every run of the same suite
     case: str  #: canonical name
     family: str
     params: Mapping[str, Any]
     form: str
     sizes: Mapping[str, int]  #: variables, equalities, inequalities, bounds of the QP
-    solver: str  #: its label in the suite
-    options: Mapping[str, Any]  #: every option of the solver, defaults resolved
+    solver: str  #: label in the suite
+    options: Mapping[str, Any]  #: all options of the solver, including defaults
     tol: float
     repeat: int  #: 0, 1, …
-    block: int  #: measurements of one block ran next to each other in time
+    block: int  #: number of the unit of work; its measurements ran consecutively
     verdict: Verdict
     claimed: str | None = None  #: the solver's own status
-    message: str = ""  #: its words, the reason it declined, or how it died
+    message: str = ""  #: of the solver, reason to decline, or cause of death
     iterations: int | None = None
     counts: Mapping[str, Any] = field(default_factory=dict)
     reported: Mapping[str, Any] = field(
         default_factory=dict
-    )  #: its linear solver, its own times in seconds
-    build_seconds: float | None = None  #: of the case, in the process that built it
-    dualise_seconds: float | None = (
-        None  #: part of build: factor, dual; dual forms only
+    )  #: other data from the solver, such as its own times in seconds
+    build_seconds: float | None = (
+        None  #: of building the case, in the process that built it
     )
-    recover_seconds: float | None = None  #: from the point to quantities
-    certify_seconds: float | None = None  #: from a new point to energy_bound
-    canary_seconds: float | None = None  #: a fixed kernel, just before: drift
-    threads: int | None = None  #: most threads of any library in the worker, as checked
-    cpu: int | None = None  #: that the worker was bound to
-    ranks: int = 1  #: processes of MPI that solved it together
-    #: of the solve on ranks, [mean, largest] of these, s: products, exchange, coarse,
-    #: waiting; see `harness.distributed.vectors.Ranks`
+    #: the part of `build_seconds` for factor and dual; dual forms only
+    dualise_seconds: float | None = None
+    recover_seconds: float | None = None  #: of computing quantities from the point
+    certify_seconds: float | None = None  #: of computing `energy_bound`
+    canary_seconds: float | None = (
+        None  #: of a fixed computation just before, which shows drift
+    )
+    threads: int | None = None  #: largest number of any library in the worker
+    cpu: int | None = None  #: CPU that the worker was bound to
+    ranks: int = 1  #: number of MPI processes of the solve
+    #: parts of a solve on ranks, s: [mean, largest] over ranks of products, exchange,
+    #: coarse, waiting; see `harness.distributed.vectors.Ranks`
     rank_seconds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: alike: reductions, messages sent to neighbours, bytes of these
+    #: [mean, largest] of reductions, messages to neighbours, and their bytes
     rank_counts: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: alike: what one of these takes, s: reduction_seconds, message_seconds,
-    #: seconds_per_byte; see `harness.distributed.network`
+    #: [mean, largest] of reduction_seconds, message_seconds, seconds_per_byte; see
+    #: `harness.distributed.network`
     rank_network: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    #: or "sequence": may use what earlier steps left; "sequence, tighten=θ": to
-    #: tolerances that tighten, see `Record.tighten`
+    #: "cold"; "sequence": earlier steps may be reused; "sequence, tighten=θ": the same
+    #: with tightening tolerances, see `Record.tighten`
     mode: str = "cold"
-    #: solved to and judged at, where that is looser than `tol`: an early step of a
-    #: sequence that tightens
+    #: tolerance of an early step of a tightening sequence, where looser than `tol`
     step_tol: float | None = None
-    accuracy: float | None = None  #: judged at, where that is not `tol`: a sweep
-    #: "null": the same solver once more, to show the noise; "copies": as many of it at
-    #: once as there are `ranks`, each by itself
+    accuracy: float | None = None  #: tolerance of the verdict in a sweep, if not `tol`
+    #: "null": a second copy of a solver, which shows the noise; "copies": `ranks`
+    #: independent solves at the same time
     role: str = ""
-    primal: float | None = None  #: the four scale-free residuals of harness.verify.kkt
+    primal: float | None = (
+        None  #: this and the next three: residuals of harness.verify.kkt
+    )
     dual: float | None = None
     complementarity: float | None = None
     gap: float | None = None
-    #: "reference" where `optimum_error` decided the verdict, and not the residuals;
-    #: "certificate" where a claim of infeasibility was proven
+    #: "residuals"; "reference": `optimum_error` decided the verdict; "certificate": a
+    #: claim of infeasibility was proven
     decided_by: str = "residuals"
-    optimum_error: float | None = (
-        None  #: against the proven optimum, harness.verify.optimum
+    optimum_error: float | None = None  #: see `harness.verify.optimum`
+    energy_bound: float | None = (
+        None  #: certified bound of the relative error, energy norm
     )
-    energy_bound: float | None = None  #: certified relative error, energy norm
-    #: what it is made of, as relative; see `harness.verify.verdicts.certified`
+    #: relative components of that bound; see `harness.verify.verdicts.certified`
     certificate: Mapping[str, Any] = field(default_factory=dict)
     objective: float | None = None  #: ½xᵀPx + qᵀx of the emitted QP
     quantities: Mapping[str, Any] = field(default_factory=dict)  #: physical, SI
     qp: str | None = None  #: digest of the emitted QP; None in old journals
-    environment: str = ""  #: digest of environment.json or of one in environments/
-    node: str = ""  #: host name, where a cluster measured
+    environment: str = ""  #: digest of environment.json, or of a file in environments/
+    node: str = ""  #: host name, if a cluster measured
     vectors: str | None = None  #: digest of the stored solution
     fields: str | None = None  #: digest of the stored deformed state
     started: str = ""  #: UTC, ISO 8601
-    session: str = ""  #: of one command; empty in journals from before there were any
+    session: str = ""  #: id of the command; empty in old journals
 
     @property
     def tighten(self) -> float:
-        """θ of a sequence whose tolerances tighten towards `tol`, else 0.
+        """θ of a sequence with tolerances that tighten towards `tol`, else 0.
 
-        A step of it is solved to max(tol, θ·`harness.plugin.Case.unsettled`).
+        Its steps are solved to max(tol, θ·`harness.plugin.Case.unsettled`).
         """
         _, _, number = self.mode.partition(TIGHTENING)
         return float(number or 0)
 
     @property
     def asked_tol(self) -> float:
-        """The tolerance that the solver was given."""
+        """Tolerance passed to the solver."""
         return self.tol if self.step_tol is None else self.step_tol
 
     @property
     def judged_at(self) -> float:
-        """The tolerance that the verdict is about."""
+        """Tolerance of the verdict."""
         return self.asked_tol if self.accuracy is None else self.accuracy
 
     @property
     def claims_answer(self) -> bool:
-        """True if the solver claims a solution, or rightly that there is none."""
+        """True if the solver claims a solution, or a proven infeasibility."""
         return self.claimed == "solved" or self.verdict is Verdict.VERIFIED_INFEASIBLE
 
-    def but(self, **changes: Any) -> Self:
-        """Copy with some fields changed."""
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
         return replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
-        """Give every field by its name in the journal; nested data is not copied."""
+        """Return all fields by their journal names; nested data is not copied."""
         return {name: getattr(self, f.name) for name, f in JOURNAL.items()}
 
     def to_json(self) -> str:
-        """Serialise to one line of strict JSON.
+        """Return one line of strict JSON.
 
-        NaN, inf and integers that no reader can hold become null. A line from before
-        there were sessions, or steps with a tolerance of their own, is written as it
-        was read.
+        NaN, inf and integers beyond 64 bits become null. Fields that old journals lack
+        are omitted at their defaults, so that an old line is written as it was read.
         """
         row = finite(self.to_dict())
         if not self.session:
@@ -220,30 +226,29 @@ class Record(Measurement):
 
     @staticmethod
     def from_json(line: str | bytes, shared: dict[Any, Any] | None = None) -> Record:
-        """Parse what `to_json` wrote; fields that we do not know are ignored.
+        """Parse a line written by `to_json`; unknown fields are ignored.
 
-        A lone surrogate, which no file can hold, is spelt out. Of a key that is there
-        twice the last one counts.
+        Lone surrogates, which no file can contain, are escaped. The last of several
+        equal keys counts.
 
-        shared : texts and tables of the lines before; what equals one of them is held
-            in memory once
+        shared : texts and tables of earlier lines; equal ones are stored once
 
         Raises
         ------
         ValueError
-            When the line is no JSON object, lacks a field, has another schema, or a
-            field of the wrong type or out of its range.
+            When the line is not a JSON object, lacks a field, has another schema, or a
+            field with a wrong type or value.
 
         """
-        import msgspec  # here: the processes that measure read no journal
+        import msgspec  # late: processes that measure do not read journals
 
         try:
             try:
                 parsed = _decoder().decode(line)
             except msgspec.ValidationError as e:
                 raise ValueError(_explained(e, _parsed(line))) from None
-            except msgspec.DecodeError:  # no JSON, or a lone surrogate
-                row = _spelt(_parsed(line))
+            except msgspec.DecodeError:  # malformed, or a lone surrogate
+                row = _escaped(_parsed(line))
                 try:
                     parsed = msgspec.convert(row, _line())
                 except msgspec.ValidationError as e:
@@ -252,35 +257,35 @@ class Record(Measurement):
             _check(record)
             return _share(record, {} if shared is None else shared)
         except RecursionError:
-            raise ValueError(f"nested deeper than {MOST_LEVELS} levels") from None
+            raise ValueError(f"nested deeper than {MAX_LEVELS} levels") from None
 
 
-#: what fields are called in the journal, where that is not the name in the code
+#: journal names of the fields that have another name in the code
 _JOURNAL_NAMES = {"verdict": "status", "inner_loops": "inner", "role": "arm"}
 
 
 def in_space(quantities: Mapping[str, Any]) -> bool:
-    """Return whether these are of bodies in space, which have no thickness.
+    """Return True for quantities of three-dimensional bodies.
 
-    Forces are in N there and energies in J, in the plane in N/m and J/m.
+    Their forces are in N and energies in J, in the plane in N/m and J/m.
     """
     nodes, dofs = quantities.get("nodes"), quantities.get("dofs")
     return isinstance(nodes, int) and nodes > 0 and dofs == 3 * nodes
 
 
 def journal_name(name: str) -> str:
-    """Give the name in the journal of a field."""
+    """Return the journal name of a field."""
     return _JOURNAL_NAMES.get(name, name)
 
 
 def _journal() -> dict[str, Field[Any]]:
-    own = [f for f in fields(Record) if f.name not in MEASURED]
-    at = [f.name for f in own].index("build_seconds")  # of what else took time
-    ordered = (*own[:at], *fields(Measurement), *own[at:])
+    others = [f for f in fields(Record) if f.name not in MEASURED]
+    at = [f.name for f in others].index("build_seconds")  # next to the other times
+    ordered = (*others[:at], *fields(Measurement), *others[at:])
     return {journal_name(f.name): f for f in ordered}
 
 
-#: the fields of a record by their names in the journal, in the order of a line
+#: fields of a record by their journal names, in the order of a line
 JOURNAL: Mapping[str, Field[Any]] = _journal()
 _NOT_NEGATIVE = (
     "repeat", "block", *MEASURED, "build_seconds", "dualise_seconds",
@@ -294,10 +299,10 @@ _seconds = attrgetter(*_SECONDS)
 
 
 def _parsed(line: str | bytes) -> Any:
-    """Parse JSON without the constants that only Python knows."""
+    """Parse strict JSON, without NaN and Infinity, which Python accepts."""
 
     def refuse(text: str) -> NoReturn:
-        raise ValueError(f"{text} is no number in JSON; expected null or a number")
+        raise ValueError(f"{text} is not a number in JSON; expected null or a number")
 
     return json.loads(line, parse_constant=refuse)
 
@@ -311,7 +316,7 @@ def _decoder() -> Decoder[Struct]:
 
 @cache
 def _line() -> type[Struct]:
-    """Make the type of a journal line: a record's fields, by the journal's names."""
+    """Return the msgspec type of a journal line: the fields by their journal names."""
     import msgspec
 
     types = get_type_hints(Record)
@@ -326,7 +331,7 @@ def _line() -> type[Struct]:
 
 
 def _explained(e: Exception, row: object) -> str:
-    """Say which field of a journal line has the wrong type, and its value."""
+    """Return the message for a journal line with a field of the wrong type."""
     if not isinstance(row, dict) or row.get("schema") not in READABLE:
         return _WRONG_SCHEMA
     place = re.search(r"at `\$\.(\w+)", str(e))
@@ -340,12 +345,12 @@ def _explained(e: Exception, row: object) -> str:
 
 
 def _check(r: Record) -> None:
-    """Refuse a record with a value out of its range.
+    """Check the ranges of all values.
 
     Raises
     ------
     ValueError
-        With the field, its value, and what would be right.
+        With the field, its value, and the range.
 
     """
     if r.schema not in READABLE:
@@ -367,13 +372,13 @@ def _check(r: Record) -> None:
         for name, value in zip(_NOT_NEGATIVE, _not_negative(r), strict=True):
             if (value or 0) < 0:
                 name = journal_name(name)
-                raise ValueError(f"{name} = {value!r}; expected no negative number")
+                raise ValueError(f"{name} = {value!r}; expected a number of at least 0")
             _check_nested(journal_name(name), value, 0)
     if not 1 <= r.ranks <= LARGEST_INTEGER:
         raise ValueError(f"ranks = {r.ranks!r}; expected a number of ranks, 1 or more")
     _check_seconds(r)
     _check_nested("iterations", r.iterations, 0)
-    _check_nested("reported", r.reported, MOST_LEVELS)
+    _check_nested("reported", r.reported, MAX_LEVELS)
     _check_spent("rank_seconds", r.rank_seconds)
     _check_spent("rank_counts", r.rank_counts)
     _check_spent("rank_network", r.rank_network)
@@ -391,18 +396,18 @@ def _check_spent(where: str, spent: Mapping[str, tuple[float, float]]) -> None:
     for part, pair in spent.items():
         if not min(pair) >= 0:
             raise ValueError(
-                f"{where}[{shown(part)}] = {pair!r}; expected no negative number"
+                f"{where}[{shown(part)}] = {pair!r}; expected a number of at least 0"
             )
 
 
 def _share(record: Record, shared: dict[Any, Any]) -> Record:
-    """Replace texts and tables by equal ones met before; check those that are new."""
+    """Replace texts and tables by equal ones of earlier lines; check new ones."""
     for name, text in zip(_TEXTS, _texts(record), strict=True):
         object.__setattr__(record, name, shared.setdefault(text, text))
     for name, table in zip(_TABLES, _tables(record), strict=True):
-        key = (repr(table),)  # a tuple: no text is taken for a table
+        key = (repr(table),)  # a tuple, so that no text equals the key of a table
         if key not in shared:
-            _check_nested(name, table, MOST_LEVELS)
+            _check_nested(name, table, MAX_LEVELS)
             if name == "params":
                 _check_values(table)
             shared[key] = table
@@ -411,7 +416,7 @@ def _share(record: Record, shared: dict[Any, Any]) -> Record:
 
 
 def _check_values(params: Mapping[str, Any]) -> None:
-    """Refuse what no case name can hold."""
+    """Raise ValueError for values that a case name cannot contain."""
     for key, value in params.items():
         if isinstance(value, dict | list):
             raise ValueError(
@@ -420,10 +425,10 @@ def _check_values(params: Mapping[str, Any]) -> None:
 
 
 def _check_nested(where: str, data: Any, levels: int) -> None:
-    """Refuse what is nested too deeply, and integers that no reader can hold."""
+    """Raise ValueError for data nested too deeply, and for integers beyond 64 bits."""
     match data:
         case dict() | list() if not levels:
-            raise ValueError(f"{where} is nested deeper than {MOST_LEVELS} levels")
+            raise ValueError(f"{where} is nested deeper than {MAX_LEVELS} levels")
         case dict():
             for key, value in data.items():
                 _check_nested(f"{where}.{key}", value, levels - 1)
@@ -434,23 +439,25 @@ def _check_nested(where: str, data: Any, levels: int) -> None:
             raise ValueError(f"{where} = {shown(data)}; {_TOO_LARGE}")
 
 
-def _spelt(data: Any) -> Any:
-    """Spell out the lone surrogates inside nested plain data."""
+def _escaped(data: Any) -> Any:
+    """Escape the lone surrogates in nested plain data."""
     match data:
         case str():
             return data.encode(errors="backslashreplace").decode()
         case dict():
-            return {_spelt(k): _spelt(v) for k, v in data.items()}
+            return {_escaped(k): _escaped(v) for k, v in data.items()}
         case list():
-            return [_spelt(v) for v in data]
+            return [_escaped(v) for v in data]
         case _:
             return data
 
 
 def finite(data: Any) -> Any:
-    """Replace numbers inside nested plain data that JSON's readers cannot hold by None.
+    """Replace NaN, inf and integers beyond 64 bits in nested plain data by None.
 
-    These are NaN, inf and integers beyond 64 bits.
+    >>> from mortarbench.harness.record import finite
+    >>> finite({"gap": [1e-9, float("nan")], "count": 3})
+    {'gap': [1e-09, None], 'count': 3}
     """
     match data:
         case float():

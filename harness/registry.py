@@ -1,15 +1,14 @@
-"""From the name of a solver to a configured solver; plug-ins from files and packages.
+"""Registries of solvers and families, and plug-ins from files and packages.
 
-A registry is a plain mapping from names to solvers. Its entry ``"PREFIX:*"`` stands for
-all backends of one generic adapter: the text after the last colon goes into the
-adapter's field ``backend``, and ``backends()``, where the adapter has it, lists what is
-there.
+A registry maps names to solvers. An entry ``"PREFIX:*"`` stands for all backends of a
+generic adapter: the text after the last colon is the value of the adapter's field
+``backend``, and ``backends()``, if the adapter has it, lists those installed.
 
-A plug-in in a file is loaded as a Python package of its own, whose path is the folder
-of the file. So it may import the modules and packages beside it (its neighbours), and
-two plug-ins have neighbours of their own, even of the same names: as the code is
-compiled, ``import helper`` becomes an import of the package's module ``helper``. In the
-same way ``from harness import QP`` means `mortarbench.harness`.
+A plug-in file is loaded as a Python package of its own, whose path is the folder of the
+file. It can import the modules and packages in that folder, its neighbours, and two
+plug-ins may have different neighbours of the same name: when the code is compiled,
+``import helper`` is replaced by an import of the submodule ``helper`` of the package.
+In the same way, ``from harness import QP`` refers to `mortarbench.harness`.
 """
 
 from __future__ import annotations
@@ -56,50 +55,54 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-COPIES = "copies"  #: the role of a spec that `SolverSpec.copies` makes
+COPIES = "copies"  #: role of the specs from `SolverSpec.copies`
 
 _SOLVER_PARTS = ("declines", "prepare")
 _FAMILY_PARTS = ("name", "defaults", "forms", "build")
 _LABELLED = re.compile(r"([\w.-]+)=(.+)", re.DOTALL)
-#: that a plug-in finds where everybody does, whatever lies beside it
+#: Modules that a plug-in never imports from its own folder.
 _NEVER_BESIDE = sys.stdlib_module_names | {"harness", "mortarbench"}
-#: subpackages of ours that plug-ins of old import without the name of the package
+#: Subpackages that old plug-ins import without the prefix ``mortarbench``.
 _ROOMS = ("harness", "problems", "solvers", "reports")
-_BESIDE = "beside a plug-in: "  #: before a folder on the path of a plug-in's package
+_BESIDE = "beside a plug-in: "  #: prefix of a folder in the path of its package
 
 
 @dataclass(frozen=True, kw_only=True)
 class SolverSpec:
-    """A solver as a suite asks for it."""
+    """A solver in a suite: its name, label and options."""
 
     name: str  #: in the registry, e.g. "NAME" or "PREFIX:BACKEND"
     label: str  #: in records and reports
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  #: that differ from defaults
-    #: "null": one that the suite has already, to show the noise; "copies": so many
-    #: independent solves at once, one on each rank, to show what these could reach
+    #: "null": a second copy of a solver, which shows the noise; "copies": `ranks`
+    #: independent solves at the same time, an upper bound for the speed of ranks
     role: str = ""
-    ranks: int = 1  #: processes of MPI that one solve runs on
+    ranks: int = 1  #: number of MPI processes of a solve
 
     def on(self, ranks: int) -> SolverSpec:
-        """Ask for the same on so many ranks, under a label that says so."""
+        """Return the same solver on a number of ranks, which the label states."""
         if ranks == 1:
             return self
         return replace(self, ranks=ranks, label=f"{self.label} ranks={ranks}")
 
     def copies(self, count: int) -> SolverSpec:
-        """Ask for so many of the same at once, each on a rank of its own."""
+        """Return `count` independent copies of the solver, each on its own rank."""
         label = f"{self.label} copies={count}"
         return replace(self, ranks=count, role=COPIES, label=label)
 
 
 @dataclass(frozen=True)
 class PluginFile:
-    """A plug-in in a file, as ``FILE.py`` or ``LABEL=FILE.py`` asks for it.
+    """A plug-in file, written ``FILE.py`` or ``LABEL=FILE.py``.
 
-    A label goes before the names of its solvers, ``LABEL:NAME``, so that two versions
-    of a plug-in can be measured in one run. Families keep their names.
+    A label prefixes the names of its solvers, ``LABEL:NAME``, so that two versions of a
+    plug-in can be measured in one run. Families keep their names.
+
+    >>> from mortarbench.harness.registry import PluginFile
+    >>> PluginFile.of("new=mine.py")
+    PluginFile(path=PosixPath('mine.py'), label='new')
     """
 
     path: Path
@@ -107,11 +110,11 @@ class PluginFile:
 
     @classmethod
     def of(cls, text: str | Path | PluginFile) -> PluginFile:
-        """Read what a user writes; a path that holds ``=`` needs a ``/`` before it."""
+        """Parse ``[LABEL=]FILE.py``; a path with ``=`` needs a ``/`` before that."""
         if isinstance(text, PluginFile):
             return text
-        if isinstance(text, str) and (found := _LABELLED.fullmatch(text)):
-            return cls(Path(found[2]), found[1])
+        if isinstance(text, str) and (match := _LABELLED.fullmatch(text)):
+            return cls(Path(match[2]), match[1])
         return cls(Path(text))
 
     def __str__(self) -> str:
@@ -119,23 +122,23 @@ class PluginFile:
 
     @property
     def name(self) -> str:
-        """The label, and the name of the file without its folder."""
+        """The label and the file name without its folder."""
         return str(replace(self, path=Path(self.path.name)))
 
     def resolved(self) -> PluginFile:
-        """Give the same with an absolute path."""
+        """Return the same with an absolute path."""
         return replace(self, path=self.path.resolve())
 
     def content(self) -> Iterator[bytes]:
-        """Read the code: the file, then its neighbours, in the order of their paths.
+        """Yield the code: the file, then its neighbours in the order of their paths.
 
-        Neighbours are found by reading: whatever an import statement names, on
-        whichever level of the code and however indirectly.
+        Neighbours are found in the source: all modules that import statements name, at
+        any level of the code, and those that these modules import in turn.
 
         Raises
         ------
         InputError
-            When there is no such file.
+            When the file does not exist.
 
         """
         path = self.path.resolve()
@@ -150,44 +153,54 @@ class PluginFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Plugin:
-    """What a plug-in adds to the registries."""
+    """Entries that a plug-in adds to the registries."""
 
     solvers: Mapping[str, Solver] = field(default_factory=dict)
     problems: Mapping[str, Family] = field(default_factory=dict)
-    operators: Mapping[str, Maker] = field(default_factory=dict)  #: `harness.operators`
+    operators: Mapping[str, Maker] = field(
+        default_factory=dict
+    )  #: makers, see `harness.operators`
     origin: str = ""  #: its file, or "entry points"
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of a registry: where a thing is, and how it is configured."""
+    """An object of a registry that is imported when needed."""
 
     module: str
     attribute: str  #: a class, or an instance
-    options: Mapping[str, Any] = field(default_factory=dict)  #: of the class
+    options: Mapping[str, Any] = field(default_factory=dict)  #: arguments of the class
 
     def load(self) -> Any:
-        """Import the module, and make the instance."""
-        found = getattr(import_module(self.module), self.attribute)
-        return found(**self.options) if isinstance(found, type) else found
+        """Import the module, and return the instance."""
+        thing = getattr(import_module(self.module), self.attribute)
+        return thing(**self.options) if isinstance(thing, type) else thing
 
 
 def entry(module: str, attribute: str, **options: Any) -> Entry:
-    """Write one line of a registry."""
+    """Return one line of a registry.
+
+    >>> from mortarbench.harness.registry import Registry, entry
+    >>> registry = Registry({"half": entry("fractions", "Fraction", numerator="1/2")})
+    >>> list(registry)  # nothing is imported yet
+    ['half']
+    >>> registry["half"]
+    Fraction(1, 2)
+    """
     return Entry(module, attribute, options)
 
 
 class Registry(Mapping[str, T]):
-    """Things by name, each imported when it is asked for, and once."""
+    """Objects by name, each imported at its first access."""
 
     def __init__(self, entries: Mapping[str, Entry | T]) -> None:
-        self.entries = dict(entries)  #: a thing, or where it is
+        self.entries = dict(entries)  #: objects, or where to import them from
         self._loaded: dict[str, T] = {}
 
     def __getitem__(self, name: str) -> T:
         if name not in self._loaded:
-            found = self.entries[name]
-            self._loaded[name] = found.load() if isinstance(found, Entry) else found
+            thing = self.entries[name]
+            self._loaded[name] = thing.load() if isinstance(thing, Entry) else thing
         return self._loaded[name]
 
     def __contains__(self, name: object) -> bool:
@@ -201,13 +214,13 @@ class Registry(Mapping[str, T]):
 
 
 def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
-    """Configure the solver that `spec` asks for.
+    """Return the configured solver of `spec`.
 
     Raises
     ------
     InputError
-        For an unknown solver, backend or option, and for an option's value that is of
-        the wrong type or that the solver refuses.
+        For an unknown solver, backend or option, and for the value of an option that
+        has the wrong type or that the solver refuses.
 
     """
     prefix, colon, backend = spec.name.rpartition(":")
@@ -220,12 +233,12 @@ def resolve(spec: SolverSpec, solvers: Mapping[str, Solver]) -> Solver:
 
 
 def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
-    """Refuse a name that no solver has, without loading any.
+    """Raise for an unknown name of a solver, without importing any solver.
 
     Raises
     ------
     InputError
-        For an unknown solver. The backends of an adapter are not looked up.
+        For an unknown solver. Backends of adapters are not checked.
 
     """
     prefix, colon, _ = name.rpartition(":")
@@ -234,7 +247,7 @@ def check_name(name: str, solvers: Mapping[str, Solver]) -> None:
 
 
 def options_of(solver: Solver) -> dict[str, Any]:
-    """Every option of a configured solver with its value; none if it has no fields."""
+    """Return all options of a solver with their values; empty without fields."""
     if not is_dataclass(solver):
         return {}
     return {f.name: getattr(solver, f.name) for f in fields(solver) if f.init}
@@ -243,8 +256,8 @@ def options_of(solver: Solver) -> dict[str, Any]:
 def option_types(solver: Solver) -> dict[str, Any]:
     """Return the annotated types of a solver's options.
 
-    An option is absent where its annotation leaves the type open, and all are where
-    Python cannot evaluate the annotations; the type of the default decides then.
+    Options annotated as Any or object are omitted, and so are all options if Python
+    cannot evaluate the annotations. The type of the default decides for these.
     """
     try:
         hints = get_type_hints(type(solver))
@@ -260,40 +273,45 @@ def option_types(solver: Solver) -> dict[str, Any]:
 def load_plugin(file: str | Path | PluginFile) -> Plugin:
     """Import a file that defines ``SOLVERS`` and/or ``PROBLEMS``.
 
-    Where families of it make operators, ``OPERATORS`` has what puts them together.
+    ``OPERATORS`` contains the makers of operators of its families, if there are any.
 
     Raises
     ------
     InputError
-        When the file is missing, fails to import, or defines neither or nonsense.
+        When the file is missing, fails to import, defines neither, or defines objects
+        of a wrong type.
 
     """
-    asked = PluginFile.of(file)
-    if not asked.path.is_file():
-        raise _no_file(asked)
-    module = _imported(asked.path)
+    plugin_file = PluginFile.of(file)
+    if not plugin_file.path.is_file():
+        raise _no_file(plugin_file)
+    module = _imported(plugin_file.path)
     if not hasattr(module, "SOLVERS") and not hasattr(module, "PROBLEMS"):
-        raise InputError(f"{asked.path}: defines neither SOLVERS nor PROBLEMS")
+        raise InputError(f"{plugin_file.path}: defines neither SOLVERS nor PROBLEMS")
     operators = getattr(module, "OPERATORS", {})
     if not isinstance(operators, Mapping) or not all(
         isinstance(name, str) and callable(make) for name, make in operators.items()
     ):
-        raise InputError(f"{asked.path}: OPERATORS is no dict from names to functions")
+        raise InputError(
+            f"{plugin_file.path}: OPERATORS is not a dict from names to functions"
+        )
     found = _checked(
-        str(asked.path), getattr(module, "SOLVERS", {}), getattr(module, "PROBLEMS", {})
+        str(plugin_file.path),
+        getattr(module, "SOLVERS", {}),
+        getattr(module, "PROBLEMS", {}),
     )
-    prefix = f"{asked.label}:" if asked.label else ""
+    prefix = f"{plugin_file.label}:" if plugin_file.label else ""
     solvers = {f"{prefix}{name}": solver for name, solver in found.solvers.items()}
     return replace(found, solvers=solvers, operators=dict(operators))
 
 
 def entry_point_plugins() -> Plugin:
-    """Collect what installed packages offer, one solver or family per entry point.
+    """Import the solvers and families of installed packages, one per entry point.
 
     Raises
     ------
     InputError
-        When one fails to import, or is neither a solver nor a family.
+        When an entry point fails to import, or is neither a solver nor a family.
 
     """
     found: dict[str, dict[str, Any]] = {"solvers": {}, "problems": {}}
@@ -312,9 +330,10 @@ def entry_point_plugins() -> Plugin:
 
 
 def _some_package_offers() -> bool:
-    """Whether an installed package declares entry points for us.
+    """Return True if an installed package may declare entry points for mortarbench.
 
-    Looks into the folders of `sys.path`; of an archive there nothing is known.
+    It searches the folders of `sys.path`, which is faster than importing
+    importlib.metadata. An archive on the path counts as a package that does.
     """
     for place in sys.path:
         if os.path.isfile(place):
@@ -329,12 +348,12 @@ def _some_package_offers() -> bool:
 
 
 def merged(what: str, known: Mapping[str, T], new: Mapping[str, T]) -> Mapping[str, T]:
-    """Join two registries.
+    """Return the union of two registries.
 
     Raises
     ------
     InputError
-        When both have the same name: which of the two ran would be anybody's guess.
+        When both have the same name, since results could not be attributed.
 
     """
     if both := sorted(known.keys() & new.keys()):
@@ -373,7 +392,7 @@ def _with_options(
         where, kind = f"{spec.name}: {name}", annotated.get(name)
         changes[name] = _option(where, value, known[name], kind)
     if not changes:
-        return solver  # type: ignore[no-any-return]  # need not even be a dataclass
+        return solver  # type: ignore[no-any-return]  # without options, it need not be a dataclass
     try:
         configured: Solver = replace(solver, **changes)
     except (TypeError, ValueError) as e:  # the solver's own check of its options
@@ -382,7 +401,7 @@ def _with_options(
 
 
 def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
-    """Check the type of an option's value by its annotation, else by the default."""
+    """Check the type of an option by its annotation, else by that of the default."""
     kinds = _classes(annotation)
     if kinds is None:
         kinds = None if current is None else (type(current),)
@@ -407,7 +426,7 @@ def _option(where: str, value: Any, current: Any, annotation: Any) -> Any:
 
 
 def _classes(annotation: Any) -> tuple[type, ...] | None:
-    """List the classes of values that an annotation allows; None if it is open."""
+    """Return the classes that an annotation allows, or None for any class."""
     if annotation is None:
         return None
     if get_origin(annotation) is Literal:
@@ -422,14 +441,14 @@ def _classes(annotation: Any) -> tuple[type, ...] | None:
     return (kind,) if is_class else None
 
 
-def _no_file(asked: PluginFile) -> InputError:
+def _no_file(plugin_file: PluginFile) -> InputError:
     return InputError(
-        f"{asked.path}: no such file; expected a Python file, or LABEL=FILE.py"
+        f"{plugin_file.path}: no such file; expected a Python file, or LABEL=FILE.py"
     )
 
 
 def _imported(path: Path) -> ModuleType:
-    """Import a plug-in as a package of its own; see the head of this module."""
+    """Import a plug-in as a package of its own; see the docstring of this module."""
     whole = path.resolve()
     stem = re.sub(r"\W", "_", whole.stem)
     name = f"plugin_{stem}_{hex_digest([bytes(whole)])}"
@@ -454,17 +473,17 @@ def _imported(path: Path) -> ModuleType:
 
 
 def _forget(package: str) -> None:
-    """Remove a package and its modules from memory; their files may have changed."""
+    """Remove a package from `sys.modules`, since its files may have changed."""
     for name in [n for n in sys.modules if f"{n}.".startswith(f"{package}.")]:
         del sys.modules[name]
     importlib.invalidate_caches()
 
 
 class _PluginLoader(SourceFileLoader):
-    """Compiles a module of a plug-in so that its imports find its neighbours first."""
+    """Loader of the modules of a plug-in, whose imports prefer its neighbours."""
 
     def get_code(self, fullname: str) -> CodeType:
-        # not from __pycache__: the meaning of an import depends on the folder's files
+        # not from __pycache__: rewritten imports depend on the files in the folder
         package = fullname.partition(".")[0]
         (entry,) = sys.modules[package].__path__
         imports = _Imports(package, entry.removeprefix(_BESIDE))
@@ -474,7 +493,7 @@ class _PluginLoader(SourceFileLoader):
 
 
 class _Imports(ast.NodeTransformer):
-    """Import statements of a plug-in, with the full names of the modules they mean."""
+    """Transformer of the imports of a plug-in to the full names of their modules."""
 
     def __init__(self, package: str, folder: str) -> None:
         self._package = package
@@ -509,7 +528,7 @@ class _Imports(ast.NodeTransformer):
 
 
 class _NeighbourFinder(FileFinder):
-    """Finds the modules beside a plug-in, as those of the package that it is."""
+    """Finder of the neighbours of a plug-in as submodules of its package."""
 
     def __init__(self, folder: str) -> None:
         super().__init__(
@@ -531,7 +550,7 @@ class _NeighbourFinder(FileFinder):
 def _neighbour_finder(entry: str) -> _NeighbourFinder:
     """Return the finder for an entry of the path of a plug-in's package."""
     if not entry.startswith(_BESIDE):
-        raise ImportError  # an entry of somebody else's
+        raise ImportError  # not an entry of a plug-in
     return _NeighbourFinder(entry.removeprefix(_BESIDE))
 
 
@@ -539,9 +558,9 @@ sys.path_hooks.append(_neighbour_finder)
 
 
 def stand_for_harness() -> None:
-    """Import the exported names under `harness`, as plug-ins of old name the package.
+    """Install a module `harness` with the exported names, which old plug-ins import.
 
-    In a process of ours; elsewhere the name belongs to the user, see
+    Only worker processes call it: in the process of a user, the name is the user's, see
     `_standing_for_harness`.
     """
     exports = ModuleType("harness")  # without a path: it has no submodules
@@ -552,7 +571,7 @@ def stand_for_harness() -> None:
 
 @contextmanager
 def _standing_for_harness() -> Iterator[None]:
-    """Let `harness` stand for the exported names while a package is imported."""
+    """Install the module `harness` temporarily, while a package is imported."""
     before = sys.modules.get("harness")
     stand_for_harness()
     try:
@@ -564,7 +583,7 @@ def _standing_for_harness() -> Iterator[None]:
 
 
 def _neighbour(name: str, folder: str) -> ModuleSpec | None:
-    """Find a module or a package with an ``__init__`` in the folder of a plug-in."""
+    """Find a module, or a package with ``__init__``, in the folder of a plug-in."""
     if name in _NEVER_BESIDE:
         return None
     spec = PathFinder.find_spec(name, [folder])
@@ -572,7 +591,7 @@ def _neighbour(name: str, folder: str) -> ModuleSpec | None:
 
 
 def _neighbours(path: Path) -> set[Path]:
-    """List the files that a plug-in imports from its folder, without importing any."""
+    """Return the files that a plug-in would import from its folder."""
     found: set[Path] = set()
     unread = [path]
     while unread:
@@ -592,10 +611,10 @@ def _neighbours(path: Path) -> set[Path]:
 
 
 def _imported_names(file: Path) -> set[str]:
-    """List the first parts of the names that the import statements of a file have.
+    """Return the top-level names in the import statements of a file.
 
-    Those of relative imports, too: ``from .helper import f`` of a plug-in finds its
-    neighbour. A file that is no Python has none; who imports it will say so.
+    Relative imports count: ``from .helper import f`` finds a neighbour of a plug-in.
+    The result is empty for a file with a syntax error, which its import will report.
     """
     names: set[str] = set()
     try:
@@ -612,7 +631,7 @@ def _imported_names(file: Path) -> set[str]:
 
 
 def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
-    """Check what a plug-in offers before anything is run with it."""
+    """Check the objects of a plug-in, and return them as a `Plugin`."""
     for name, offered, kind, parts in (
         ("SOLVERS", solvers, "solver", _SOLVER_PARTS),
         ("PROBLEMS", problems, "family", _FAMILY_PARTS),
@@ -642,17 +661,17 @@ def _checked(where: str, solvers: Any, problems: Any) -> Plugin:
 
 
 def is_solver(thing: object) -> bool:
-    """Return True if a thing is a solver, or the class of one, and no name."""
+    """Return True for a solver or the class of a solver, False for a name."""
     return _has(_SOLVER_PARTS, thing)
 
 
 def check_solver(thing: object) -> None:
-    """Refuse a `thing` that is neither the name of a solver nor a solver.
+    """Raise unless `thing` is a solver or the name of one.
 
     Raises
     ------
     InputError
-        With the expected names of methods.
+        With the names of the methods that a solver needs.
 
     """
     methods = " and ".join(_SOLVER_PARTS)
@@ -673,7 +692,7 @@ def _has(parts: Sequence[str], thing: object) -> bool:
 
 
 def _check_names(where: str, family: Any) -> None:
-    """Refuse a family whose case names could not be read or written."""
+    """Raise InputError unless the keys and forms of a family can be part of names."""
     defaults, forms = family.defaults, family.forms
     if not isinstance(defaults, Mapping) or not all(
         isinstance(key, str) and type(value) in (int, float, str)

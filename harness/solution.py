@@ -1,18 +1,18 @@
-"""What a solver hands back: a claim, a primal-dual point, and a row per iteration.
+"""The result of a solver: a claim, a primal-dual point, and a history of iterations.
 
-The columns of a history are free and of one length. Reports know these, and any solver
-may fill some of them:
+A history has columns of equal length, with any names. Reports use these:
 
-* ``step``: kind of the step, one letter: c cg, e expansion, f fallback, p proportioning
+* ``step``: kind of the step, one letter: c CG, e expansion, f fallback, p proportioning
 * ``outer``: number of the outer iteration; ``products``: products with P so far
 * ``free_gradient``, ``chopped_gradient``: ‖φ‖ and ‖β‖, so that the projected gradient
   has the norm √(‖φ‖² + ‖β‖²)
 * ``infeasibility``: ‖Ax − b‖, relative; ``active``: number of active bounds
-* ``two_sided``: number of active bounds of components between two bounds; in a dual
-  with friction the rows that slip, while those between their bounds stick
-* ``cost``: value of the objective or the Lagrangian; ``seconds``: since prepare began
+* ``two_sided``: number of active bounds of components with two finite bounds: in a dual
+  with friction, the rows that slip
+* ``cost``: value of the objective or the Lagrangian; ``seconds``: since the start of
+  `prepare`
 
-All of it is the solver's own word; no verdict rests on it.
+These are statements of the solver; no verdict depends on them.
 """
 
 from __future__ import annotations
@@ -29,28 +29,43 @@ from mortarbench.harness.qp import QP, Vector
 
 History = Mapping[str, NDArray[Any]]
 
-_LONGEST_TEXT = 16  #: characters
-MOST_HISTORY = 2**28  #: bytes, so that no folder of results fills the disk
+_MAX_TEXT = 16  #: characters of an entry
+MAX_HISTORY_BYTES = 2**28  #: keeps a result folder from filling the disk
 _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
 class Status(StrEnum):
-    """A solver's own claim about how its run ended."""
+    """Claim of a solver about the outcome of its run."""
 
-    SOLVED = "solved"  #: it says that it met its tolerance
+    SOLVED = "solved"  #: claims that its tolerance is met
     ITERATION_LIMIT = "iteration_limit"
     TIME_LIMIT = "time_limit"
-    INFEASIBLE = "infeasible"  #: it says that no feasible (or no bounded) point exists
-    FAILED = "failed"  #: it gave up, or raised
-    DECLINED = "declined"  #: never started; the reason is in the message
+    INFEASIBLE = "infeasible"  #: claims that no feasible (or no bounded) point exists
+    FAILED = "failed"  #: stopped without a solution, or raised
+    DECLINED = "declined"  #: not started; the message has the reason
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """A primal-dual point in the sign convention of `QP`; NaN where there is none.
+    """A primal-dual point in the sign convention of `QP`; NaN without a point.
 
     At a solution  P x + q + Aᵀy + Gᵀz + z_box = 0.  With a claim of infeasibility, y, z
     and z_box may be a certificate: see `without_point`.
+
+    Examples
+    --------
+    The minimum of ½x² − x subject to x ≤ ½, where z_box balances the gradient −½:
+
+    >>> import numpy as np
+    >>> from mortarbench import QP, Solution, Status, verify
+    >>> qp = QP.from_arrays([[1]], [-1], ub=0.5)
+    >>> s = Solution(
+    ...     status=Status.SOLVED, x=np.array([0.5]), y=np.zeros(0), z=np.zeros(0),
+    ...     z_box=np.array([0.5]),
+    ... )
+    >>> verify(qp, s.x, s.y, s.z, s.z_box).verdict.value
+    'verified'
+
     """
 
     status: Status
@@ -58,15 +73,15 @@ class Solution:
     y: Vector  #: (m,) of A x = b
     z: Vector  #: (p,) of G x ≤ h, nonnegative
     z_box: Vector  #: (n,) of the bounds, ≤ 0 at an active lb, ≥ 0 at an active ub
-    iterations: int | None = None  #: None where the solver does not tell
+    iterations: int | None = None  #: None if the solver does not report it
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
-    message: str = ""  #: the solver's own words, for the record
+    message: str = ""  #: of the solver, stored in the record
     reported: Mapping[str, float | str] = field(
         default_factory=dict
-    )  #: what it tells besides, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
+    )  #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}
     history: History = field(
         default_factory=dict
-    )  #: columns of one length, a row per iteration; see the top of this module
+    )  #: columns of equal length, a row per iteration; see `harness.solution`
 
     @classmethod
     def without_point(
@@ -79,11 +94,19 @@ class Solution:
         z: Vector | None = None,
         z_box: Vector | None = None,
     ) -> Solution:
-        """Report that no point was found: NaN vectors of the right shapes.
+        """Return a solution without a point: NaN vectors of the right shapes.
 
-        y, z, z_box : a certificate that no point is feasible, where the solver has one:
-            Aᵀy + Gᵀz + z_box = 0, z ≥ 0, and the sum of bᵀy, hᵀz and of z_box times its
-            bounds is negative
+        y, z, z_box : a certificate of infeasibility, if the solver has one: Aᵀy + Gᵀz +
+            z_box = 0, z ≥ 0, and the sum of bᵀy, hᵀz and of z_box times its bounds is
+            negative
+
+        Examples
+        --------
+        >>> from mortarbench import QP, Solution, Status
+        >>> qp = QP.from_arrays([[1]], [0])
+        >>> Solution.without_point(qp, Status.ITERATION_LIMIT, "200 iterations").x
+        array([nan])
+
         """
         n, m, p = (np.full(v.size, np.nan) for v in (qp.q, qp.b, qp.h))
         return cls(
@@ -92,7 +115,7 @@ class Solution:
         )  # fmt: skip
 
     def mismatch(self, qp: QP) -> str | None:
-        """Say which vector has a shape that does not fit `qp`, or None."""
+        """Return a message if a vector has the wrong shape for `qp`, else None."""
         expected = {"x": qp.q, "y": qp.b, "z": qp.h, "z_box": qp.q}
         for name, like in expected.items():
             got = np.shape(getattr(self, name))
@@ -102,9 +125,9 @@ class Solution:
 
 
 def usable_history(history: object) -> tuple[History, str]:
-    """Return a history as plain arrays and "", or none and what is wrong with it.
+    """Return a history as plain arrays and "", or an empty one and what is wrong.
 
-    Never raises: a malformed history must not cost the answer that it came with.
+    It never raises: a malformed history must not cost the answer that it belongs to.
     """
     try:
         return checked_history(history), ""
@@ -118,8 +141,8 @@ def checked_history(history: object) -> History:
     Raises
     ------
     ValueError
-        When it is no mapping from identifiers to columns of one length, or larger than
-        MOST_HISTORY.
+        When it is not a mapping from identifiers to columns of equal length, or larger
+        than MAX_HISTORY_BYTES.
 
     """
     if not isinstance(history, Mapping):
@@ -127,10 +150,10 @@ def checked_history(history: object) -> History:
     columns = {name: _column(name, values) for name, values in history.items()}
     lengths = {name: column.size for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
-        found = ", ".join(f"{name} {length}" for name, length in lengths.items())
-        raise ValueError(f"its columns have different lengths: {found}")
-    if (size := sum(column.nbytes for column in columns.values())) > MOST_HISTORY:
-        raise ValueError(f"it has {size} bytes, expected at most {MOST_HISTORY}")
+        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise ValueError(f"its columns have different lengths: {listed}")
+    if (size := sum(column.nbytes for column in columns.values())) > MAX_HISTORY_BYTES:
+        raise ValueError(f"it has {size} bytes, expected at most {MAX_HISTORY_BYTES}")
     return columns
 
 
@@ -141,9 +164,9 @@ def _column(name: object, values: object) -> NDArray[Any]:
     if column.ndim != 1:
         raise ValueError(f"{name} has shape {column.shape}, expected one row each")
     kind = column.dtype.kind
-    if kind == "U" and column.dtype.itemsize <= 4 * _LONGEST_TEXT:
+    if kind == "U" and column.dtype.itemsize <= 4 * _MAX_TEXT:
         return column
     if kind not in _STORED_AS:
-        expected = f"numbers or texts of up to {_LONGEST_TEXT} characters"
+        expected = f"numbers or texts of up to {_MAX_TEXT} characters"
         raise ValueError(f"{name} has dtype {column.dtype}, expected {expected}")
     return column.astype(_STORED_AS[kind])

@@ -264,7 +264,7 @@ def _is_open(case: Case, record: Record, solution: Solution) -> bool:
     mechanics = case.made.mechanics if "made" in vars(case) else None
     if mechanics is None:
         return False
-    normal = mechanics.back(solution).z[: mechanics.primal.h.size]
+    normal = mechanics.to_primal(solution).z[: mechanics.primal.h.size]
     load = np.abs(mechanics.primal.q).sum()
     return bool(np.abs(normal).sum() <= UNFELT_FORCE * load)
 

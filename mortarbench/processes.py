@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.vectors import Emitted, Ranks
+from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.processes.case_worker import CaseWorker
 from mortarbench.harness.processes.case_worker import serve as serve_cases
@@ -33,7 +33,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
     solver = resolve(spec, solvers)
     ranks = this_rank() if request.get("ranks", 1) > 1 else None
 
-    def emit(case: Mapping[str, Any], ranks: Ranks) -> Emitted:
+    def emit(case: Mapping[str, Any], ranks: Ranks) -> DistributedQP:
         from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 
         family = registries.families[case["family"]]

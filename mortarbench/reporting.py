@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.arguments import FORMATS, GATES, check_known
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.registries import Registries, known, report_folder
 
@@ -98,7 +98,7 @@ def report(
         raise InputError("fail_on needs a second folder; expected report DIR DIR2")
     if not after:
         write = registries.report
-        with full_disk_told(first):
+        with report_full_disk(first):
             files = write(first, formats, factor=factor, pool_forms=pool_forms)
         if write is not report_folder:  # somebody's own report has no such sentence
             return Report(files=tuple(files))
@@ -114,7 +114,7 @@ def report(
 
     with ExitStack() as told:
         for one in after:
-            told.enter_context(full_disk_told(one))
+            told.enter_context(report_full_disk(one))
         found, said, pages = write_comparisons(first, after, formats, factor)
     changes = tuple(map(_change, found))
     failed = [what for what in fail_on if any(change[what] for change in changes)]

@@ -19,7 +19,7 @@ from mortarbench.harness.environment.doctor import load_advice
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError, some, unknown
 from mortarbench.harness.errors import shown as given
-from mortarbench.harness.files.reading import MOST_TOML, read_text
+from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import is_solver, resolve
 from mortarbench.harness.results.faults import in_words
@@ -306,7 +306,7 @@ def run(
         with located("suite"):
             text = suite_text(suite)
     else:
-        text = read_text(registries.suite_path(suite), "a TOML file", MOST_TOML)
+        text = read_text(registries.suite_path(suite), "a TOML file", MAX_TOML_MIB)
     folder = folder or Path("out") / name_in(text)
     fresh = checked.flag("fresh", fresh)  # which forgets copies of files, too
     if folder.is_dir():

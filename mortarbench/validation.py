@@ -26,9 +26,9 @@ from mortarbench.harness.crossval.discretisation import (
     discretisation_errors,
 )
 from mortarbench.harness.crossval.summary import as_data
-from mortarbench.harness.crossval.validation import validated
+from mortarbench.harness.crossval.validation import validate_folder
 from mortarbench.harness.errors import InputError, some, unknown
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.names import CaseId, assemble
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.processes.measurement import scratch_folder
@@ -98,20 +98,20 @@ def validate(
     checked.function("progress", progress)
     registries = known(plugins, registries)
     families = registries.families_with_copies(path)
-    found = validated(path, families, registries.reference, progress)
+    found = validate_folder(path, families, registries.reference, progress)
     data = as_data(found, path.resolve().name, ours=OURS)
     if not (data["counts"]["answers"] or found.false_claims or found.proven):
         why = found.not_validated[0].text if found.not_validated else "none is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
-    with full_disk_told(path):
+    with report_full_disk(path):
         replace_file(path / "validation.json", text.encode())
     pages = registries.validation_page(path, data, ())
     records = {r.case: r for r in read_journal(path, progress)}
     cases = []
     for r in records.values():
         if r.family in families:
-            # a case of another version is listed as not validated
+            # a case of another version is listed as not validate_folder
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
@@ -145,7 +145,7 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
         "Certificates contradicted (a fault of ours)": [
             f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
         ],
-        "Not validated": _together(data["not_validated"]),
+        "Not validate_folder": _together(data["not_validated"]),
         "Without a reference": [
             f"{d['problem']}: {d['text']}" for d in data["without_reference"]
         ],

@@ -1,4 +1,4 @@
-"""Families of problems: each emits the same contact problem as several QPs."""
+"""Registry of families of problems; each emits one problem as QPs of several forms."""
 
 from __future__ import annotations
 
@@ -32,7 +32,12 @@ PROBLEMS: Registry[Family] = Registry(
     }
 )
 
-#: what puts an operator P of these families together, see `harness.operators`
+#: functions that assemble a stored operator P of these families, see
+#: `harness.operators`
 OPERATORS: Registry[Maker] = Registry(
-    {"tfeti": entry("mortarbench.problems.feti.stored", "made")}
+    {
+        "tfeti": entry(
+            "mortarbench.problems.feti.operator_arrays", "dual_operator_from_arrays"
+        )
+    }
 )

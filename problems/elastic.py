@@ -1,8 +1,25 @@
-"""What an elastic family of one's own is made of: the list that plug-ins may rely on.
+"""Building blocks of elastic families in plug-ins; the names in `__all__` are stable.
 
-Mesh the bodies, `join` them, `assemble` their supports, load and contact pairs, and let
-`one_step` emit the QP: docs/plugins.md has a whole family. All lengths are in m, moduli
-and tractions in Pa, forces in N per m of thickness.
+Mesh the bodies, `join` them, `assemble` them with supports, load and contact pairs, and
+emit the QP by `one_step`. docs/plugins.md has a complete family. Lengths are in m,
+moduli and tractions in Pa, forces in N per m of thickness.
+
+A block of steel, pressed onto another one::
+
+    lower = prefixed(rectangle((0.0, 0.0), (1.0, 0.5), (6, 3)), "lower_")
+    upper = prefixed(rectangle((0.0, 0.5), (1.0, 0.5), (4, 2)), "upper_")
+    mesh, body = join((lower, upper))
+    side, load = mesh.boundaries, np.zeros(mesh.dofs)
+    top = side["upper_top"]
+    load[dofs_of(top, 2, 1)] = -1e6 * nodal_lengths(mesh.points[top])
+    left = np.concatenate([side["lower_left"], side["upper_left"]])
+    bodies = assemble(
+        mesh, body, names=("lower", "upper"), materials=(Material(210e9, 0.3),) * 2,
+        plane="strain", units=(1.0, 1e6),
+        fixed=np.append(dofs_of(left, 2, 0), dofs_of(side["lower_bottom"], 2, 1)),
+        load=load, pairs=(ContactPair(side["upper_bottom"], side["lower_top"]),),
+    )
+    case = one_step(bodies, "dual")
 """
 
 from __future__ import annotations
@@ -26,8 +43,8 @@ from mortarbench.problems.duality.case_forms import FORMS, case_of
 from mortarbench.problems.duality.problem import (
     Choice,
     ContactProblem,
-    by_keys,
-    stated,
+    elastic_bodies_of,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
@@ -43,8 +60,8 @@ from mortarbench.problems.fem.mesh import (
 )
 from mortarbench.problems.ranges import (
     GLUES,
+    LAW_PARAMETERS,
     LAWS,
-    NEEDED,
     at_least,
     at_most,
     one_of,
@@ -87,25 +104,26 @@ def one_step(
     parts: int = 0,
     glue: Literal["orthonormal", "chain", "redundant"] = "orthonormal",
 ) -> Case:
-    """Emit the QP of bodies under their full load, contact linearised where they lie.
+    """Return the QP of bodies under their full load, linearised at the initial state.
 
     Parameters
     ----------
-    form : "primal", "dual" or, where supports alone hold every body, "dual-bounds"
-    contact : node to segment, or mortar
-    basis : of the multipliers of mortar contact
-    friction : between the sides of every pair: FrictionLaw("tresca", bound=1e6), in Pa,
-        or FrictionLaw("coulomb", mu=0.3), the last of its fixed point
-    reference : what `Family.build` is given; Coulomb's law needs its solutions
-    parts : subdomains of all bodies together, for "dual" alone: Total FETI; 0: none
-    glue : the rows that hold copies of a node together
+    form : "primal", "dual" or, if the supports fix every body, "dual-bounds"
+    contact : "nts" (node to segment) or "mortar"
+    basis : basis of the multipliers of mortar contact
+    friction : law for the sides of every pair: FrictionLaw("tresca", bound=1e6), in Pa,
+        or FrictionLaw("coulomb", mu=0.3), of which the QP is the last iterate
+    reference : argument of `Family.build`; required by Coulomb's law
+    parts : number of subdomains of all bodies together (Total FETI), with form "dual"
+        only; 0: no decomposition
+    glue : kind of rows that join the copies of a node
 
     Raises
     ------
     InputError
-        When the form is none of these, no slave node faces its master, nothing balances
-        the load of some body, the law of friction is unknown or its value negative, the
-        fixed point does not settle, or the bodies have no such parts or no such glue.
+        When the form is unknown, no slave node faces its master, the load of some body
+        is not balanced, the law of friction is unknown or its value negative, the fixed
+        point does not converge, or `parts` or `glue` is not possible.
 
     """
     if form not in FORMS:
@@ -115,23 +133,25 @@ def one_step(
         raise InputError(
             f"parts with form {form} is not built; expected form dual, or parts=0"
         )
-    law = FrictionLaw() if friction is None else _checked(friction, reference)
+    law = FrictionLaw() if friction is None else _check_law(friction, reference)
     laws = (law,) * len(bodies.pairs)
-    of = stated(bodies)
+    elastic = elastic_bodies_of(bodies)
     rows = linearisation(bodies, contact, basis, laws)(np.zeros(bodies.mesh.dofs))
-    check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))  # it may hold either way
+    # friction can act in both directions
+    check_balance(bodies, vstack([rows.B, rows.T, -rows.T]))
     problem = ContactProblem(
-        bodies=of, linearise=by_keys({"contact": contact, "basis": basis}),
-        stages=load_steps(1, 1, of.forces, of.fixed, laws),
-        # friction may have to hold bodies
-        pressed=float(np.abs(of.forces.value).sum()),
+        bodies=elastic,
+        linearise=keyed_linearisation({"contact": contact, "basis": basis}),
+        stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
+        # first bound of Coulomb's law: large enough to support bodies by friction
+        initial_force=float(np.abs(elastic.forces.value).sum()),
     )  # fmt: skip
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)
 
 
-def _checked(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
-    """Raise InputError for a law that is none, or that lacks what it needs."""
+def _check_law(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
+    """Return the law; raise InputError if it is unknown or lacks a parameter."""
     if law.kind not in LAWS:
         raise InputError(
             f"friction {law.kind!r} is unknown; expected one of {', '.join(LAWS)}"
@@ -140,15 +160,16 @@ def _checked(law: FrictionLaw, reference: Reference | None) -> FrictionLaw:
         value = physical(f"friction {law.kind}: {key}", getattr(law, key))
         if value < 0:
             raise InputError(
-                f"friction {law.kind}: {key} = {value:g}; expected {NEEDED[key]}"
+                f"friction {law.kind}: {key} = {value:g}; expected "
+                + LAW_PARAMETERS[key]
             )
     if law.mu and reference is None:
         raise InputError(
-            "friction coulomb needs solutions; expected reference=, as build is given"
+            "friction coulomb needs a reference solve; expected reference= of build"
         )
     return law
 
 
 def _no_reference(qp: QP) -> Solution:
-    """Stand for the reference solve where nothing is to be solved."""
+    """Raise AssertionError, in place of a reference solve that is never called."""
     raise AssertionError("no reference solve was given")

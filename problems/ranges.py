@@ -1,6 +1,6 @@
-"""Keys of families, declared: defaults, ranges, and conditions between several keys.
+"""Declaration of the keys of families: defaults, ranges, conditions between keys.
 
-Every check raises InputError with the one line that says what would be right.
+A failed check raises InputError with one line that states the expected value.
 """
 
 from __future__ import annotations
@@ -19,24 +19,26 @@ if TYPE_CHECKING:
     from mortarbench.harness import Value
 
 CONTACT_FORMS = ("primal", "dual", "dual-bounds")
-SHORTEST = 0.1  #: stretch that a body is pressed to
-LEAST, MOST = 1e-30, 1e30  #: sizes of physical values, SI
-MOST_STEPS = 10_000  #: load steps, linearisations, halvings of a mesh: of each
-COMPONENT_MIB = 1 / 1024  #: that a displacement component takes at the very least
+MIN_STRETCH = 0.1  #: smallest stretch of a body under pressure
+#: magnitudes of physical values, SI: products of several stay finite and non-zero
+MIN_SIZE, MAX_SIZE = 1e-30, 1e30
+MAX_STEPS = 10_000  #: most load steps, and most linearisations of each
+#: lower bound of the memory per displacement component: K and its pattern
+COMPONENT_MIB = 1 / 1024
 
 
 @dataclass(frozen=True, kw_only=True)
 class Key:
-    """One key of a family: its default, and the values that it may have."""
+    """One key of a family: its default and its allowed values."""
 
     default: Value
-    least: int | None = None
-    most: int | None = None
-    values: tuple[Value, ...] = ()  #: all that it may have; empty: no such list
-    is_size: bool = False  #: positive, and of a usual size in SI units
+    least: int | None = None  #: smallest integer; None: no limit
+    most: int | None = None  #: largest integer; None: no limit
+    values: tuple[Value, ...] = ()  #: allowed values; empty: not a list of choices
+    is_size: bool = False  #: positive, between MIN_SIZE and MAX_SIZE
 
-    def but(self, default: Value) -> Key:
-        """Return the same key with another default."""
+    def with_default(self, default: Value) -> Key:
+        """Return the key with another default."""
         return replace(self, default=default)
 
     def check(self, family: str, key: str, params: Mapping[str, Value]) -> None:
@@ -55,22 +57,26 @@ Keys = Mapping[str, Key]
 
 
 def key(default: Value, least: int | None = None, most: int | None = None) -> Key:
-    """Declare a key with a range of integers, or none."""
+    """Declare a key, optionally with a range of integers."""
     return Key(default=default, least=least, most=most)
 
 
 def choice(*values: Value) -> Key:
-    """Declare a key with a list of values, of which the first is the default."""
+    """Declare a key with a list of allowed values; the first is the default."""
     return Key(default=values[0], values=values)
 
 
 def size(default: float) -> Key:
-    """Declare a key that is a physical size."""
+    """Declare a key with a positive physical value."""
     return Key(default=default, is_size=True)
 
 
-def declared(**keys: Key) -> Keys:
-    """Declare the keys of a family, in the order of canonical names."""
+def schema(**keys: Key) -> Keys:
+    """Return the keys of a family, in the order of canonical names.
+
+    >>> defaults_of(schema(n=key(10, 1), law=choice("hertz", "cattaneo")))
+    {'n': 10, 'law': 'hertz'}
+    """
     return MappingProxyType(keys)
 
 
@@ -80,47 +86,48 @@ def defaults_of(keys: Keys) -> dict[str, Value]:
 
 
 HALVINGS = key(0, 0, 30)
-STEPS = key(10, 1, MOST_STEPS)
-#: the keys that choose the method; node-to-segment takes no notice of basis
-METHODS = declared(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
-PLANES = declared(plane=choice("strain", "stress"))
-#: how copies of a node are held together, `problems.feti.gluing`
-GLUES = declared(glue=choice("orthonormal", "chain", "redundant"))
-#: the keys of bodies in subdomains: H/h, 0 for one piece per body, and `GLUES`
-DECOMPOSITION = declared(feti=key(0, 0), **GLUES)
-#: the laws of friction, each with the key that it needs
+STEPS = key(10, 1, MAX_STEPS)
+#: keys of the contact method; node-to-segment contact ignores basis
+METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
+PLANES = schema(plane=choice("strain", "stress"))
+#: key of the gluing rows, which join the copies of a node, see `problems.feti.gluing`
+GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
+#: keys of a decomposition into subdomains: H/h (0: one piece per body), and `GLUES`
+DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
+#: laws of friction, each with the key of its parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
-NEEDED = {
+#: parameters of the laws of friction, with their allowed values
+LAW_PARAMETERS = {
     "bound": "a traction of 0 or more, Pa",
     "mu": "a coefficient of friction of 0 or more",
 }
-#: the keys of friction; -1 is no bound and no mu
-LAW = declared(
+#: keys of friction; the default -1 means that bound or mu is not set
+LAW_KEYS = schema(
     friction=choice(*LAWS),
     bound=key(-1.0),
     mu=key(-1.0),
     loading=choice("quasi-static", "static"),
 )
-FRICTION = declared(**LAW, iterate=key(0, 0))
-#: the keys of large deformation; newton: 0 is the last iteration
-KINEMATICS = declared(
+FRICTION = schema(**LAW_KEYS, iterate=key(0, 0))
+#: keys of large deformation; newton=0 is the last iteration
+KINEMATICS = schema(
     kinematics=choice("linear", "finite"),
     material=choice("neo-hooke", "svk"),
     newton=key(0, 0),
 )
-#: whether second derivatives of the gaps join the tangent
-CONTACT_STIFFNESS = declared(contact_stiffness=choice("none", "geometric"))
-#: what is not built at finite strain, where a family has the key
+#: key of the second derivatives of the gaps in the tangent
+CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
+#: keys that finite strain does not support, with the only value it allows
 LINEAR_ONLY: Mapping[str, Value] = {
     "feti": 0, "parts": 0, "friction": "none", "plane": "strain", "relin": 1
 }  # fmt: skip
-#: what the name of a case of bodies may set, with the value where its file says nothing
-SETTINGS = declared(
+#: keys that the name of a case of bodies may set, with the defaults of its file
+SETTINGS = schema(
     **METHODS,
     **PLANES,
     steps=STEPS,
-    relin=key(1, 1, MOST_STEPS),
-    **LAW,
+    relin=key(1, 1, MAX_STEPS),
+    **LAW_KEYS,
     kinematics=KINEMATICS["kinematics"],
     material=KINEMATICS["material"],
     **CONTACT_STIFFNESS,
@@ -146,57 +153,63 @@ def at_most(
 
 
 def positive(family: str, params: Mapping[str, Value], keys: Iterable[str]) -> None:
-    """Raise InputError unless each of the real `keys` is positive and of a usual size.
+    """Raise InputError unless the real `keys` are between MIN_SIZE and MAX_SIZE.
 
-    Products of several values beyond that would be no numbers any more.
+    Products of several values outside this range may overflow or underflow.
     """
     for key in keys:
         if float(params[key]) <= 0:
             raise InputError(f"{family}: {key}={params[key]} must be positive")
-        if not LEAST <= float(params[key]) <= MOST:
+        if not MIN_SIZE <= float(params[key]) <= MAX_SIZE:
             raise InputError(
-                f"{family}: {key}={params[key]} must be between {LEAST:g} and {MOST:g}"
+                f"{family}: {key}={params[key]} must be between {MIN_SIZE:g} and "
+                f"{MAX_SIZE:g}"
             )
 
 
 def physical(where: str, value: Any) -> float:
-    """Take a number whose products with others stay numbers, in SI units.
+    """Return a physical value in SI units as float.
 
-    Zero, or between 1e-30 and 1e30 in size: Young's modulus of steel is 2e11 Pa.
+    Raises
+    ------
+    InputError
+        Unless it is 0 or between MIN_SIZE and MAX_SIZE in magnitude. (For comparison,
+        Young's modulus of steel is 2e11 Pa.)
+
     """
-    if not is_number(value) or not (value == 0 or LEAST <= abs(value) <= MOST):
+    if not is_number(value) or not (value == 0 or MIN_SIZE <= abs(value) <= MAX_SIZE):
         raise InputError(
-            f"{where} = {shown(value)}; expected a number between {LEAST:g} and "
-            f"{MOST:g} in size, or 0"
+            f"{where} = {shown(value)}; expected a number between {MIN_SIZE:g} and "
+            f"{MAX_SIZE:g} in magnitude, or 0"
         )
     return float(value)
 
 
-def fits(family: str, components: int) -> None:
-    """Raise InputError for a case that cannot fit into memory, before it is built.
+def check_memory(family: str, components: int) -> None:
+    """Raise InputError for a case that cannot fit into memory, before building it.
 
-    components : of the displacement, or fewer; each takes 1 KiB at the very least (the
-        stiffness matrix and its pattern), with a factor about 4 KiB
+    components : lower bound of the number of displacement components; each takes at
+        least 1 KiB (stiffness and its pattern), and about 4 KiB with a factor
     """
     needed, limit = components * COMPONENT_MIB, case_limit_mib()
     if needed > limit:
         raise InputError(
-            f"{family}: {components:.2g} components of the displacement take "
-            f"{needed:.2g} MiB of memory at least; expected a mesh that fits into "
-            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to what there is"
+            f"{family}: {components:.2g} displacement components take at "
+            f"least {needed:.2g} MiB of memory; expected a mesh that fits into "
+            f"{limit:.0f} MiB, or {CASE_VARIABLE} set to the memory available"
         )
 
 
 def check_friction(
     family: str, params: Mapping[str, Value], *, elsewhere: bool = False
 ) -> None:
-    """Raise InputError unless the keys of friction fit together.
+    """Raise InputError unless the keys of friction are consistent.
 
-    elsewhere : whether pairs of sides may have laws of their own
+    elsewhere : True if single pairs of sides may have laws of their own
     """
     law = str(params["friction"])
-    for key, what in NEEDED.items():
-        value, default = float(params[key]), LAW[key].default
+    for key, allowed in LAW_PARAMETERS.items():
+        value, default = float(params[key]), LAW_KEYS[key].default
         if key != LAWS[law] and value != default:
             (user,) = (other for other, needed in LAWS.items() if needed == key)
             raise InputError(
@@ -204,11 +217,11 @@ def check_friction(
                 f"no {key}, or friction={user}"
             )
         if key == LAWS[law] and value == default and not elsewhere:
-            raise InputError(f"{family}: friction={law} needs {key}, {what}")
-        if value != default and not (value == 0 or LEAST <= value <= MOST):
-            raise InputError(f"{family}: {key}={value:g}; expected {what}")
-    unused = params["loading"] != LAW["loading"].default
-    if law == "none" and not elsewhere and unused:
+            raise InputError(f"{family}: friction={law} needs {key}, {allowed}")
+        if value != default and not (value == 0 or MIN_SIZE <= value <= MAX_SIZE):
+            raise InputError(f"{family}: {key}={value:g}; expected {allowed}")
+    sets_loading = params["loading"] != LAW_KEYS["loading"].default
+    if law == "none" and not elsewhere and sets_loading:
         raise InputError(
             f"{family}: loading={params['loading']} is not used by friction=none; "
             "expected no loading, or friction=tresca or friction=coulomb"
@@ -227,9 +240,9 @@ def check_decomposition(
     key: str = "feti",
     what: str = "the most cells along a subdomain's side",
 ) -> None:
-    """Raise InputError unless the keys of subdomains fit together.
+    """Raise InputError unless the keys of a decomposition are consistent.
 
-    key, what : that asks for subdomains, and what it is the number of
+    key, what : key that requests subdomains, and its meaning for the message
     """
     if not params[key] and params["glue"] != GLUES["glue"].default:
         raise InputError(
@@ -239,7 +252,7 @@ def check_decomposition(
 
 
 def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError unless the keys of large deformation fit together."""
+    """Raise InputError unless the keys of large deformation are consistent."""
     if params["kinematics"] == "linear":
         for key, default in defaults_of({**KINEMATICS, **CONTACT_STIFFNESS}).items():
             if params.get(key, default) != default:
@@ -248,11 +261,11 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
                     f"expected no {key}, or kinematics=finite"
                 )
         return
-    for key, built in LINEAR_ONLY.items():
-        if params.get(key, built) != built:
+    for key, allowed in LINEAR_ONLY.items():
+        if params.get(key, allowed) != allowed:
             raise InputError(
                 f"{family}: {key}={params[key]} with kinematics=finite is not built; "
-                f"expected {key}={built}, or kinematics=linear"
+                f"expected {key}={allowed}, or kinematics=linear"
             )
     if params.get("contact_stiffness") == "geometric" and params["contact"] != "nts":
         raise InputError(
@@ -261,20 +274,20 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
-def without_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError where there is friction on sides that halving bends."""
+def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError for friction on arcs, whose polygons refinement changes."""
     if params["friction"] != "none":
         raise InputError(
-            f"{family}: friction={params['friction']} on curved sides, whose slip is "
-            "another on finer meshes; expected friction=tresca on flat sides"
+            f"{family}: friction={params['friction']} on curved sides, whose slip "
+            "depends on the mesh; expected friction=tresca on flat sides"
         )
 
 
-def one_state(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError at finite strain, whose QPs are linearised at their own states.
+def refuse_finite_strain(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError for the error of a mesh at finite strain.
 
-    The QP of the next finer mesh belongs to another state, so that the distance of the
-    two solutions is not the error of either mesh.
+    The QP of the next finer mesh is linearised at another state, so that the distance
+    between the two solutions is not the discretisation error of either mesh.
     """
     if params["kinematics"] == "finite":
         raise InputError(
@@ -283,20 +296,21 @@ def one_state(family: str, params: Mapping[str, Value]) -> None:
         )
 
 
-def minimised(family: str, laws: Iterable[str], meshes: str) -> None:
-    """Raise InputError where a law is Coulomb's, whose solutions minimise nothing.
+def refuse_coulomb(family: str, laws: Iterable[str], meshes: str) -> None:
+    """Raise InputError for the error of a mesh with Coulomb's law, which has no energy.
 
-    meshes : keys with values whose answers may be compared instead
+    laws : kinds of the laws of all pairs
+    meshes : keys of cases whose answers can be compared instead, for the message
     """
     if "coulomb" in laws:
         raise InputError(
-            f"{family}: friction=coulomb minimises no energy on any mesh, so that "
-            f"there is no error in its norm; compare answers with {meshes}"
+            f"{family}: friction=coulomb has no energy to minimise, so that no error "
+            f"in its norm exists; compare answers with {meshes}"
         )
 
 
-def tangential(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak: parts of μP, no sliding."""
+def check_tangential(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError unless 0 < peak < 1 and |Q| ≤ peak, in units of μP."""
     Q, peak = float(params["Q"]), float(params["peak"])
     if not 0 < peak < 1:
         key = "Q" if peak == Q else "peak"
@@ -312,7 +326,7 @@ def tangential(family: str, params: Mapping[str, Value]) -> None:
 def one_of(
     family: str, params: Mapping[str, Value], known: Mapping[str, tuple[Value, ...]]
 ) -> None:
-    """Raise InputError unless each key of `known` has one of its values."""
+    """Raise InputError unless each key of `known` has one of the values listed."""
     for key, values in known.items():
         if params[key] not in values:
             raise InputError(
@@ -321,17 +335,17 @@ def one_of(
             )
 
 
-def doubled(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
-    """Return the integer `keys`, numbers of cells, twice as large."""
+def double(params: Mapping[str, Value], *keys: str) -> dict[str, Value]:
+    """Return twice the value of each of the integer `keys`, numbers of cells."""
     return {key: 2 * int(params[key]) for key in keys}
 
 
-def fits_dense(family: str, n: int) -> None:
-    """Raise InputError for a full matrix of n² numbers that cannot fit into memory."""
+def check_dense_memory(family: str, n: int) -> None:
+    """Raise InputError for a dense n × n matrix that cannot fit into memory."""
     needed, limit = 8 * n**2 / 2**20, case_limit_mib()
     if needed > limit:
         raise InputError(
             f"{family}: a full matrix of {n} rows takes {needed:.2g} MiB of memory; "
             f"expected one that fits into {limit:.0f} MiB, or {CASE_VARIABLE} set to "
-            "what there is"
+            "the memory available"
         )

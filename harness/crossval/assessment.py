@@ -1,7 +1,7 @@
-"""How far an answer is from the truth: numbers that need no other answer.
+"""Errors of one answer against the reference solution.
 
-What is allowed follows from what is claimed. An answer at tolerance t is verified while
-its KKT residuals are at most 10t, and the residual of the gap is g/E with the energy
+The errors allowed follow from the claim. An answer at tolerance t is verified if its
+KKT residuals are at most 10t, and the residual of the gap is g/E with the energy
 E = ‖u*‖². With the identity of Prager and Synge (`harness.verify.certificate`, (2)),
 
     ‖u − u*‖² + ‖u_λ − u*‖² ≤ 2g ≤ 20t‖u*‖²,
@@ -10,9 +10,9 @@ so that neither the displacement nor the equilibrium u_λ under the contact forc
 farther off than √(20t)‖u*‖. The second distance is that of the contact forces in the
 dual norm, ‖Bᵀ(λ − λ*)‖: multipliers themselves need not be unique.
 
-A row is taken to be closed where λᵢDᵢ > gapᵢ with its compliance Dᵢ. That much energy
-moves λᵢDᵢ or gapᵢ by sᵢ = √(20t Dᵢ)‖u*‖: only where both the truth and the answer are
-farther than sᵢ from having neither force nor gap do they contradict each other.
+A row with compliance Dᵢ counts as closed if λᵢDᵢ > gapᵢ. An error of that energy moves
+λᵢDᵢ or gapᵢ by sᵢ = √(20t Dᵢ)‖u*‖. Truth and answer therefore contradict each other on
+a row only if max(λᵢDᵢ, gapᵢ) > sᵢ in both.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mortarbench.harness.verify.references import ReferencePoint
 
 @dataclass(frozen=True, kw_only=True)
 class Assessment:
-    """One answer, measured; None where the problem has no such thing.
+    """Errors of one answer; None where the problem has no such quantity.
 
     Energies are relative to ½‖u*‖², lengths in the energy norm to ‖u*‖.
     """
@@ -45,18 +45,18 @@ class Assessment:
     equilibrium_error: float | None  #: ‖u_λ − u*‖
     energy: float  #: J(u) − J(u*)
     penetration: float | None  #: max (Bu − c)₊ over the mesh size
-    balance: float | None  #: worst force or moment left on a body, of those on it
-    active: int | None  #: rows that are closed
-    rows: tuple[int, ...] = ()  #: closed in truth and open here, or the reverse
-    #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ, or exceeds the bound of friction so
+    balance: float | None  #: largest unbalanced force or moment on a body, relative
+    active: int | None  #: number of closed contact rows
+    rows: tuple[int, ...] = ()  #: closed in the reference and open here, or vice versa
+    #: rows whose multiplier pulls, λᵢDᵢ < −sᵢ, or exceeds the friction bound by as much
     pulls: tuple[int, ...] = ()
 
 
 class Deviation(NamedTuple):
-    """Where an answer is, seen from the reference, over ‖u*‖: what pairs need."""
+    """Difference of an answer from the reference, over ‖u*‖; see `distances`."""
 
-    u: Vector
-    equilibrium: Vector | None
+    u: Vector  #: (n,)
+    equilibrium: Vector | None  #: (n,) of u_λ; None without mechanics
 
 
 def energy_allowed(tol: float) -> float:
@@ -68,9 +68,10 @@ def energy_allowed(tol: float) -> float:
 def assess(
     mechanics: Mechanics, truth: ReferencePoint, s: Solution, tol: float
 ) -> tuple[Assessment, Deviation]:
-    """Measure `s`, a finite point as ``mechanics.back`` gives it, against the solution.
+    """Measure `s`, a finite point from ``mechanics.to_primal``, against the solution.
 
-    Where that is zero, against what the load would do without contact.
+    If the solution is zero, errors are relative to the displacement under the load
+    without contact.
     """
     exact = mechanics.exact
     u, lam = s.x.astype(Real), mechanics.multipliers(s).astype(Real)
@@ -82,12 +83,12 @@ def assess(
     rubbed = exact.friction_work(u) - exact.friction_work(truth.u)
     energy = float(slope @ off + 0.5 * (off @ (K @ off)) + rubbed.sum())
     length = truth.norm or mechanics.norm(equilibrium(mechanics, exact.f)[0])
-    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.loose)
+    small: Extended = Real(energy_allowed(tol) * length) * np.sqrt(exact.compliance)
     closed, strict = _closed(exact, lam, gap, small)
     true_gap = -exact.motion(truth.u)
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
     contradicted = (closed != true_closed) & strict & true_strict & contact
-    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.loose
+    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.compliance
     assessment = Assessment(
         error=_over(mechanics.norm(off), length),
         equilibrium_error=_over(mechanics.norm(off_rest), length),
@@ -108,8 +109,8 @@ def assess(
 def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Deviation]:
     """Measure a finite point of a QP without mechanics, in the seminorm ‖·‖_P.
 
-    ‖u*‖² is the larger of xᵀPx and |qᵀx| there. Px is the same for all solutions, x
-    itself where P is positive definite.
+    Errors are relative to `point_norm`. All solutions have the same Px, and the same x
+    if P is positive definite.
     """
     norm = point_norm(qp, truth)
     off = s.x - truth.x
@@ -125,7 +126,7 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
 
 
 def point_norm(qp: QP, s: Solution) -> float:
-    """Return the length that errors of x are relative to."""
+    """Return √max(xᵀPx, |qᵀx|), which errors of x are relative to."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
 
 
@@ -135,31 +136,32 @@ def distances(
 ) -> NDArray[np.float64]:
     """Return ‖v_i − v_j‖_P of all pairs (k, k), inf where one is not finite.
 
-    By the Gram matrix of the points, which are small: they are deviations. Two are told
-    apart from 1e-8 of the farther one on.
+    They are computed from the Gram matrix, whose cancellation hides distances below
+    1e-8 of the norm of the longer vector. So the points have to be deviations from a
+    common reference.
 
-    kernel : orthonormal rigid motions (n, r), taken out first
+    kernel : (n, r) orthonormal rigid motions, which are projected out
     """
     V = np.stack(points, axis=1)
     V = V - kernel @ (kernel.T @ V)
     gram = V.T @ np.asarray(P @ V)
-    own = np.diag(gram)
-    squares = np.maximum(own[:, None] + own[None, :] - 2 * gram, 0)
-    found = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
-    np.fill_diagonal(found, 0)
-    return np.asarray(found)
+    norms = np.diag(gram)  # squared
+    squares = np.maximum(norms[:, None] + norms[None, :] - 2 * gram, 0)
+    lengths = np.sqrt(np.where(np.isfinite(squares), squares, np.inf))
+    np.fill_diagonal(lengths, 0)  # inf − inf = NaN otherwise
+    return np.asarray(lengths)
 
 
 def _closed(
     exact: Exact, lam: Extended, gap: Extended, small: Extended
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell which rows are closed, and which of the answers to that are strict."""
-    force = lam * exact.loose
+    """Mark the closed rows (m,), and those that are clearly closed or clearly open."""
+    force = lam * exact.compliance
     return force > gap, np.maximum(force, gap) > small
 
 
 def _balance(mechanics: Mechanics, s: Solution) -> float | None:
-    """Return the worst |Rᵀ(f − B_Eᵀy − B_Iᵀz)| of a body, relative to its forces."""
+    """Return the largest |Rᵀ(f − B_Eᵀy − B_Iᵀz)| of a body, relative to its forces."""
     R, primal = mechanics.rigid, mechanics.primal
     if not R.shape[1]:
         return None
@@ -181,7 +183,7 @@ def _numbers(rows: NDArray[np.bool_]) -> tuple[int, ...]:
 
 
 def _over(value: float, scale: float) -> float:
-    """Divide, where 0/0 = 0 and NaN, of an overflow, is inf."""
+    """Divide with 0/0 = 0; a NaN, which overflow leaves, becomes inf."""
     if value == 0:
         return 0.0
     ratio = value / scale if scale else np.inf

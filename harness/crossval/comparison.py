@@ -1,12 +1,11 @@
-"""One problem, all answers to it: each against the truth, and each against each.
+"""Comparison of all answers to one problem with a reference and with each other.
 
-The truth is a reference point with a proven error (`harness.verify.references`), of no
-solver under test. So a disagreement has a culprit that does not depend on what most
-say: an answer is refuted by its own residuals, or by its distance to the truth, less
-what is not known of that, where it is larger than what was claimed allows
-(`harness.crossval.assessment`). Distances between answers need no reference; two that
-are farther apart than both claims allow, neither refuted, are a disagreement without
-one.
+The reference is a point with a proven error (`harness.verify.references`), computed by
+none of the solvers under test. An answer is refuted by its own residuals, or if its
+distance to the reference, less the error of the reference, exceeds what the claim
+allows (`harness.crossval.assessment`). Which answer is wrong therefore does not depend
+on a majority. Distances between answers need no reference: two answers that differ by
+more than both claims allow, neither of them refuted, are an unresolved disagreement.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ from mortarbench.harness.crossval.assessment import (
     energy_allowed,
 )
 from mortarbench.harness.crossval.ground_truth import (
-    Given,
     GroundTruth,
+    StoredAnswer,
     ground_truth_of,
     nan_last,
     residuals_of,
@@ -40,13 +39,14 @@ from mortarbench.harness.verify.kkt import allowed, verdict
 from mortarbench.harness.verify.optimum import Proves, decided, proves
 from mortarbench.harness.verify.verdicts import note_of
 
-OUTLYING = 100  #: times the median of the other solvers, from where on one stands out
-PEERS = 3  #: answers of others that make a median
+#: Error of an outlier, relative to the median error of the other solvers.
+OUTLIER_RATIO = 100
+MIN_PEERS = 3  #: fewest answers of other solvers that have a meaningful median
 
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What one answer is worth; plain data."""
+    """The judgement of one answer; plain data."""
 
     run_id: str
     repeats: int
@@ -55,39 +55,39 @@ class Answer:
     form: str
     tol: float
     claimed: str
-    stored: Verdict  #: as the run judged it
-    verdict: Verdict  #: as the stored point is judged now, at 10·tol
+    stored: Verdict  #: verdict of the run
+    verdict: Verdict  #: verdict on the stored point now, at 10·tol
     residuals: Mapping[str, float]  #: the four of `harness.verify.kkt`
     optimum_error: (
         float | None
-    )  #: decides instead of them, see `harness.verify.optimum`
+    )  #: decides in place of the residuals, see `harness.verify.optimum`
     allowed: float  #: largest residual of a verified answer
-    energy_allowed: float  #: largest error in the energy norm of one
-    energy_bound: float | None  #: the certificate of the run
-    doubt: float | None  #: the errors in `assessment` are known to ± this
+    energy_allowed: float  #: its largest relative error in the energy norm
+    energy_bound: float | None  #: certificate stored by the run
+    doubt: float | None  #: uncertainty ± of the errors in `assessment`
     assessment: Assessment | None
-    refuted: tuple[str, ...] = ()  #: why the claim is false; empty if it stands
-    contradiction: str = ""  #: of the run's certificate by the reference: our fault
+    refuted: tuple[str, ...] = ()  #: reasons why the claim is false
+    contradiction: str = ""  #: of the run's certificate by the reference: a bug here
     remarks: tuple[str, ...] = ()
 
     @property
     def error(self) -> float | None:
-        """Certified: neither displacement nor contact forces are farther off."""
+        """Certified bound of the errors of displacement and contact forces."""
         if self.assessment is None or self.doubt is None:
             return None
-        found = self.assessment
-        return max(found.error, found.equilibrium_error or 0.0) + self.doubt
+        a = self.assessment
+        return max(a.error, a.equilibrium_error or 0.0) + self.doubt
 
 
 class Pair(NamedTuple):
-    """Two answers, relative to the size of the solution; None without contact."""
+    """Distances between two answers, relative to the solution; None without contact."""
 
-    a: int  #: numbers of answers
-    b: int
+    a: int  #: index of the first answer
+    b: int  #: index of the second answer
     distance: float  #: ‖u − u'‖ in the energy norm
     equilibrium: float | None  #: ‖u_λ − u_λ'‖ = ‖Bᵀ(λ − λ')‖ in the dual norm
     energy: float  #: |J(u) − J(u')|
-    allowed: float  #: the sum of what both claims allow
+    allowed: float  #: sum of the errors that both claims allow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,63 +95,66 @@ class Problem:
     """All answers to one problem, of every solver and form; plain data."""
 
     name: str  #: the case without its form
-    truth: str  #: "reference", or whose answer stands for it; empty if nothing does
+    truth: str  #: "reference", or the answer in its place; empty without either
     doubt: float | None  #: bound of its relative error in the energy norm
-    closed: int | None  #: rows that are closed in it
+    closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
     pairs: tuple[Pair, ...]  #: of answers at one tolerance
-    unresolved: tuple[Pair, ...]  #: too far apart, and neither is refuted
-    note: str = ""  #: why there is no reference
+    unresolved: tuple[Pair, ...]  #: beyond `allowed`, with neither answer refuted
+    note: str = ""  #: reason why there is no reference
 
 
-def compared(
-    name: str, given: Sequence[Given], solve: Reference, references: Path | None
+def compare_answers(
+    name: str,
+    answers: Sequence[StoredAnswer],
+    solve: Reference,
+    references: Path | None,
 ) -> Problem:
     """Judge all answers to one problem.
 
-    given : of one problem: equal ``mechanics.program``, or one QP without mechanics
+    answers : to one problem: equal ``mechanics.program``, or one QP without mechanics
     solve : the reference solve
-    references : folder that keeps reference points
+    references : folder in which reference points are cached; None for no cache
     """
     prove = proves(solve)
-    truth = ground_truth_of(given, solve, references)
+    truth = ground_truth_of(answers, solve, references)
     if isinstance(truth, str):
-        alone = tuple(_answer(g, None, None, prove) for g in given)
+        unassessed = tuple(_answer(g, None, None, prove) for g in answers)
         return Problem(
-            name=name, truth="", doubt=None, closed=None, answers=alone, pairs=(),
+            name=name, truth="", doubt=None, closed=None, answers=unassessed, pairs=(),
             unresolved=(), note=truth,
         )  # fmt: skip
-    answers, deviations = [], []
-    for g in given:
+    judged, deviations = [], []
+    for g in answers:
         try:
             assessment, deviation = truth.assess(g)
-        except Exception as e:  # the family's code, of the way back
+        except Exception as e:  # to_primal is the family's code
             g = replace(g, remarks=(*g.remarks, note_of("distance", e)))
-            answers.append(_answer(g, None, None, prove))
+            judged.append(_answer(g, None, None, prove))
             continue
-        deviations.append((len(answers), deviation))
-        answers.append(_answer(g, assessment, truth.doubt, prove))
-    pairs = _pairs(answers, deviations, truth)
+        deviations.append((len(judged), deviation))
+        judged.append(_answer(g, assessment, truth.doubt, prove))
+    pairs = _pairs(judged, deviations, truth)
     unresolved = [
         p
         for p in pairs
         if max(p.distance, p.equilibrium or 0.0) > p.allowed
         and all(
-            answers[i].claimed == Status.SOLVED and not answers[i].refuted
+            judged[i].claimed == Status.SOLVED and not judged[i].refuted
             for i in (p.a, p.b)
         )
     ]
     return Problem(
         name=name, truth=truth.name, doubt=truth.doubt, closed=truth.closed,
-        answers=tuple(_outliers(answers)), pairs=tuple(pairs),
+        answers=tuple(_outliers(judged)), pairs=tuple(pairs),
         unresolved=tuple(unresolved), note=truth.note,
     )  # fmt: skip
 
 
 def _answer(
-    g: Given, found: Assessment | None, doubt: float | None, prove: Proves
+    g: StoredAnswer, assessment: Assessment | None, doubt: float | None, prove: Proves
 ) -> Answer:
-    """Put together what is known of an answer, and whether its claim stands."""
+    """Judge one answer: its verdict, and the reasons why its claim is false."""
     r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
     error = decided(g.case.qp, g.solution, residuals, tol, prove)
     answer = Answer(
@@ -160,7 +163,7 @@ def _answer(
         verdict=verdict(g.solution.status, residuals, tol, error=error),
         residuals=residuals._asdict(), optimum_error=error, allowed=allowed(tol),
         energy_allowed=energy_allowed(tol), energy_bound=r.energy_bound,
-        doubt=doubt, assessment=found, remarks=g.remarks,
+        doubt=doubt, assessment=assessment, remarks=g.remarks,
     )  # fmt: skip
     refuted = tuple(_refutations(answer))
     twin = (f"the very point that it gave for {g.twin}",) if g.twin and refuted else ()
@@ -173,9 +176,10 @@ def _answer(
 
 
 def _contradiction(a: Answer) -> str:
-    """Say so where an error is larger than the certificate of it allows.
+    """Return how an error exceeds the certificate of the run, or "".
 
-    Of the point that the run certified, that is, which has the verdict that it had.
+    A point with remarks, or with another verdict than in the run, may not be the one
+    that was certified, and is skipped.
     """
     if a.assessment is None or a.doubt is None or a.energy_bound is None or a.remarks:
         return ""
@@ -188,7 +192,7 @@ def _contradiction(a: Answer) -> str:
 
 
 def _refutations(a: Answer) -> Iterable[str]:
-    """Say why a claim of success is false; nothing where it stands or was not made."""
+    """Yield the reasons why a claim of success is false."""
     if a.claimed != Status.SOLVED:
         return
     if a.verdict is not Verdict.VERIFIED and a.optimum_error is not None:
@@ -216,7 +220,7 @@ def _refutations(a: Answer) -> Iterable[str]:
 
 
 def _outliers(answers: Sequence[Answer]) -> list[Answer]:
-    """Remark on answers that are far less accurate than others, though as claimed."""
+    """Add a remark to answers that keep their claim but are far less accurate."""
     groups: dict[tuple[str, float], list[tuple[str, float]]] = {}
     for a in answers:
         if not a.refuted and a.error is not None:
@@ -224,11 +228,11 @@ def _outliers(answers: Sequence[Answer]) -> list[Answer]:
     marked = []
     for a in answers:
         others = [e for who, e in groups.get((a.case, a.tol), []) if who != a.solver]
-        if a.refuted or a.error is None or len(others) < PEERS:
+        if a.refuted or a.error is None or len(others) < MIN_PEERS:
             marked.append(a)
             continue
         usual = median(others)
-        if a.error - 2 * (a.doubt or 0.0) > max(OUTLYING * usual, a.tol):
+        if a.error - 2 * (a.doubt or 0.0) > max(OUTLIER_RATIO * usual, a.tol):
             text = f"error {brief(a.error)}, the median of the others is {brief(usual)}"
             a = replace(a, remarks=(*a.remarks, text))
         marked.append(a)
@@ -240,19 +244,19 @@ def _pairs(
     places: Sequence[tuple[int, Deviation]],
     truth: GroundTruth,
 ) -> list[Pair]:
-    """Set each answer against each other one at its tolerance."""
+    """Compute the distances of all pairs of answers at equal tolerances."""
     if not places:
         return []
     apart = partial(distances, truth.P, truth.kernel)
     u = apart([d.u for _, d in places])
     rest = [d.equilibrium for _, d in places if d.equilibrium is not None]
     lam = apart(rest) if rest else None
-    found = []
+    pairs = []
     for (i, (p, _)), (j, (q, _)) in combinations(enumerate(places), 2):
         a, b = answers[p], answers[q]
         if a.tol != b.tol or a.assessment is None or b.assessment is None:
             continue
-        found.append(
+        pairs.append(
             Pair(
                 a=p,
                 b=q,
@@ -262,10 +266,10 @@ def _pairs(
                 allowed=a.energy_allowed + b.energy_allowed,
             )
         )
-    return found
+    return pairs
 
 
 def brief(value: float) -> str:
-    """Print an order of magnitude with two digits: 3.2e-9, 1.0e0."""
+    """Format a number with two significant digits: 3.2e-9, 1.0e0."""
     mantissa, _, exponent = f"{value:.1e}".partition("e")
     return f"{mantissa}e{int(exponent)}" if exponent else mantissa

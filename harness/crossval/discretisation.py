@@ -1,25 +1,25 @@
-"""How far the solution on a mesh is from that of the continuum: what accuracy is worth.
+"""Estimate of the discretisation error, which bounds the useful accuracy of a solver.
 
-Meshes whose cells are halved in turn have the solutions u_h, u_{h/2}, u_{h/4}. Their
-distances in the energy norm, u_h interpolated on the finer mesh, tell how fast they
-converge and what is left (Richardson's extrapolation of squares):
+Successive halving of all cells gives solutions u_h, u_{h/2}, u_{h/4}. Their distances
+in the energy norm, with u_h interpolated on the finer mesh, determine the rate of
+convergence and the remaining error (Richardson extrapolation of squares):
 
     2^q = ‖u_h − u_{h/2}‖² / ‖u_{h/2} − u_{h/4}‖²
     ‖u_h − u‖² = ‖u_h − u_{h/2}‖² / (1 − 2^−q)                                       (1)
 
-with q = 2 for linear and bilinear elements where u is smooth. (1) is Galerkin's
-orthogonality, which holds without contact in spaces that contain each other; contact
-adds the work of its pressure on the gaps between the solutions, which is of higher
-order if few nodes change. Estimates are relative to ‖û‖, the norm that
-`harness.verify.certificate` divides by, so that both can be compared.
+with q = 2 for linear and bilinear elements where u is smooth. Without contact, (1) is
+Galerkin orthogonality in nested spaces; contact adds the work of its pressure on the
+gaps between the solutions, which is of higher order if few nodes change state.
+Estimates are relative to ‖û‖, as are the bounds of `harness.verify.certificate`, so
+that both can be compared.
 
-Energies would be simpler, ‖u_h − u‖² ≤ 2(J_h − J), but they also move, at the same
-order in h, with what is no error of u: a curved side is another polygon on every mesh,
-and so are boundary values. On the membrane they give 1.5 times the true error, on a
-cylinder with four cells per a an eighth of it. Load steps are linearised at the
-solution of each mesh, which is an error of the mesh like others. Under a point load
-there is no limit: the energy falls like log h, and what is left to say is how far the
-next mesh is.
+Differences of energies, ‖u_h − u‖² ≤ 2(J_h − J), would be simpler, but they contain
+terms of the same order in h that are not errors of u: each mesh has another polygon for
+a curved side, and other boundary values. On the membrane they give 1.5 times the true
+error, on a cylinder with four cells per contact half-width a an eighth of it. Load
+steps are linearised at the solution of each mesh, which is part of the error. Under a
+point load there is no limit, since the energy decreases like log h: only the distance
+to the next mesh is reported.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from time import perf_counter
 from mortarbench.harness.crossval.comparison import brief
 from mortarbench.harness.crossval.mesh_refinement import prolongation
 from mortarbench.harness.errors import InputError
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.mechanics import Extended, Grid, Mechanics, Real
 from mortarbench.harness.names import CaseId, assemble, unbuilt
@@ -43,13 +43,15 @@ from mortarbench.harness.plugin import Family, Reference
 from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
 FILE = "discretisation.json"  #: in the result folder
-SCHEMA = 1
-MOST_UNKNOWNS = 200_000  #: of a mesh that is solved
-GROWTH = 4.0  #: of the unknowns by halving, until it is known better
-POWER = 1.5  #: of the unknowns that the time of a reference solve grows like
-LEVELS = 3  #: two halvings, where they are affordable
-SLOWEST = 0.5  #: q below which nothing is extrapolated
-ROUNDING = 1e-8  #: of u: slender bodies in doubles, where certificates say less
+SCHEMA = 1  #: version of the file
+MAX_UNKNOWNS = 200_000  #: of a mesh that is solved
+GROWTH = 4.0  #: of the unknowns by the first halving; later ones use the observed ratio
+TIME_EXPONENT = 1.5  #: p in the growth of the time of a reference solve, unknowns^p
+MAX_LEVELS = 3  #: fewest meshes that determine a rate
+MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
+#: Least relative error of u that is assumed where certificates prove less: rounding of
+#: slender bodies in double precision.
+ROUNDING = 1e-8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,7 +60,7 @@ class Level:
 
     case: str  #: canonical name
     unknowns: int
-    energy: float  #: J_h, J/m or what the family calls energy
+    energy: float  #: J_h; J/m in the plane
     norm: float  #: ‖û‖, in √energy
     bound: float  #: certified relative error of the reference solution
     distance: float | None = None  #: to the solution on the level before, in √energy
@@ -66,11 +68,11 @@ class Level:
 
 @dataclass(frozen=True, kw_only=True)
 class Discretisation:
-    """What the meshes say of one physical case; plain data.
+    """Discretisation error of one physical case; plain data.
 
-    kind : "limit", `error` is that against the limit of fine meshes; "change", it is
-        the difference from the next mesh; "rounding", it is less than `error`, which is
-        what rounding hides; "unknown", there is none, see `note`
+    kind : "limit": `error` is relative to the limit of fine meshes; "change": it is the
+        difference from the next mesh; "rounding": the error is below `error`, the level
+        of rounding; "unknown": there is no estimate, see `note`
     """
 
     case: str  #: canonical name without the form
@@ -78,12 +80,12 @@ class Discretisation:
     error: float | None = None  #: relative to ‖û‖, energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
     rate: float | None = None  #: q of the squared error, observed
-    note: str = ""  #: why there is no more than that; of a limit, of which geometry
-    levels: tuple[Level, ...] = ()  #: coarsest first, that is the case itself
-    params: Mapping[str, object] = field(default_factory=dict)  #: of the case, all
+    note: str = ""  #: reason for a lesser kind; for a limit, the geometry that it is of
+    levels: tuple[Level, ...] = ()  #: coarsest first, which is the case itself
+    params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
 
     def __str__(self) -> str:
-        """Put the error in words, or the reason why it is not known."""
+        """Describe the error, or the reason why it is unknown."""
         if self.error is None:
             return f"unknown: {self.note}"
         before = {"limit": "about ", "rounding": "less than "}.get(self.kind, "")
@@ -93,13 +95,13 @@ class Discretisation:
         return f"{before}{brief(self.error)}{after}"
 
 
-def estimated(
+def estimate_error(
     case: str, levels: Sequence[Level], singular: str = "", note: str = ""
 ) -> Discretisation:
     """Estimate the error of the first of one to three levels.
 
-    singular : why energies have no limit, where they have none
-    note : why there are no more levels
+    singular : reason why energies have no limit; empty if they have one
+    note : reason why there are no more levels
     """
     nothing = Discretisation(case=case, kind="unknown", note=note, levels=tuple(levels))
     if len(levels) < 2:
@@ -119,7 +121,7 @@ def estimated(
             found, note="it does not fall on these meshes: the next halving changes "
             f"{2 ** (-rate / 2):.3g} times as much",
         )  # fmt: skip
-    if rate < SLOWEST:
+    if rate < MIN_RATE:
         return replace(
             found, note=f"it falls slowly on these meshes, like h^{rate / 2:.2f}"
         )
@@ -135,12 +137,12 @@ def discretisation_errors(
 ) -> list[Discretisation]:
     """Estimate the error of every physical case, and write ``folder/FILE``.
 
-    What the file says already stays where there was less time than there was then.
+    An earlier estimate from more meshes is kept if this call runs out of time.
 
-    cases : forms of one physical case count once
-    folder : the result folder; its ``references`` keep what was solved
-    budget : seconds; a mesh that would take longer than what is left is not begun
-    tell : is told of each case that begins
+    cases : of which the forms of one physical case count once
+    folder : result folder, with the cache of reference points in ``references``
+    budget : seconds; a mesh that is expected to take longer than the rest is skipped
+    tell : called with a message before each case
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
     earlier: dict[str, Discretisation] = {}
@@ -152,7 +154,7 @@ def discretisation_errors(
             tell(f"finer meshes of {physical}")
             left = _Halving(case.family, reference, folder / "references", end)
             levels = tuple(left.levels(case))
-            new = estimated(physical, levels, case.family.singular, left.why)
+            new = estimate_error(physical, levels, case.family.singular, left.why)
             kept = case.family.unrefined(case.params) if new.error is not None else ""
             note = "; ".join(filter(None, [new.note, kept]))
             new = replace(new, params=case.params, note=note)
@@ -163,7 +165,7 @@ def discretisation_errors(
 
 
 def read_discretisation(folder: Path) -> dict[str, Discretisation]:
-    """Read what `discretisation_errors` wrote, by physical case; empty without a file.
+    """Read the file of `discretisation_errors`, by physical case; empty without one.
 
     Raises
     ------
@@ -189,7 +191,7 @@ def read_discretisation(folder: Path) -> dict[str, Discretisation]:
 
 
 def _continues(old: Discretisation, new: Discretisation) -> bool:
-    """Whether `old` has the meshes of `new` and finer ones."""
+    """Return True if `old` has the meshes of `new` and finer ones."""
     common = [
         (a.case, a.unknowns) == (b.case, b.unknowns)
         for a, b in zip(old.levels, new.levels, strict=False)
@@ -200,27 +202,27 @@ def _continues(old: Discretisation, new: Discretisation) -> bool:
 
 
 def _write(path: Path, found: Iterable[Discretisation]) -> None:
-    """Replace the file as a whole."""
+    """Replace the file atomically."""
     data = {"schema": SCHEMA, "cases": [asdict(d) for d in found]}
     text = json.dumps(data, indent=1, allow_nan=False) + "\n"
-    with full_disk_told(path.parent):
+    with report_full_disk(path.parent):
         replace_file(path, text.encode())
 
 
 @dataclass(eq=False)
 class _Halving:
-    """Solves a case on finer and finer meshes, and remembers why it stopped."""
+    """Solutions of a case on successively halved meshes."""
 
     family: Family
     reference: Reference
     references: Path
-    end: float
-    why: str = ""
-    late: bool = False  #: stopped for lack of time
+    end: float  #: deadline, in seconds of `perf_counter`
+    why: str = ""  #: reason why there is no finer mesh
+    late: bool = False  #: True if that reason is the deadline
     _coarse: tuple[Grid, Extended] | None = None
 
     def levels(self, case: CaseId) -> Iterator[Level]:
-        """Yield the levels that can be afforded, coarsest first."""
+        """Yield the affordable levels, coarsest first."""
         form = "primal" if "primal" in self.family.forms else case.form
         sizes: list[int] = []
         seconds = 0.0
@@ -229,7 +231,7 @@ class _Halving:
         except InputError as e:
             self.why = str(e)
             return
-        while len(sizes) < LEVELS:
+        while len(sizes) < MAX_LEVELS:
             if params is None:
                 self.why = f"the family {self.family.name} offers no refined mesh"
                 return
@@ -237,14 +239,17 @@ class _Halving:
             if sizes and self._refused(growth * sizes[-1]):
                 return
             left = self.end - perf_counter()
-            if not left > seconds * growth**POWER:
+            if not left > seconds * growth**TIME_EXPONENT:
                 self.late = True
                 self.why = "the next mesh would take more time than was left"
                 return
             start = perf_counter()
             level = self._level(params, form, first=not sizes)
             if level is None and not sizes and form != case.form:
-                form, self.why = case.form, ""  # subdomains have a dual only
+                form, self.why = (
+                    case.form,
+                    "",
+                )  # cases on subdomains have only a dual form
                 level = self._level(params, form, first=True)
             if level is None:
                 return
@@ -255,18 +260,18 @@ class _Halving:
             params = self.family.refined(complete)
 
     def _refused(self, size: float) -> bool:
-        if size <= MOST_UNKNOWNS:
+        if size <= MAX_UNKNOWNS:
             return False
         self.why = (
             f"the next mesh would have about {size:,.0f} unknowns; at most "
-            f"{MOST_UNKNOWNS:,} are solved"
+            f"{MAX_UNKNOWNS:,} are solved"
         )
         return True
 
     def _level(
         self, params: Mapping[str, object], form: str, *, first: bool
     ) -> Level | None:
-        """Solve one mesh; None, with the reason, where that is impossible."""
+        """Solve one mesh; return None and set `why` if that is impossible."""
         text = self.family.name
         try:
             case = assemble(self.family, params, form)
@@ -280,7 +285,7 @@ class _Halving:
                 return None
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):
-                return None  # before it is solved
+                return None  # no rate without a second mesh: do not solve the first
             point = reference_point(mechanics, self.reference, self.references)
             distance = self._distance(mechanics, mechanics.grid, point.u)
         except UnsolvedError as e:
@@ -297,7 +302,7 @@ class _Halving:
         )  # fmt: skip
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
-        """Return ‖u − u_{2h}‖ on this mesh, and keep u for the next one."""
+        """Return ‖u − u_{2h}‖ on this mesh, None on the first; store u for the next."""
         whole = u + grid.lift
         before, self._coarse = self._coarse, (grid, whole)
         if before is None:

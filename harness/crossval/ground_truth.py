@@ -1,7 +1,8 @@
-"""What the answers to one problem are set against: never a majority of them.
+"""Reference point that the answers to one problem are compared with.
 
-A reference point where the reference solve finds one; else the answer with the smallest
-certified error, and the page says so.
+It is the point of the reference solve if that succeeds, and otherwise the answer with
+the smallest certified error, which the page then states. It is never decided by a
+majority of answers.
 """
 
 from __future__ import annotations
@@ -35,132 +36,140 @@ from mortarbench.harness.verify.references import (
 )
 from mortarbench.harness.verify.verdicts import note_of
 
-#: KKT residual up to which the best answer may stand for a reference
-GOOD_ENOUGH = 1e-3
+#: Largest KKT residual of an answer that may replace a missing reference.
+MAX_REFERENCE_RESIDUAL = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Given:
-    """A stored answer, with the case that was built anew to judge it."""
+class StoredAnswer:
+    """A stored answer, and the case as rebuilt for its judgement."""
 
     record: Record
-    label: str  #: of the solver, sequences apart
-    repeats: int  #: measurements that gave this very point
+    label: str  #: of the solver; sequences have a label of their own
+    repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
-    remarks: tuple[str, ...] = ()  #: what is odd about the point itself
-    twin: str = ""  #: another case to which it gave the very same point
+    remarks: tuple[str, ...] = ()  #: anomalies of the point itself
+    twin: str = ""  #: another case with exactly the same point; empty if there is none
 
 
 class GroundTruth(NamedTuple):
-    """What answers are set against, and the norm of distances."""
+    """A reference point, and the norm of distances."""
 
-    name: str
-    doubt: float
-    closed: int | None
-    assess: Callable[[Given], tuple[Assessment, Deviation]]
-    P: Matrix
-    kernel: NDArray[np.float64]
-    note: str = ""
+    name: str  #: "reference", or the solver and form of the answer in its place
+    doubt: float  #: bound of its relative error in the energy norm
+    closed: int | None  #: number of closed contact rows; None without mechanics
+    #: measures an answer against this point
+    assess: Callable[[StoredAnswer], tuple[Assessment, Deviation]]
+    P: Matrix  #: (n, n) matrix of the norm
+    kernel: NDArray[np.float64]  #: (n, r) rigid motions, which have no norm
+    note: str = ""  #: reason why it is not the reference solution
 
 
 def ground_truth_of(
-    given: Sequence[Given], solve: Reference, references: Path | None
+    answers: Sequence[StoredAnswer], solve: Reference, references: Path | None
 ) -> GroundTruth | str:
-    """Find the reference, or else the best answer; or say why there is neither."""
-    mechanics = given[0].case.mechanics
+    """Return the reference or the best answer, or the reason why there is neither."""
+    mechanics = answers[0].case.mechanics
     if mechanics is None:
-        return _plain_truth(given, solve)
+        return _plain_truth(answers, solve)
     mechanics = mechanics.whole
     try:
-        found = _elastic_truth(mechanics, given, solve, references)
+        truth = _elastic_truth(mechanics, answers, solve, references)
     except Exception as e:  # the family's code, of the factorisation
         return note_of("reference", e)
-    if isinstance(found, str):
-        return found
-    point, name, why = found
+    if isinstance(truth, str):
+        return truth
+    point, name, why = truth
 
-    def assessed(g: Given) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
         assert g.case.mechanics is not None
-        at = g.case.mechanics.back(g.solution)
+        at = g.case.mechanics.to_primal(g.solution)
         return assess(mechanics, point, at, g.record.asked_tol)
 
     exact = mechanics.exact
     contact = exact.contact
-    closed = (point.multipliers * exact.loose > -exact.motion(point.u))[contact]
+    closed = (point.multipliers * exact.compliance > -exact.motion(point.u))[contact]
     kernel = mechanics.inverse.kernel
     P = mechanics.primal.P
     return GroundTruth(name, point.bound, int(closed.sum()), assessed, P, kernel, why)
 
 
 def _elastic_truth(
-    mechanics: Mechanics, given: Sequence[Given], solve: Reference,
+    mechanics: Mechanics, answers: Sequence[StoredAnswer], solve: Reference,
     references: Path | None,
 ) -> tuple[ReferencePoint, str, str] | str:  # fmt: skip
-    """Find a point, its name, and why it is not the reference, if it is not."""
+    """Return a point, its name and, if it is not the reference, the reason for that."""
     try:
         return reference_point(mechanics, solve, references), "reference", ""
     except UnsolvedError as e:
-        best = _best_certified(mechanics, given)
+        best = _best_certified(mechanics, answers)
         return (
             f"{e}, and no answer can be certified" if best is None else (*best, f"{e}")
         )
 
 
 def _best_certified(
-    mechanics: Mechanics, given: Sequence[Given]
+    mechanics: Mechanics, answers: Sequence[StoredAnswer]
 ) -> tuple[ReferencePoint, str] | None:
-    """Take the answer with the smallest certified error, and whose it is."""
-    found = []
-    for g in given:
+    """Return the answer with the smallest certified error, and its solver and form."""
+    certified = []
+    for g in answers:
         try:
             assert g.case.mechanics is not None
-            found.append((certify(mechanics, g.case.mechanics.back(g.solution)), g))
+            certified.append(
+                (certify(mechanics, g.case.mechanics.to_primal(g.solution)), g)
+            )
         except UncertifiableError:
             continue
-    if not found:
+    if not certified:
         return None
-    c, g = min(found, key=lambda pair: pair[0].bound)
+    c, g = min(certified, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
         u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
         states=suggested(mechanics.exact, c.u, c.multipliers),
         norm=c.norm, bound=c.bound,
     )  # fmt: skip
-    return point, _who(g)
+    return point, _origin(g)
 
 
-def _plain_truth(given: Sequence[Given], solve: Reference) -> GroundTruth | str:
-    """Do so for a QP alone: what its residuals prove is a bound as for claims."""
-    qp, why = given[0].case.qp, ""
+def _plain_truth(
+    answers: Sequence[StoredAnswer], solve: Reference
+) -> GroundTruth | str:
+    """Find the reference of a QP without mechanics.
+
+    Its doubt is the error √(2·residual) that its residuals allow, as for claims.
+    """
+    qp, why = answers[0].case.qp, ""
     try:
         s, name = solve(qp), "reference"
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:
         why = str(e)
-        best = min(given, key=lambda g: nan_last(residuals_of(g).worst))
-        s, name = best.solution, _who(best)
+        best = min(answers, key=lambda g: nan_last(residuals_of(g).worst))
+        s, name = best.solution, _origin(best)
     worst = kkt_residuals(qp, s).worst
-    if not worst <= GOOD_ENOUGH:
+    if not worst <= MAX_REFERENCE_RESIDUAL:
         return f"{why}, and no answer satisfies the KKT conditions"
-    nothing = np.zeros((qp.q.size, 0))
+    no_kernel = np.zeros((qp.q.size, 0))
 
-    def assessed(g: Given) -> tuple[Assessment, Deviation]:
+    def assessed(g: StoredAnswer) -> tuple[Assessment, Deviation]:
         return assess_point(qp, s, g.solution)
 
     return GroundTruth(
-        name, float(np.sqrt(2 * worst)), None, assessed, qp.P, nothing, why
+        name, float(np.sqrt(2 * worst)), None, assessed, qp.P, no_kernel, why
     )
 
 
 @np.errstate(all="ignore")  # a point may hold 1e300
-def residuals_of(g: Given) -> Residuals:
-    """Measure the KKT residuals of a stored point anew."""
+def residuals_of(g: StoredAnswer) -> Residuals:
+    """Compute the KKT residuals of a stored point."""
     return kkt_residuals(g.case.qp, g.solution)
 
 
-def _who(g: Given) -> str:
+def _origin(g: StoredAnswer) -> str:
     return f"{g.label} on {g.record.form}"
 
 
 def nan_last(value: float) -> float:
-    """Order NaN above every number."""
+    """Return the value as a sort key that orders NaN above every number."""
     return np.inf if np.isnan(value) else value

@@ -1,8 +1,8 @@
-"""From a mesh to the one with every cell halved, by what is next to what.
+"""Interpolation from a mesh to its refinement, by adjacency.
 
-Positions would not do: on a curved side the new nodes lie beside the chord, by more
-than a cell where cells are thin. So only the nodes that both meshes share are found by
-position; a new node is the one neighbour that two others have in common.
+Only the nodes that both meshes share are matched by position. Positions do not identify
+new nodes: on a curved side these lie off the chord, by more than a cell where cells are
+thin. A new node is the only common neighbour of two old ones.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ from mortarbench.harness.mechanics import Grid
 
 Nodes = NDArray[np.int64]
 
-SAME = 1e-9  #: distance of nodes that are one, in sizes of the body
+#: Largest distance between shared nodes, relative to the extent of the body.
+MAX_NODE_DISTANCE = 1e-9
 
 
 def prolongation(coarse: Grid, fine: Grid) -> csr_array:
-    """Interpolate from the nodes of `coarse` (N) to those of `fine` (M), (M, N).
+    """Return the interpolation (M, N) from the nodes of `coarse` to those of `fine`.
 
-    Linear on the edges and bilinear in the cells of `coarse`, which are segments or
-    quadrilaterals; of these, the last two corners may be one. Such a triangle is cut
-    into four triangles, or like a quadrilateral, about the middle between the one
-    corner and the side across.
+    It is linear on the edges and bilinear in the cells of `coarse`, which are segments
+    or quadrilaterals. A quadrilateral whose last two corners coincide is a triangle. It
+    is refined into four triangles, or like a quadrilateral, around the midpoint between
+    that corner and the opposite side.
 
     Raises
     ------
@@ -45,13 +46,13 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     ]
     places = [to, *middles]
     if len(corners) == 4:
-        # in four triangles the middles of the sides next to the one corner are joined
+        # four triangles: an edge joins the midpoints of the sides at the double corner
         joined = np.asarray(near[middles[1], middles[3]]).ravel() > 0
         cut = ~(joined & (corners[2] == corners[3]))
         places.append(_between(near, middles[0][cut], middles[2][cut]))
         rows.append(csr_array(rows[0] + rows[2])[cut] / 2)
-    found, first = np.unique(np.concatenate(places), return_index=True)
-    if found.size != len(fine.points):
+    nodes, first = np.unique(np.concatenate(places), return_index=True)
+    if nodes.size != len(fine.points):
         raise _unfit()
     return csr_array(csr_array(vstack([unit, *rows]))[first])
 
@@ -61,39 +62,44 @@ def _turned(corners: list[Nodes]) -> list[Nodes]:
 
 
 def _shared(coarse: Grid, fine: Grid) -> Nodes:
-    """Find every node of `coarse` in the same body of `fine`, (N,)."""
+    """Find the nodes (N,) of `fine` at the nodes of `coarse`, body by body."""
     to = np.zeros(len(coarse.points), dtype=np.int64)
     for body in np.unique(coarse.bodies):
         mine = np.unique(coarse.cells[coarse.bodies == body])
         theirs = np.unique(fine.cells[fine.bodies == body])
         if not theirs.size:
             raise _unfit()
-        apart, which = cKDTree(fine.points[theirs]).query(coarse.points[mine])
-        if apart.max() > SAME * np.ptp(coarse.points[mine], axis=0).max():
+        distance, nearest = cKDTree(fine.points[theirs]).query(coarse.points[mine])
+        if (
+            distance.max()
+            > MAX_NODE_DISTANCE * np.ptp(coarse.points[mine], axis=0).max()
+        ):
             raise _unfit()
-        to[mine] = theirs[which]
+        to[mine] = theirs[nearest]
     return to
 
 
 def _neighbours(grid: Grid) -> csr_array:
-    """Connect nodes that share an edge, (M, M); no node is its own neighbour."""
+    """Return the adjacency matrix (M, M) of the edges, with a zero diagonal."""
     corners = list(grid.cells.T)
     a, b = np.concatenate(corners), np.concatenate(_turned(corners))
-    apart, n = a != b, len(grid.points)
-    edges = coo_array((np.ones(apart.sum()), (a[apart], b[apart])), (n, n)).tocsr()
+    # a triangle repeats its last corner, which is not an edge
+    differs, n = a != b, len(grid.points)
+    ends = a[differs], b[differs]
+    edges = coo_array((np.ones(differs.sum()), ends), (n, n)).tocsr()
     both = csr_array(edges + edges.T)
     both.data[:] = 1
     return both
 
 
 def _between(near: csr_array, a: Nodes, b: Nodes) -> Nodes:
-    """Find the common neighbour of each pair (E,); of a node with itself, the node."""
-    found, apart = a.copy(), a != b
-    common = csr_array(near[a[apart]].multiply(near[b[apart]]))
+    """Return the only common neighbour of each pair (E,), or the node if a = b."""
+    middle, differs = a.copy(), a != b
+    common = csr_array(near[a[differs]].multiply(near[b[differs]]))
     if (np.diff(common.indptr) != 1).any():
         raise _unfit()
-    found[apart] = common.indices
-    return found
+    middle[differs] = common.indices
+    return middle
 
 
 def _unfit() -> ValueError:

@@ -1,6 +1,6 @@
-"""What a cross-validation comes to: counts, one row per solver, lists of what is wrong.
+"""Summary of a cross-validation: counts, one row per solver, lists of disagreements.
 
-The result is plain data, for a page, for a terminal and for machines alike.
+The result is plain data, which the page, the terminal and ``--json`` share.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from mortarbench.harness.errors import some
 from mortarbench.harness.record import finite
 from mortarbench.harness.verify.verdicts import plain
 
-SCHEMA = 1  #: of the data
+SCHEMA = 1  #: version of the data
 
 
 @dataclass(frozen=True, kw_only=True)
 class Row:
-    """One solver at one tolerance; None where nothing was to be measured."""
+    """One solver at one tolerance; None where nothing could be measured."""
 
     solver: str
     tol: float
@@ -30,100 +30,105 @@ class Row:
     unanswered: int
     error_median: float | None  #: certified, relative, energy norm
     error_worst: float | None
-    worst_case: str  #: where that occurs
-    penetration: float | None  #: worst, over the mesh size
-    balance: float | None  #: worst force or moment left on a body
-    contradicted_rows: int  #: closed in truth and open here, or the reverse
-    primal_dual: float | None  #: worst distance of its answers to primal and dual forms
-    from_ours: float | None  #: worst distance of its answers from ours
+    worst_case: str  #: case of `error_worst`
+    penetration: float | None  #: largest, over the mesh size
+    balance: float | None  #: largest unbalanced force or moment on a body
+    contradicted_rows: int  #: closed in the reference and open here, or vice versa
+    primal_dual: float | None  #: largest distance between its primal and dual answers
+    from_ours: float | None  #: largest distance of its answers from those of `ours`
 
 
-def as_data(found: Validation, folder: str, ours: str) -> dict[str, Any]:
-    """Put a cross-validation together, summary first.
+def as_data(validation: Validation, folder: str, ours: str) -> dict[str, Any]:
+    """Return a cross-validation as plain data, summary first.
 
-    ours : the solver that every other one is set against, where it took part
+    ours : label of the solver that all others are compared with, if it took part
     """
-    answers = [a for p in found.problems for a in p.answers]
+    answers = [a for p in validation.problems for a in p.answers]
     refuted = [a for a in answers if a.refuted]
-    wrong = [*map(_disagreement, refuted), *map(_without_point, found.false_claims)]
-    unresolved = [_apart(p, pair) for p in found.problems for pair in p.unresolved]
+    wrong = [
+        *map(_disagreement, refuted),
+        *map(_without_point, validation.false_claims),
+    ]
+    unresolved = [_apart(p, pair) for p in validation.problems for pair in p.unresolved]
     broken = [_remark(a, a.contradiction) for a in answers if a.contradiction]
     outliers = [
         _remark(a, text) for a in answers if not a.refuted for text in a.remarks
     ]
     counts = {
-        "problems": len(found.problems),
+        "problems": len(validation.problems),
         "cases": len({a.case for a in answers}),
         "solvers": len({a.solver for a in answers}),
         "answers": len(answers),
-        "pairs": sum(len(p.pairs) for p in found.problems),
+        "pairs": sum(len(p.pairs) for p in validation.problems),
         "refuted": len(wrong),
         "unresolved": len(unresolved),
         "contradictions": len(broken),
         "remarks": len(outliers),
-        "unanswered": len(found.unanswered),
-        "declined": found.declined,
-        "proven_infeasible": found.proven,
-        "not_validated": len(found.not_validated),
+        "unanswered": len(validation.unanswered),
+        "declined": validation.declined,
+        "proven_infeasible": validation.proven,
+        "not_validated": len(validation.not_validated),
     }
     without = [
         {"problem": p.name, "truth": p.truth, "text": p.note}
-        for p in found.problems
+        for p in validation.problems
         if p.truth != "reference"
     ]
     data = {
         "schema": SCHEMA,
         "folder": folder,
-        "agreed": found.agreed,
-        "headline": _headline(found.agreed, counts, wrong),
+        "agreed": validation.agreed,
+        "headline": _headline(validation.agreed, counts, wrong),
         "counts": counts,
-        "solvers": [asdict(row) for row in _rows(found, ours)],
+        "solvers": [asdict(row) for row in _rows(validation, ours)],
         "disagreements": wrong,
         "unresolved": unresolved,
         "contradictions": broken,
         "remarks": outliers,
-        "unanswered": list(map(asdict, found.unanswered)),
-        "not_validated": list(map(asdict, found.not_validated)),
+        "unanswered": list(map(asdict, validation.unanswered)),
+        "not_validated": list(map(asdict, validation.not_validated)),
         "without_reference": without,
-        "problems": list(map(_problem, found.problems)),
+        "problems": list(map(_problem, validation.problems)),
     }
     return dict(finite(plain(data)))
 
 
-def _rows(found: Validation, ours: str) -> list[Row]:
-    """Sum up every solver at every tolerance, the loosest first, ours before others."""
-    answers = [a for p in found.problems for a in p.answers]
+def _rows(validation: Validation, ours: str) -> list[Row]:
+    """Summarise each solver at each tolerance: loosest first, `ours` before others."""
+    answers = [a for p in validation.problems for a in p.answers]
     keys = {(a.solver, a.tol) for a in answers}
-    keys |= {(x.solver, x.tol) for x in (*found.false_claims, *found.unanswered)}
+    keys |= {
+        (x.solver, x.tol) for x in (*validation.false_claims, *validation.unanswered)
+    }
     ordered = sorted(keys, key=lambda key: (-key[1], key[0] != ours, key[0]))
-    return [_row(found, solver, tol, ours) for solver, tol in ordered]
+    return [_row(validation, solver, tol, ours) for solver, tol in ordered]
 
 
-def _row(found: Validation, solver: str, tol: float, ours: str) -> Row:
-    own = [
+def _row(validation: Validation, solver: str, tol: float, ours: str) -> Row:
+    answers = [
         a
-        for p in found.problems
+        for p in validation.problems
         for a in p.answers
         if (a.solver, a.tol) == (solver, tol)
     ]
-    errors = [(e, a.case) for a in own if (e := a.error) is not None]
+    errors = [(e, a.case) for a in answers if (e := a.error) is not None]
     worst, worst_case = max(errors, default=(None, ""))
-    false = _of(found.false_claims, solver, tol)
-    measured = [a.assessment for a in own if a.assessment is not None]
+    false = _of(validation.false_claims, solver, tol)
+    measured = [a.assessment for a in answers if a.assessment is not None]
     return Row(
         solver=solver,
         tol=tol,
-        answers=len(own),
-        refuted=sum(bool(a.refuted) for a in own) + len(false),
-        unanswered=len(_of(found.unanswered, solver, tol)),
+        answers=len(answers),
+        refuted=sum(bool(a.refuted) for a in answers) + len(false),
+        unanswered=len(_of(validation.unanswered, solver, tol)),
         error_median=median(e for e, _ in errors) if errors else None,
         error_worst=worst,
         worst_case=worst_case,
         penetration=_worst(a.penetration for a in measured),
         balance=_worst(a.balance for a in measured),
         contradicted_rows=sum(len(a.rows) for a in measured),
-        primal_dual=_worst(_between_forms(found.problems, solver, tol)),
-        from_ours=_worst(_between(found.problems, solver, ours, tol)),
+        primal_dual=_worst(_between_forms(validation.problems, solver, tol)),
+        from_ours=_worst(_between(validation.problems, solver, ours, tol)),
     )
 
 
@@ -138,7 +143,7 @@ def _worst(values: Iterable[float | None]) -> float | None:
 def _between_forms(
     problems: Sequence[Problem], solver: str, tol: float
 ) -> Iterable[float]:
-    """Yield how far a solver's answers to the primal are from those to duals."""
+    """Yield the distances between a solver's primal answers and its dual ones."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
@@ -151,7 +156,7 @@ def _between_forms(
 def _between(
     problems: Sequence[Problem], solver: str, other: str, tol: float
 ) -> Iterable[float]:
-    """Yield how far a solver's answers are from another's, of any form."""
+    """Yield the distances between the answers of two solvers, in any form."""
     for p in problems:
         for pair in p.pairs:
             a, b = p.answers[pair.a], p.answers[pair.b]
@@ -162,7 +167,7 @@ def _between(
 def _headline(
     agreed: bool, counts: dict[str, int], wrong: Sequence[dict[str, Any]]
 ) -> str:
-    """Say in one sentence what came of it."""
+    """Return the result as a sentence."""
     answers, solvers, cases, pairs = (
         _many(counts[f"{noun}s"], noun) for noun in ("answer", "solver", "case", "pair")
     )
@@ -189,8 +194,8 @@ def _many(count: int, noun: str) -> str:
 
 
 def _disagreement(a: Answer) -> dict[str, Any]:
-    """Say what was claimed, what is true, and where."""
-    found = a.assessment
+    """Describe a refuted answer: the claim, the errors and the rows concerned."""
+    assessment = a.assessment
     return _about(a) | {
         "claimed": a.claimed,
         "stored": a.stored.value,
@@ -198,9 +203,9 @@ def _disagreement(a: Answer) -> dict[str, Any]:
         "reasons": [*a.refuted, *a.remarks],
         "residual": max(a.residuals.values()),
         "error": a.error,
-        "energy": None if found is None else found.energy,
-        "rows": [] if found is None else list(found.rows),
-        "pulls": [] if found is None else list(found.pulls),
+        "energy": None if assessment is None else assessment.energy,
+        "rows": [] if assessment is None else list(assessment.rows),
+        "pulls": [] if assessment is None else list(assessment.pulls),
     }
 
 
@@ -216,7 +221,7 @@ def _without_point(x: Listed) -> dict[str, Any]:
 
 
 def _about(x: Answer | Listed) -> dict[str, Any]:
-    """Name a measurement."""
+    """Return the fields that identify a measurement."""
     return {"run_id": x.run_id, "solver": x.solver, "case": x.case, "tol": x.tol}
 
 
@@ -237,7 +242,7 @@ def _remark(a: Answer, text: str) -> dict[str, Any]:
 
 
 def _problem(p: Problem) -> dict[str, Any]:
-    """Lay out a problem with all answers, and pairs by the numbers of these."""
+    """Return a problem as plain data; pairs refer to answers by their index."""
     answers = [asdict(a) | {"error": a.error} for a in p.answers]
     data = {
         "name": p.name, "truth": p.truth, "doubt": p.doubt, "closed": p.closed,

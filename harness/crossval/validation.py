@@ -1,7 +1,8 @@
-"""Cross-validation of a result folder: its answers are judged anew, case by case.
+"""Cross-validation of a result folder, case by case.
 
-Nothing that a run concluded is taken over. Cases are built again, stored points read,
-residuals, errors and distances computed from them; what cannot be is listed.
+No conclusion of the run is reused: cases are rebuilt, stored points are read, and
+residuals, errors and distances are computed from these. Answers that cannot be judged
+are listed with the reason.
 """
 
 from __future__ import annotations
@@ -14,8 +15,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mortarbench.harness.crossval.comparison import Answer, Problem, brief, compared
-from mortarbench.harness.crossval.ground_truth import Given
+from mortarbench.harness.crossval.comparison import (
+    Answer,
+    Problem,
+    brief,
+    compare_answers,
+)
+from mortarbench.harness.crossval.ground_truth import StoredAnswer
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.files.store import (
@@ -35,13 +41,14 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
-ALIKE = 1e-3  #: relative difference of contact forces up to which they are the same
-PROVEN = 1e-2  #: bound of a solution's error that refutes the claim of there being none
+MAX_FORCE_DIFFERENCE = 1e-3  #: relative, between contact forces that count as equal
+#: Largest error bound of a solution that refutes a claim of infeasibility.
+MAX_SOLUTION_ERROR = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True)
 class Listed:
-    """A measurement that something is to be said of; plain data."""
+    """A remark on a measurement; plain data."""
 
     run_id: str
     solver: str
@@ -52,19 +59,19 @@ class Listed:
 
 @dataclass(frozen=True, kw_only=True)
 class Validation:
-    """All that the answers of a result folder say of each other; plain data."""
+    """Result of a cross-validation; plain data."""
 
     problems: tuple[Problem, ...]
-    solvers: tuple[str, ...]  #: labels, of all that measured something
-    false_claims: tuple[Listed, ...]  #: without a point: nowhere in `problems`
-    unanswered: tuple[Listed, ...]  #: no claim, no point: died, gave up, ran out
+    solvers: tuple[str, ...]  #: labels of all solvers with a record
+    false_claims: tuple[Listed, ...]  #: without a point, hence not in `problems`
+    unanswered: tuple[Listed, ...]  #: neither claim nor point: crashed, failed, limit
     not_validated: tuple[Listed, ...]  #: stored points that could not be judged
     declined: int
     proven: int = 0  #: claims of infeasibility that a certificate proves
 
     @property
     def agreed(self) -> bool:
-        """Whether no claim is refuted, and no two answers disagree otherwise."""
+        """True if no claim is refuted and no pair of answers disagrees."""
         return not self.false_claims and not any(
             p.unresolved or any(a.refuted or a.contradiction for a in p.answers)
             for p in self.problems
@@ -73,7 +80,7 @@ class Validation:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Folder:
-    """Where answers come from, and what they are judged with."""
+    """A result folder, and the families and the reference solve to judge it with."""
 
     path: Path
     families: Mapping[str, Family]
@@ -86,26 +93,26 @@ class _Folder:
 
 
 class _Part(NamedTuple):
-    """What came of one physical case."""
+    """Judgement of one physical case, in all its forms."""
 
     problems: list[Problem]
     lost: list[Listed]  #: answers that could not be judged
-    false: list[Listed]  #: claims without a point that are not so
+    false: list[Listed]  #: false claims without a point
     suspects: dict[str, Vector]  #: multipliers of refuted answers by run_id
-    truths: dict[str, Vector]
-    proven: int  #: claims of infeasibility
+    truths: dict[str, Vector]  #: multipliers of references by the problem's name
+    proven: int  #: number of proven claims of infeasibility
 
 
-def validated(
+def validate_folder(
     path: Path,
     families: Mapping[str, Family],
     reference: Reference,
     tell: Callable[[str], None],
 ) -> Validation:
-    """Judge every answer that a result folder holds.
+    """Judge all answers of a result folder.
 
     reference : the reference solve, none of the solvers
-    tell : is told of each case that begins
+    tell : called with the name of each case before it is judged
 
     Raises
     ------
@@ -131,7 +138,7 @@ def validated(
     false_claims = [claim for part in parts for claim in part.false]
     refuted = {k: z for part in parts for k, z in part.suspects.items()}
     truths = {k: z for part in parts for k, z in part.truths.items()}
-    problems = _recognised(
+    problems = _with_mix_ups(
         (p for part in parts for p in part.problems), refuted, truths
     )
     return Validation(
@@ -152,7 +159,7 @@ def validated(
 
 
 def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
-    """Group what was measured by physical case, in the order of names."""
+    """Group records by physical case, in the order of names."""
     groups: dict[str, list[Record]] = {}
     for r in sorted(records, key=lambda r: (r.case, -r.tol, r.solver, r.repeat)):
         if r.verdict is not Verdict.DECLINED:
@@ -161,13 +168,15 @@ def _groups(records: Iterable[Record]) -> dict[str, list[Record]]:
 
 
 def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
-    """Judge the answers to one physical case, and claims that there is none."""
+    """Judge the answers to one physical case, and claims of its infeasibility."""
     cases, lost = _built(folder, records)
-    given, damaged = _given(folder, [r for r in records if r.case in cases], cases)
+    answers, damaged = _stored_answers(
+        folder, [r for r in records if r.case in cases], cases
+    )
     lost += damaged
     claims = [r for r in records if _is_proven(r) and r.case in cases]
     contradictory = set()
-    for r in claims:  # the solver's certificate is not stored: another one is sought
+    for r in claims:  # the solver's certificate is not stored: search for another
         qp = cases[r.case].qp
         claim = Solution.without_point(qp, Status.INFEASIBLE)
         if infeasibility_margin(qp, claim) is not None:
@@ -177,25 +186,27 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
         for r in claims
         if r.run_id not in contradictory
     ]
-    # answers to equal numbers are to one problem, whatever the form
-    by_numbers: dict[str, list[Given]] = {}
-    for g in given:
+    # forms with equal mechanics are one problem; a QP without mechanics is its own
+    by_numbers: dict[str, list[StoredAnswer]] = {}
+    for g in answers:
         of = g.case.mechanics
         key = g.record.case if of is None else qp_digest(of.program)
         by_numbers.setdefault(key, []).append(g)
-    solve, kept = folder.reference, folder.references
+    solve, cache = folder.reference, folder.references
     problems: list[Problem] = []
     forces: dict[str, Vector] = {}
     truths: dict[str, Vector] = {}
     for same in by_numbers.values():
         forms = ", ".join(dict.fromkeys(g.record.form for g in same))
         called = name if len(by_numbers) == 1 else f"{name} ({forms})"
-        p = compared(called, same, solve, kept)
+        p = compare_answers(called, same, solve, cache)
         problems.append(p)
         forces |= _suspects(p, same)
-        if (known := _true_forces(p, same, solve, kept)) is not None:
-            truths[p.name] = known
-    proven = [p for p in problems if p.doubt is not None and p.doubt < PROVEN]
+        if (exact_forces := _true_forces(p, same, solve, cache)) is not None:
+            truths[p.name] = exact_forces
+    proven = [
+        p for p in problems if p.doubt is not None and p.doubt < MAX_SOLUTION_ERROR
+    ]
     solvable = {a.case: p for p in proven for a in p.answers}
     elastic = next((p for p in proven if p.closed is not None), None)  # of all forms
     false = [
@@ -208,7 +219,7 @@ def _group(folder: _Folder, name: str, records: Sequence[Record]) -> _Part:
 
 
 def _pointless(records: Sequence[Record]) -> str:
-    """Say why a folder has nothing to judge."""
+    """Return the reason why a folder has no answers to judge."""
     if any(r.vectors for r in records):
         return "its stored points are gone; expected vectors/*.npz, which a run writes"
     statuses = Counter(r.verdict.words for r in records)
@@ -219,7 +230,7 @@ def _pointless(records: Sequence[Record]) -> str:
 def _built(
     folder: _Folder, records: Sequence[Record]
 ) -> tuple[dict[str, Case], list[Listed]]:
-    """Build the forms of a case that have answers; list what cannot be built."""
+    """Build the forms that have answers; list the answers to those that fail."""
     cases: dict[str, Case] = {}
     lost: list[Listed] = []
     answered = [r for r in records if r.vectors or _is_proven(r)]
@@ -233,11 +244,11 @@ def _built(
     return cases, lost
 
 
-def _given(
+def _stored_answers(
     folder: _Folder, records: Iterable[Record], cases: Mapping[str, Case]
-) -> tuple[list[Given], list[Listed]]:
-    """Read the stored points of claims, each distinct one once."""
-    found: dict[tuple[str, str, float, str], Given] = {}
+) -> tuple[list[StoredAnswer], list[Listed]]:
+    """Read the stored points of claims, each distinct point once."""
+    answers: dict[tuple[str, str, float, str], StoredAnswer] = {}
     lost: list[Listed] = []
     for r in records:
         if not r.vectors or not (
@@ -245,8 +256,9 @@ def _given(
         ):
             continue
         key = (r.solver, r.case, r.asked_tol, r.vectors)
-        if key in found:
-            found[key] = replace(found[key], repeats=found[key].repeats + 1)
+        if key in answers:
+            repeats = answers[key].repeats + 1
+            answers[key] = replace(answers[key], repeats=repeats)
             continue
         case = cases[r.case]
         try:
@@ -257,23 +269,23 @@ def _given(
         except InputError as e:
             lost.append(_listed(r, str(e)))
             continue
-        found[key] = Given(
+        answers[key] = StoredAnswer(
             record=r, label=r.solver, repeats=1, case=case, solution=s,
             remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
             twin=min(folder.twins[r.solver, r.vectors] - {r.case}, default=""),
         )  # fmt: skip
-    return list(found.values()), lost
+    return list(answers.values()), lost
 
 
 def _is_proven(r: Record) -> bool:
-    """Return whether a claim of infeasibility was proven when it was measured."""
+    """Return True if the run proved a claim of infeasibility."""
     return r.verdict is Verdict.VERIFIED_INFEASIBLE
 
 
 def _falsehood(r: Record, solved: Problem | None) -> str:
-    """Say what is false about a claim without a point; empty where nothing is.
+    """Return the reason why a claim without a point is false, or "".
 
-    solved : the problem, where it has a solution that is known
+    solved : the problem, if its solution is known
     """
     if r.claimed == Status.SOLVED and not r.vectors:
         return "claims success without a finite point"
@@ -286,8 +298,8 @@ def _falsehood(r: Record, solved: Problem | None) -> str:
 
 
 def _apart(r: Record) -> Record:
-    """Call a solver that drove a sequence by another name than one that began cold."""
-    return r if r.mode == "cold" else r.but(solver=f"{r.solver} ({r.mode})")
+    """Append its mode to the label of a solver that ran as a sequence."""
+    return r if r.mode == "cold" else r.replace(solver=f"{r.solver} ({r.mode})")
 
 
 def _listed(r: Record, text: str) -> Listed:
@@ -295,39 +307,48 @@ def _listed(r: Record, text: str) -> Listed:
 
 
 def _true_forces(
-    problem: Problem, given: Sequence[Given], solve: Reference, references: Path
+    problem: Problem,
+    answers: Sequence[StoredAnswer],
+    solve: Reference,
+    references: Path,
 ) -> Vector | None:
-    """Return the multipliers (m,) of the reference; None where there is none."""
-    mechanics = given[0].case.mechanics
+    """Return the multipliers (m,) of the reference, or None without a reference."""
+    mechanics = answers[0].case.mechanics
     if mechanics is None or problem.truth != "reference":
         return None
-    point = reference_point(mechanics, solve, references)  # which keeps it
+    point = reference_point(mechanics, solve, references)  # read from its cache
     return np.asarray(point.multipliers, dtype=float)
 
 
-def _suspects(problem: Problem, given: Sequence[Given]) -> dict[str, Vector]:
+def _suspects(problem: Problem, answers: Sequence[StoredAnswer]) -> dict[str, Vector]:
     """Return the multipliers of refuted answers by run_id."""
     refuted = {a.run_id for a in problem.answers if a.refuted and a.assessment}
     return {
-        g.record.run_id: g.case.mechanics.multipliers(g.case.mechanics.back(g.solution))
-        for g in given
+        g.record.run_id: g.case.mechanics.multipliers(
+            g.case.mechanics.to_primal(g.solution)
+        )
+        for g in answers
         if g.record.run_id in refuted and g.case.mechanics is not None
     }
 
 
-def _recognised(
+def _with_mix_ups(
     problems: Iterable[Problem],
-    found: Mapping[str, Vector],
+    suspects: Mapping[str, Vector],
     truths: Mapping[str, Vector],
 ) -> list[Problem]:
-    """Remark on each refuted answer that is the solution of another problem.
+    """Add a remark to each refuted answer that solves a different problem.
 
-    found : multipliers of refuted answers by run_id
+    suspects : multipliers of refuted answers by run_id
     truths : multipliers of solutions by the name of the problem
     """
 
     def remarked(a: Answer, own: str) -> Answer:
-        name = _whose(found[a.run_id], truths, own) if a.run_id in found else ""
+        name = (
+            _nearest_problem(suspects[a.run_id], truths, own)
+            if a.run_id in suspects
+            else ""
+        )
         if not name:
             return a
         text = f"its contact forces are those of {name}"
@@ -339,15 +360,16 @@ def _recognised(
     ]
 
 
-def _whose(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
-    """Name the problem whose contact forces are nearest.
+def _nearest_problem(z: Vector, truths: Mapping[str, Vector], own: str) -> str:
+    """Return the name of the problem whose contact forces are nearest.
 
-    Empty if none are alike, or its own are: then something else is wrong.
+    Empty if no forces are equal, or if those of its own problem `own` are: the answer
+    then fails for another reason.
     """
     differences = {
         name: float(np.linalg.norm(z - lam) / np.linalg.norm(lam))
         for name, lam in truths.items()
         if lam.shape == z.shape and lam.any()
     }
-    alike = {name: d for name, d in differences.items() if d <= ALIKE}
-    return "" if own in alike else min(alike, key=lambda n: alike[n], default="")
+    equal = {name: d for name, d in differences.items() if d <= MAX_FORCE_DIFFERENCE}
+    return "" if own in equal else min(equal, key=lambda n: equal[n], default="")

@@ -1,1 +1,1 @@
-"""One solve on several processes: vectors spread over them, and what starts them."""
+"""Distributed solves: vectors over MPI ranks, collective failures, factorisation."""

@@ -1,21 +1,21 @@
-"""A Cholesky factor of a sum of matrices over ranks, A = Σ_p A_p = LLᵀ.
+"""Cholesky factor of a sum of matrices over ranks, A = Σ_p A_p = LLᵀ.
 
-Every rank p has a symmetric, positive semidefinite A_p on the rows that it *touches*.
-No entry couples rows that one rank alone touches, its *inner* ones, with those of
-another: each rank eliminates its own. The Schur complements on the *shared* rows are
-summed over the ranks, and that sum is factorised by all of them alike (substructuring;
-Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A solve is one
-reduction of shared rows; all else is work of each rank on its own rows.
+Rank p has a symmetric, positive semidefinite A_p on the rows that it *touches*. Rows
+that a single rank touches are its *inner* rows. No entry couples inner rows of
+different ranks, so each rank eliminates its inner rows by itself. The Schur complements
+on the *shared* rows are summed over the ranks, and every rank factorises the sum
+(substructuring; Smith, Bjørstad and Gropp, Domain Decomposition, 1996, Chapter 4). A
+solve needs one reduction, of shared rows; all other work is local.
 
-A vector of rows is held in one of three ways, each of them a `DistributedVector`:
+A vector of rows has one of three representations, each a `DistributedVector`:
 
-* additive: the sum over ranks is meant, as of G_p v with the columns G_p of a rank
+* additive: the vector is the sum over ranks, as for G_p v with the local columns G_p
 * consistent: each rank has the entries of the rows that it touches
-* orthonormal: in the order of L, inner rows on their rank; of each shared entry all P
-  ranks hold 1/√P
+* orthonormal: in the order of L, inner rows on their rank; each of the P ranks has 1/√P
+  times the shared entries
 
-An additive times a consistent one, and two orthonormal ones, give the inner product of
-the whole.
+The product of an additive and a consistent vector, or of two orthonormal ones, summed
+over ranks, is the inner product of the vectors represented.
 """
 
 from __future__ import annotations
@@ -38,45 +38,49 @@ from mortarbench.harness.qp import Matrix
 
 Rows = NDArray[np.int64]
 Dense = NDArray[np.float64]
-DEPENDENT = 1e-13  #: pivots of rows of length one below this are rounding
-UNSTUCK = 1e-15  #: added to the diagonal so that no pivot of dependent rows is zero
-PIVOT = 1e-3  #: by which a pivot may miss its least value, for the rounding of both
-FILL = 8  #: entries for each row of A that the dense factor of the shared rows may have
+#: Largest pivot, of rows of length one, that counts as rounding of zero.
+DEPENDENCE_TOLERANCE = 1e-13
+#: Added to a diagonal of ones: a pivot of exactly zero would end the factorisation.
+PIVOT_SHIFT = 1e-15
+#: Relative amount by which a pivot may fall below its lower bound: both are rounded.
+PIVOT_TOLERANCE = 1e-3
+#: Largest size of the dense factor of the shared rows, in entries per row of A.
+MAX_FILL = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Touched:
-    """The rows of A that a rank touches."""
+    """Rows of A that a rank touches."""
 
     ranks: Ranks
     rows: Rows  #: (k,) ascending
-    touching: Rows  #: (k,) how many ranks touch each
-    shared: Rows  #: (s,) rows that several ranks touch, the same on all of them
+    touching: Rows  #: (k,) number of ranks that touch each row
+    shared: Rows  #: (s,) all rows that several ranks touch, replicated
 
     @cached_property
     def is_shared(self) -> NDArray[np.bool_]:
-        """Which of its rows are."""
+        """Mask (k,) of the shared rows."""
         return self.touching > 1
 
     @cached_property
     def place(self) -> Rows:
-        """Places in `shared` of its shared rows, ascending."""
+        """Positions of the local shared rows in `shared`, ascending."""
         return np.searchsorted(self.shared, self.rows[self.is_shared])
 
     @property
     def few_shared(self) -> bool:
-        """Whether so few are shared that their dense factor is the lesser work."""
+        """True if a dense factor of the shared rows is small; see `MAX_FILL`."""
         inner = self.ranks.total(np.array([float(np.count_nonzero(~self.is_shared))]))
         s = self.shared.size
-        return s**2 <= FILL * (s + float(inner[0]))
+        return s**2 <= MAX_FILL * (s + float(inner[0]))
 
     def additive(self, t: Dense) -> DistributedVector:
-        """Make what every rank has of its rows (k,) a vector that is summed."""
+        """Convert a consistent vector (k,) to an additive one."""
         return distributed(t / self.touching, self.ranks)
 
 
 def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
-    """Tell the others which rows this rank touches, and learn which are shared."""
+    """Exchange the rows that ranks touch, and return them with the shared ones."""
     every, count = np.unique(
         np.concatenate(ranks.comm.allgather(rows)), return_counts=True
     )
@@ -85,38 +89,39 @@ def touched_rows(rows: Rows, ranks: Ranks) -> Touched:
 
 
 class DependentRowsError(ValueError):
-    """A is singular; raised on all ranks alike."""
+    """Error for a singular A; all ranks raise it."""
 
 
 @dataclass(frozen=True, eq=False)
 class LocalFactor:
-    """A_p with its unchanging inner rows eliminated, once.
+    """A_p with its unchanging inner rows eliminated.
 
-    Rows that may change, and shared ones, are its *border*.
+    The *border* consists of the inner rows that may change, and of the shared rows.
     """
 
     at: Touched
-    order: Rows  #: (k,) of its rows: unchanging, changing, shared
-    changing: int  #: how many of these may change
-    #: of A_p in that order, with 1 added to the diagonal of shared rows; None without
-    #: rows
+    order: Rows  #: (k,) permutation of the local rows: unchanging, changing, shared
+    changing: int  #: number of changing rows
+    #: factor of A_p in that order, with 1 added to the diagonal of shared rows; None
+    #: without rows
     factor: Factor | None
-    L_bb: Dense  #: (b, b) its last block, of the border
+    L_bb: Dense  #: (b, b) last block of the factor, of the border
 
     @property
     def border(self) -> Rows:
-        """Its border, as places in its rows, (b,)."""
+        """Positions (b,) of the border in the local rows."""
         return self.order[self.order.size - len(self.L_bb) :]
 
     @cached_property
     def complement(self) -> Dense:
-        """The Schur complement of A_p on the border, (b, b)."""
+        """Schur complement (b, b) of A_p on the border."""
         T = self.L_bb @ self.L_bb.T
+        # less the 1 added to the diagonal of shared rows
         T[np.arange(self.changing, len(T)), np.arange(self.changing, len(T))] -= 1
         return T
 
     def reduced(self, t: Dense) -> tuple[Dense, Dense]:
-        """Eliminate in an additive t (k,): L_aa⁻¹t_a, and what is left of t_b."""
+        """Eliminate an additive t (k,): L_aa⁻¹t_a, and t_b − L_baL_aa⁻¹t_a."""
         if self.factor is None:
             return np.zeros(0), np.zeros(0)
         u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
@@ -132,12 +137,12 @@ class LocalFactor:
         return y
 
     def completed(self) -> SummedFactor:
-        """Factorise A.
+        """Factorise A; called by all ranks.
 
         Raises
         ------
         DependentRowsError
-            Where that is not positive definite.
+            When A is not positive definite.
 
         """
         ranks, c = self.at.ranks, self.changing
@@ -155,7 +160,7 @@ class LocalFactor:
             raise DependentRowsError("the rows depend on each other") from None
 
     def _onto_shared(self, T: Dense, L_cc: Dense) -> tuple[Dense, Dense]:
-        """Eliminate changing rows of T (b, b): L_sc, and the sum over ranks (s, s)."""
+        """Eliminate changing rows of T (b, b); return L_sc and the sum S (s, s)."""
         c, s, place = self.changing, self.at.shared.size, self.at.place
         L_sc = blas.dtrsm(1.0, L_cc, T[:c, c:], lower=1).T if c else T[c:, :0]
         S = np.zeros((s, s))
@@ -165,30 +170,30 @@ class LocalFactor:
 
 @dataclass(frozen=True, eq=False)
 class SummedFactor:
-    """LLᵀ = A, or (1 + κ)A − Σ_p less_p, over ranks."""
+    """Factor L of A, or of (1 + κ)A − Σ_p less_p, over ranks."""
 
     local: LocalFactor
     root: float  #: √(1 + κ)
     L_cc: Dense  #: (c, c) of the changing rows of this rank
     L_sc: Dense  #: (s_p, c) of its shared rows
-    L_ss: Dense  #: (s, s) of the shared rows of all, the same on all ranks
+    L_ss: Dense  #: (s, s) of all shared rows, replicated
 
     @property
     def least_pivot(self) -> float:
-        """The least diagonal entry of L, of all ranks; inf where there are no rows."""
+        """Smallest diagonal entry of L on all ranks; inf without rows."""
         factor, inner = self.local.factor, self.local.order.size - len(self.local.L_bb)
         of_inner = np.zeros(0) if factor is None else factor.L().diagonal()[:inner]
-        own = np.concatenate([
+        pivots = np.concatenate([
             self.root * of_inner, np.diag(self.L_cc), np.diag(self.L_ss),
         ])  # fmt: skip
-        return self.local.at.ranks.extreme(float(own.min(initial=np.inf)), np.min)
+        return self.local.at.ranks.extreme(float(pivots.min(initial=np.inf)), np.min)
 
     def shifted(self, shift: float, less: Dense) -> SummedFactor:
         """Factorise (1 + shift)A − Σ_p `less`_p with the factor of A.
 
-        less : (b, b) on the border, with Σ_p `less`_p ≤ A. Schur complements grow with
-            their matrix, so that those met here are at least `shift` times those of A,
-            which L_cc and L_ss are factors of.
+        less : (b, b) on the border, with Σ_p `less`_p ≤ A. The matrix is then at least
+            shift·A. Schur complements are monotone, so those formed here are at least
+            `shift` times those of A, whose factors are L_cc and L_ss.
         """
         local, c, scale = self.local, self.local.changing, 1 + shift
         T = scale * local.complement - less
@@ -198,7 +203,7 @@ class SummedFactor:
         return SummedFactor(local, float(np.sqrt(scale)), L_cc, L_sc, L_ss)
 
     def forward(self, t: Dense) -> DistributedVector:
-        """Take an additive t (k,) to L⁻¹t (k - s_p + s,), orthonormal."""
+        """Map an additive t (k,) to the orthonormal L⁻¹t (k - s_p + s,)."""
         ranks = self.local.at.ranks
         with ranks.clocked("coarse"):
             u, r = self.local.reduced(np.asarray(t))
@@ -208,7 +213,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Take an orthonormal a (k - s_p + s,) to L⁻ᵀa (k,), consistent."""
+        """Map an orthonormal a (k - s_p + s,) to the consistent L⁻ᵀa (k,)."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)
@@ -220,7 +225,7 @@ class SummedFactor:
             return distributed(y, ranks)
 
     def __call__(self, t: Dense) -> DistributedVector:
-        """Solve for the consistent y (k,) of an additive t (k,)."""
+        """Solve A y = t for the consistent y (k,) of an additive t (k,)."""
         local = self.local
         with local.at.ranks.clocked("coarse"):
             u, r = local.reduced(np.asarray(t))
@@ -232,13 +237,16 @@ class SummedFactor:
             return distributed(y, local.at.ranks)
 
     def _changing(self, r: Dense) -> tuple[Dense, Dense]:
-        """Eliminate changing rows of a border (c + s_p,); and what the others keep."""
+        """Eliminate the changing rows of a border vector (c + s_p,).
+
+        Returns L_cc⁻¹r_c and r_s − L_sc L_cc⁻¹r_c.
+        """
         c = len(self.L_cc)
         z_c = _solved(self.L_cc, r[:c])
         return z_c, r[c:] - self.L_sc @ z_c
 
     def _gathered(self, r: Dense) -> Dense:
-        """Add what all ranks have for shared rows (s_p,): (s,)."""
+        """Sum the entries (s_p,) of shared rows over all ranks: (s,)."""
         shared = np.zeros(len(self.L_ss))
         shared[self.local.at.place] = r
         return self.local.at.ranks.total(shared) if shared.size else shared
@@ -247,15 +255,15 @@ class SummedFactor:
 def local_factor(
     A: csc_array, at: Touched, changing: NDArray[np.bool_] | None = None
 ) -> LocalFactor:
-    """Eliminate the unchanging inner rows of this rank's A_p (k, k).
+    """Eliminate the unchanging inner rows of the local A_p (k, k).
 
-    A : of rows whose diagonal entries, summed over the ranks, are about one
-    changing : (k,) inner rows that may change; none unless given
+    A : A_p, with diagonal entries that sum to about one over the ranks
+    changing : (k,) mask of the inner rows that may change; None for no rows
 
     Raises
     ------
     DependentRowsError
-        Where the inner rows of any rank depend on each other.
+        When the inner rows of any rank are linearly dependent.
 
     """
     changes = np.zeros(at.rows.size, bool) if changing is None else changing
@@ -266,7 +274,9 @@ def local_factor(
     order = np.concatenate([first, second, np.flatnonzero(at.is_shared)])
     factor, L_bb, fails = None, np.zeros((0, 0)), 0.0
     if order.size:
-        raised = np.where(at.is_shared[order], 1.0, 0.0)  # A_p may be singular there
+        raised = np.where(
+            at.is_shared[order], 1.0, 0.0
+        )  # A_p alone may be singular there
         M = with_int32(csc_array(A[order][:, order]) + diags_array(raised))
         factor = analyze(M, ordering_method="natural", use_long=False)
         try:
@@ -280,15 +290,16 @@ def local_factor(
 
 
 def independent_rows(gram: Matrix) -> Rows:
-    """Return rows G of a matrix that are independent and span all, from GGᵀ (r, r).
+    """Return a maximal set of independent rows of a matrix G, from GGᵀ (r, r).
 
-    A row counts as dependent where its pivot, the square of its distance from the span
-    of the rows before it, is at most `DEPENDENT` of the square of its length. The first
-    such row is left out, then all pivots are computed anew: those behind are rounding.
+    The pivot of a row is the square of its distance from the span of the rows before.
+    The row is dependent if that is at most `DEPENDENCE_TOLERANCE` times the square of
+    its length. Only the first such row is dropped before all pivots are computed again,
+    since the pivots behind it are rounding.
 
     Returns
     -------
-    (k,) their numbers, ascending
+    (k,) indices of the rows, ascending
 
     """
     size = np.sqrt(gram.diagonal())
@@ -296,10 +307,10 @@ def independent_rows(gram: Matrix) -> Rows:
     while kept.size:
         inverse = diags_array(1 / size[kept])
         unit = inverse @ csc_array(gram)[kept][:, kept] @ inverse
-        shifted = with_int32(unit + diags_array(np.full(kept.size, UNSTUCK)))
+        shifted = with_int32(unit + diags_array(np.full(kept.size, PIVOT_SHIFT)))
         factor = analyze(shifted, mode="simplicial", use_long=False)
         factor.cholesky_inplace(shifted)
-        dependent = np.flatnonzero(factor.D() <= DEPENDENT)
+        dependent = np.flatnonzero(factor.D() <= DEPENDENCE_TOLERANCE)
         if not dependent.size:
             break
         kept = np.delete(kept, factor.P()[dependent[0]])
@@ -307,23 +318,23 @@ def independent_rows(gram: Matrix) -> Rows:
 
 
 def factor_above(M: Dense, share: float, L_0: Dense) -> Dense:
-    """Return L with LLᵀ = M, for an M that exact arithmetic has at least share·L₀L₀ᵀ.
+    """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
 
-    M is a difference of matrices as large as L₀L₀ᵀ. Where the share is less than what
-    they cancel to, its eigenvalues are rounding, of either sign. The pivots of M are no
-    less than those of share·L₀L₀ᵀ; where they are, the matrix L₀⁻¹ML₀⁻ᵀ ≥ share·I is
-    decomposed instead, its eigenvalues λ are raised to the share, and
+    M is a difference of matrices as large as L₀L₀ᵀ. If the share is below the rounding
+    of these, eigenvalues of M may have either sign. In exact arithmetic the pivots of M
+    are at least those of share·L₀L₀ᵀ. If computed ones are smaller, L₀⁻¹ML₀⁻ᵀ ≥ share·I
+    is decomposed instead, its eigenvalues λ are raised to the share, and
 
         LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   from a QR factorisation of √λ QᵀL₀ᵀ,
 
-    which forms no difference, and has that floor whatever was cancelled.
+    which involves no subtraction and keeps the lower bound in spite of cancellation.
 
     M : (k, k) symmetric
     L_0 : (k, k) lower triangular
     """
     try:
         L = _cholesky(M)
-        if (np.diag(L) ** 2 >= (1 - PIVOT) * share * np.diag(L_0) ** 2).all():
+        if (np.diag(L) ** 2 >= (1 - PIVOT_TOLERANCE) * share * np.diag(L_0) ** 2).all():
             return L
     except np.linalg.LinAlgError:
         pass
@@ -337,7 +348,7 @@ def factor_above(M: Dense, share: float, L_0: Dense) -> Dense:
 
 
 def _cholesky(M: Dense) -> Dense:
-    """Return L with LLᵀ = M, its upper triangle not to be read."""
+    """Return L with LLᵀ = M; its upper triangle is undefined."""
     if not len(M):
         return np.zeros((0, 0), order="F")
     L, failed = lapack.dpotrf(M, lower=1, clean=0)
@@ -354,7 +365,7 @@ def _solved(L: Dense, x: Dense, *, transposed: bool = False) -> Dense:
 
 
 def with_int32(M: Matrix) -> csc_matrix:
-    """Have the entries of a sparse M (k, l) numbered as `Factor` does: 32 bits."""
+    """Return a sparse M (k, l) with the 32-bit indices that `Factor` needs."""
     M = csc_matrix(M)
     M.indices, M.indptr = M.indices.astype(np.int32), M.indptr.astype(np.int32)
     return M

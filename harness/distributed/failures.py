@@ -1,10 +1,10 @@
-"""What one rank cannot do, all of them cannot: failures are agreed upon, or end all.
+"""Collective handling of failures: all ranks raise, or all processes end.
 
-A rank that raises while others wait for its numbers would leave them waiting. So ranks
-tell one another after each piece of work how it ended (`agreed`), through a
-communicator that is used for nothing else. Who has failed waits a while for the others
-to come there; if they do not, they wait elsewhere for what never comes, and only the
-end of all processes ends that (`abort`).
+If one rank raised while others wait for its messages, these would wait for ever. Ranks
+therefore exchange the outcome of each piece of work (`run_collectively`), on a
+communicator that is used for nothing else. A rank that failed waits there for the
+others. If they do not arrive, they are blocked in a message that it will never send,
+and all processes are ended (`abort`).
 """
 
 from __future__ import annotations
@@ -24,60 +24,61 @@ from mortarbench.harness.distributed.vectors import Ranks
 
 T = TypeVar("T")
 
-ALONE_SECONDS = 5.0  #: that a rank which failed waits for the others
-#: environment variable with the file descriptor where `harness.processes.ranks.launch`
-#: reads how ranks failed; what a solver prints is not looked at
+PEER_TIMEOUT = 5.0  #: seconds that a rank which failed waits for the others
+#: Environment variable with the file descriptor on which `harness.processes.ranks`
+#: reads failures of ranks. The output of a solver is not searched for them.
 RECORD = "MORTARBENCH_RANK_RECORD"
-_PAUSE_SECONDS = 1e-3  #: between two looks whether they have come
-_LONGEST = 500  #: bytes that are told of a failure
+_POLL_SECONDS = 1e-3  #: between two tests whether the others have arrived
+_MESSAGE_BYTES = 500  #: of the description of a failure; longer ones are cut
 
 
 class RankFailedError(Exception):
-    """A rank has failed; the message says which one, and how."""
+    """Failure of a rank; the message names the rank and its exception."""
 
 
-def agreed(ranks: Ranks, work: Callable[[], T]) -> T:
-    """Do a piece of work that all ranks do, and raise on all of them if any fails.
+def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
+    """Execute `work` on all ranks, and raise on all of them if any fails.
 
     Raises
     ------
     RankFailedError
-        On every rank, when some have failed, or not all alike. What all raise alike
-        comes through.
+        On every rank, if some ranks failed, or with different exceptions. An exception
+        that all ranks raise with equal messages is raised as it is.
 
     """
-    apart = ranks.apart  # all ranks are here, so that all can make it
+    # created here, since all ranks are here: Dup is collective
+    comm = ranks.private_comm
     failure: Exception | None = None
     try:
-        found = work()
+        result = work()
     except Exception as e:
         failure = e
-    own = np.zeros(_LONGEST, dtype=np.uint8)
+    message = np.zeros(_MESSAGE_BYTES, dtype=np.uint8)
     if failure is not None:
-        text = in_a_line(failure).encode()[:_LONGEST]
-        own[: len(text)] = np.frombuffer(text, dtype=np.uint8)
-    everyones = np.empty((ranks.size, _LONGEST), dtype=np.uint8)
-    told = apart.Iallgather(own, everyones)
+        text = in_a_line(failure).encode()[:_MESSAGE_BYTES]
+        message[: len(text)] = np.frombuffer(text, dtype=np.uint8)
+    messages = np.empty((ranks.size, _MESSAGE_BYTES), dtype=np.uint8)
+    request = comm.Iallgather(message, messages)
     if failure is None:
-        told.Wait()
-    deadline = time.monotonic() + ALONE_SECONDS
-    while failure is not None and not told.Test():
+        request.Wait()
+    deadline = time.monotonic() + PEER_TIMEOUT
+    while failure is not None and not request.Test():
         if time.monotonic() > deadline:
             abort(ranks, failure)
-        time.sleep(_PAUSE_SECONDS)
-    failed = np.flatnonzero(everyones.any(axis=1))
+        time.sleep(_POLL_SECONDS)
+    failed = np.flatnonzero(messages.any(axis=1))
     if not failed.size:
-        return found
-    if failure is not None and (everyones == own).all():
+        return result
+    if failure is not None and (messages == message).all():
         raise failure
-    first = bytes(everyones[failed[0]]).rstrip(b"\0").decode(errors="replace")
+    first = bytes(messages[failed[0]]).rstrip(b"\0").decode(errors="replace")
     raise RankFailedError(_named(int(failed[0]), ranks, first)) from failure
 
 
 def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
     """Record which rank failed and how, and end all ranks."""
     record(ranks.rank, _named(ranks.rank, ranks, in_a_line(failure)))
-    with suppress(OSError, ValueError):  # a solver may have closed it
+    with suppress(OSError, ValueError):  # a solver may have closed stderr
         traceback.print_exception(failure)
         sys.stderr.flush()
     ranks.comm.Abort(1)
@@ -87,17 +88,17 @@ def abort(ranks: Ranks, failure: BaseException) -> NoReturn:
 def record(rank: int, failure: str) -> None:
     """Report the failure of a rank to the process that launched the ranks, if any.
 
-    One line, written at once, so that lines of several ranks do not mix.
+    The line is a single write, so that lines of several ranks do not mix.
     """
-    what = {"rank": rank, "failed": failure[:_LONGEST]}
+    entry = {"rank": rank, "failed": failure[:_MESSAGE_BYTES]}
     with suppress(OSError, KeyError):
-        os.write(int(os.environ[RECORD]), f"{json.dumps(what)}\n".encode())
+        os.write(int(os.environ[RECORD]), f"{json.dumps(entry)}\n".encode())
 
 
 def in_a_line(failure: BaseException) -> str:
-    """Name the type of an exception, and what it says."""
+    """Return the type and the message of an exception in one line."""
     return " ".join(f"{type(failure).__name__}: {failure}".split())
 
 
-def _named(rank: int, ranks: Ranks, what: str) -> str:
-    return f"rank {rank} of {ranks.size}: {what}"
+def _named(rank: int, ranks: Ranks, message: str) -> str:
+    return f"rank {rank} of {ranks.size}: {message}"

@@ -1,4 +1,4 @@
-"""Whether, and on how many processes of MPI, a solve can run: its ranks."""
+"""Availability of MPI, and the number of ranks of a solve."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mortarbench.harness.errors import InputError, shown
 
-MOST_RANKS = 4096
+MAX_RANKS = 4096
 MISSING = (
     "needs mpi4py and an mpiexec; expected `pip install 'mortarbench[mpi]'`, or an MPI "
     "of the system with an mpi4py that was built for it"
@@ -17,7 +17,7 @@ MISSING = (
 
 
 def mpiexec() -> str | None:
-    """Find what starts ranks, beside this Python or on the path; None without MPI."""
+    """Return the path of mpiexec, beside this Python or on PATH; None without MPI."""
     if find_spec("mpi4py") is None:
         return None
     beside = Path(sys.executable).with_name("mpiexec")
@@ -25,19 +25,19 @@ def mpiexec() -> str | None:
 
 
 def ranks_asked(count: object, where: str) -> int:
-    """Check a number of ranks, and that they can be started here if there are several.
+    """Check a number of ranks, and that MPI is available if there are several.
 
-    where : what asks, for the message
+    where : option or key, for the message
 
     Raises
     ------
     InputError
-        When it is no number from 1 on, or there is no MPI.
+        When it is not an integer from 1 to MAX_RANKS, or MPI is missing.
 
     """
-    if type(count) is not int or not 1 <= count <= MOST_RANKS:
+    if type(count) is not int or not 1 <= count <= MAX_RANKS:
         raise InputError(
-            f"{where} = {shown(count)}; expected a number of ranks, 1 to {MOST_RANKS}"
+            f"{where} = {shown(count)}; expected a number of ranks, 1 to {MAX_RANKS}"
         )
     if count > 1 and mpiexec() is None:
         raise InputError(f"{where} = {count} {MISSING}")

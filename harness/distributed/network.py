@@ -1,4 +1,4 @@
-"""How fast the ranks of a solve talk to one another: latencies and bandwidth."""
+"""Latency and bandwidth of the messages between the ranks of a solve."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE = 2**20  #: bytes of a message that only bandwidth matters to
-_BATCHES = 5  #: of calls that are timed together, the first included
+LARGE_BYTES = 2**20  #: of a message whose time is determined by bandwidth
+_BATCHES = 5  #: of calls that are timed together; the first one warms up
 
 
 def network(comm: Comm) -> dict[str, float]:
     """Time reductions and messages; called by all ranks, takes some milliseconds.
 
-    Messages go round a ring, all ranks sending at the same time, as neighbours do in a
-    product. Medians of batches.
+    All ranks send around a ring at the same time, like neighbours in a product. The
+    times are medians over batches.
 
     Returns
     -------
@@ -31,7 +31,7 @@ def network(comm: Comm) -> dict[str, float]:
     """
     right, left = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size
     one, all_ = np.zeros(1), np.zeros(comm.size)
-    sent, received = np.zeros(LARGE // 8), np.zeros(LARGE // 8)
+    sent, received = np.zeros(LARGE_BYTES // 8), np.zeros(LARGE_BYTES // 8)
 
     def reduction() -> None:
         comm.Allgather(one, all_)
@@ -44,16 +44,16 @@ def network(comm: Comm) -> dict[str, float]:
     return {
         "reduction_seconds": _seconds(reduction, 10),
         "message_seconds": short,
-        "seconds_per_byte": max(long - short, 0.0) / LARGE,
+        "seconds_per_byte": max(long - short, 0.0) / LARGE_BYTES,
     }
 
 
-def _seconds(act: Callable[[], None], times: int) -> float:
-    """Take the median over batches of the time of one act, s; the first warms up."""
-    found = []
+def _seconds(call: Callable[[], None], times: int) -> float:
+    """Return the median over batches of the time of a call, s."""
+    seconds = []
     for _ in range(_BATCHES):
         start = perf_counter()
         for _ in range(times):
-            act()
-        found.append((perf_counter() - start) / times)
-    return median(found[1:])
+            call()
+        seconds.append((perf_counter() - start) / times)
+    return median(seconds[1:])

@@ -1,19 +1,19 @@
 # cython: language_level=3, boundscheck=False, wraparound=False
-"""Products with a sparse matrix by rows, together with the sum that they are part of.
+"""Products with a sparse matrix in CSR format, fused with a linear combination.
 
-On ranks, vectors are short and products many: what a library does around a product, and
-a pass for the sum, would cost as much as the product. Compiled when the package is
-installed; `sparse.pyi` has the types.
+On ranks, vectors are short and products many: the overhead of a library call, and
+another pass over the vectors for the combination, would cost as much as the product.
+Compiled when the package is installed; `sparse.pyi` has the types.
 """
 
 import numpy as np
 
 
 cdef class CompressedRows:
-    """A matrix M (n, k) by rows (CSR)."""
+    """A matrix M (n, k) in CSR format."""
 
     cdef readonly tuple shape
-    cdef object matrix  # which holds what is pointed to
+    cdef object matrix  # keeps the arrays alive that the pointers below refer to
     cdef Py_ssize_t n, k
     cdef const double *data
     cdef const int *indices
@@ -34,47 +34,47 @@ cdef class CompressedRows:
     def __matmul__(self, const double[::1] x):
         """Return Mx (n,) of x (k,)."""
         self._expect(x.shape[0], self.k)
-        found = np.empty(self.n)
-        cdef double[::1] y = found
+        product = np.empty(self.n)
+        cdef double[::1] y = product
         if self.n and self.k:
             _times(self.n, self.data, self.indices, self.indptr, &x[0], &y[0])
         else:
             y[:] = 0
-        return found
+        return product
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
         """Return sv + tMx (n,) of v (n,) and x (k,)."""
         self._expect(v.shape[0], self.n)
-        found = self @ x
-        cdef double[::1] y = found
+        product = self @ x
+        cdef double[::1] y = product
         cdef Py_ssize_t i
         for i in range(self.n):
             y[i] = s * v[i] + t * y[i]
-        return found
+        return product
 
     def weighted_difference(
         self, const double[::1] v, const double[::1] x, const double[::1] weights
     ):
-        """Return v − Mx (n,) of v (n,) and x (k,), each entry times its weight (n,)."""
+        """Return diag(weights)(v − Mx) (n,) of v (n,), x (k,) and weights (n,)."""
         self._expect(v.shape[0], self.n)
         self._expect(weights.shape[0], self.n)
-        found = self @ x
-        cdef double[::1] y = found
+        product = self @ x
+        cdef double[::1] y = product
         cdef Py_ssize_t i
         for i in range(self.n):
             y[i] = weights[i] * (v[i] - y[i])
-        return found
+        return product
 
     def transposed_times(self, const double[::1] x):
         """Return Mᵀx (k,) of x (n,)."""
         self._expect(x.shape[0], self.n)
-        found = np.zeros(self.k)
-        cdef double[::1] y = found
+        product = np.zeros(self.k)
+        cdef double[::1] y = product
         if self.n and self.k:
             _transposed_times(
                 self.n, self.data, self.indices, self.indptr, &x[0], &y[0]
             )
-        return found
+        return product
 
     cdef int _expect(self, Py_ssize_t got, Py_ssize_t expected) except -1:
         if got != expected:

@@ -1,15 +1,15 @@
-"""Vectors that are spread over the processes of one solve, the *ranks* of MPI.
+"""Vectors distributed over the processes of one solve, the *ranks* of MPI.
 
-Every rank runs the same code on its own slice. What acts on each component alone needs
-no other rank; what reduces a vector to a number reduces it over all of them, and all
-ranks get the same number, so that they take the same branches. An algorithm that is
-written with NumPy's vectors therefore runs on ranks as it is written:
+Every rank runs the same code on its local slice. Elementwise operations need no
+communication; reductions to a number run over all ranks and return the same number on
+each, so that all ranks take the same branches. An algorithm written for NumPy vectors
+therefore runs on ranks unchanged:
 
     x + alpha*p, np.where(free, g, 0)   on each slice
     x @ y, v.max(), moves.any()         over all ranks
 
-Whatever else is asked of a `DistributedVector` is refused, rather than answered with
-the slice alone.
+A `DistributedVector` raises TypeError for any other operation, whose result would
+depend on the local slice only.
 """
 
 from __future__ import annotations
@@ -39,62 +39,66 @@ if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
 T = TypeVar("T")
-FEW = 64  #: numbers that are added in the order of the ranks
+#: Arrays of up to this size are gathered and added in the order of the ranks, so that
+#: all ranks round alike. Longer ones go through Allreduce.
+MAX_ORDERED_SUM = 64
 
-
-#: what `Ranks.clocked` tells apart: products with local operators; copying what is
-#: exchanged; solves of the coarse problem and what else all ranks do alike; blocked in
-#: MPI until the numbers of the others have come
+#: Parts of the time of a solve: products with local operators; packing and unpacking of
+#: exchanged values; solves of the coarse problem and other work repeated on all ranks;
+#: waiting in MPI for other ranks.
 PARTS = ("products", "exchange", "coarse", "waiting")
 
 
 @dataclass(frozen=True, eq=False)
 class Ranks:
-    """The processes of one solve, and what this one has spent on it."""
+    """The processes of one solve, with timers and counters of this process."""
 
     comm: Comm
-    #: s, of the `PARTS`, which do not overlap
+    #: s, spent on each of the `PARTS`, which do not overlap
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
-    #: collective reductions; messages to single ranks, and bytes of these
+    #: number of reductions; of messages to single ranks, and of their bytes
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )
-    #: s: how fast they talk to one another, as `harness.distributed.network.network`
-    #: measured it; empty where it did not
+    #: latencies and time per byte, s, from `harness.distributed.network.network`;
+    #: empty if they were not measured
     network: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
-    def apart(self) -> Comm:
-        """A communicator of the same processes; called first by all ranks together."""
+    def private_comm(self) -> Comm:
+        """A duplicate of the communicator; the first access is collective."""
         return self.comm.Dup()
 
     @property
     def size(self) -> int:
-        """How many there are."""
+        """Number of ranks."""
         return int(self.comm.size)
 
     @property
     def rank(self) -> int:
-        """Which one this process is, from 0 on."""
+        """Index of this rank, from 0."""
         return int(self.comm.rank)
 
     def total(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Add arrays of one shape over all ranks; every rank gets the same sum."""
+        """Sum arrays of equal shape over all ranks; every rank gets the same result."""
         part = np.ascontiguousarray(part, dtype=float)
-        if part.size <= FEW:
-            return np.asarray(self.everyones(part).sum(axis=0))
-        found = np.empty_like(part)
+        if part.size <= MAX_ORDERED_SUM:
+            return np.asarray(self.gather_all(part).sum(axis=0))
+        total = np.empty_like(part)
         self.counts["reductions"] += 1
         with self.clocked("waiting"):
-            self.comm.Allreduce(part, found)
-        return found
+            self.comm.Allreduce(part, total)
+        return total
 
     def extreme(self, value: float, pick: Callable[[Any], Any]) -> float:
-        """Pick the least or largest number of all ranks."""
-        return float(pick(self.everyones(np.array([value], dtype=float))))
+        """Return the least or largest number of all ranks.
 
-    def everyones(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the arrays of one shape of all ranks, (size, …)."""
+        pick : np.min or np.max
+        """
+        return float(pick(self.gather_all(np.array([value], dtype=float))))
+
+    def gather_all(self, part: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Gather the arrays of all ranks, of equal shape, to (size, …) on each."""
         parts = np.empty((self.size, *part.shape))
         self.counts["reductions"] += 1
         with self.clocked("waiting"):
@@ -107,23 +111,24 @@ class Ranks:
         sizes: NDArray[np.int64],
         coming: NDArray[np.int64],
     ) -> Callable[[], NDArray[np.float64]]:
-        """Send consecutive parts to other ranks, who send at the same time.
+        """Start to exchange consecutive parts of an array with other ranks.
 
-        sizes, coming : (size,) of what goes to each and of what comes from each
+        sizes, coming : (size,) numbers of entries sent to and received from each rank
 
         Returns
         -------
-        waits until all is there, and returns what came, in the order of the ranks;
-        what is done before that is done meanwhile
+        a function that waits for all messages and returns the entries received, in the
+        order of the ranks; work done before its call overlaps with communication
 
         """
-        out, found = np.ascontiguousarray(out), np.empty(int(coming.sum()))
+        out, received = np.ascontiguousarray(out), np.empty(int(coming.sum()))
         ends, at = np.cumsum(sizes), np.cumsum(coming)
         sends, comes = (np.flatnonzero(n).tolist() for n in (sizes, coming))
         self.counts["messages"] += len(sends)
         self.counts["bytes"] += out.nbytes
         posted = [
-            self.comm.Irecv(found[at[r] - coming[r] : at[r]], source=r) for r in comes
+            self.comm.Irecv(received[at[r] - coming[r] : at[r]], source=r)
+            for r in comes
         ]
         posted += [
             self.comm.Isend(out[ends[r] - sizes[r] : ends[r]], dest=r) for r in sends
@@ -134,81 +139,85 @@ class Ranks:
                 with self.clocked("waiting"):
                     for request in posted:
                         request.Wait()
-            return found
+            return received
 
         return arrived
 
-    def clocked(self, what: str) -> _Clock:
-        """Note how long something takes, one of the `PARTS`, less other parts in it."""
-        return _Clock(self.seconds, what)
+    def clocked(self, part: str) -> _Clock:
+        """Return a context that adds its time to one of the `PARTS`.
+
+        The time of contexts nested in it counts for their parts only.
+        """
+        return _Clock(self.seconds, part)
 
     def clear(self) -> None:
-        """Begin to count anew."""
+        """Reset timers and counters."""
         for table in (self.seconds, self.counts):
             table.update(dict.fromkeys(table, 0))
 
 
-def alone() -> Ranks:
-    """Return the ranks of a single process, which needs no MPI."""
-    return Ranks(cast("Comm", _Alone()))
+def single_process() -> Ranks:
+    """Return the `Ranks` of a single process, without MPI."""
+    return Ranks(cast("Comm", _SingleProcess()))
 
 
-class _Alone:
-    """The communicator of a single process: there is nobody else to hear from."""
+class _SingleProcess:
+    """The communicator of a single process, which has no other rank."""
 
     size = 1
     rank = 0
 
-    def Dup(self) -> _Alone:
+    def Dup(self) -> _SingleProcess:
         """Return a communicator of the same process."""
         return self
 
     def allgather(self, part: T) -> list[T]:
-        """Return what all have, in the order of the ranks."""
+        """Return the objects of all ranks, in their order."""
         return [part]
 
     def alltoall(self, parts: list[T]) -> list[T]:
-        """Return what all have for this one."""
+        """Return the objects that all ranks send to this one."""
         return parts
 
     def Allgather(self, part: NDArray[Any], parts: NDArray[Any]) -> None:
-        """Fill parts (1, …) with what all have."""
+        """Fill parts (1, …) with the arrays of all ranks."""
         parts[0] = part
 
-    def Allreduce(self, part: NDArray[Any], found: NDArray[Any]) -> None:
-        """Fill `found` with the sum of what all have."""
-        found[...] = part
+    def Allreduce(self, part: NDArray[Any], total: NDArray[Any]) -> None:
+        """Fill `total` with the sum over all ranks."""
+        total[...] = part
 
 
 class _Clock:
-    """Adds what a block takes to a part, without what other parts in it took.
+    """Timer of a block for one part, without the time of nested blocks.
 
-    A class, since as a generator it would take a few times as long.
+    It is a class because a generator context costs a few times as much.
     """
 
-    __slots__ = ("before", "seconds", "start", "what")
+    __slots__ = ("before", "part", "seconds", "start")
 
-    def __init__(self, seconds: dict[str, float], what: str) -> None:
-        self.seconds, self.what = seconds, what
+    def __init__(self, seconds: dict[str, float], part: str) -> None:
+        self.seconds, self.part = seconds, part
 
     def __enter__(self) -> None:
+        # nested blocks add their time to the same table: it is subtracted at the end
         self.before = sum(self.seconds.values())
         self.start = perf_counter()
 
     def __exit__(self, *_: object) -> None:
         passed = perf_counter() - self.start
         within = sum(self.seconds.values()) - self.before
-        self.seconds[self.what] += passed - within
+        self.seconds[self.part] += passed - within
 
 
 class DistributedVector(np.ndarray):
-    """The slice (n_rank,) of a vector that this rank holds; reductions are of all.
+    """The local slice (n_rank,) of a vector; reductions run over all ranks.
 
     Raises
     ------
     TypeError
-        For what is neither done component by component nor one of the reductions sum,
-        min, max, any, all, dot product, norm and count.
+        For operations that are neither elementwise nor one of the reductions sum, min,
+        max, any, all, dot product, norm and count.
 
     """
 
@@ -237,7 +246,7 @@ class DistributedVector(np.ndarray):
         if method == "__call__":
             if "out" in how:
                 how["out"] = tuple(_slice(out) for out in how["out"])
-            return _again(self.ranks, getattr(ufunc, method)(*plain, **how))
+            return _rewrap(self.ranks, getattr(ufunc, method)(*plain, **how))
         if method == "reduce" and ufunc in _REDUCTIONS:
             return _REDUCTIONS[ufunc](self.ranks, ufunc.reduce(*plain, **how))
         raise TypeError(f"{ufunc.__name__}.{method} of a distributed vector")
@@ -250,39 +259,39 @@ class DistributedVector(np.ndarray):
             return np.sqrt(float(_contracted(self.ranks, plain[0], plain[0])))
         if function is np.count_nonzero:
             return int(self.ranks.total(np.array([np.count_nonzero(plain[0])]))[0])
-        if function in _COMPONENTWISE:
-            return _again(self.ranks, function(*plain, **kwargs))
+        if function in _ELEMENTWISE:
+            return _rewrap(self.ranks, function(*plain, **kwargs))
         raise TypeError(f"{function.__name__} of a distributed vector")
 
 
 def distributed(part: NDArray[Any], ranks: Ranks) -> DistributedVector:
-    """Take an array (n_rank,) for this rank's slice of a vector."""
-    found = np.ascontiguousarray(part).view(DistributedVector)
-    found.ranks = ranks
-    return found
+    """Wrap an array (n_rank,) as the local slice of a vector."""
+    vector = np.ascontiguousarray(part).view(DistributedVector)
+    vector.ranks = ranks
+    return vector
 
 
 def _slice(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, DistributedVector) else value
 
 
-def _again(ranks: Ranks, found: Any) -> Any:
-    if isinstance(found, tuple):
-        return tuple(_again(ranks, f) for f in found)
-    return distributed(found, ranks) if np.ndim(found) == 1 else found
+def _rewrap(ranks: Ranks, result: Any) -> Any:
+    if isinstance(result, tuple):
+        return tuple(_rewrap(ranks, r) for r in result)
+    return distributed(result, ranks) if np.ndim(result) == 1 else result
 
 
 def _contracted(ranks: Ranks, a: NDArray[Any], b: NDArray[Any]) -> Any:
-    """Multiply (n,) or (k, n) with (n,) or (n, k), summed over all ranks."""
-    found = ranks.total(np.atleast_1d(a @ b))
-    return found if np.ndim(a) + np.ndim(b) > 2 else float(found[0])
+    """Multiply (n,) or (k, n) by (n,) or (n, k), and sum over all ranks."""
+    product = ranks.total(np.atleast_1d(a @ b))
+    return product if np.ndim(a) + np.ndim(b) > 2 else float(product[0])
 
 
 @dataclass(frozen=True, eq=False)
 class DistributedColumns:
-    """A sparse matrix G (r, n) of whose columns each rank holds a slice.
+    """A sparse matrix G (r, n) whose columns are distributed over the ranks.
 
-    Vectors (r,) are the same on all ranks: r is the size of a coarse problem.
+    Vectors (r,) are replicated on all ranks: r is the size of a coarse problem.
     """
 
     part: csr_array  #: (r, n_rank)
@@ -290,13 +299,13 @@ class DistributedColumns:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows, and columns of this rank."""
+        """Number of rows, and of local columns."""
         rows, columns = self.part.shape
         return rows, columns
 
     @property
     def T(self) -> _DistributedRows:
-        """Gᵀ, which takes (r,) to this rank's slice of (n,)."""
+        """Gᵀ, which maps (r,) to the local slice of (n,)."""
         return _DistributedRows(self)
 
     def __matmul__(self, v: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -306,22 +315,25 @@ class DistributedColumns:
         return DistributedColumns(abs(self.part), self.ranks)
 
     def scaled(self, s: NDArray[np.float64]) -> DistributedColumns:
-        """Multiply row i with s[i]."""
+        """Multiply row i by s[i]."""
         return DistributedColumns(csr_array(diags_array(s) @ self.part), self.ranks)
 
     def __getitem__(self, rows: NDArray[np.int64]) -> DistributedColumns:
         return DistributedColumns(csr_array(self.part[rows]), self.ranks)
 
     def gram(self, columns: NDArray[np.bool_] | None = None) -> csc_array:
-        """Return G_F G_Fᵀ (r, r) of some columns F, or of all."""
+        """Return G_F G_Fᵀ (r, r) for the columns F, or GGᵀ.
+
+        columns : (n_rank,) mask of F; None for all columns
+        """
         part = self.part
         if columns is not None:
             part = part[:, np.flatnonzero(np.asarray(columns))]
         with self.ranks.clocked("coarse"):
-            mine = csc_array(part @ part.T)
+            local = csc_array(part @ part.T)
             with self.ranks.clocked("waiting"):
-                all_ = self.ranks.comm.allgather(mine)
-            return csc_array(sum(all_))
+                grams = self.ranks.comm.allgather(local)
+            return csc_array(sum(grams))
 
 
 @dataclass(frozen=True, eq=False)
@@ -333,67 +345,68 @@ class _DistributedRows:
 
 
 class Share(NamedTuple):
-    """What one rank has of a QP that is solved on several."""
+    """The part of a distributed QP on one rank."""
 
-    qp: QP  #: vectors are distributed, A has distributed columns, b is on every rank
-    #: gathers a solution of it on rank 0; None on the others
+    qp: QP  #: vectors and the columns of A are distributed, b is replicated
+    #: gathers a solution on rank 0; returns None on other ranks
     whole: Callable[[Solution], Solution | None]
 
 
-#: begins the digest of a QP that no process has whole: `Emitted.digest`
-EMITTED = "emitted-"
+#: Prefix of the digest of a QP that is not stored as a whole: `DistributedQP.digest`.
+DISTRIBUTED_DIGEST = "emitted-"
 
 
-class Answered(NamedTuple):
-    """What ranks make of a solution together; all of them call what they call."""
+class Evaluation(NamedTuple):
+    """Collective evaluation of a solution; its functions are called by all ranks."""
 
-    #: what `harness.verify.over_ranks` takes to certify it; None: that needs the whole
+    #: arguments of `certify_over_ranks` (`harness.verify.over_ranks`); None if a
+    #: certificate needs the whole QP
     certifiable: Any | None
-    #: physical results, SI, the same on all ranks; None: these need the whole
+    #: returns physical results, SI, equal on all ranks; None if they need the whole QP
     quantities: Callable[[], Mapping[str, Any]] | None
 
 
-class Emitted(NamedTuple):
-    """A QP that ranks have made together, each its share; no process has it whole."""
+class DistributedQP(NamedTuple):
+    """A QP assembled by ranks, each its share; no process stores it as a whole."""
 
-    variables: int  #: of the whole
-    equality_rows: int  #: of the whole
-    bounds: int  #: finite ones, of the whole
-    #: puts this rank's operator together, anew each time: called by all ranks
+    variables: int  #: total number
+    equality_rows: int  #: total number
+    bounds: int  #: total number of finite bounds
+    #: assembles the local share; each call builds a new operator. Collective.
     share: Callable[[], Share]
-    #: names the numbers of the QP; called by all ranks. Not as
-    #: `harness.files.qpfile.qp_digest`, which takes the whole, and therefore marked by
-    #: `EMITTED`
+    #: digest of the coefficients. Collective. It differs from
+    #: `harness.files.qpfile.qp_digest`, which needs the whole QP, and therefore has the
+    #: prefix `DISTRIBUTED_DIGEST`.
     digest: Callable[[], str]
-    #: of this rank's slice of a solution, what it means; called by all ranks
-    answer: Callable[[Solution], Answered]
+    #: evaluates a solution from its local slice. Collective.
+    answer: Callable[[Solution], Evaluation]
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Say of the whole what `harness.qp.QP.sizes` does."""
+        """Sizes of the whole QP, as in `harness.qp.QP.sizes`."""
         return {
             "variables": self.variables, "equalities": self.equality_rows,
             "inequalities": 0, "bounds": self.bounds,
         }  # fmt: skip
 
 
-#: has all ranks emit a case, family, params and form, where its family can
-Emit = Callable[[Mapping[str, Any], Ranks], Emitted]
+#: Assembles a case, given by family, params and form, on all ranks. Collective.
+Emit = Callable[[Mapping[str, Any], Ranks], DistributedQP]
 
 
 @runtime_checkable
 class Distributable(Protocol):
-    """A product x ↦ Px that can be done by several ranks.
+    """A product x ↦ Px that can be distributed over ranks.
 
-    What puts an operator together may return one (`harness.operators`).
+    A maker of an operator (`harness.operators`) may return one.
     """
 
     @property
     def parts(self) -> int:
-        """How many parts there are, the most ranks that can share them."""
+        """Number of parts, which is the largest number of ranks."""
 
     def share(self, qp: QP, ranks: Ranks) -> Share:
-        """Take this rank's share of a `qp` with this P; called by all ranks.
+        """Return the local share of a `qp` with this P; called by all ranks.
 
         Raises
         ------
@@ -410,6 +423,6 @@ _REDUCTIONS: Mapping[np.ufunc, Callable[[Ranks, Any], Any]] = {
     np.logical_or: lambda ranks, part: bool(ranks.extreme(part, np.max)),
     np.logical_and: lambda ranks, part: bool(ranks.extreme(part, np.min)),
 }
-_COMPONENTWISE = frozenset(
+_ELEMENTWISE = frozenset(
     {np.where, np.clip, np.zeros_like, np.empty_like, np.copy, np.broadcast_to}
 )

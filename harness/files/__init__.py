@@ -1,1 +1,1 @@
-"""What is read and written: texts, arrays, QPs in several formats."""
+"""Reading and writing of files: texts, arrays, and QPs in several formats."""

@@ -1,9 +1,9 @@
 """Copies of the files that cases are read from: ``FOLDER/files/DIGEST.SUFFIX``.
 
-A result folder is complete without the machine where it was measured: files of QPs
-travel with it, each content once, as far as their sizes permit. ``files/copies.json``
-lists the paths by which cases name them, with those that were too large. Its texts are
-compared with names of cases; none of them is ever opened as a path.
+Result folders are self-contained: they have copies of the files of QPs, one per
+content, unless these are too large. ``files/copies.json`` lists the paths in the names
+of cases, including files that were too large. These texts are only compared with names
+of cases, and never opened as paths.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ from mortarbench.harness.plugin import SourceFile
 
 FOLDER = "files"
 LIST = "copies.json"
-MOST_FILE_MIB = 64  #: largest file that is copied: results stay small enough to send
-MOST_FOLDER_MIB = 256  #: all copies of a result folder
+MAX_FILE_MIB = (
+    64  #: largest file that is copied, so that results stay small enough to send
+)
+MAX_FOLDER_MIB = 256  #: sum of all copies in a result folder
 
 _DIGITS = 12  #: of the SHA-256 of a file, as in the parameters of cases
 _COPY = re.compile(rf"([0-9a-f]{{{_DIGITS}}})((?:\.[a-z0-9]{{1,8}}){{1,2}})")
 
 
 def content_digest(*paths: Path) -> str:
-    """Digest the bytes of files, 12 hexadecimal digits of SHA-256.
+    """Return the digest of files, 12 hexadecimal digits of SHA-256.
 
     Raises
     ------
     InputError
-        When one cannot be read, is no regular file, or is larger than
+        When one cannot be read, is not a regular file, or is larger than
         `harness.files.datafile` allows.
 
     """
@@ -52,34 +54,34 @@ def content_digest(*paths: Path) -> str:
 
 
 def is_copy(name: str) -> bool:
-    """Return whether a file in ``files/`` is named like one that we write."""
+    """Return True for the names of files that this module writes to ``files/``."""
     return name == LIST or _COPY.fullmatch(name) is not None
 
 
 class _Entry(NamedTuple):
-    """A file as the list describes it."""
+    """An entry of the list of files."""
 
-    path: str  #: as cases name it
+    path: str  #: in the names of cases
     sha256: str
     size: int  #: bytes
 
 
 class Copies:
-    """Files of cases, beside the copies of a result folder.
+    """Files of cases, with the copies of a result folder as a fallback.
 
-    The folder is looked at when a file is missing, not before.
+    The folder is read only if a file is missing.
     """
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder / FOLDER
 
     def locate(self, source: SourceFile) -> Path:
-        """Return the original if its content is that of the digest, else the copy.
+        """Return the original if its content has the digest, and otherwise the copy.
 
         Raises
         ------
         InputError
-            When there is neither, or the copy has another content.
+            When both are missing, or the copy has another content.
 
         """
         here = _digest_if_there(Path(source.path))
@@ -88,8 +90,8 @@ class Copies:
         name = f"{source.sha256}{source.suffix}"
         if not _COPY.fullmatch(name):  # it could lead out of the folder
             raise InputError(
-                f"{shortened(source.path)}: {shortened(source.sha256)!r} is no digest; "
-                f"expected {_DIGITS} hex digits"
+                f"{shortened(source.path)}: {shortened(source.sha256)!r} is not a "
+                f"digest; expected {_DIGITS} hex digits"
             )
         copy = self._folder / name
         if not os.path.lexists(copy):
@@ -98,7 +100,7 @@ class Copies:
         return copy
 
     def digest(self, path: str) -> str:
-        """Return the digest of a file; of one that is missing, that of its copy.
+        """Return the digest of a file or, if it is missing, of its copy.
 
         Raises
         ------
@@ -108,25 +110,26 @@ class Copies:
         """
         if os.path.lexists(path):
             return content_digest(Path(path))
-        known = {e.sha256 for e in _entries(self._folder) if e.path == path}
-        if not known:
-            return content_digest(Path(path))  # which says that there is no such file
-        if len(known) > 1:
+        digests = {e.sha256 for e in _entries(self._folder) if e.path == path}
+        if not digests:
+            return content_digest(Path(path))  # raises: no such file
+        if len(digests) > 1:
             raise InputError(
-                f"{path} is not here, and {self._folder} has {len(known)} contents of "
-                f"that name (sha256 {some(sorted(known))}); put the right one at {path}"
+                f"{path} is not here, and {self._folder} has {len(digests)} contents "
+                f"of that name (sha256 {some(sorted(digests))}); put the right one at "
+                f"{path}"
             )
-        return known.pop()
+        return digests.pop()
 
     def paths(self) -> list[str]:
-        """List the paths by which cases name the files."""
+        """Return the paths in the names of cases."""
         return sorted({entry.path for entry in _entries(self._folder)})
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
-        """Name a file that is neither here nor among the copies."""
+        """Return the error for a file that is neither here nor among the copies."""
         sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
-        if sizes and (size := max(sizes)) > MOST_FILE_MIB * MIB:
+        if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
             why = f"was too large to travel with the results ({_mib(size)})"
         other = f" (the file changed: it has {here})" if here is not None else ""
         return InputError(
@@ -136,7 +139,7 @@ class Copies:
 
 
 def check_copy(copy: Path, digest: str, remedy: str) -> None:
-    """Refuse a copy whose content is not that of its name.
+    """Raise unless the content of a copy has the digest in its name.
 
     Raises
     ------
@@ -146,26 +149,26 @@ def check_copy(copy: Path, digest: str, remedy: str) -> None:
     """
     with opened(copy, "the copy of a file") as file:
         size = os.fstat(file.fileno()).st_size
-        if size > MOST_FILE_MIB * MIB:
+        if size > MAX_FILE_MIB * MIB:
             raise InputError(
-                f"{copy}: {_mib(size)}, where copies have {MOST_FILE_MIB} MiB at most; "
+                f"{copy}: {_mib(size)}, where copies have {MAX_FILE_MIB} MiB at most; "
                 f"{remedy}"
             )
-        found = hex_digest(pieces(file), _DIGITS)
-    if found != digest:
+        actual = hex_digest(pieces(file), _DIGITS)
+    if actual != digest:
         raise InputError(
-            f"{copy}: its content has the digest {found}, not {digest}: it was damaged "
-            f"or exchanged; {remedy}"
+            f"{copy}: its content has the digest {actual}, not {digest}: it was "
+            f"damaged or exchanged; {remedy}"
         )
 
 
 def check_copies(folder: Path) -> None:
-    """Refuse a result folder with a copy whose content is not that of its name.
+    """Check all copies of a result folder, see `check_copy`.
 
     Raises
     ------
     InputError
-        With the first of them.
+        For the first copy with another content.
 
     """
     for copy, digest, _ in copies_in(folder):
@@ -177,7 +180,7 @@ def keep_copies(
 ) -> None:
     """Copy the files of cases into a result folder, each content once.
 
-    tell : is told, in a line each, of files that are too large to travel
+    tell : called with a message for each file that is too large
 
     Raises
     ------
@@ -188,63 +191,63 @@ def keep_copies(
     distinct = {(s.path, s.sha256): s for s in sources}.values()
     if not distinct:
         return
-    kept = _Kept(folder, tell)
+    writer = _Writer(folder, tell)
     for source in distinct:
-        kept.keep(Path(source.path), source.sha256, source.suffix, source.path)
-    kept.write_list()
+        writer.keep(Path(source.path), source.sha256, source.suffix, source.path)
+    writer.write_list()
 
 
 def merge_copies(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None]
 ) -> None:
-    """Copy the files that result folders hold to another one, each content once."""
-    kept = _Kept(out, tell)
+    """Copy the copies of several result folders to another, each content once."""
+    writer = _Writer(out, tell)
     for source in sources:
         paths: dict[str, str] = {}
         for entry in _entries(source / FOLDER):
             paths.setdefault(entry.sha256, entry.path)
-            kept.add(entry)
+            writer.add(entry)
         for copy, digest, suffix in copies_in(source):
-            kept.keep(copy, digest, suffix, paths.get(digest))
-    kept.write_list()
+            writer.keep(copy, digest, suffix, paths.get(digest))
+    writer.write_list()
 
 
 def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
-    """List the copies of a result folder: path, digest, suffix."""
-    found = []
+    """Return path, digest and suffix of each copy in a result folder."""
+    copies = []
     for name in _names(folder / FOLDER):
         if match := _COPY.fullmatch(name):
-            found.append((folder / FOLDER / name, match[1], match[2]))
-    return found
+            copies.append((folder / FOLDER / name, match[1], match[2]))
+    return copies
 
 
 def remove_copies(folder: Path) -> None:
-    """Delete the copies of a result folder; what else lies beside them stays."""
+    """Delete the copies of a result folder, but no other files beside them."""
     for name in filter(is_copy, _names(folder / FOLDER)):
         (folder / FOLDER / name).unlink(missing_ok=True)
 
 
 def refuse_own_copies(folder: Path, sources: Iterable[SourceFile]) -> None:
-    """Refuse cases that are read from copies which are about to be deleted.
+    """Raise if a case is read from a copy that is about to be deleted.
 
     Raises
     ------
     InputError
-        With the first of them.
+        For the first such case.
 
     """
-    own = (folder / FOLDER).resolve()
+    copies = (folder / FOLDER).resolve()
     for path in {s.path for s in sources}:
-        there = Path(path).resolve()
-        if there.parent == own and is_copy(there.name):
+        real = Path(path).resolve()
+        if real.parent == copies and is_copy(real.name):
             raise InputError(
                 f"{path} is a copy that --fresh deletes; put the file elsewhere, or "
                 "choose another --out"
             )
 
 
-class _Kept:
-    """The copies of a folder, while files are added."""
+class _Writer:
+    """Writer of copies to a folder."""
 
     def __init__(self, folder: Path, tell: Callable[[str], None]) -> None:
         self._folder = folder / FOLDER
@@ -254,13 +257,13 @@ class _Kept:
         self._size = sum(p.stat().st_size for p, *_ in copies_in(folder))
 
     def add(self, entry: _Entry) -> None:
-        """List a file, whether or not there is a copy of it."""
+        """Add an entry to the list; the file need not be copied."""
         self._entries[entry] = None
 
     def keep(self, original: Path, digest: str, suffix: str, name: str | None) -> None:
-        """Copy one file, unless a sound copy is there or it is too large.
+        """Copy a file, unless an intact copy exists or it is too large.
 
-        name : by which cases know it, to be listed; None where that is not known
+        name : path in the names of cases, for the list; None if unknown
         """
         copy = self._folder / f"{digest}{suffix}"
         if os.path.lexists(copy) and _digest_if_there(copy) == digest:
@@ -279,30 +282,30 @@ class _Kept:
                 for piece in pieces(file):
                     content.update(piece)
                     new.write(piece)
-                if (found := content.hexdigest()[:_DIGITS]) != digest:
+                if (actual := content.hexdigest()[:_DIGITS]) != digest:
                     raise InputError(
-                        f"{original}: its content has the digest {found}, not "
+                        f"{original}: its content has the digest {actual}, not "
                         f"{digest}; it changed while it was read; start again"
                     )
         self._size += size
 
     def _has_room(self, name: str, size: int) -> bool:
-        if size > MOST_FILE_MIB * MIB:
+        if size > MAX_FILE_MIB * MIB:
             self._tell(
-                f"{name} ({_mib(size)}) is larger than {MOST_FILE_MIB} MiB, and does "
+                f"{name} ({_mib(size)}) is larger than {MAX_FILE_MIB} MiB, and does "
                 "not travel with the results"
             )
             return False
-        if self._size + size > MOST_FOLDER_MIB * MIB:
+        if self._size + size > MAX_FOLDER_MIB * MIB:
             self._tell(
                 f"{name} ({_mib(size)}) does not travel with the results: their copies "
-                f"of files would take more than {MOST_FOLDER_MIB} MiB"
+                f"of files would take more than {MAX_FOLDER_MIB} MiB"
             )
             return False
         return True
 
     def write_list(self) -> None:
-        """Write the list, where it has changed."""
+        """Write the list if it has changed."""
         if list(self._entries) == self._before:
             return
         data = {"files": [entry._asdict() for entry in self._entries]}
@@ -311,7 +314,7 @@ class _Kept:
 
 
 def _digest_if_there(path: Path) -> str | None:
-    """Digest a file; return None where it cannot be read."""
+    """Return the digest of a file, or None if it cannot be read."""
     try:
         return content_digest(path)
     except InputError:
@@ -326,12 +329,12 @@ def _names(folder: Path) -> list[str]:
 
 
 def _entries(folder: Path) -> list[_Entry]:
-    """Read the list of a folder of copies; empty where there is none.
+    """Read the list of a folder of copies; empty without a list.
 
     Raises
     ------
     InputError
-        When it is no list that a run writes.
+        When the list is malformed.
 
     """
     path = folder / LIST

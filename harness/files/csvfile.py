@@ -1,8 +1,8 @@
-"""CSV tables whose texts are texts, also in spreadsheets.
+"""CSV tables that are safe to open in spreadsheets.
 
-A spreadsheet takes a cell that begins with ``=``, ``+``, ``-`` or ``@`` for a formula,
-and control characters may end a cell or turn its direction. Numbers are written as they
-are; a text that would be a formula gets an apostrophe in front, as one types it there.
+Spreadsheets interpret a cell that begins with ``=``, ``+``, ``-`` or ``@`` as a
+formula, and control characters may end a cell or change its direction. Numbers are
+written as they are; a text that would be a formula is prefixed with an apostrophe.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-_FORMULA = frozenset("=+-@＝＋－＠")  #: the wide ones in East Asian spreadsheets
+_FORMULA = frozenset("=+-@＝＋－＠")  #: also full-width, for East Asian spreadsheets
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})  #: categories that programs skip
 _CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})
-#: controls of the category Cf, which has the joiners of scripts and symbols, too
+#: direction controls; other characters of Cf join letters and symbols
 _DIRECTIONS = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
                         "\u2066\u2067\u2068\u2069")  # fmt: skip
 
 
 def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    """Write a table with a row of heads; of a float all digits, None as nothing."""
+    """Return a table as CSV, floats with all digits and None as an empty cell."""
     text = StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(map(_cell, heads))
@@ -36,9 +36,9 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Put an apostrophe before a text that a spreadsheet would take for a formula.
+    """Prefix a text that a spreadsheet would evaluate with an apostrophe.
 
-    What a program may skip before the sign does not hide it.
+    Characters that programs may skip before the sign are skipped here as well.
     """
     for char in text:
         if char in _FORMULA:
@@ -50,7 +50,7 @@ def inert(text: str) -> str:
 
 @lru_cache(1 << 16)
 def visible(text: str) -> str:
-    r"""Spell out controls, direction overrides and lone surrogates, as ``\n``."""
+    r"""Escape controls, direction overrides and lone surrogates, as ``\n``."""
     if text.isascii() and text.isprintable():
         return text
     return "".join(

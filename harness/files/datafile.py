@@ -1,9 +1,9 @@
-"""Data files that others made: regular ones only, of a size that a limit bounds.
+"""Reading of data files from untrusted sources, within a limit of memory.
 
-A file can declare far more than it holds: an archive that expands a thousandfold, a
-matrix of a billion columns without entries. So readers find out, from headers, what
-reading would take, and refuse what exceeds the limit before they begin. The limit is
-the environment variable ``MORTARBENCH_MOST_MIB``, in MiB, 2048 unless it is set.
+A small file can declare huge data: an archive that expands a thousandfold, or a matrix
+with a billion columns and no entries. Readers therefore determine the memory that they
+need from headers, and refuse files beyond the limit before reading. The limit is the
+environment variable ``MORTARBENCH_MOST_MIB``, in MiB, default 2048.
 """
 
 from __future__ import annotations
@@ -23,23 +23,23 @@ from mortarbench.harness.errors import InputError, shortened
 from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
-MOST_MIB = 2048
-MIB = 2**20
+DEFAULT_MIB = 2048
+MIB = 2**20  #: bytes
 
-_PIECE = 2**20  #: bytes that are expanded at once
-_LEAST_ROOM = 256 * MIB  #: of a parser, for what it imports and keeps
+_PIECE_BYTES = 2**20  #: expanded at a time
+_PARSER_BYTES = 256 * MIB  #: allowed for the code of a parser itself
 
 
-def most_bytes() -> int:
-    """Give the limit of what a data file may take in memory.
+def max_bytes() -> int:
+    """Return the limit of the memory for a data file.
 
     Raises
     ------
     InputError
-        When the environment variable is set, and no positive number.
+        When the environment variable is not a positive integer.
 
     """
-    text = os.environ.get(VARIABLE, str(MOST_MIB))
+    text = os.environ.get(VARIABLE, str(DEFAULT_MIB))
     try:
         most = int(text)
     except ValueError:
@@ -52,15 +52,17 @@ def most_bytes() -> int:
 
 
 def check_size(what: str, size: int) -> None:
-    """Refuse what would take more than the limit.
+    """Raise if `size` bytes exceed the limit.
+
+    what : subject of the message
 
     Raises
     ------
     InputError
-        With what it would take, in MiB, and how to raise the limit.
+        With the memory needed, in MiB, and how to raise the limit.
 
     """
-    if size > (most := most_bytes()):
+    if size > (most := max_bytes()):
         needed = f"{size // MIB}" if size < 2**60 else "more than 10^12"
         raise InputError(
             f"{what} would take {needed} MiB of memory; expected at most {most // MIB} "
@@ -70,15 +72,15 @@ def check_size(what: str, size: int) -> None:
 
 @contextmanager
 def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[BinaryIO]:
-    """Open a regular file to be read; pipes and devices could give without end.
+    """Open a regular file for reading; pipes and devices are refused.
 
-    expected : what would be right, for messages, e.g. "an npz file"
-    limited : whether a file above the limit is refused
+    expected : description of the file, for messages, e.g. "an npz file"
+    limited : refuse a file that exceeds the limit
 
     Raises
     ------
     InputError
-        When it cannot be opened, or is none of these.
+        When it cannot be opened, is not a regular file, or exceeds the limit.
 
     """
     with reading.opened(path, expected) as file:
@@ -88,36 +90,39 @@ def opened(path: Path, expected: str, *, limited: bool = True) -> Iterator[Binar
 
 
 def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
-    """Read a file whole; what is compressed by gzip, its name ends in .gz, expanded.
+    """Read a whole file, and expand it with gzip if its name ends in .gz.
 
-    expected : what would be right, for messages
-    copies : of the content that its parser may hold, for the limit
+    expected : description of the file, for messages
+    copies : number of copies of the content that the parser may store, for the limit
 
     Raises
     ------
     InputError
-        As `opened`; when the content would exceed the limit, or cannot be expanded.
+        For the same reasons as `opened`, and when the content would exceed the limit or
+        cannot be expanded.
 
     """
     with opened(path, expected) as file:
         if path.suffix.lower() != ".gz":
             size = os.fstat(file.fileno()).st_size
-            check_size(f"{path}: what it says", copies * size)
+            check_size(f"{path}: its content", copies * size)
             return file.read(size)
         try:
-            most, size = most_bytes() // copies, 0
+            most, size = max_bytes() // copies, 0
             with gzip.GzipFile(fileobj=file) as pieces:
-                while piece := pieces.read(_PIECE):  # first count: it costs no memory
+                while piece := pieces.read(
+                    _PIECE_BYTES
+                ):  # a first pass counts, without memory
                     if (size := size + len(piece)) > most:
                         raise InputError(
-                            f"{path}: what it expands to would take more than "
-                            f"{most_bytes() // MIB} MiB of memory with its parser; "
+                            f"{path}: its expanded content would take more than "
+                            f"{max_bytes() // MIB} MiB of memory with its parser; "
                             f"expected less (set {VARIABLE} to allow more)"
                         )
             file.seek(0)
             with gzip.GzipFile(fileobj=file) as whole:
                 return whole.read(size)
-        except (OSError, EOFError, zlib.error):  # no gzip, damaged, cut off
+        except (OSError, EOFError, zlib.error):  # not gzip, damaged, truncated
             raise InputError(
                 f"{path}: not a gzip file, or damaged; expected {expected}, compressed"
             ) from None
@@ -125,19 +130,19 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Let a library read a file: whatever that raises is the file's fault.
+    """Attribute all exceptions of a library, which parses a file, to the file.
 
-    wrong : what to say of it then
-    room : bytes of memory that the library may take beside 256 MiB; the kernel refuses
-        more
+    wrong : the message
+    room : bytes of memory that the library may use beside 256 MiB, as a limit of the
+        address space
 
     Raises
     ------
     InputError
-        For every exception but our own, and for a library that warns.
+        For every exception and warning in the block.
 
     """
-    room += _LEAST_ROOM
+    room += _PARSER_BYTES
     try:
         with warnings.catch_warnings(), _at_most(room):
             warnings.simplefilter("error")
@@ -149,18 +154,18 @@ def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
             f"{path}: would take more than {room // MIB} MiB of memory, while its size "
             "and its head declare less; expected a file that is not damaged"
         ) from None
-    except Exception:  # libraries raise whatever a damaged file leads them to
+    except Exception:  # damaged files cause many types of exceptions
         raise InputError(f"{path}: {wrong}") from None
 
 
 @contextmanager
 def _at_most(size: int) -> Iterator[None]:
-    """Bound what this process may take of address space beyond what it has."""
+    """Limit the address space of this process to `size` bytes more than in use."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     limit = pages * os.sysconf("SC_PAGE_SIZE") + size
-    known = [k for k in (limit, soft, hard) if k != resource.RLIM_INFINITY]
-    resource.setrlimit(resource.RLIMIT_AS, (min(known), hard))
+    finite = [k for k in (limit, soft, hard) if k != resource.RLIM_INFINITY]
+    resource.setrlimit(resource.RLIMIT_AS, (min(finite), hard))
     try:
         yield
     finally:
@@ -173,7 +178,7 @@ def json_object(text: str | bytes) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        When it is none, or nested deeper than Python's parser goes.
+        When it is not an object, or nested too deeply for Python's parser.
 
     """
     try:
@@ -181,5 +186,5 @@ def json_object(text: str | bytes) -> dict[str, Any]:
     except RecursionError:
         raise ValueError("meta is nested too deeply") from None
     if not isinstance(data, dict):
-        raise ValueError("meta is no JSON object")
+        raise ValueError("meta is not a JSON object")
     return data

@@ -1,7 +1,8 @@
-"""Files that outlive a crash: whole or not there; and full disks.
+"""Atomic replacement of files, and messages for full disks.
 
-A process may die, and a disk may be full, at any instant. A file that is replaced holds
-either its old content or all of its new one. Files of lines: `harness.files.lines`.
+A process may be killed, and a disk may become full, at any time. A file that is being
+replaced has either its old or its complete new content. For files that grow line by
+line see `harness.files.lines`.
 """
 
 from __future__ import annotations
@@ -17,42 +18,42 @@ from typing import IO
 
 from mortarbench.harness.errors import InputError
 
-_UNFINISHED = ".mortarbench-*.tmp"  #: what files are called until they are whole
-_OTHERS = ("*.tmp", "*.new", ".*.new")  #: of older versions, and of a case being built
-_OLD = ("suite.tmp", "environment.tmp")
+_UNFINISHED = ".mortarbench-*.tmp"  #: name of a file that is not yet complete
+_OTHERS = ("*.tmp", "*.new", ".*.new")  #: names in older versions, and in case folders
+_OLD = ("suite.tmp", "environment.tmp")  #: names in older versions
 
-#: of an OSError: the disk, or our share of it, takes no more
+#: Codes of an OSError for a full disk, an exhausted quota or a file size limit.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16
+_PROBE_BYTES = 2**16  #: written to find out whether a disk is full
 _MIB = 2**20
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """Open a new file that takes the place of `path` at the end of the block.
+    """Open a new file that replaces `path` at the end of the block.
 
-    It is on the disk by then. Whatever happens, `path` leads to what was there before
-    or to all that was written; who has opened or mapped the old file keeps that.
+    It is flushed to the disk before. After a crash, `path` is either the old file or
+    the complete new one. Processes that have opened or mapped the old file keep it.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:
         with new.open("x+b") as file:
             yield file
-            _sync(file)
+            _sync(file)  # before the rename, or a crash could leave an empty file
             move_file(new, path)
     finally:
         new.unlink(missing_ok=True)
 
 
 def replace_file(path: Path, content: bytes | memoryview) -> None:
-    """Write a file as `replacing` does; its folder is made if need be."""
+    """Replace a file by `content`, see `replacing`; missing folders are created."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         file.write(content)
 
 
 def move_file(whole: Path, path: Path) -> None:
-    """Have a file that is on the disk take the place of `path`, in the same folder."""
+    """Rename a synced file to `path`, in the same folder, and sync the folder."""
     os.replace(whole, path)
     sync_folder(path.parent)
 
@@ -66,30 +67,30 @@ def _sync(file: IO[bytes]) -> None:
 def remove_unfinished(
     folder: Path, own: Iterable[Path], shared: Iterable[Path] = ()
 ) -> None:
-    """Delete what killed writers left in a result folder that nobody writes now.
+    """Delete unfinished files of killed processes in an otherwise unused result folder.
 
-    own : its folders, in which every file is ours
-    shared : its folders that may hold files of the user, too
+    own : its subfolders that contain no files of the user
+    shared : its subfolders that may contain files of the user
     """
-    found = [*folder.glob(_UNFINISHED), *(folder / name for name in _OLD)]
-    found += [path for one in shared for path in one.glob(_UNFINISHED)]
+    unfinished = [*folder.glob(_UNFINISHED), *(folder / name for name in _OLD)]
+    unfinished += [path for one in shared for path in one.glob(_UNFINISHED)]
     for one in own:
-        found += [*one.rglob(_UNFINISHED)]
-        found += [path for pattern in _OTHERS for path in one.glob(pattern)]
-    for path in found:
+        unfinished += [*one.rglob(_UNFINISHED)]
+        unfinished += [path for pattern in _OTHERS for path in one.glob(pattern)]
+    for path in unfinished:
         path.unlink(missing_ok=True)
 
 
 @contextmanager
-def full_disk_told(folder: Path) -> Iterator[None]:
-    """Turn what a full disk makes Python raise into one line.
+def report_full_disk(folder: Path) -> Iterator[None]:
+    """Convert an OSError for a full disk, raised in the block, to an InputError.
 
-    folder : that was written to
+    folder : that the block writes to
 
     Raises
     ------
     InputError
-        When the disk is full, with the file system and how to go on.
+        When the disk is full, with the file system and a remedy.
 
     """
     try:
@@ -101,21 +102,22 @@ def full_disk_told(folder: Path) -> Iterator[None]:
 
 
 def refuse_full_disk(folder: Path, failure: str) -> None:
-    """Tell whether something failed because the disk is full.
+    """Raise if a failure was caused by a full disk.
 
-    folder : where it wrote to
-    failure : what it said of that
+    folder : that was written to
+    failure : message of the failure
 
     Raises
     ------
     InputError
-        When it was, with the file system and how to go on.
+        When the message says so, or the disk is full now, with the file system and a
+        remedy.
 
     """
     for code in FULL:
         if os.strerror(code) in failure:
             raise InputError(_full(folder, code))
-    with full_disk_told(folder):
+    with report_full_disk(folder):
         path = folder / _UNFINISHED.replace("*", token_hex(8))
         try:
             with suppress(FileNotFoundError), path.open("xb") as file:  # no such folder
@@ -125,7 +127,7 @@ def refuse_full_disk(folder: Path, failure: str) -> None:
 
 
 def _full(path: Path, code: int) -> str:
-    """Say which file system is full, and how to go on."""
+    """Return the message for a full file system."""
     there = next(p for p in (path, *path.absolute().parents) if p.exists())
     root = there.absolute()
     while not os.path.ismount(root):
@@ -138,7 +140,7 @@ def _full(path: Path, code: int) -> str:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush the names in a folder to the disk."""
+    """Flush the directory entries of a folder to the disk."""
     fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         os.fsync(fd)

@@ -1,9 +1,9 @@
-"""What an experiment measured, as plain files that can be read without us.
+"""Data of an experiment as plain files, readable without this package.
 
 ::
 
-    FOLDER/setting.json     what was measured, where, and which state is which file
-    FOLDER/NAME.csv         one table: a row for each measurement
+    FOLDER/setting.json     setting, names of the tables, digests of the states
+    FOLDER/NAME.csv         a table: a row for each measurement
     FOLDER/vectors/*.npz    deformed states
 """
 
@@ -28,15 +28,15 @@ Row = Mapping[str, Value]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Experiment:
-    """Tables of measurements, deformed states, and under which setting."""
+    """Tables of measurements, deformed states, and their setting."""
 
-    setting: Mapping[str, Any]  #: what JSON can hold
-    tables: Mapping[str, Sequence[Row]]  #: the rows of a table have the same keys
+    setting: Mapping[str, Any]  #: plain data for JSON
+    tables: Mapping[str, Sequence[Row]]  #: rows of a table have equal keys
     states: Mapping[str, Fields]
 
 
 def save_experiment(experiment: Experiment, folder: Path) -> None:
-    """Write the files above."""
+    """Write the files of an experiment; see `harness.files.experiment`."""
     folder.mkdir(parents=True, exist_ok=True)
     states = {name: save_fields(folder, f) for name, f in experiment.states.items()}
     for name, rows in experiment.tables.items():
@@ -53,7 +53,7 @@ def save_experiment(experiment: Experiment, folder: Path) -> None:
 
 
 def load_experiment(folder: Path) -> Experiment:
-    """Read what `save_experiment` wrote, numbers to the last digit.
+    """Read the files of `save_experiment`; numbers keep all digits.
 
     Raises
     ------
@@ -82,7 +82,7 @@ def _read_csv(path: Path) -> list[Row]:
 
 
 def _value(text: str) -> Value:
-    """Read an integer, a float or else a text."""
+    """Convert a text to an integer or a float, if possible."""
     for kind in (int, float):
         try:
             return kind(text)

@@ -1,7 +1,7 @@
-"""Files of lines, such as a journal: appended to line by line, read within bounds.
+"""Files that grow line by line, such as a journal, and are read within limits.
 
-Such a file holds whole lines and at most one partial line at the end, which counts for
-nothing: readers skip it, the next writer cuts it off.
+Such a file contains whole lines and at most one partial line at the end, from a writer
+that was killed. Readers skip the partial line, and the next writer truncates it.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import replace_file, sync_folder
 
-LONGEST_LINE = 2**24  #: bytes
-_CHUNK = 2**16
+MAX_LINE_BYTES = 2**24
+_CHUNK_BYTES = 2**16  #: read at a time
 
 
 def read_lines(path: Path, expected: str) -> Iterator[bytes]:
-    """Read the whole lines of a file one by one, each with its newline.
+    """Yield the whole lines of a file, each with its newline.
 
-    expected : what would be right, for messages, e.g. "a journal"
+    expected : description of the file, for messages, e.g. "a journal"
 
     Raises
     ------
     InputError
-        When the file is not a regular one, is larger than `harness.files.datafile`
-        allows, or has a line above `LONGEST_LINE`.
+        When the file is not a regular file, is larger than `harness.files.datafile`
+        allows, or has a line longer than `MAX_LINE_BYTES`.
 
     """
     with opened(path, expected) as file:
         for number in count(1):
-            line = file.readline(LONGEST_LINE)
+            line = file.readline(MAX_LINE_BYTES)
             if line.endswith(b"\n"):
                 yield line
-            elif len(line) < LONGEST_LINE:
+            elif len(line) < MAX_LINE_BYTES:
                 return
             else:
                 raise InputError(
-                    f"{path}, line {number}: longer than {LONGEST_LINE >> 20} MiB; "
+                    f"{path}, line {number}: longer than {MAX_LINE_BYTES >> 20} MiB; "
                     f"expected {expected}, as a run appends it"
                 )
 
 
 class Lines:
-    """The writer's end of a file of lines, of which nobody else writes.
+    """The only writer of a file of lines.
 
-    A digest of the content runs along, so that a line which another program edits in
-    place is noticed: whenever the times of the file are not those of our last write,
-    and at the end. The digest is in memory only; between two runs lines may be edited.
+    It keeps a digest of the content, to detect edits by other programs. The digest is
+    compared whenever the times of the file are not those of the last write here, and at
+    the end. It is in memory only: lines may be edited between two runs.
 
-    restored : called with a line of text when the file had to be written again
+    restored : called with a message when the file had to be written again
     """
 
     def __init__(self, path: Path, restored: Callable[[str], None]) -> None:
@@ -65,14 +65,14 @@ class Lines:
         self._open()
 
     def append(self, text: str) -> None:
-        """Write one line and return when it is on the disk, or raise and write none.
+        """Append a line and flush it to the disk, or raise and append nothing.
 
         Raises
         ------
         InputError
-            When something else writes to the file.
+            When another program writes to the file.
         OSError
-            When the disk is full, say.
+            When the line cannot be written, for instance because the disk is full.
 
         """
         self.restore()
@@ -92,13 +92,13 @@ class Lines:
     def restore(self) -> None:
         """Write the file again if it was deleted or replaced since it was opened.
 
-        All that was in it is in the file that we hold open, whatever its name leads to.
-        Lines that a file in its place has and ours has not are kept.
+        The file that is held open still has the content, whatever its name refers to.
+        Lines of a file that has replaced it are kept.
 
         Raises
         ------
         InputError
-            When the content of the file has been changed by something else.
+            When another program has changed the content of the file.
 
         """
         held = os.fstat(self._fd)
@@ -107,11 +107,11 @@ class Lines:
         with suppress(FileNotFoundError):
             if os.path.samestat(held, self._path.stat()):
                 return
-        there = [*read_lines(self._path, "lines")] if self._path.exists() else []
-        known = set(there)
+        present = [*read_lines(self._path, "lines")] if self._path.exists() else []
+        known = set(present)
         mine = b"".join(self._chunks()).splitlines(keepends=True)
         lost = [line for line in mine if line not in known]
-        replace_file(self._path, b"".join([*there, *lost]))
+        replace_file(self._path, b"".join([*present, *lost]))
         os.close(self._fd)
         self._open()
         self._restored(
@@ -124,28 +124,32 @@ class Lines:
         self._fd = os.open(self._path, flags, 0o666)
         self._end = _end_of_lines(self._fd)
         os.ftruncate(self._fd, self._end)
-        self._times = _times(os.fstat(self._fd))  # an edit while it is read is noticed
+        self._times = _times(
+            os.fstat(self._fd)
+        )  # before reading, to detect an edit meanwhile
         self._digest: Digest = running_digest(self._chunks())
         sync_folder(self._path.parent)
 
     def _refuse_changed(self) -> None:
-        """Refuse a file whose content is not what we have read and written."""
+        """Raise if the content is not what was read and written here."""
         held = os.fstat(self._fd)
         is_same = held.st_size == self._end
         if is_same:
-            found = running_digest(self._chunks())
-            is_same = found.digest() == self._digest.digest()
+            digest = running_digest(self._chunks())
+            is_same = digest.digest() == self._digest.digest()
         if not is_same:
             raise InputError(
                 f"{self._path} was changed by another program while the run wrote it; "
                 "the same command continues with what it holds now"
             )
-        self._times = _times(held)  # touched, linked or deleted
+        self._times = _times(
+            held
+        )  # same content: the file was touched, linked or deleted
 
     def _chunks(self) -> Iterator[bytes]:
-        """Read the whole lines of the file that is held open."""
+        """Yield the whole lines of the open file in chunks."""
         start = 0
-        while chunk := os.pread(self._fd, min(_CHUNK, self._end - start), start):
+        while chunk := os.pread(self._fd, min(_CHUNK_BYTES, self._end - start), start):
             yield chunk
             start += len(chunk)
 
@@ -154,22 +158,22 @@ class Lines:
 
     def __exit__(self, kind: object, error: object, trace: object) -> None:
         try:
-            if error is None:  # an edit within the resolution of a file's times, too
+            if error is None:  # also after edits within the resolution of times
                 self._refuse_changed()
         finally:
             os.close(self._fd)
 
 
 def _times(info: os.stat_result) -> tuple[int, int]:
-    """Return the times at which content and anything else were changed last, ns."""
+    """Return the times of the last change of content and of status, ns."""
     return info.st_mtime_ns, info.st_ctime_ns
 
 
 def _end_of_lines(fd: int) -> int:
-    """Find the offset behind the last newline."""
+    """Return the offset after the last newline."""
     end = os.fstat(fd).st_size
     while end > 0:
-        start = max(0, end - _CHUNK)
+        start = max(0, end - _CHUNK_BYTES)
         newline = os.pread(fd, end - start, start).rfind(b"\n")
         if newline != -1:
             return start + newline + 1

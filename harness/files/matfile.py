@@ -1,7 +1,7 @@
 """One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
 
 Vectors ``q, h, b, lb, ub`` are columns, matrices ``P, G, A`` sparse, ``meta`` is a JSON
-text. Next to them lie what a case offers of its own, e.g. F, d, B, c, R of the paper.
+text. Further arrays are those of the case, such as F, d, B, c, R of the paper.
 """
 
 from __future__ import annotations
@@ -32,16 +32,18 @@ from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetri
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
-_HEADER, _TAG = 128, 8  #: bytes of the head of a version 5 file, and of an element
-_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: kinds of elements, and of their parts
+_HEADER, _TAG = 128, 8  #: bytes of the header of a version 5 file, and of an element
+_COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: types of elements, and of their parts
 _TYPES = {
     1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
     13: "u8", 17: "u2", 18: "u4",
 }  # fmt: skip
 _TEXT, _SPARSE = 4, 5  #: classes of variables
-_CLASSES = frozenset((_TEXT, _SPARSE, *range(6, 16)))  #: and numbers of every type
-_COMPLEX = 0x800  #: among the flags of a variable
-_COPIES = 8  #: of a file that its parser may hold
+_CLASSES = frozenset(
+    (_TEXT, _SPARSE, *range(6, 16))
+)  #: and numeric arrays of every type
+_COMPLEX = 0x800  #: flag of a variable
+_COPIES = 8  #: of the content that a parser may store
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -52,7 +54,7 @@ def save_mat(
 ) -> None:
     """Write `qp` and the arrays `more` to `path`; `meta` is as in `save_qp`.
 
-    more : where P is an operator, it may be among them
+    more : further arrays by name; an operator P may be among them
 
     Raises
     ------
@@ -74,12 +76,12 @@ def save_mat(
 
 
 def read_mat(path: Path) -> dict[str, Any]:
-    """Read the variables of a .mat file; None stands for what is no number or text.
+    """Read the variables of a .mat file, as None for other types than numbers and text.
 
     Raises
     ------
     InputError
-        When it cannot be read, is no .mat file of MATLAB 4 to 7.2, or declares more
+        When it cannot be read, is not a .mat file of MATLAB 4 to 7.2, or declares more
         than `harness.files.datafile` allows.
 
     """
@@ -91,27 +93,27 @@ def read_mat(path: Path) -> dict[str, Any]:
             return dict(loadmat(BytesIO(data), spmatrix=False))
         elements = list(_elements(data))
         size = sum(map(_declared, elements))
-        check_size(f"{path}: what it holds", size)
+        check_size(f"{path}: its content", size)
     with parsing(path, _WRONG, _COPIES * size):
-        found: dict[str, Any] = {}
+        variables: dict[str, Any] = {}
         for element in elements:
             name, value = _variable(element)
-            if name in found:
+            if name in variables:
                 raise ValueError(f"{name} is there twice")
-            found[name] = value
-        return found
+            variables[name] = value
+        return variables
 
 
 class _Element(NamedTuple):
-    """What a file of version 5 is made of, after its head."""
+    """An element of a version 5 file, after the header."""
 
-    order: str  #: of bytes, as struct and numpy have it
+    order: str  #: of bytes, in the notation of struct and NumPy
     kind: int
     body: bytes
 
 
 def _elements(data: bytes) -> Iterator[_Element]:
-    """List the elements of a version 5 file."""
+    """Yield the elements of a version 5 file."""
     order = {b"IM": "<", b"MI": ">"}[data[_HEADER - 2 : _HEADER]]
     at = _HEADER
     while at < len(data):
@@ -123,7 +125,7 @@ def _elements(data: bytes) -> Iterator[_Element]:
 
 
 def _declared(element: _Element) -> int:
-    """Tell how many bytes an element has, or will have; its head says so."""
+    """Return the size of an element after decompression, as its header declares."""
     if element.kind != _COMPRESSED:
         return len(element.body)
     head = zlib.decompressobj().decompress(element.body, _TAG)
@@ -131,7 +133,7 @@ def _declared(element: _Element) -> int:
 
 
 def _decompressed(element: _Element) -> _Element:
-    """Decompress an element, and not a byte beyond what its head declares."""
+    """Decompress an element, up to the size that its header declares."""
     inflate = zlib.decompressobj()
     head = inflate.decompress(element.body, _TAG)
     kind, size = struct.unpack(f"{element.order}II", head)
@@ -142,14 +144,14 @@ def _decompressed(element: _Element) -> _Element:
 
 
 def _variable(element: _Element) -> tuple[str, Any]:
-    """Read a variable: a text, an array, a sparse matrix, or None for anything else.
+    """Read a variable: a text, an array, a sparse matrix, or None for other types.
 
-    scipy's reader is not used: some damaged files crash Python in it (scipy 1.17.1).
+    SciPy's reader is not used, since some damaged files crash it (SciPy 1.17.1).
     """
     if element.kind == _COMPRESSED:
         element = _decompressed(element)
     if element.kind != _MATRIX:
-        raise ValueError("an element that is no variable")
+        raise ValueError("an element that is not a variable")
     parts = _parts(element)
     flags, shape = int(next(parts)[0]), tuple(map(int, next(parts)))
     name = next(parts).tobytes().decode("latin-1")
@@ -160,7 +162,7 @@ def _variable(element: _Element) -> tuple[str, Any]:
         raise ValueError(f"{name} is of shape {shape}")
     if kind == _SPARSE:
         rows, starts, values = (next(parts) for _ in range(3))
-        count = starts[-1]  # room for more may follow
+        count = starts[-1]  # unused entries may follow
         return name, compressed(values[:count], rows[:count], starts, shape)
     values = next(parts)
     if kind == _TEXT:
@@ -169,12 +171,12 @@ def _variable(element: _Element) -> tuple[str, Any]:
 
 
 def _parts(element: _Element) -> Iterator[NDArray[Any]]:
-    """List the arrays of numbers that a variable is made of."""
+    """Yield the numeric arrays that a variable consists of."""
     order, _, body = element
     at = 0
     while at < len(body):
         (kind,) = struct.unpack_from(f"{order}I", body, at)
-        if kind >> 16:  # four bytes at most, in the tag itself
+        if kind >> 16:  # data of up to four bytes are part of the tag
             kind, size, begin = kind & 0xFFFF, kind >> 16, at + 4
             at += _TAG
         else:
@@ -190,12 +192,12 @@ def _parts(element: _Element) -> Iterator[NDArray[Any]]:
 
 
 def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
-    """Make of the variables that `save_mat` wrote the QP and its meta data.
+    """Return the QP and the meta data from the variables of `save_mat`.
 
     Raises
     ------
     InputError
-        When one is missing, of the wrong kind, or they make no QP.
+        When a variable is missing or has the wrong type, or they are not a QP.
 
     """
     vectors: dict[str, Any] = {name: vector(arrays, name) for name in _VECTORS}
@@ -203,7 +205,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
     try:
         text = np.asarray(arrays.get("meta", "{}"))
         if text.dtype.kind != "U" or text.size != 1:
-            raise ValueError("meta is no text")
+            raise ValueError("meta is not a text")
         meta = json_object(str(text.item()))
         for name in _MATRICES:
             if not np.isfinite(matrices[name].data).all():
@@ -219,7 +221,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
 
 
 def vector(arrays: Mapping[str, Any], name: str) -> Vector:
-    """Take the numbers of a row, a column or a sparse one, (n,)."""
+    """Return a vector (n,) from a dense or sparse row or column."""
     M = matrix(arrays, name)
     if M.size and 1 not in M.shape:
         raise InputError(f"{name} is of shape {M.shape}; expected one row or column")
@@ -229,21 +231,21 @@ def vector(arrays: Mapping[str, Any], name: str) -> Vector:
 
 
 def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
-    """Take a matrix of numbers, dense or sparse, as csc."""
+    """Return a dense or sparse matrix as csc."""
     if name not in arrays:
         raise InputError(f"{name} is missing")
     if getattr(arrays[name], "dtype", np.dtype(object)).kind not in "iufb":
-        raise InputError(f"{name} is no matrix of numbers")
-    given = arrays[name]
-    if given.ndim > 2:
-        raise InputError(f"{name} has {given.ndim} dimensions; expected at most two")
-    check_size(f"{name}, {max(given.shape, default=1)} wide or high,",
-               8 * max(given.shape, default=1))  # fmt: skip
+        raise InputError(f"{name} is not a matrix of numbers")
+    array = arrays[name]
+    if array.ndim > 2:
+        raise InputError(f"{name} has {array.ndim} dimensions; expected at most two")
+    check_size(f"{name}, {max(array.shape, default=1)} wide or high,",
+               8 * max(array.shape, default=1))  # fmt: skip
     try:
         with np.errstate(over="ignore"):
-            M = csc_array(given, dtype=float)
+            M = csc_array(array, dtype=float)
     except (ValueError, TypeError, OverflowError, IndexError) as e:
-        raise InputError(f"{name} is no matrix: {shortened(str(e))}") from None
+        raise InputError(f"{name} is not a matrix: {shortened(str(e))}") from None
     M = canonical(M)
     if np.isnan(M.data).any():
         raise InputError(f"{name} holds NaN; expected numbers")

@@ -1,8 +1,8 @@
-"""npz files whose arrays can be mapped into memory instead of being read.
+"""Npz files whose arrays can be mapped into memory.
 
-An npz file is a zip archive of npy files. Here they are stored uncompressed and begin,
-with their values, at multiples of 64 bytes, so that ``np.load`` reads them like any
-others and `mapped` gives arrays that lie in the page cache, shared by all processes.
+An npz file is a zip archive of npy files. Here these are uncompressed, and their values
+are aligned to 64 bytes. ``np.load`` reads such a file as usual, and `mapped` returns
+arrays in the page cache, which all processes share.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from mortarbench.harness.files.durable import replacing
 EXPECTED = "an npz file"
 ALIGNMENT = 64
 _LOCAL_HEADER = 30  #: bytes before name and extra field of a member
-_PADDING = b"\xfe\xca"  #: an extra field that nobody knows, and all skip
+_PADDING = b"\xfe\xca"  #: id of an extra field that readers skip
 _ENCRYPTED = 1  #: among the flags of a member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_KINDS = "biufcSU"  #: of types: neither objects, which are pickles, nor structures
-_PIECE = 2**20  #: bytes that are decompressed at once
+_KINDS = "biufcSU"  #: kinds of dtypes: no objects, which are pickles, and no structures
+_PIECE_BYTES = 2**20  #: decompressed at a time
 
 
 class _PickledError(ValueError):
-    """An array of Python objects, as numpy saves a sparse matrix of scipy."""
+    """An array of Python objects, such as a SciPy matrix saved by NumPy."""
 
 
 def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays so that they can be mapped.
+    """Write arrays to a file that can be mapped.
 
-    A file that is there is replaced, not written over: whoever has mapped it keeps what
-    it held, while truncating it would kill them by SIGBUS.
+    An existing file is replaced, not overwritten: truncating a file would kill the
+    processes that have mapped it by SIGBUS.
     """
     with replacing(path) as file, zipfile.ZipFile(file, "w") as archive:
         for name, array in arrays.items():
@@ -50,22 +50,22 @@ def write_mappable(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
             npy.write_array_header_1_0(header, npy.header_data_from_array_1_0(stored))
             member = zipfile.ZipInfo(f"{name}.npy", (1980, 1, 1, 0, 0, 0))
             start = file.tell() + _LOCAL_HEADER + len(member.filename.encode()) + 4
-            lacking = -start % ALIGNMENT  # the npy header is a multiple of 64 itself
-            member.extra = _PADDING + lacking.to_bytes(2, "little") + bytes(lacking)
+            padding = -start % ALIGNMENT  # the npy header is a multiple of 64 itself
+            member.extra = _PADDING + padding.to_bytes(2, "little") + bytes(padding)
             archive.writestr(member, header.getvalue() + stored.tobytes())
 
 
 def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Map every array of a file; writing to one changes a private copy only.
+    """Map all arrays of a file; writing to one changes a private copy only.
 
-    limited : whether a file above the limit of `harness.files.datafile` is refused
+    limited : refuse a file above the limit of `harness.files.datafile`
 
     Raises
     ------
     InputError
-        As `harness.files.datafile.opened`.
+        For the same reasons as `harness.files.datafile.opened`.
     ValueError, BadZipFile
-        When the file holds something else.
+        When the file is not an npz file that can be mapped.
 
     """
     with opened(path, EXPECTED, limited=limited) as file:
@@ -76,20 +76,20 @@ def mapped(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
 
 
 def read(path: Path) -> dict[str, NDArray[Any]]:
-    """Read every array of a file, never unpickling.
+    """Read all arrays of a file without unpickling.
 
     Raises
     ------
     InputError
-        As `harness.files.datafile.opened`, when the arrays would exceed its limit, and
-        when one is pickled.
+        For the same reasons as `harness.files.datafile.opened`, and when the arrays
+        would exceed its limit, or one is pickled.
     ValueError, BadZipFile
-        When the file holds something else.
+        When the file is not an npz file of plain arrays.
 
     """
     with opened(path, EXPECTED) as file, zipfile.ZipFile(file) as archive:
         members = _members(archive)
-        check_size(f"{path}: what it holds", sum(m.file_size for m in members.values()))
+        check_size(f"{path}: its content", sum(m.file_size for m in members.values()))
         arrays = {}
         for name, member in members.items():
             try:
@@ -104,20 +104,20 @@ def read(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
-    """List the arrays by name."""
-    found: dict[str, zipfile.ZipInfo] = {}
+    """Return the members of an archive by the name of their array."""
+    members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(".npy")
-        if name == member.filename or name in found:
+        if name == member.filename or name in members:
             raise ValueError(f"{shortened(name)!r} is no array, or there twice")
         if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
             raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
-        found[name] = member
-    return found
+        members[name] = member
+    return members
 
 
 def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
-    """View one member; a compressed or unaligned one would be no array of ours."""
+    """Return a view of a member, which has to be uncompressed and aligned."""
     begin = member.header_offset
     header = memory[begin : begin + _LOCAL_HEADER]
     skip = int.from_bytes(header[26:28], "little") + int.from_bytes(
@@ -145,7 +145,7 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
         values = bytearray(count * dtype.itemsize)
         view, begin = memoryview(values), 0
         while begin < len(values):
-            piece = file.read(min(_PIECE, len(values) - begin))
+            piece = file.read(min(_PIECE_BYTES, len(values) - begin))
             if not piece:
                 raise ValueError(f"{member.filename} is truncated")
             view[begin : begin + len(piece)] = piece
@@ -157,7 +157,7 @@ def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> NDArray[An
 
 
 def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Read the header of an npy file: shape, whether in Fortran order, type."""
+    """Read the header of an npy file: shape, True for Fortran order, and dtype."""
     readers = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
     version = npy.read_magic(file)
     if version not in readers:
@@ -171,7 +171,7 @@ def _header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 def _count(shape: tuple[int, ...], dtype: np.dtype[Any], there: int) -> int:
-    """Count the values of an array that has `there` bytes at most."""
+    """Return the number of values of an array, at most `there` bytes."""
     count = prod(shape)  # in Python's integers, which do not overflow
     if min(shape, default=0) < 0 or count * dtype.itemsize > there:
         raise ValueError(f"{there} bytes; expected {count} values of {dtype}")

@@ -1,17 +1,16 @@
 """One QP in one Parquet file, as qpbenchmark's test sets load it.
 
 A row is a problem, with the columns ``P, q, G, h, A, b, lb, ub`` (lists of doubles) and
-``name``. The format knows dense matrices only: each lies there row by row, and has as
-many columns as q has components. Absent constraints and bounds are null. qpbenchmark's
-``ParquetTestSet`` reads these columns and no others [1]_.
+``name``. All matrices are dense and stored row by row, with as many columns as q has
+components. Absent constraints and bounds are null. qpbenchmark's ``ParquetTestSet``
+reads exactly these columns [1]_.
 
-What the format has no place for, the case's `meta` of `harness.files.qpfile`, follows
-in the metadata of the schema under the key ``mortarbench``, where other readers pass it
-by.
+The `meta` of `harness.files.qpfile` has no column. It is stored in the metadata of the
+schema under the key ``mortarbench``, which other readers ignore.
 
 References
 ----------
-.. [1] https://github.com/qpsolvers/qpbenchmark, as of version 2.7.1
+.. [1] https://github.com/qpsolvers/qpbenchmark, version 2.7.1
 
 """
 
@@ -31,7 +30,7 @@ from mortarbench.harness.errors import InputError, shortened
 from mortarbench.harness.files.datafile import (
     check_size,
     json_object,
-    most_bytes,
+    max_bytes,
     opened,
 )
 from mortarbench.harness.files.durable import replacing
@@ -43,12 +42,12 @@ _KEY = "mortarbench"
 _READER = Path(__file__).with_name("parquetreader.py")
 _COLUMNS = ("P", "q", "G", "h", "A", "b", "lb", "ub")
 _RIGHT_HAND_SIDE = {"G": "h", "A": "b"}
-#: entries of a matrix, 1 GiB: a row lies in one page, whose size is an int32
-_MOST = 2**27
+#: Entries of a matrix, 1 GiB: a row is a single page, whose size is an int32.
+_MAX_ENTRIES = 2**27
 
 
 def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
-    """Write `qp` to `path`; `meta` is as in `save_qp`, its ``name`` names the problem.
+    """Write `qp` to `path`; `meta` is as in `save_qp`, with ``name`` for the problem.
 
     Raises
     ------
@@ -56,16 +55,17 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         When a matrix is too large for a dense format, or the file cannot be written.
 
     """
-    import pyarrow as pa  # late: workers need none of it
+    import pyarrow as pa  # late: slow to import, and workers need neither
     import pyarrow.parquet as pq
 
     n = qp.q.size
     rows = {"P": n, "G": qp.h.size, "A": qp.b.size}
     for name, count in rows.items():
-        if count * n > _MOST:
+        if count * n > _MAX_ENTRIES:
             raise InputError(
                 f"{path}: {name} has {count} × {n} entries, and Parquet holds them "
-                f"dense, at most {_MOST}; expected .npz or .mat for a QP of this size"
+                f"dense, at most {_MAX_ENTRIES}; expected .npz or .mat for a QP of "
+                "this size"
             )
     matrices, dense = explicit_matrices(qp)
     flat = {"q": qp.q, "P": _flat(matrices["P"])}
@@ -87,13 +87,13 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
-    """Read a QP and its meta data; matrices that `save_parquet` met sparse are csc.
+    """Read a QP and its meta data; matrices that were sparse when saved are csc.
 
     Raises
     ------
     InputError
-        When the file is no Parquet, holds not exactly one problem, lacks a column, or
-        what it holds is no QP.
+        When the file is not Parquet, does not contain exactly one problem, lacks a
+        column, or the columns are not a QP.
 
     """
     flat, text = _columns(path)
@@ -123,15 +123,17 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 
 
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
-    """Have `harness.files.parquetreader` read the columns, and what lies under our key.
+    """Read the columns and the text of `meta` in a process of its own.
+
+    `harness.files.parquetreader` has the reason.
 
     Raises
     ------
     InputError
-        When the file is no Parquet, not of one row, too large, or lacks a column.
+        When the file is not Parquet, has not one row, is too large, or lacks a column.
 
     """
-    command = [sys.executable, "-I", str(_READER), str(most_bytes()), _KEY]
+    command = [sys.executable, "-I", str(_READER), str(max_bytes()), _KEY]
     with opened(path, "a Parquet file") as file:
         done = subprocess.run(
             [*command, *_COLUMNS], stdin=file, capture_output=True, check=False
@@ -139,25 +141,25 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     line, _, numbers = done.stdout.partition(b"\n")
     if done.returncode or not line:
         raise InputError(f"{path}: malformed; expected a Parquet file")
-    told = json.loads(line)
-    if told["rows"] != 1:
-        raise InputError(f"{path}: holds {told['rows']} problems; expected one row")
-    if missing := told["missing"]:
+    head = json.loads(line)
+    if head["rows"] != 1:
+        raise InputError(f"{path}: holds {head['rows']} problems; expected one row")
+    if missing := head["missing"]:
         raise InputError(f"{path}: no column {', '.join(missing)}; expected a problem")
-    check_size(f"{path}: what it holds", told["bytes"])
+    check_size(f"{path}: its content", head["bytes"])
     flat: dict[str, Vector | None] = {}
     begin = 0
-    for name, count in told["columns"].items():
+    for name, count in head["columns"].items():
         if count == -1:
-            raise InputError(f"{path}: {name} is no list of numbers")
+            raise InputError(f"{path}: {name} is not a list of numbers")
         end = begin + 8 * (count or 0)
         flat[name] = None if count is None else np.frombuffer(numbers[begin:end])
         begin = end
-    return flat, told["meta"]
+    return flat, head["meta"]
 
 
 def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
-    """Shape a matrix of n columns that lies there row by row."""
+    """Return the matrix with n columns whose rows are concatenated in `flat`."""
     if n == 0 or flat.size % n:
         raise ValueError(f"{name} has {flat.size} entries; expected rows of {n}")
     if not np.isfinite(flat).all():
@@ -167,5 +169,5 @@ def _matrix(name: str, flat: Vector, n: int, dense: bool) -> Matrix:
 
 
 def _flat(M: Matrix) -> Vector:
-    """List the entries row by row."""
+    """Return the concatenated rows of a matrix."""
     return np.asarray(M.toarray() if issparse(M) else M, dtype=float).ravel()

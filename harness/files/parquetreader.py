@@ -1,15 +1,14 @@
-"""The process that reads a Parquet file: arrow ends it at some that are damaged.
+"""Process that reads a Parquet file, since damaged ones can crash Arrow.
 
 ::
 
-    python parquetreader.py MOST KEY COLUMN... < FILE
+    python parquetreader.py MAX_BYTES KEY COLUMN... < FILE
 
 prints a line of JSON with the number of ``rows``, the columns ``missing``, the
-``bytes`` that the file declares, at most MOST if it is to be read, and as ``meta`` the
-text under KEY in the metadata of its schema. Of a file of one row ``columns`` follows,
-the length of each column's list, null where it is null, -1 where it is no list of
-numbers; then the numbers of one column after the other, as float64. It imports nothing
-of ours, to start fast.
+``bytes`` that the file declares, and as ``meta`` the text under KEY in the metadata of
+its schema. For a file of one row of at most MAX_BYTES, the line also has ``columns``:
+the length of each list, null for a null, and -1 for other types. The numbers of all
+columns follow as float64. No other module of this package is imported, for speed.
 """
 
 from __future__ import annotations
@@ -24,49 +23,49 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-CPU_SECONDS = 60  #: after which the kernel ends this process
-SECONDS = 600  #: likewise, of waiting for what never comes
-ROOM = 2**29  #: bytes of address space beside four times what the file declares
+CPU_SECONDS = 60  #: after which the kernel kills this process
+SECONDS = 600  #: the same for elapsed time: a file may block
+ROOM = 2**29  #: bytes of address space beside four times the declared size
 
 
-def main(most: int, key: str, wanted: list[str]) -> None:
-    """Read standard input, write standard output."""
-    # a thread of arrow's may abort Python when it ends
+def main(max_bytes: int, key: str, wanted: list[str]) -> None:
+    """Read the file on standard input, and print its columns."""
+    # a thread of Arrow may abort Python when it ends
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
     signal.alarm(SECONDS)
     file = pq.ParquetFile(sys.stdin.buffer, pre_buffer=False)
-    told = file.metadata
-    # a page can say "the same value a billion times" in few bytes: values count, too
-    groups = [told.row_group(i) for i in range(told.num_row_groups)]
+    metadata = file.metadata
+    # a page can encode a billion equal values in few bytes: the limit is on values
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
     chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
     names = file.schema_arrow.names
     meta = (file.schema_arrow.metadata or {}).get(key.encode(), b"{}")
     head: dict[str, Any] = {
-        "rows": told.num_rows,
+        "rows": metadata.num_rows,
         "missing": [name for name in wanted if name not in names],
         "bytes": size,
         "meta": meta.decode(errors="replace"),
     }
-    if told.num_rows != 1 or head["missing"] or size > most:
+    if metadata.num_rows != 1 or head["missing"] or size > max_bytes:
         print(json.dumps(head))
         return
     _bound(4 * size + ROOM)
     table = file.read(columns=wanted, use_threads=False)
     table.validate(full=True)
-    found = {name: _numbers(table.column(name)[0]) for name in wanted}
-    head["columns"] = {k: v if v is None else v.size for k, v in found.items()}
+    arrays = {name: _numbers(table.column(name)[0]) for name in wanted}
+    head["columns"] = {k: v if v is None else v.size for k, v in arrays.items()}
     head["columns"] |= {
-        k: -1 for k, v in found.items() if v is not None and v.ndim != 1
+        k: -1 for k, v in arrays.items() if v is not None and v.ndim != 1
     }
     print(json.dumps(head), flush=True)
-    for values in found.values():
+    for values in arrays.values():
         if values is not None and values.ndim == 1:
             sys.stdout.buffer.write(values.astype("<f8").tobytes())
 
 
 def _bound(room: int) -> None:
-    """Have the kernel refuse memory beyond `room`."""
+    """Limit the address space to `room` bytes more than are in use."""
     with open("/proc/self/statm") as file:
         pages = int(file.read().split()[0])
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
@@ -77,7 +76,7 @@ def _bound(room: int) -> None:
 
 
 def _numbers(scalar: Any) -> Any:
-    """Take the numbers of a list; None of a null, an array without axes otherwise."""
+    """Return the numbers of a list, None for a null, and a 0-d array otherwise."""
     if not scalar.is_valid:
         return None
     try:
@@ -90,4 +89,4 @@ def _numbers(scalar: Any) -> Any:
 if __name__ == "__main__":
     main(int(sys.argv[1]), sys.argv[2], sys.argv[3:])
     sys.stdout.flush()
-    os._exit(0)  # without waiting for threads of arrow's, which may not end
+    os._exit(0)  # without waiting for threads of Arrow, which may not end

@@ -1,17 +1,17 @@
-"""One QP in one npz file, without pickles, for workers and for other people's solvers.
+"""QPs in npz files without pickles, for workers and for other programs.
 
 ::
 
     min ½xᵀPx + qᵀx   s.t.   Gx ≤ h,  Ax = b,  lb ≤ x ≤ ub
 
-holds the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
-``M_data, M_indices, M_indptr, M_shape`` of its compressed sparse columns (P whole, not
-a triangle); and ``meta``, a JSON object. Absent constraints have zero rows, absent
-bounds are ±inf. ``meta["dense"]`` lists the matrices that were dense. The structure of
-a dual, where there is one, follows as matrices ``K, B`` and the vector ``fixed``.
+is stored as the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
+``M_data, M_indices, M_indptr, M_shape`` of its CSC format (both triangles of P); and
+``meta``, a JSON object. Absent constraints have zero rows, absent bounds are ±inf.
+``meta["dense"]`` lists the matrices that were dense. The optional structure of a dual
+is stored as matrices ``K, B`` and the vector ``fixed``.
 
-What ``np.savez(path, P=P, q=q, G=G, h=h)`` writes is read, too: any matrix as a dense
-array or in CSC parts, pairs ``G, h`` and ``A, b`` and bounds where there are any.
+Files of ``np.savez(path, P=P, q=q, G=G, h=h)`` are accepted as well: matrices are dense
+arrays or CSC parts, and ``G, h``, ``A, b`` and bounds are optional.
 """
 
 from __future__ import annotations
@@ -46,17 +46,18 @@ _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
 _STRUCTURE = ("K", "B")
 _PARTS = ("data", "indices", "indptr", "shape")
-_INGREDIENT = "P_from_"  #: of a P that is a serialised operator
+_INGREDIENT = "P_from_"  #: prefix of the arrays of a serialised operator P
 _PLAIN = {*_VECTORS, *_MATRICES} | {f"{M}_{part}" for M in _MATRICES for part in _PARTS}
 
 
 def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
-    """Return P, G and A, an operator P multiplied out, and the names of dense ones.
+    """Return P, G and A as matrices, and the names of dense ones.
 
     Raises
     ------
     InputError
-        When an operator P is too large for that, as `check_dense`.
+        When an operator P is too large to be assembled, or the QP has sets other than
+        bounds.
 
     """
     P = qp.P
@@ -77,19 +78,32 @@ def save_qp(
     *,
     serialised: bool = False,
 ) -> str:
-    """Write `qp` to `path`; an operator P is multiplied out and counts as dense.
+    """Write `qp` to `path`, and return the digest of its coefficients.
 
-    Returns 16 hex digits that name its numbers: equal digests, equal QPs. An operator P
-    that is serialised has another digest than the same one multiplied out.
+    An operator P is assembled, and counts as dense. Equal digests, of 16 hex digits,
+    mean equal QPs. A serialised operator has another digest than the assembled one.
 
-    meta : plain data; its keys ``dense`` and ``maker`` are filled in here
-    serialised : whether a P that is a `SerialisableOperator` is written as its arrays,
-        which only we can read
+    meta : plain data; the keys ``dense`` and ``maker`` are set here
+    serialised : write a P that is a `SerialisableOperator` as its arrays, which only
+        workers of the same run can read
 
     Raises
     ------
     InputError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> from mortarbench import QP
+    >>> from mortarbench.harness import save_qp
+    >>> with TemporaryDirectory() as folder:
+    ...     path = Path(folder, "small.npz")
+    ...     digest = save_qp(path, QP.from_arrays(np.eye(2), [-1, -1], lb=0))
+    ...     np.load(path)["q"]
+    array([-1., -1.])
 
     """
     arrays, dense, maker = _parts(qp, serialised=serialised)
@@ -103,14 +117,14 @@ def save_qp(
 
 
 def qp_digest(qp: QP, *, serialised: bool = False) -> str:
-    """Name the numbers of a QP by 16 hex digits, as `save_qp` does."""
+    """Return the digest of the coefficients of a QP, see `save_qp`."""
     return digest_of(_parts(qp, serialised=serialised)[0])
 
 
 def _parts(
     qp: QP, *, serialised: bool
 ) -> tuple[dict[str, NDArray[Any]], list[str], dict[str, str]]:
-    """Take a QP apart; also tell which matrices are dense, and who makes P."""
+    """Return the arrays of a QP, names of dense matrices, and the maker of P."""
     P = qp.P
     if not (serialised and isinstance(P, SerialisableOperator)):
         return *_arrays(qp, structure=serialised), {}
@@ -120,7 +134,7 @@ def _parts(
 
 
 def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[str]]:
-    """Take a QP apart; also tell which matrices are dense."""
+    """Return the arrays of a QP, and the names of dense matrices."""
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
     if structure and qp.structure is not None:
@@ -138,38 +152,38 @@ def load_qp(
 ) -> tuple[QP, dict[str, Any]]:
     """Read a QP and its meta data.
 
-    operators : makers of operators (`harness.operators`), for a file that the case
-        worker of this very run wrote: it may hold an operator, and is as large as it
-        is. Without them the file may be anybody's: an operator is refused, and so is
-        what exceeds the limit of `harness.files.datafile`, or has no symmetric P
+    operators : makers of operators (`harness.operators`), for a file written by the
+        case worker of the same run, which may contain an operator and has no limit of
+        size. None for a file of unknown origin: operators, an asymmetric P, and sizes
+        above the limit of `harness.files.datafile` are refused
 
     Raises
     ------
     InputError
-        When the file is no npz, lacks an array, or what it holds is no QP.
+        When the file is not an npz file, lacks an array, or the arrays are not a QP.
 
     """
     parts = tuple(f"{name}_{part}" for name in _MATRICES for part in _PARTS)
-    own = operators is not None
-    arrays = mapped_arrays(path, limited=not own)
+    is_trusted = operators is not None
+    arrays = mapped_arrays(path, limited=not is_trusted)
     lacking = [name for name in (*_VECTORS, *parts, "meta") if name not in arrays]
-    if lacking and not own and "meta" not in arrays:
+    if lacking and not is_trusted and "meta" not in arrays:
         return _plain_qp(path, arrays), {}
     if lacking:
         raise InputError(f"{path}: {', '.join(lacking)} missing")
     try:
         array = arrays["meta"]
         if array.dtype.kind != "U" or array.size != 1:
-            raise ValueError("meta is no text")
+            raise ValueError("meta is not a text")
         meta = json_object(str(array.item()))
         vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
         dense = listed_dense(meta)
-        if not own:
+        if not is_trusted:
             _check_foreign(matrices, dense, meta)
         structure = _structure(arrays) if "fixed" in arrays else None
         for name in dense:
-            # the values of a full one are viewed, not copied
+            # a full matrix becomes a view of its values, which may be mapped
             M = matrices[name]
             rows, columns = M.shape
             full = M.nnz == rows * columns and M.has_canonical_format
@@ -180,7 +194,7 @@ def load_qp(
                 n, maker, _ingredients(arrays), operators
             )
         qp = QP(**vectors, **matrices, structure=structure)
-        if not own:
+        if not is_trusted:
             check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
@@ -190,7 +204,7 @@ def load_qp(
 
 
 def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
-    """Make a QP of the arrays that somebody saved under their names."""
+    """Return the QP of arrays that were saved by `np.savez`."""
     try:
         for name in arrays:
             if name not in _PLAIN:
@@ -223,7 +237,7 @@ def _plain_matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix | Non
 
 
 def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | None:
-    """Take a vector, also one that is saved as a matrix of one row or column."""
+    """Return a vector, also from a matrix with one row or column."""
     if name not in arrays:
         return None
     v = _vector(arrays, name)
@@ -231,27 +245,27 @@ def _plain_vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector | Non
 
 
 def listed_dense(meta: Mapping[str, Any]) -> set[str]:
-    """Take the names of dense matrices from meta data.
+    """Return the names of dense matrices in the meta data.
 
     Raises
     ------
     ValueError
-        When they are no list of texts.
+        When they are not a list of texts.
 
     """
     names = meta.get("dense", [])
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise ValueError("meta: dense is no list of names")
+        raise ValueError("meta: dense is not a list of names")
     return set(_MATRICES).intersection(names)
 
 
 def check_dense(name: str, M: Matrix) -> None:
-    """Refuse a matrix that would be too large if it were dense.
+    """Raise if a matrix would exceed the limit of memory as a dense array.
 
     Raises
     ------
     InputError
-        As `harness.files.datafile.check_size`.
+        For the same reason as `harness.files.datafile.check_size`.
 
     """
     check_size(f"{name}, dense and {M.shape[0]} × {M.shape[1]},", 8 * prod(M.shape))
@@ -260,7 +274,7 @@ def check_dense(name: str, M: Matrix) -> None:
 def _check_foreign(
     matrices: Mapping[str, Matrix], dense: set[str], meta: Mapping[str, Any]
 ) -> None:
-    """Refuse what only our own runs write, and what would be too large."""
+    """Raise for an operator, which only workers read, and for too large matrices."""
     if "maker" in meta:
         raise ValueError(
             "holds P as an operator, which is read only where the run itself wrote it; "
@@ -297,12 +311,12 @@ def _ingredients(arrays: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
 def _vector(arrays: Mapping[str, NDArray[Any]], name: str) -> Vector:
     if arrays[name].dtype.kind not in "iuf":
         raise ValueError(f"{name} is of type {arrays[name].dtype}; expected numbers")
-    with np.errstate(over="ignore"):  # beyond double precision is inf, which is judged
+    with np.errstate(over="ignore"):  # inf beyond double precision, which callers check
         return arrays[name].astype(float, copy=False)
 
 
 def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
-    """Put a matrix together; unchecked, an index out of range crashes a product."""
+    """Return a matrix from its CSC parts, after checking them."""
     data = _vector(arrays, f"{name}_data")
     if not np.isfinite(data).all():
         raise ValueError(f"{name}_data holds NaN or inf; expected finite numbers")
@@ -312,23 +326,24 @@ def _matrix(arrays: Mapping[str, NDArray[Any]], name: str) -> Matrix:
     try:
         return compressed(data, indices, indptr, tuple(shape.tolist()))
     except (ValueError, TypeError, OverflowError) as e:
-        raise ValueError(f"{name} is no matrix in CSC parts: {e}") from None
+        raise ValueError(f"{name} is not a matrix in CSC parts: {e}") from None
 
 
 def compressed(
     data: NDArray[Any], indices: NDArray[Any], indptr: NDArray[Any], shape: Any
 ) -> Matrix:
-    """Make a matrix of its compressed columns; a wrong index would crash a product.
+    """Return a matrix from its CSC parts.
+
+    They are checked, since an index out of range would crash a product.
 
     Raises
     ------
     ValueError, TypeError, OverflowError
-        When they fit neither each other nor `shape`.
+        When they do not fit each other or `shape`.
 
     """
-    if (
-        indptr[1:] < indptr[:-1]
-    ).any():  # scipy (1.17.1) looks at differences: overflow
+    # SciPy (1.17.1) checks differences, which may overflow
+    if (indptr[1:] < indptr[:-1]).any():
         raise ValueError("indptr decreases")
     M = csc_array((data, indices, indptr), shape=shape)
     M.check_format(full_check=True)

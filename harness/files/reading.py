@@ -1,9 +1,9 @@
-"""Text files that somebody else wrote, read within bounds.
+"""Reading of text files from untrusted sources, within limits.
 
-What is read is a regular file (a device or a pipe could last for ever), of the size
-that it declares (files of /proc declare none), not larger than a limit that users can
-raise, UTF-8, and nested as deeply as data are. All functions raise `InputError`, with
-the place and what would be right.
+A file has to be regular (a device or a pipe may have no end), to have the size that it
+declares (files in /proc declare none), to be UTF-8 and not larger than a limit that
+users can raise, and data must not be nested too deeply. All functions raise
+`InputError` with the place and the expected content.
 """
 
 from __future__ import annotations
@@ -23,28 +23,30 @@ from typing import Any, BinaryIO, NoReturn
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import FULL
 
-VARIABLE = "MORTARBENCH_TEXT_MIB"  #: the largest text file that is read
-MOST_TOML = 1.0  #: MiB, where the variable is not set: a second to parse
-MOST_JSON = 64.0  #: MiB
-MOST_LEVELS = 50  #: of what is nested
+VARIABLE = "MORTARBENCH_TEXT_MIB"  #: size of the largest text file that is read
+MAX_TOML_MIB = 1.0  #: default of the variable for TOML, which takes 1 s to parse
+MAX_JSON_MIB = 64.0  #: default of the variable for other files
+MAX_LEVELS = 50  #: of nesting
 
-#: a TOML key of more parts than levels are allowed, found before it is parsed: the
-#: parser takes a time that grows with the square of their number
+#: A TOML key with more parts than allowed levels. It has to be found before parsing,
+#: since the time of the parser grows like the square of the number of parts.
 _LONG_KEY = re.compile(
     r"""(?<![\w"'.-])[\w"'-]++(?:[ \t]*+\.[ \t]*+[\w"'-]++)"""
-    f"{{{MOST_LEVELS}}}"
+    f"{{{MAX_LEVELS}}}"
 )
 
 
 @contextmanager
 def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
-    """Open a regular file to be read; pipes and devices could give without end.
+    """Open a regular file for reading; pipes and devices are refused.
 
-    expected : what to say instead of "a file"
+    expected : description of the file, for messages
     """
     try:
-        regular = stat.S_ISREG(path.stat().st_mode)  # to open a device may act on it
-        flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC  # a pipe took its place
+        regular = stat.S_ISREG(path.stat().st_mode)  # opening a device may have effects
+        flags = (
+            os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC
+        )  # does not block if a pipe has replaced the file
         fd = os.open(path, flags) if regular else -1
     except (OSError, ValueError) as e:  # a NUL in the name
         why = e.strerror if isinstance(e, OSError) else "no name of a file"
@@ -58,23 +60,23 @@ def opened(path: Path, expected: str = "a file") -> Iterator[BinaryIO]:
         try:
             if os.fstat(fd).st_size == 0 and os.pread(fd, 1, 0):
                 raise InputError(
-                    f"{path}: of no size that it declares, as files of the kernel; "
+                    f"{path}: declares no size, like files of the kernel; "
                     f"expected {expected}"
                 )
             yield file
-        except OSError as e:  # of reading: others name a file, or tell of a full disk
+        except OSError as e:  # of reading; others are of the caller's own files
             if e.errno in (None, *FULL) or e.filename is not None:
                 raise
             raise InputError(f"{path}: {e.strerror}; expected {expected}") from None
 
 
 def read_text(
-    path: Path, expected: str = "a text file", most: float = MOST_JSON
+    path: Path, expected: str = "a text file", most: float = MAX_JSON_MIB
 ) -> str:
     """Read a text file.
 
-    expected : what to say instead of "a text file"
-    most : MiB, unless the user set another limit
+    expected : description of the file, for messages
+    most : limit in MiB, unless the user has set another one
     """
     limit = _limit(most)
     with opened(path, expected) as file:
@@ -92,7 +94,7 @@ def read_text(
 
 def read_toml(path: Path, expected: str = "a TOML file") -> dict[str, Any]:
     """Read and parse a TOML file."""
-    text = read_text(path, expected, MOST_TOML)
+    text = read_text(path, expected, MAX_TOML_MIB)
     try:
         return toml(text)
     except InputError as e:
@@ -111,7 +113,7 @@ def toml(text: str) -> dict[str, Any]:
         raise InputError(f"{place}: {what}") from None
     except RecursionError:
         raise _too_deep() from None
-    except ValueError:  # Python's own limit
+    except ValueError:  # limit of Python
         raise InputError(
             "an integer with too many digits; expected at most "
             f"{sys.get_int_max_str_digits()}"
@@ -121,7 +123,7 @@ def toml(text: str) -> dict[str, Any]:
 
 def read_json(path: Path, expected: str = "a JSON file") -> Any:
     """Read and parse a JSON file."""
-    text = read_text(path, expected, MOST_JSON)
+    text = read_text(path, expected, MAX_JSON_MIB)
     try:
         data = json.loads(
             text, parse_constant=_no_constant, parse_int=_integer, parse_float=_number
@@ -140,9 +142,9 @@ def read_json(path: Path, expected: str = "a JSON file") -> Any:
 
 
 def _refuse_deep(data: object) -> None:
-    """Refuse what is nested too deeply for what works on it step by step."""
+    """Raise RecursionError for data nested too deeply for recursive functions."""
     level = [data]
-    for _ in range(MOST_LEVELS + 1):
+    for _ in range(MAX_LEVELS + 1):
         level = [
             inner
             for outer in level
@@ -155,11 +157,11 @@ def _refuse_deep(data: object) -> None:
 
 
 def _too_deep() -> InputError:
-    return InputError(f"nested too deeply; expected at most {MOST_LEVELS} levels")
+    return InputError(f"nested too deeply; expected at most {MAX_LEVELS} levels")
 
 
 def _no_constant(text: str) -> NoReturn:
-    raise ValueError(f"{text} is no number in JSON")
+    raise ValueError(f"{text} is not a number in JSON")
 
 
 def _integer(text: str) -> int:
@@ -174,7 +176,7 @@ def _number(text: str) -> float:
 
 
 def _limit(most: float) -> float:
-    """Give the limit in force, MiB."""
+    """Return the limit in force, MiB."""
     text = os.environ.get(VARIABLE)
     if text is None:
         return most

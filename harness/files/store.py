@@ -1,4 +1,4 @@
-"""Arrays of a result folder, stored once by content: ``FOLDER/vectors/DIGEST.npz``."""
+"""Content-addressed arrays of a result folder: ``FOLDER/vectors/DIGEST.npz``."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ _POINT = ("x", "y", "z", "z_box")
 _ALWAYS = ("points", "cells", "bodies", "displacement")
 _OPTIONAL = ("contact_nodes", "contact_forces", "subdomains")
 _NODAL = "nodal_"
-_SIDE = "side_{}_"  #: of the contact of that number
+_SIDE = "side_{}_"  #: prefix of the arrays of a contact, with its number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
-#: of rows of contact; with friction; of exact solutions
+#: optional arrays of a contact
 _SOME = ("push", "shear", "friction", "exact")
 _HISTORY = "history_"
 
@@ -69,7 +69,7 @@ def save_fields(folder: Path, fields: Fields) -> str:
 
 
 def field_arrays(fields: Fields) -> Arrays:
-    """List the arrays of a deformed state by name."""
+    """Return the arrays of a deformed state by name."""
     arrays = {name: getattr(fields, name) for name in _ALWAYS + _OPTIONAL}
     arrays |= {_NODAL + name: values for name, values in fields.nodal.items()}
     for i, side in enumerate(fields.contacts):
@@ -97,7 +97,7 @@ def load_fields(folder: Path, digest: str) -> Fields:
 
 
 def _sides(arrays: Arrays) -> Iterator[ContactSide]:
-    """Find the contacts of a deformed state; none in files of old."""
+    """Yield the contacts of a deformed state; old files have none."""
     for i in range(len(arrays)):
         side = _with_prefix(_SIDE.format(i), arrays)
         if not set(side) >= {"name", *_ALONG}:
@@ -110,18 +110,18 @@ def _sides(arrays: Arrays) -> Iterator[ContactSide]:
 
 
 def write_point(path: Path, solution: Solution) -> None:
-    """Write the point of a solution, and its history, to a file of its own."""
+    """Write the point of a solution, and its history, to a file."""
     write_arrays(path, point_arrays(solution))
 
 
 def write_arrays(path: Path, arrays: Arrays) -> None:
-    """Write arrays to a file of their own."""
-    with path.open("wb") as file:  # given a name, savez would append .npz to it
+    """Write arrays to an npz file."""
+    with path.open("wb") as file:  # savez would append .npz to a name
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_point(path: Path, status: Status) -> Solution:
-    """Read what `write_point` wrote, as a `Solution` that claims `status`."""
+    """Read a file of `write_point` as a `Solution` that claims `status`."""
     arrays = read_arrays(path, _POINT)
     x, y, z, z_box = (arrays[name] for name in _POINT)
     history = _history(path, arrays)
@@ -129,34 +129,34 @@ def read_point(path: Path, status: Status) -> Solution:
 
 
 def read_arrays(path: Path, expected: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Read an npz file, never unpickling.
+    """Read an npz file without unpickling.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is no npz, is larger than `harness.files.datafile`
-        allows, or lacks one of the `expected` arrays.
+        When the file cannot be read, is not an npz file, is larger than
+        `harness.files.datafile` allows, or lacks one of the `expected` arrays.
 
     """
     return _expected(path, npz.read, expected)
 
 
 def mapped_arrays(path: Path, *, limited: bool = True) -> dict[str, NDArray[Any]]:
-    """Do as `read_arrays`, but map what can be mapped; see `harness.files.npz`.
+    """Read an npz file like `read_arrays`, mapping arrays where possible.
 
-    limited : whether the size of a file that can be mapped has the limit, too
+    limited : apply the limit of sizes to files that can be mapped as well
 
     Raises
     ------
     InputError
-        As `read_arrays`.
+        For the same reasons as `read_arrays`.
 
     """
 
     def mapped(path: Path) -> dict[str, NDArray[Any]]:
         try:
             return npz.mapped(path, limited=limited)
-        except ValueError:  # an npz file of somebody else
+        except ValueError:  # an npz file that another program wrote
             return npz.read(path)
 
     return _expected(path, mapped, ())
@@ -173,7 +173,7 @@ def _expected(
             arrays = read(path)
     except InputError:
         raise
-    except Exception:  # what a text, a pickle, a damaged archive lead zipfile to raise
+    except Exception:  # zipfile raises many types for texts, pickles, damage
         raise InputError(
             f"{path}: not an npz file of plain arrays; expected what numpy.savez writes"
         ) from None
@@ -183,13 +183,13 @@ def _expected(
 
 
 def point_arrays(solution: Solution) -> Arrays:
-    """List the four vectors of a point, and the columns of its history, by name."""
+    """Return the vectors of a point and the columns of its history by name."""
     point = {name: getattr(solution, name) for name in _POINT}
     return point | {_HISTORY + name: v for name, v in solution.history.items()}
 
 
 def _history(path: Path, arrays: Arrays) -> History:
-    """Find the history among the arrays of a point; none in files of old."""
+    """Return the history among the arrays of a point; old files have none."""
     try:
         return checked_history(_with_prefix(_HISTORY, arrays))
     except ValueError as e:
@@ -197,7 +197,7 @@ def _history(path: Path, arrays: Arrays) -> History:
 
 
 def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
-    """Select by the start of a name, and cut it off."""
+    """Return the arrays whose names have a prefix, by the rest of the name."""
     return {
         name.removeprefix(prefix): values
         for name, values in arrays.items()
@@ -207,7 +207,7 @@ def _with_prefix(prefix: str, arrays: Arrays) -> dict[str, NDArray[Any]]:
 
 @contextmanager
 def _restorable() -> Iterator[None]:
-    """Say of a file of a result folder what can be done."""
+    """Add the remedy to errors about files of a result folder."""
     try:
         yield
     except InputError as e:
@@ -217,7 +217,7 @@ def _restorable() -> Iterator[None]:
 def _as_stored(
     folder: Path, digest: str, expected: tuple[str, ...]
 ) -> tuple[Path, dict[str, NDArray[Any]]]:
-    """Read arrays whose content must be that of the digest."""
+    """Read stored arrays, and compare their content with the digest."""
     path = _path(folder, digest)
     arrays = read_arrays(path, expected)
     if digest_of(arrays) != digest:
@@ -226,12 +226,12 @@ def _as_stored(
 
 
 def is_stored(folder: Path, digest: str) -> bool:
-    """Whether a folder has arrays of that digest."""
+    """Return True if a folder has arrays of that digest."""
     return bool(_DIGEST.fullmatch(digest)) and _path(folder, digest).exists()
 
 
 def copy_stored(source: Path, folder: Path, digest: str) -> bool:
-    """Copy arrays to another folder, unless it has them; tell whether it has now."""
+    """Copy arrays to another folder; return True if it has them afterwards."""
     if is_stored(folder, digest):
         return True
     if not is_stored(source, digest):
@@ -244,28 +244,31 @@ def copy_stored(source: Path, folder: Path, digest: str) -> bool:
 
 
 def _path(folder: Path, digest: str) -> Path:
-    """Locate stored arrays; what is no digest could lead out of the folder."""
+    """Return the path of stored arrays; other texts could lead out of the folder."""
     if not _DIGEST.fullmatch(digest):
         raise InputError(
-            f"{folder}: {shortened(digest)!r} is no digest; expected 16 hex digits"
+            f"{folder}: {shortened(digest)!r} is not a digest; expected 16 hex digits"
         )
     return folder / "vectors" / f"{digest}.npz"
 
 
 def save(folder: Path, arrays: Arrays) -> str:
-    """Write arrays under the digest of their content, unless a folder has them."""
+    """Store arrays under the digest of their content, and return the digest."""
     digest = digest_of(arrays)
     path = _path(folder, digest)
     if path.exists():
         return digest
     archive = BytesIO()
     np.savez(archive, **arrays)  # type: ignore[arg-type]
-    replace_file(path, archive.getbuffer())  # before the line that will refer to it
+    replace_file(path, archive.getbuffer())  # before the journal line that refers to it
     return digest
 
 
 def digest_of(arrays: Arrays) -> str:
-    """Hash names, types, shapes and values, not the archive, which holds dates."""
+    """Return the digest of names, types, shapes and values.
+
+    The archive itself is not hashed, since it contains dates.
+    """
 
     def parts() -> Iterator[bytes]:
         for name in sorted(arrays):

@@ -102,7 +102,7 @@ def measured(
         reply = worker.ask(request, time_limit=time_limit, memory_limit=memory_limit)
         if reply.fault:
             raise FaultError(f"{record.solver} on {record.case}: {reply.message}")
-        record = record.but(
+        record = record.replace(
             started=started,
             message=reply.message,
             peak_mib=reply.peak_mib,
@@ -113,9 +113,9 @@ def measured(
             qp, record = _as_told(reply.emitted, record)
         else:
             qp = whole()
-            record = record.but(sizes=qp.sizes)
+            record = record.replace(sizes=qp.sizes)
         if reply.answer is None:
-            return Measured(record.but(verdict=reply.verdict), None)
+            return Measured(record.replace(verdict=reply.verdict), None)
         solution = replace(
             read_point(out, Status(reply.answer["claimed"])),
             iterations=reply.answer["iterations"],
@@ -136,16 +136,16 @@ def measured(
     found = reply.answer["evaluated"] if by_ranks else None
     notes += found["notes"] if found is not None else []
     if found is not None and found["values"] is not None:
-        record = judged(record, qp, solution, found=found["values"]).but(
+        record = judged(record, qp, solution, values=found["values"]).replace(
             quantities=found["quantities"] or {},
             recover_seconds=found["recover_seconds"],
             **(found["bounds"] or {}),
         )
     elif is_pointless:
-        record = judged(record, qp, solution, found=_NO_POINT)
+        record = judged(record, qp, solution, values=_NO_POINT)
     else:
         record = judged(record, whole() if by_ranks else qp, solution, prove)
-    record = _within(memory_limit, noted(record, reply.message, *notes)).but(
+    record = _within(memory_limit, noted(record, reply.message, *notes)).replace(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
     lacks = found is None or None in (found["quantities"], found["bounds"])
@@ -170,7 +170,7 @@ def _timed(
     if not notes:
         first, what = reply.answer["first_seconds"], (record.qp, record.asked_tol)
         notes = _cached(cost, first, first_seconds, what)
-    return record.but(**asdict(cost)), *notes
+    return record.replace(**asdict(cost)), *notes
 
 
 def case_request(record: Record) -> dict[str, Any]:
@@ -186,7 +186,7 @@ def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Rec
     if emitted is None or not emitted["sizes"]:
         return without_content(0, 0), record
     sizes = emitted["sizes"]
-    return without_content(sizes["variables"], sizes["equalities"]), record.but(
+    return without_content(sizes["variables"], sizes["equalities"]), record.replace(
         sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
     )
 
@@ -250,10 +250,10 @@ def _within(limit: float, record: Record) -> Record:
     peak = record.peak_mib
     if peak is not None and peak > limit:
         message = f"reached {peak:.0f} MiB, above the limit of {limit:g} MiB"
-        return noted(record.but(verdict=Verdict.MEMORY_LIMIT), message)
+        return noted(record.replace(verdict=Verdict.MEMORY_LIMIT), message)
     succeeded = record.verdict.is_verified or record.verdict is Verdict.INACCURATE
     if not succeeded and out_of_memory(record.message, peak, limit):
-        return record.but(verdict=Verdict.MEMORY_LIMIT)
+        return record.replace(verdict=Verdict.MEMORY_LIMIT)
     return record
 
 
@@ -306,7 +306,7 @@ def measured_once(
             qp_file = scratch / "qp.npz"
             meta = {"name": record.case}
             digest = save_qp(qp_file, case().qp, meta, serialised=True)
-            record = record.but(qp=digest)
+            record = record.replace(qp=digest)
             if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
@@ -322,10 +322,10 @@ def measured_once(
         return record, solution
     if not record.quantities:
         quantities, note = quantities_of(case(), solution)
-        record = noted(record, note).but(quantities=quantities)
+        record = noted(record, note).replace(quantities=quantities)
     if record.certify_seconds is None:
         bounds, objection = certified(case(), solution)
-        record = noted(record, objection).but(**bounds)
+        record = noted(record, objection).replace(**bounds)
     return record, solution
 
 

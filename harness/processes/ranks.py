@@ -35,19 +35,19 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator
 
 from mortarbench.harness.distributed.failures import (
-    ALONE_SECONDS,
+    PEER_TIMEOUT,
     RECORD,
     RankFailedError,
     abort,
-    agreed,
     in_a_line,
+    run_collectively,
 )
 from mortarbench.harness.distributed.mpi import MISSING, mpiexec
 from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import (
     Distributable,
+    DistributedQP,
     Emit,
-    Emitted,
     Ranks,
     Share,
 )
@@ -121,14 +121,14 @@ class _Ends:
     def first(self, mpiexec: int) -> str:
         """Wait until mpiexec has ended, and describe the end of the first rank.
 
-        The others have `ALONE_SECONDS` to end after it, whatever its exit code. Empty
+        The others have `PEER_TIMEOUT` to end after it, whatever its exit code. Empty
         where mpiexec was the first to end.
         """
         mpi, deadline = os.pidfd_open(mpiexec), np.inf
         self._events.register(mpi, EPOLLIN)
         has_ended = False
         while not has_ended and (left := deadline - time.monotonic()) > 0:
-            ready = [fd for fd, _ in self._events.poll(min(left, ALONE_SECONDS))]
+            ready = [fd for fd, _ in self._events.poll(min(left, PEER_TIMEOUT))]
             has_ended = mpi in ready
             for fd in ready:
                 if fd in self._rank_of:
@@ -139,7 +139,7 @@ class _Ends:
                 if fd == mpi:  # ranks that end now, end because it has
                     self._note("")
             if self._first is not None and deadline == np.inf:
-                deadline = time.monotonic() + ALONE_SECONDS
+                deadline = time.monotonic() + PEER_TIMEOUT
         if self._first is None or isinstance(self._first, str):
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
@@ -212,7 +212,7 @@ def follow(
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
-    emitted: Emitted | None = None
+    emitted: DistributedQP | None = None
     solution: Solution | None = None
     while (order := _next_order(ranks)) is not None:
         try:
@@ -241,7 +241,7 @@ def follow(
             elif run is not None and share is not None:
                 solution, _ = _solved(run, share, ranks)
         except BaseException as e:
-            if _ordered(ranks, ALONE_SECONDS):
+            if _ordered(ranks, PEER_TIMEOUT):
                 continue  # rank 0 has failed alike, and says so
             abort(ranks, e)
 
@@ -289,7 +289,7 @@ class OnRanks:
         self._solver = self.__wrapped__ = solver  # its file is that of failures
         self._ranks = ranks
         self._emit = emit
-        self._emitted: Emitted | None = None
+        self._emitted: DistributedQP | None = None
         self._unemitted: Exception | None = None
         self._copies = copies
         self._path = Path()
@@ -404,7 +404,7 @@ class OnRanks:
 
 def _emitted(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
-) -> tuple[Emitted, dict[str, Any]]:
+) -> tuple[DistributedQP, dict[str, Any]]:
     """Emit on all ranks, and tell of it what `OnRanks.shares` does.
 
     Raises
@@ -415,9 +415,11 @@ def _emitted(
     """
     start = time.perf_counter()
     try:
-        made = agreed(ranks, lambda: emit(case, ranks))  # by then the slowest is done
+        made = run_collectively(
+            ranks, lambda: emit(case, ranks)
+        )  # by then the slowest is done
         seconds = time.perf_counter() - start
-        digest = agreed(ranks, made.digest)
+        digest = run_collectively(ranks, made.digest)
         told = {"sizes": made.sizes, "digest": digest, "build_seconds": seconds}
         return made, told
     except InputError:

@@ -18,12 +18,12 @@ from mortarbench.harness.errors import InputError, shortened, some
 from mortarbench.harness.files.copies import FOLDER as COPIES
 from mortarbench.harness.files.copies import is_copy, remove_copies
 from mortarbench.harness.files.durable import (
-    full_disk_told,
     remove_unfinished,
     replace_file,
+    report_full_disk,
 )
 from mortarbench.harness.files.reading import (
-    MOST_TOML,
+    MAX_TOML_MIB,
     opened,
     read_json,
     read_text,
@@ -222,7 +222,7 @@ def locked(folder: Path) -> Iterator[Held]:
 
     """
     try:
-        with full_disk_told(folder):
+        with report_full_disk(folder):
             held = Held(folder)
     except OSError as e:
         raise InputError(
@@ -351,7 +351,7 @@ def suite_text(folder: Path) -> str:
     """
     path = folder / "suite.toml"
     read_stored(path)
-    return read_text(path, "the suite of a result folder", MOST_TOML)
+    return read_text(path, "the suite of a result folder", MAX_TOML_MIB)
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.copies import check_copies, merge_copies
-from mortarbench.harness.files.durable import full_disk_told, replace_file
+from mortarbench.harness.files.durable import replace_file, report_full_disk
 from mortarbench.harness.files.store import copy_stored
 from mortarbench.harness.record import Record
 from mortarbench.harness.results.faults import FAULTS, read_faults
@@ -49,14 +49,14 @@ class _Union:
 
     def add(self, record: Record) -> bool:
         """Take a measurement; tell whether it is one that is there already."""
-        content = hex_digest([record.but(run_id="").to_json().encode()], 32)
+        content = hex_digest([record.replace(run_id="").to_json().encode()], 32)
         if content in self._contents:
             return True
         if (record.run_id, record.environment) in self._known:
             return True
         self._known[record.run_id, record.environment] = record
         if record.run_id in self.records:
-            record = record.but(
+            record = record.replace(
                 run_id=hex_digest([f"{record.run_id} {record.environment}".encode()])
             )
         if record.run_id in self.records:
@@ -99,7 +99,7 @@ def merge(
     suite = as_toml(united(suites))
     for folder in folders:
         check_copies(folder)
-    with full_disk_told(out), locked(out):
+    with report_full_disk(out), locked(out):
         union = _Union()
         for folder in before:
             for record in read_journal(folder):
@@ -141,7 +141,9 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
         environment: hex_digest([f"{environment} {started}".encode()])
         for environment, started in first.items()
     }
-    return [r if r.session else r.but(session=sessions[r.environment]) for r in records]
+    return [
+        r if r.session else r.replace(session=sessions[r.environment]) for r in records
+    ]
 
 
 def _refuse_nested(source: Path, out: Path) -> None:

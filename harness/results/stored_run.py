@@ -8,7 +8,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from mortarbench.harness.distributed.vectors import EMITTED
+from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.names import CaseId, assemble, unbuilt
@@ -187,7 +187,7 @@ def rebuild(
         case = name.build(reference)
     except (Exception, SystemExit) as e:  # the family's code
         raise InputError(unbuilt(r.case, e)) from None
-    if r.qp is None or r.qp.startswith(EMITTED):
+    if r.qp is None or r.qp.startswith(DISTRIBUTED_DIGEST):
         return case
     if (now := qp_digest(case.qp, serialised=True)) != r.qp:
         raise InputError(

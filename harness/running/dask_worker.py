@@ -104,7 +104,7 @@ class ExecutorPlugin(WorkerPlugin):
         opened = self._open = self._open or self._opened()
         os.sched_setaffinity(0, {opened.cpu.number})  # of this thread
         here = {"environment": opened.digest, "node": platform.node()}
-        turns = tuple(tuple(r.but(**here) for r in turn) for turn in block.turns)
+        turns = tuple(tuple(r.replace(**here) for r in turn) for turn in block.turns)
         outcomes = []
         try:
             for outcome in opened.executor.execute(replace(block, turns=turns)):

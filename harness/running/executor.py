@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from mortarbench.harness.errors import FaultError
-from mortarbench.harness.files.durable import full_disk_told, refuse_full_disk
+from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
@@ -84,7 +84,7 @@ class Executor:
             When the disk is full.
 
         """
-        with full_disk_told(self.scratch):
+        with report_full_disk(self.scratch):
             try:
                 if block.number != self._number:  # else it goes on with its next turns
                     self._number, self._entries = block.number, ()
@@ -164,7 +164,7 @@ class Executor:
                 yield from _broken(there[step + 1 :], record)
                 break
         for record in turn[len(there) :]:
-            declined = record.but(verdict=Verdict.DECLINED, message=self._end)
+            declined = record.replace(verdict=Verdict.DECLINED, message=self._end)
             yield Result(record=declined)
 
     def _request(
@@ -187,7 +187,7 @@ class Executor:
             request |= {"qp": str(at.qp), "digest": at.digest}
         keys = ("qp", "build_seconds", "dualise_seconds")
         known = {key: at.meta.get(key) for key in keys}
-        return request, record.but(**known, step_tol=_step_tol(record, at))
+        return request, record.replace(**known, step_tol=_step_tol(record, at))
 
     def _source(self, record: Record) -> Source:
         """Return where the QP of a record comes from."""
@@ -238,7 +238,7 @@ class Executor:
         try:
             answer = self._ask_case_worker(request, block)
             notes = answer["notes"]
-            record = record.but(
+            record = record.replace(
                 quantities=answer["quantities"],
                 recover_seconds=answer["seconds"],
                 **answer["bounds"],
@@ -355,7 +355,7 @@ def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
     """Give the steps that a sequence did not come to, because of how one ended."""
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
-        yield Result(record=record.but(verdict=end.verdict, message=reason))
+        yield Result(record=record.replace(verdict=end.verdict, message=reason))
 
 
 class _UnbuiltError(Exception):

@@ -17,7 +17,7 @@ from typing import Any
 
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.files.copies import keep_copies, refuse_own_copies
-from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.files.lines import Lines
 from mortarbench.harness.files.store import save
 from mortarbench.harness.plugin import Solver
@@ -95,7 +95,7 @@ def run(
     with (
         ended_by_signals(),
         _continuation_told(progress),
-        full_disk_told(out),
+        report_full_disk(out),
         locked(out) as held,
     ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
@@ -195,12 +195,12 @@ class _Book:
         record = result.record
         if result.part:
             number = self.schedule.number_of_part(record.block, result.part)
-            record = record.but(block=number)
+            record = record.replace(block=number)
         self.was_deleted = not self.held.is_there()
         if result.point is not None:
-            record = record.but(vectors=save(self.out, result.point))
+            record = record.replace(vectors=save(self.out, result.point))
         if result.fields is not None:
-            record = record.but(fields=save(self.out, result.fields))
+            record = record.replace(fields=save(self.out, result.fields))
         self.journal.append(record)
         self.schedule.note(record)
         self._count(record, record)

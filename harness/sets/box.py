@@ -15,7 +15,19 @@ from mortarbench.harness.sets.convex import Limits, Sum, Vector
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """Bounds: lower ≤ x ≤ upper, component by component; ±inf where there are none."""
+    """Bounds lower ≤ x ≤ upper, component by component; ±inf for absent bounds.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import Box
+    >>> box = Box(np.array([0.0, -np.inf]), np.array([1.0, np.inf]))
+    >>> box.project(np.array([2.0, 5.0]))
+    array([1., 5.])
+    >>> box.block  # variables with a finite bound
+    array([0])
+
+    """
 
     lower: Vector  #: (n,) less than inf
     upper: Vector  #: (n,) greater than -inf
@@ -49,19 +61,19 @@ class Box:
         return np.clip(x, self.lower, self.upper)
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Measure the slack of the finite lower, then of the finite upper bounds."""
-        size, found = np.abs(x), list[Limits]()
+        """Return the slacks of the finite lower, then of the finite upper bounds."""
+        size, limits = np.abs(x), list[Limits]()
         for bound, sign in ((self.lower, 1), (self.upper, -1)):
             is_finite = np.isfinite(bound)
             if is_finite.any():
                 at = bound[is_finite]
-                found.append(
+                limits.append(
                     Limits(
                         sign * (x[is_finite] - at), np.abs(at), size[is_finite],
-                        partial(_taken, is_finite),
+                        partial(_selected, is_finite),
                     )
                 )  # fmt: skip
-        return found
+        return limits
 
     def admissible(self, z: Vector) -> Vector:
         """Return z (n,) without multipliers of absent bounds."""
@@ -103,5 +115,5 @@ class Box:
                 yield bound[is_finite], np.maximum(sign * z, 0)[is_finite], sign
 
 
-def _taken(mask: NDArray[np.bool_], v: Vector) -> Vector:
+def _selected(mask: NDArray[np.bool_], v: Vector) -> Vector:
     return v[mask]

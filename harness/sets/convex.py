@@ -1,13 +1,14 @@
 """Convex sets of the variables of a QP, used only through their operations.
 
 A QP constrains x ∈ S₀ × S₁ × …: S₀ is a `Box` of all variables, and each further set
-has a block of variables to itself, which S₀ leaves free. KKT residuals, verdicts,
-transforms and files use the operations below and no particular kind of set.
+constrains a block of variables that are free in S₀ and in all other sets. KKT
+residuals, verdicts, transforms and files use the operations below, and do not depend on
+the kind of a set.
 
 A vector z is normal to S at x ∈ S if zᵀ(y − x) ≤ 0 for all y ∈ S. With the support
-function σ(z) = sup zᵀy over y ∈ S, that is  σ(z) − zᵀx = 0,  and the left side, the
-support gap, is never negative at x ∈ S (Rockafellar 1970, Theorem 23.5). Of a box it is
-the sum of what is known as complementarity: multiplier times distance to the bound.
+function σ(z) = sup zᵀy over y ∈ S, this is  σ(z) − zᵀx = 0,  where the left-hand side,
+the support gap, is nonnegative for x ∈ S (Rockafellar 1970, Theorem 23.5). For a box it
+is the sum of the complementarity terms, multiplier times distance to the bound.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ S = TypeVar("S", bound="ConvexSet")
 
 
 class Limits(NamedTuple):
-    """Scalar constraints at a point, nonnegative slack where they hold."""
+    """Scalar constraints at a point; the slack is nonnegative where they hold."""
 
     slack: Vector  #: distance to the limit, negative outside
     size: Vector  #: absolute value of the limit
-    terms: Vector  #: size of the variables' part in the slack
+    terms: Vector  #: sum of the absolute terms of the variables in the slack
     sized: Callable[[Vector], Vector]  #: the same for variables of sizes (n,)
 
 
 class Sum(NamedTuple):
-    """A sum and that of the absolute values of its terms."""
+    """A sum, and the sum of the absolute values of its terms."""
 
     value: Any
     terms: Any
@@ -47,7 +48,7 @@ class ConvexSet(Protocol):
         """The variables that the set constrains, in ascending order."""
 
     def check(self, n: int) -> None:
-        """Raise ValueError where the set is empty, holds NaN or does not fit n."""
+        """Raise ValueError if the set is empty, holds NaN or does not fit n."""
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
         """Return the smallest box (n,), (n,) that contains the set."""
@@ -56,10 +57,10 @@ class ConvexSet(Protocol):
         """Return the point (n,) of the set that is nearest to x (n,)."""
 
     def limits(self, x: Vector) -> Sequence[Limits]:
-        """Measure the slack of x (n,)."""
+        """Return the slacks of x (n,)."""
 
     def admissible(self, z: Vector) -> Vector:
-        """Return z (n,) without components that are normal to the set nowhere."""
+        """Return the part of z (n,) that is normal to the set at some point."""
 
     def support(self, z: Vector) -> Sum:
         """Evaluate σ at an admissible z (n,)."""
@@ -69,11 +70,11 @@ class ConvexSet(Protocol):
     ) -> Sequence[Sum]:
         """Evaluate σ(z) − zᵀx limit by limit; x and z are (n,).
 
-        limits : as `limits` measures them at x
+        limits : result of `limits` at x
         """
 
     def substituted(self: S, T: Any, a: Vector) -> S:
-        """Return the set of all x' with T x' + a in this one.
+        """Return the set of all x' with T x' + a in this set.
 
         T : (n, n) sparse, one entry in each row and column
         """
@@ -92,7 +93,7 @@ def hull(sets: Sequence[ConvexSet], n: int) -> tuple[Vector, Vector]:
 
 
 def admissible(sets: Sequence[ConvexSet], z: Vector) -> Vector:
-    """Return z (n,) without components that are normal to no set of a product."""
+    """Return the part of z (n,) that is normal to a product of sets at some point."""
     total, *others = (one.admissible(z) for one in sets)
     for other in others:
         total = total + other

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from mortarbench.harness import checked
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, shown, unknown
-from mortarbench.harness.files.reading import MOST_TOML, read_text, read_toml, toml
+from mortarbench.harness.files.reading import MAX_TOML_MIB, read_text, read_toml, toml
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.record import TIGHTENING
@@ -125,7 +125,7 @@ def load_suite(
         With the file and the place in it, and what would be right.
 
     """
-    text = read_text(path, "a TOML file", MOST_TOML)
+    text = read_text(path, "a TOML file", MAX_TOML_MIB)
     return parse_suite(text, f"{path}", path.parent, families, solvers)
 
 

@@ -1,1 +1,1 @@
-"""What an answer is worth: measured residuals, verdicts, certificates."""
+"""Verification of answers: residuals, verdicts, proven optima, certificates."""

@@ -1,14 +1,14 @@
-"""Displacement and contact forces for given closed rows, and the exchange of rows.
+"""Solution for given closed rows in extended precision, and the exchange of rows.
 
-Given the rows A that are closed, both follow from linear equations,
+For a set A of closed rows, displacement and multipliers solve linear equations,
 
     K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,   λ_N at a bound elsewhere,
 
-refined with residuals in extended precision until nothing is left of them. A row is
-closed, or at the lower or the upper bound of its multiplier: an open contact is at the
-lower one, zero; friction sticks, or slips at −g or g. Rows whose multiplier exceeds a
-bound, or whose motion is against the bound that they are at (a gap that is negative),
-are exchanged, as in a primal-dual active set method, until there is none.
+refined with residuals in extended precision. A row is closed, or its multiplier is at
+the lower or the upper bound: an open contact is at the lower one, zero; friction
+sticks, or slips at −g or g. As in a primal-dual active set method, rows are exchanged
+whose multiplier exceeds a bound, or whose motion contradicts the bound of the
+multiplier (a negative gap), until there are none.
 """
 
 from __future__ import annotations
@@ -21,37 +21,38 @@ from numpy.typing import NDArray
 from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.verify.admissible import closing
 
-EXCHANGES = 60  #: of active sets
-REFINEMENTS = 6
+MAX_EXCHANGES = 60  #: of active sets
+REFINEMENTS = 6  #: of a solution, each with a residual in extended precision
 
 States = NDArray[np.int8]  #: (m,) of each row
-LOWER, CLOSED, UPPER = -1, 0, 1  #: where the multiplier is, or that the row is closed
+LOWER, CLOSED, UPPER = -1, 0, 1  #: multiplier at its lower bound, free, at its upper
 
 _EPS = Real(np.finfo(Real).eps)
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
-    """Solve  K u = force  on the free components, zero on the others.
+    """Solve  K u = force  with u = 0 on fixed components.
 
-    Returns u, without rigid motion, and the energy norm of what one refinement left
-    undone, √(rᵀK⁺r) with the residual r, in extended precision.
+    Returns u in extended precision, without rigid motion, and the energy norm of its
+    error, √(rᵀK⁺r) with the residual r.
     """
-    K, held = mechanics.stiffness, mechanics.exact.held
+    K, fixed = mechanics.stiffness, mechanics.exact.fixed
     u = np.zeros(force.size, dtype=Real)
     for _ in range(3):
         r = force - K @ u
-        r[held] = 0
-        r = mechanics.still(r)
-        step = mechanics.relaxed(r)
+        r[fixed] = 0
+        r = mechanics.without_rigid_motion(r)
+        step = mechanics.apply_inverse(r)
         left = float(np.sqrt(abs(r @ step)))
         u = u + step
-    return u - step, left
+    return u - step, left  # the u that the last residual belongs to
 
 
 def unconstrained_guess(mechanics: Mechanics) -> States:
-    """Guess the rows that bodies alone would violate; all, where contact holds them.
+    """Guess that the rows are closed that the displacement without contact violates.
 
-    Friction is guessed to stick.
+    If contact alone supports a body, all rows are guessed to be closed. Friction is
+    guessed to stick.
     """
     exact = mechanics.exact
     if mechanics.inverse.kernel.shape[1]:
@@ -61,19 +62,19 @@ def unconstrained_guess(mechanics: Mechanics) -> States:
 
 
 def suggested(exact: Exact, u: Extended, multipliers: Extended) -> States:
-    """Guess from a pair which rows are closed: λ + v/D within its bounds, v = Bu − c.
+    """Guess states from a pair: closed where λ + v/D is within its bounds, v = Bu − c.
 
-    D is the compliance of the row; the guess is that of a primal-dual active set
+    D is the compliance of the row; this is the prediction of a primal-dual active set
     method.
     """
     room = multipliers - exact.lower, exact.upper - multipliers
-    return predicted(room, exact.loose, exact.motion(u))
+    return predicted(room, exact.compliance, exact.motion(u))
 
 
 def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:
-    """Tell where λ + v/D is: within its bounds, or beyond which of them.
+    """Return the states (m,) for λ + v/D: closed within its bounds, at one beyond.
 
-    room : of λ to its lower and its upper bound (m,), infinite where there is none
+    room : (m,) distances of λ from its lower and its upper bound, inf without a bound
     """
 
     def passed(room: Any, push: Any) -> Any:
@@ -85,22 +86,22 @@ def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:
 
 
 def at_bounds(exact: Exact, states: States, multipliers: Extended) -> Extended:
-    """Set the multipliers of the rows that are not closed to the bounds they are at."""
+    """Set the multipliers of rows that are not closed to their bounds."""
     upper = np.where(states == UPPER, exact.upper, multipliers)
     return np.asarray(np.where(states == LOWER, exact.lower, upper))
 
 
 def exchanged(
-    mechanics: Mechanics, states: States, rounds: int = EXCHANGES
+    mechanics: Mechanics, states: States, rounds: int = MAX_EXCHANGES
 ) -> tuple[Extended, Extended, States]:
-    """Exchange rows from a guess on; return u (n,), multipliers (m,), and states.
+    """Exchange rows, starting from a guess; return u (n,), multipliers (m,), states.
 
-    Where sets recur, or there are too many, the last one is returned: whether it is
-    right is for a certificate to say.
+    If a set recurs, or after `rounds` sets, the last one is returned. It need not be
+    optimal: a certificate decides.
     """
-    exact, seen = mechanics.exact, set[bytes]()
+    exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):
-        u, lam = _given(mechanics, states)
+        u, lam = _solved(mechanics, states)
         v = exact.motion(u)
         rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
         force = 1e4 * _EPS * np.abs(lam).max(initial=Real(0))
@@ -110,16 +111,16 @@ def exchanged(
         closes = ((states == LOWER) & (v > rounding)) | (
             (states == UPPER) & (v < -rounding)
         )
-        if not (below | above | closes).any() or states.tobytes() in seen:
+        if not (below | above | closes).any() or states.tobytes() in visited:
             break
-        seen.add(states.tobytes())
+        visited.add(states.tobytes())
         states = np.where(below, LOWER, np.where(above, UPPER, states))
         states = np.where(closes, CLOSED, states).astype(np.int8)
     within = np.clip(lam, exact.lower, exact.upper)
     return u, at_bounds(exact, states, within), states
 
 
-def _given(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
+def _solved(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
     """Solve with equality on the closed rows: u (n,) and multipliers (m,)."""
     exact, motions = mechanics.exact, mechanics.motions
     R, active = motions.felt, states == CLOSED
@@ -128,8 +129,8 @@ def _given(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
     alpha = np.zeros(R.shape[1], dtype=Real)
     for _ in range(REFINEMENTS):
         force = exact.f - exact.B.T @ lam
-        at_rest = equilibrium(mechanics, force - motions.KR @ alpha)[0]
-        u = at_rest + R @ alpha
+        elastic = equilibrium(mechanics, force - motions.KR @ alpha)[0]
+        u = elastic + R @ alpha
         excess = (exact.B @ u - exact.c)[active]
         force = R.T @ force - motions.KR.T @ u
         mu, further = close(excess.astype(np.float64), force.astype(np.float64))

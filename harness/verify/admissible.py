@@ -1,7 +1,7 @@
-"""Admissible pairs near an answer: a displacement without penetration, and balance.
+"""Admissible pairs near an answer: no penetration, and forces in balance.
 
-Moving slave nodes alone would not do for the displacement: the end nodes of an arc may
-be held, and a mortar row couples several.
+It does not suffice to move slave nodes alone until nothing penetrates: end nodes of an
+arc may be prescribed, and a mortar row couples several nodes.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from scipy.sparse import (
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from mortarbench.harness.mechanics import (
-    UNFELT,
+    MOTION_ROUNDING,
     Exact,
     Extended,
     Mechanics,
@@ -33,88 +33,92 @@ from mortarbench.harness.mechanics import (
 )
 from mortarbench.harness.qp import Vector
 
-ROUNDS = 20  #: of growing the set of rows
-DENSE = 2000  #: rows up to which F_VV is formed
-#: of the best held motion: how little forces, at the power ½, hold a loose one
-LOOSE = 1e-5
-ROUNDED = 1e-12  #: of its terms, that a load along a loose or free motion may be
+MAX_ROUNDS = 20  #: of extending the set of rows that are closed
+MAX_DENSE_ROWS = 2000  #: rows for which F_VV is formed; beyond, it is applied
+#: Singular values of √W G below this part of the largest belong to floating motions.
+SUPPORT_THRESHOLD = 1e-5
+#: Largest load along a floating or free motion that counts as rounding, relative to the
+#: sum of its absolute terms.
+LOAD_ROUNDING = 1e-12
 _EPS = Real(np.finfo(Real).eps)
 
 
 class UncertifiableError(Exception):
-    """Why there is no certificate: no admissible pair was found."""
+    """Failure to find an admissible pair; the message is the reason."""
 
 
 def admissible(
     mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
 ) -> Extended | None:
-    """Find û with Bû ≤ c near u, with equality on the rows `closed`; None if none.
+    """Return û near u with Bû ≤ c, and equality on the rows `closed`; None if none.
 
-    û = u − K⁺B_Vᵀμ + Rα,  F_VV μ = (Bu − c)_V + B_V Rα  is nearest in the energy norm
-    with equality on the rows V.
+    û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα is the nearest point in the
+    energy norm with equality on the rows V; V is extended until Bû ≤ c.
     """
     exact, moving = mechanics.exact, mechanics.motions
     if moving.free.shape[1]:
         u = u - moving.free @ (moving.free.T @ u)
     rows = _Rows(exact.B, exact.c, exact.contact)
-    found = _inside(rows, u, closed, partial(_nearest, mechanics))
-    return None if found is None else found.u
+    point = _feasible_near(rows, u, closed, partial(_nearest, mechanics))
+    return None if point is None else point.u
 
 
 class _Rows(NamedTuple):
-    """Rows  Bu ≤ c  of the contact, and those of friction, which any u satisfies."""
+    """Rows  Bu ≤ c  of contact, and rows of friction, which do not constrain u."""
 
     B: Any  #: (m, n), extended
     c: Extended  #: (m,)
-    contact: NDArray[np.bool_]  #: (m,)
+    contact: NDArray[np.bool_]  #: (m,) mask of the contact rows
 
 
-class Inside(NamedTuple):
-    """A displacement that no row excludes."""
+class FeasiblePoint(NamedTuple):
+    """A displacement that satisfies all contact rows."""
 
     u: Extended
-    theta: Any = Real(1)  #: of the whole displacement, where it had to be shrunk
+    theta: Any = Real(1)  #: factor of the whole displacement if it had to be scaled
 
 
-def _inside(
+def _feasible_near(
     rows: _Rows, u: Extended, closed: NDArray[np.bool_],
     nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
-) -> Inside | None:  # fmt: skip
-    """Move u inside, with equality on V.
+) -> FeasiblePoint | None:  # fmt: skip
+    """Move u into the feasible set, with equality on the rows V.
 
-    V are the closed rows, the violated ones, and those that get violated meanwhile. It
-    aims inside by some units of the last place. Where that does not end, θu with θ < 1
-    is admissible while c > 0. Rows of friction are held only where they are closed,
-    which means that they stick.
+    V holds the closed rows, the violated ones, and those that corrections violate. The
+    target is inside by some units in the last place, so that no rounding of Bu hides a
+    violation. If the rounds do not end, θu with θ < 1 is feasible provided that c ≥ 0.
+    Rows of friction belong to V only if they are closed, that is, stick.
 
-    nearest : of the rows V, the map from excesses t (v,) to the δ with B_V δ = −t
+    nearest : returns, for rows V, the map from excesses t (v,) to a δ with B_V δ = −t
     """
     B, c, contact = rows
-    held = np.zeros_like(closed)
+    enforced = np.zeros_like(closed)
     moved, step = u, None
-    for _ in range(ROUNDS):
+    for _ in range(MAX_ROUNDS):
         gap = c - B @ moved
-        size = np.abs(moved).max(initial=Real(0))  # of what is added up to get there
+        size = np.abs(moved).max(initial=Real(0))  # of the terms of the correction
         reach = abs(B) @ (16 * np.abs(moved) + 4 * size)
-        inside = _EPS * (reach + 16 * np.abs(c))
-        wanted = held | closed | (contact & (gap < 0))
-        if not wanted.any():
-            return Inside(u)
-        if (wanted != held).any():
-            held = wanted
-            step = nearest(held)
-        elif (gap[contact | held] >= 0).all() and (gap[held] <= 4 * inside[held]).all():
-            return Inside(moved)
+        margin = _EPS * (reach + 16 * np.abs(c))
+        required = enforced | closed | (contact & (gap < 0))
+        if not required.any():
+            return FeasiblePoint(u)
+        if (required != enforced).any():
+            enforced = required
+            step = nearest(enforced)
+        elif (gap[contact | enforced] >= 0).all() and (
+            gap[enforced] <= 4 * margin[enforced]
+        ).all():
+            return FeasiblePoint(moved)
         assert step is not None
-        moved = moved + step((inside - gap)[held].astype(np.float64))
+        moved = moved + step((margin - gap)[enforced].astype(np.float64))
         if not np.isfinite(moved).all():
             return _shrunk(rows, u)
     gap = (c - B @ moved)[contact]
-    return Inside(moved) if (gap >= 0).all() else _shrunk(rows, u)
+    return FeasiblePoint(moved) if (gap >= 0).all() else _shrunk(rows, u)
 
 
-def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
-    """Return θu with the largest θ that is admissible for sure."""
+def _shrunk(rows: _Rows, u: Extended) -> FeasiblePoint | None:
+    """Return θu with the largest θ ≤ 1 for which Bθu ≤ c holds in spite of rounding."""
     B, c = rows.B[rows.contact], rows.c[rows.contact]
     if (c < 0).any():
         return None
@@ -123,18 +127,15 @@ def _shrunk(rows: _Rows, u: Extended) -> Inside | None:
     theta = min((c[beyond] / reach[beyond]).min(initial=Real(1)), Real(1))
     for _ in range(8):  # the product may be rounded outwards
         if not (B @ (theta * u) > c).any():
-            return Inside(np.asarray(theta * u), theta)
+            return FeasiblePoint(np.asarray(theta * u), theta)
         theta = theta * (1 - 8 * _EPS)
-    return Inside(np.zeros_like(u), Real(0))
+    return FeasiblePoint(np.zeros_like(u), Real(0))
 
 
 def _nearest(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
-    """Return the map from excesses t (v,) to the smallest δ with B_V δ = −t.
-
-    Smallest in the energy norm.
-    """
+    """Return the map from t (v,) to the δ with B_V δ = −t of least energy norm."""
     B_V = mechanics.rows[np.flatnonzero(rows)]
     inverse, solve = mechanics.inverse, closing(mechanics, rows)
     felt = mechanics.motions.felt.astype(np.float64)
@@ -146,38 +147,38 @@ def _nearest(
     return step
 
 
-def inside_at_rows(
+def feasible_at_rows(
     exact: Exact, R: NDArray[np.float64], softness: Vector, u: Extended,
     closed: NDArray[np.bool_],
-) -> Inside | None:  # fmt: skip
-    """Move only what rows touch inside, as `_inside` does.
+) -> FeasiblePoint | None:  # fmt: skip
+    """Find a feasible point as `_feasible_near`, moving only components of the rows.
 
     Parameters
     ----------
-    exact : B has columns (w,) of what rows touch only
-    R : (w, p) rigid motions that contact feels there; they cost nothing
-    softness : (w,) 1/Kᵢᵢ, zero where a support holds
+    exact : with the components (w,) that the rows touch as the columns of B
+    R : (w, p) rigid motions that contact feels, which cost no energy
+    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
     u : (w,)
 
     Returns
     -------
-    u (w + p,) there and how far the motions have moved all
+    (w + p,) the displacement of these components, and the coefficients of R in it
 
     """
     none = csr_array((exact.c.size, R.shape[1]))
     B = csr_array(hstack([exact.B, none.astype(Real)]))
     nearest = partial(_nearest_at_rows, exact.B.astype(np.float64), R, softness)
     start = np.concatenate([u, np.zeros(R.shape[1], dtype=Real)])
-    return _inside(_Rows(B, exact.c, exact.contact), start, closed, nearest)
+    return _feasible_near(_Rows(B, exact.c, exact.contact), start, closed, nearest)
 
 
 def _nearest_at_rows(
     B: csr_array, R: NDArray[np.float64], softness: Vector, rows: NDArray[np.bool_]
 ) -> Callable[[Vector], Vector]:
-    """Return the map from t to (δ + Rα, α) with  B_V(δ + Rα) = −t,  δ smallest.
+    """Return the map from t to (δ + Rα, α) with  B_V(δ + Rα) = −t  and least δ.
 
-    Smallest in the norm of diag(1/softness), infinite where a support holds. The rigid
-    motions R cost nothing.
+    The norm of δ is that of diag(1/softness), infinite at prescribed components; α is
+    not part of it.
     """
     B_V = csr_array(B[np.flatnonzero(rows)])
     moved = csr_array((B_V * softness).T)
@@ -199,23 +200,23 @@ def _nearest_at_rows(
 def closing(
     mechanics: Mechanics, rows: NDArray[np.bool_]
 ) -> Callable[[Vector, Vector], tuple[Vector, Vector]]:
-    """Return the solve for the multipliers that close the rows V, and rigid motions.
+    """Return the solve for multipliers μ and rigid motions α that close the rows V.
 
     ::
 
         F_VV μ − G_V α = t,    G_Vᵀμ = e,        F_VV = B_V K⁺B_Vᵀ,  G_V = B_V R
 
-    for excesses t (v,) and loads e (p,) along the motions R that contact feels; of
-    those that the rows V do not feel, α = 0. F_VV may be singular where K⁺ holds what a
-    row touches, so that (F_VV + ρUUᵀ)μ is put for F_VV μ, where U spans G_V. All rows
-    are scaled to about the same compliance, which stiff and soft bodies need.
+    for excesses t (v,) and loads e (p,) along the motions R that contact feels; α = 0
+    for motions that the rows V do not feel. F_VV may be singular, since K⁺ is zero on
+    fixed components. It is therefore replaced by F_VV + ρUUᵀ, where U spans G_V. Rows
+    are scaled to similar compliance, since bodies may be of very different stiffness.
     """
     if not rows.any():
         return lambda t, e: (t, 0 * e)
     exact, motions = mechanics.exact, mechanics.motions
     V = np.flatnonzero(rows)
-    loose = exact.loose[V].astype(np.float64)
-    scale = 1 / np.sqrt(np.where(loose > 0, loose, 1.0))
+    compliance = exact.compliance[V].astype(np.float64)
+    scale = 1 / np.sqrt(np.where(compliance > 0, compliance, 1.0))
     B_V = csr_array(diags_array(scale) @ mechanics.rows[V])
     R = motions.felt.toarray().astype(np.float64)
     turn, p = felt_first(B_V, R)
@@ -225,7 +226,7 @@ def closing(
     S = np.linalg.pinv(U.T @ FU, hermitian=True)
 
     def solve(t: Vector, e: Vector) -> tuple[Vector, Vector]:
-        along = np.linalg.solve(T.T, turn[:, :p].T @ e)  # what Uᵀμ has to be
+        along = np.linalg.solve(T.T, turn[:, :p].T @ e)  # prescribed Uᵀμ
         Ft = F(scale * t)
         beta = S @ (along - U.T @ Ft)
         return scale * (Ft + FU @ beta), turn[:, :p] @ np.linalg.solve(T, beta)
@@ -236,19 +237,20 @@ def closing(
 def _compliance(
     mechanics: Mechanics, B_V: Any, U: NDArray[np.float64]
 ) -> Callable[[Vector], Vector]:
-    """Return the solve with F_VV + ρUUᵀ, or, for very many rows, CG with it.
+    """Return the solve with F_VV + ρUUᵀ: Cholesky, or CG for very many rows.
 
-    It may be singular, or very nearly; what a shift of the last digits leaves, the
-    next round mends. CG is preconditioned by B_V K B_Vᵀ (lumped, as FETI's).
+    The matrix may be singular up to rounding. It is shifted in its last digits; the
+    next round of the caller corrects the error of that. CG is preconditioned by
+    B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
-    if v <= DENSE:
+    if v <= MAX_DENSE_ROWS:
         F = inverse.congruence(B_V)
         F += F.diagonal().mean() * (U @ U.T) if U.size else 0
         F[np.diag_indices(v)] += 1e-13 * F.diagonal().max() + np.finfo(float).tiny
         factor = cho_factor(F, lower=True)
         return lambda t: np.asarray(cho_solve(factor, t))
-    rho = inverse.congruence(B_V[:DENSE]).diagonal().mean() if U.size else 0.0
+    rho = inverse.congruence(B_V[:MAX_DENSE_ROWS]).diagonal().mean() if U.size else 0.0
 
     def product(mu: Vector) -> Vector:
         mu = mu.ravel()
@@ -263,13 +265,13 @@ def _compliance(
 
 
 def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extended:
-    """Find λ̂ near `multipliers` that balances the load with û, see `Balance.near`.
+    """Return λ̂ near `multipliers` in balance with the load and û; see `Balance.near`.
 
     Raises
     ------
     UncertifiableError
-        When a load drives a motion that contact does not feel, or one that contact
-        would have to pull back.
+        When there is a load along a motion that contact does not feel, or along one
+        that only tensile contact forces could balance.
 
     """
     exact, motions = mechanics.exact, mechanics.motions
@@ -292,21 +294,21 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
 
 
 def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
-    """Whether there is a load along motions that contact does not feel (q,).
+    """Return True if the load along any motion that contact does not feel is nonzero.
 
     Parameters
     ----------
-    along, terms : the load along each, and the sum of the sizes that it is added up of
-    most : what that sum would be if each motion were its largest entry everywhere
+    along, terms : (q,) load along each motion, and the sum of its absolute terms
+    most : (q,) that sum with the largest entry of the motion in place of each entry
 
     """
-    return bool((np.abs(along) > UNFELT * terms + ROUNDED * most).any())
+    return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
 
 
 def driven(pushed: Extended, names: Sequence[str]) -> str:
-    """Say which load nothing can balance.
+    """Return the message for a load that nothing balances.
 
-    pushed : (r,) that load along the rigid motions of the bodies, in turn
+    pushed : (r,) load along the rigid motions of the bodies, in turn
     """
     most = int(np.abs(pushed).argmax()) if pushed.size else 0
     per_body = pushed.size // len(names) if names else 1
@@ -320,61 +322,61 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
 
 
 def relative(multipliers: Extended) -> Extended:
-    """Divide by the largest; ones where there is none."""
+    """Divide by the largest multiplier; return ones if none is positive."""
     largest = multipliers.max(initial=Real(0))
     return multipliers / largest if largest > 0 else np.ones_like(multipliers)
 
 
-def held_and_loose(
+def supported_and_floating(
     G: Extended, w: Extended
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split motions (p,) by whether rows with the weights w, of at most 1, hold them.
+    """Split motions (p,) into those that rows of weights w ≤ 1 support, and the others.
 
-    Returns orthonormal bases (p, h) and (p, p − h); ‖√w Gν‖ is at most LOOSE times its
-    maximum in the second.
+    Returns orthonormal bases (p, h) and (p, p − h); in the second, ‖√w Gν‖ is at most
+    SUPPORT_THRESHOLD times its maximum.
     """
     weighted = (np.sqrt(w)[:, None] * G).astype(np.float64)
     _, sizes, turn = np.linalg.svd(weighted, full_matrices=len(G) < G.shape[1])
-    h = int((sizes > LOOSE * sizes.max(initial=0.0)).sum())
+    h = int((sizes > SUPPORT_THRESHOLD * sizes.max(initial=0.0)).sum())
     return turn[:h].T, turn[h:].T
 
 
 class Balance(NamedTuple):
-    """Gᵀλ = load − bent, and how large terms are that G and load are added up from.
+    """The equations Gᵀλ = load − bent of balance, with the sizes of their terms.
 
-    Along the rigid motions R that contact feels, it is  Rᵀ(f − Bᵀλ − Ku) = 0.
+    They are  Rᵀ(f − Bᵀλ − Ku) = 0  for the rigid motions R that contact feels.
     """
 
-    G: Extended  #: (m, p)
-    G_terms: Extended  #: (m, p)
-    load: Extended  #: (p,)
-    load_terms: Extended  #: (p,)
+    G: Extended  #: (m, p)  BR
+    G_terms: Extended  #: (m, p) sums of the absolute terms of G
+    load: Extended  #: (p,)  Rᵀf
+    load_terms: Extended  #: (p,) sums of its absolute terms
     bent: Extended  #: (p,)  (KR)ᵀu
     lower: Extended  #: (m,) of λ
     upper: Extended  #: (m,)
 
     def near(self, multipliers: Extended) -> Extended:
-        """Find λ̂ near `multipliers` that balances.
+        """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
-        It is within its bounds: λ̂ ≥ 0 of contact, |λ̂| ≤ g of friction. Nearest relative
-        to the distance from these, min ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, wᵢ ≈ λᵢ of contact: what
-        balances the load must not act across wide gaps or against a slip, where it
-        would do work. Along motions that λ does not hold, see `held_and_loose`, the
-        load has to vanish up to its rounding, or else all rows have to help, in the end
-        each as much as any other.
+        λ̂ is within its bounds, λ̂ ≥ 0 of contact and |λ̂| ≤ g of friction, and minimises
+        ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, with the distance of λᵢ from its bounds for the weight wᵢ (wᵢ ≈
+        λᵢ of contact): corrections must not act across wide gaps or against slip, where
+        they would do work. Along motions that λ does not support
+        (`supported_and_floating`), the load has to vanish up to its rounding; otherwise
+        all rows contribute, in the last attempt with equal weights.
 
         Raises
         ------
         UncertifiableError
-            When the load drives a motion that contact would have to pull back.
+            When only tensile contact forces could balance the load.
 
         """
         if not self.G.shape[1]:
             return multipliers
         w = relative(np.minimum(multipliers - self.lower, self.upper - multipliers))
         for shares in (w, w + 1e-6, np.ones_like(w)):
-            if (found := self._solved(multipliers, shares)) is not None:
-                return found
+            if (balanced := self._solved(multipliers, shares)) is not None:
+                return balanced
         raise UncertifiableError(
             "contact would have to pull to balance the load: some body is driven away "
             "from all that touches it, and no support holds it"
@@ -385,33 +387,33 @@ class Balance(NamedTuple):
         )
 
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
-        """Balance by the rows with w > 0; None where that is impossible.
+        """Solve with corrections of the rows with w > 0; None if that is impossible.
 
-        λ̂ is λ + WGν cut off at its bounds, where ν minimises a convex function of as
-        many variables as there are motions.
+        λ̂ is the projection of λ + WGν onto its bounds, where ν minimises a convex
+        function with one variable per motion.
         """
-        held, loose = held_and_loose(self.G, w)
+        supported, floating = supported_and_floating(self.G, w)
         on = w > 0
-        basis = held @ _whitening((np.sqrt(w)[:, None] * self.G) @ held)
+        basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
 
-        def merged(lam: Extended) -> Extended:
+        def all_rows(lam: Extended) -> Extended:
             whole = multipliers.copy()
             whole[on] = lam
             return whole
 
         load = self.load - self.bent - self.G[~on].T @ multipliers[~on]
-        found = _newton(
+        corrected = _newton(
             multipliers[on], w[on], self.G[on] @ basis,
             np.asarray(basis.T @ load, dtype=Real),
             (self.lower[on], self.upper[on]),
-            lambda lam: np.abs(basis).T @ self._terms(merged(lam)),
+            lambda lam: np.abs(basis).T @ self._terms(all_rows(lam)),
         )  # fmt: skip
-        if found is None:
+        if corrected is None:
             return None
-        lam = merged(found)
-        missing = np.abs(loose.T @ (self.load - self.G.T @ lam))
-        total = np.abs(loose).T @ self._terms(lam)
-        return lam if (missing <= ROUNDED * total).all() else None
+        lam = all_rows(corrected)
+        missing = np.abs(floating.T @ (self.load - self.G.T @ lam))
+        total = np.abs(floating).T @ self._terms(lam)
+        return lam if (missing <= LOAD_ROUNDING * total).all() else None
 
     def _terms(self, lam: Extended) -> Extended:
         return np.asarray(self.load_terms + self.G_terms.T @ np.abs(lam))
@@ -427,7 +429,10 @@ def _newton(
     multipliers: Extended, w: Extended, G: Extended, load: Extended,
     bounds: tuple[Extended, Extended], terms: Callable[[Extended], Extended],
 ) -> Extended | None:  # fmt: skip
-    """Minimise for positive weights and GᵀWG = 1; None where nothing balances."""
+    """Solve the equations of `Balance` for w > 0 and GᵀWG = I; None if impossible.
+
+    Damped Newton's method for the dual function of `Balance.near`.
+    """
 
     def shifted(nu: Extended) -> tuple[Extended, Any]:
         free = multipliers + w * (G @ nu)
@@ -442,6 +447,7 @@ def _newton(
             return np.asarray(lam)
         on = (lam > bounds[0]) & (lam < bounds[1])
         hessian = (G[on].T @ (w[on, None] * G[on])).astype(np.float64)
+        # it is singular where all rows of a motion are at their bounds; GᵀWG = I
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):

@@ -1,41 +1,42 @@
-"""A proven bound of the error of an answer, whoever gave it and whatever they claim.
+"""Proven bound of the error of an answer, independent of its origin and claim.
 
-Let û be admissible (u = 0 where prescribed, Bû ≤ c) and λ̂ ≥ 0, and let u_λ be the
-equilibrium under it,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
+Let û be admissible (û = 0 where prescribed, Bû ≤ c), λ̂ ≥ 0, and u_λ the equilibrium
+under λ̂,  K u_λ = f − Bᵀλ̂.  With the solution u* and its multipliers λ*,
 
     ½‖û − u*‖² + ½‖u_λ − u*‖² + λ̂ᵀ(c − Bu*) + λ*ᵀ(c − Bû) = J(û) − D(λ̂)
                                                 = ½‖û − u_λ‖² + λ̂ᵀ(c − Bû)     (1)
 
-in the energy norm ‖·‖_K, where J is the primal and D the dual objective: an identity of
-Prager and Synge (1947) with the complementarity of contact. All terms on the left are
-nonnegative, so that the right, which needs no solution, bounds both errors:
+in the energy norm ‖·‖_K, where J is the primal and D the dual objective. This is the
+identity of Prager and Synge (1947) with the complementarity terms of contact. All terms
+on the left are nonnegative, so the right-hand side, which does not contain the
+solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
 Friction with a bound, Σ g|v| with the slip v = Tu − s, has multipliers |λ̂_t| ≤ g and
-adds to (1) its own terms, none of them negative either: Σ(g|v*| − λ̂_t v*) and
-Σ(g|v̂| − λ_t* v̂) on the left, and on the right Σ(g|v̂| − λ̂_t v̂), the work that friction
-would do less if it were as λ̂_t says. Of Coulomb's law the bounds g are given here: what
-is proven is about the last problem of its fixed point.
+adds nonnegative terms to (1): Σ(g|v*| − λ̂_t v*) and Σ(g|v̂| − λ_t* v̂) on the left, and
+on the right Σ(g|v̂| − λ̂_t v̂), the difference between the frictional work at the bound
+and that of λ̂_t. For Coulomb's law the bounds g are fixed: the certificate is for the
+last Tresca problem of the fixed point iteration.
 
-(Subtracting J and D would lose everything below 1e-8: they agree to as many digits as
-the answer.) A point u that is neither of the two lies near their midpoint M, since (2)
-says that  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²,  hence
+(g is not computed as J − D: they agree to as many digits as the answer has, and the
+difference would lose everything below 1e-8.) For any other point u, the midpoint M of û
+and u_λ satisfies  ‖u* − M‖² ≤ g − ¼‖û − u_λ‖²  by (2), hence
 
     ‖u − u*‖ ≤ ‖u − M‖ + √(g − ¼‖û − u_λ‖²)                                      (3)
 
-where no more than √(2g) is left of the right-hand side if u is û or u_λ.
+where the right-hand side is at most √(2g) if u is û or u_λ.
 
-Errors are relative to ‖u*‖, of which (3) gives a lower bound, ‖M‖ less the root. That
-differs from ‖û‖ only for answers that are as far off as they are large.
+Errors are relative to ‖u*‖, for which (3) gives the lower bound ‖M‖ less the root. That
+differs from ‖û‖ only for answers whose error is as large as the solution.
 
-Where contact alone holds a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
-its rigid motions R, or D(λ̂) = −∞; ‖·‖ is a seminorm then, that of v − RRᵀv, and of the
-rigid motion itself nothing is said. Motions that contact does not feel (BR = 0 up to
-rounding) or that λ̂ does not press on are left aside, with what rounding makes of K and
+If contact alone supports a body, λ̂ has to balance its load as well, Rᵀ(f − Bᵀλ̂) = 0 for
+its rigid motions R, or D(λ̂) = −∞. Then ‖·‖ is a seminorm, that of v − RRᵀv, and the
+rigid motion itself is not bounded. Motions that contact does not feel (BR = 0 up to
+rounding), or on which λ̂ does not act, are disregarded, and so is the rounding of K and
 f along them.
 
-All of this is evaluated for the stored K = TᵀK_T T + E, with subdomains or as one, see
+The bounds are evaluated for the stored K = TᵀK_T T + E, with one subdomain or more, see
 `harness.verify.substructured`. With e = û − u* = e' + Rγ, ρ = Kû − f + Bᵀλ̂, any d, and
 u_λ = Tû − d, (1) becomes, (R2) of docs/certificates.md,
 
@@ -43,7 +44,7 @@ u_λ = Tû − d, (1) becomes, (R2) of docs/certificates.md,
         = ‖d‖² + 2λ̂ᵀ(c − Bû) + 2eᵀ(ρ − TᵀK_T d) − 2eᵀEe                          (4)
 
 where the last two terms are rounding: (R3) bounds them by ‖e'‖ and γ, and (R4) bounds γ
-by what contact allows.
+by the contact conditions.
 """
 
 from __future__ import annotations
@@ -69,8 +70,8 @@ from mortarbench.harness.verify.admissible import (
     UncertifiableError,
     admissible,
     balanced,
-    held_and_loose,
     relative,
+    supported_and_floating,
 )
 from mortarbench.harness.verify.substructured import (
     Rounding,
@@ -78,42 +79,47 @@ from mortarbench.harness.verify.substructured import (
     Undivided,
     length,
     neighbour,
-    still,
+    without_rigid_motion,
 )
 
 __all__ = ["Certificate", "UncertifiableError", "certify", "proof"]
 
-MISSED = 1e-9  #: what a combination of rows may miss of the motion that it bounds
-NEARLY = 0.05  #: of the distance squared: work that another pair would not lessen
-GOOD = 1e-7  #: bound from which on it is not worth the time to find one
-NEAR = 1e-3  #: bound up to which the closed rows of an answer may stand for it
-EXCHANGES = 5  #: rounds of exchange to find one
+#: Largest residual of a combination of rows that has to equal a rigid motion.
+COMBINATION_RESIDUAL = 1e-9
+#: A pair with less work than this times the distance squared counts as sharp: without
+#: any work, the bound √(d² + 2·work) would be 5 % smaller.
+SHARP_WORK = 0.05
+SHARP_BOUND = 1e-7  #: bound below which no other pair is tried.
+#: Largest bound for which the closed rows are those of the answer: beyond, a solution
+#: for these rows would describe another point.
+MAX_EXCHANGE_BOUND = 1e-3
+EXCHANGE_ROUNDS = 5  #: from the closed rows of the answer to a better pair
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Certificate:
-    """An admissible pair near an answer, and what it proves; see the module.
+    """An admissible pair near an answer, and the bounds that it proves.
 
-    All norms are ‖·‖_K, without dimensions.
+    All norms are ‖·‖_K, non-dimensional; see the module for the mathematics.
     """
 
     u: Extended  #: û (n,)
-    multipliers: Extended  #: λ̂ (m,), of the contact, then of the friction
-    off: Extended  #: û − u_λ (n,); of substructures torn, Tû − u_λ (N,)
+    multipliers: Extended  #: λ̂ (m,), of contact, then of friction rows
+    off: Extended  #: û − u_λ (n,); with subdomains, Tû − u_λ (N,)
     norm: float  #: ‖û‖
-    distance: float  #: ‖û − u_λ‖, what the solve for u_λ left undone included
+    distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
     work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
-    sliding: float  #: the second term alone
-    rounding: float  #: charged for KR ≠ 0 and an imperfect balance, in (4)
-    stretch: float  #: at least ‖·‖_K over the norm of the torn K, ‖T·‖
+    sliding: float  #: the second term of `work`
+    rounding: float  #: charge in (4) for KR ≠ 0 and an inexact balance
+    stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, with the norm of K_T
     claimed: float  #: bound (3) of the answer itself
     least: float  #: lower bound of ‖u*‖
-    moved: float  #: ‖u − û‖, from the answer to the admissible point
-    seminorm: bool  #: whether some body can move rigidly: nothing bounds that
+    moved: float  #: ‖u − û‖, distance of the answer from û
+    seminorm: bool  #: True if a body can move rigidly, which is not bounded
 
     @property
     def equilibrium(self) -> Extended:
-        """u_λ (n,) of bodies in one piece."""
+        """u_λ (n,) of undivided bodies."""
         return np.asarray(self.u - self.off)
 
     @property
@@ -128,20 +134,20 @@ class Certificate:
 
     @property
     def bound(self) -> float:
-        """Largest relative error of û, of u_λ and of the answer, in the energy norm.
+        """Bound of the relative errors of û, u_λ and the answer, in the energy norm.
 
-        Infinite where the solution may be zero for all that is known.
+        It is infinite if the solution is not proven to be nonzero.
         """
         return self._relative(self.error)
 
     @property
     def error(self) -> float:
-        """Largest error of û, of u_λ and of the answer itself."""
+        """Bound of the errors of û, of u_λ and of the answer."""
         return max(self.pair * self.stretch, self.claimed)
 
     @property
     def parts(self) -> dict[str, float]:
-        """What the bound is made of, as relative; see `harness.verify.verdicts`."""
+        """Relative components of the bound; see `harness.verify.verdicts.certified`."""
         lengths = {
             "pair": self.pair,
             "distance": self.distance,
@@ -161,15 +167,17 @@ class Certificate:
 
 @np.errstate(all="ignore")  # a point may hold 1e300; what is not finite is refused
 def certify(mechanics: Mechanics, s: Solution) -> Certificate:
-    """Bound the error of `s`, as ``mechanics.back`` gives it.
+    """Bound the error of `s`, a solution returned by ``mechanics.to_primal``.
 
-    The pair is the answer's own, mended as little as possible. Where most of g is work,
-    as with an interior point, whose multipliers and gaps are all positive, a pair with
-    the complementarity that the answer suggests proves more, and if contact alone holds
-    a body, the solution for the rows that it suggests are closed: only where the answer
-    has been proved near, or that would speak of another one. The best one counts. If
-    none of them proves anything, as for answers that are very far off, the pair near
-    zero is left, which does not depend on the answer.
+    The certificate with the least error of these pairs is returned:
+
+    1. the answer's own pair, changed as little as admissibility requires;
+    2. if most of g is work, as for an interior point, whose multipliers and gaps are
+       all positive: a pair with the complementarity that the answer suggests;
+    3. if contact alone supports a body: the solution for the rows that the answer
+       suggests are closed, provided that a pair above proves the answer to be near;
+    4. if none of these proves anything: the pair near zero, which does not depend on
+       the answer.
 
     Raises
     ------
@@ -179,9 +187,11 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    if mechanics.in_parts is not None:
-        found: Certificate = mechanics.in_parts(s.x, mechanics.multipliers(s))
-        return found
+    if mechanics.certify_by_subdomains is not None:
+        certificate: Certificate = mechanics.certify_by_subdomains(
+            s.x, mechanics.multipliers(s)
+        )
+        return certificate
     split = Undivided(mechanics)
     best = sharpest(_certificates(split, s), lambda: _at_rest(split, s))
     if best.least >= best.error:
@@ -196,27 +206,27 @@ def sharpest(
 
     Parameters
     ----------
-    tried : certificates by pairs near the answer, or reasons why there is none
-    at_rest : evaluates the pair near zero, where no other one proves anything
+    tried : certificates of pairs near the answer, or the reasons why there are none
+    at_rest : evaluates the pair near zero; called if no other pair proves anything
 
     Raises
     ------
     UncertifiableError
-        When none of these pairs proves anything, with the first reason.
+        When no pair proves anything; the message has the first reason.
 
     """
-    proven = list(tried)
-    found = [c for c in proven if isinstance(c, Certificate)]
-    if found:
-        return min(found, key=lambda c: c.error)
+    outcomes = list(tried)
+    certificates = [c for c in outcomes if isinstance(c, Certificate)]
+    if certificates:
+        return min(certificates, key=lambda c: c.error)
     last = at_rest()
     if isinstance(last, Certificate):
         return last
-    raise UncertifiableError(f"no admissible pair near the answer: {proven[0]}")
+    raise UncertifiableError(f"no admissible pair near the answer: {outcomes[0]}")
 
 
 def _least_norm(split: Undivided) -> float:
-    """Bound ‖u*‖ from below by a pair that owes nothing to an answer."""
+    """Bound ‖u*‖ from below by a pair that does not depend on an answer."""
     mechanics = split.mechanics
     u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
@@ -226,25 +236,26 @@ def _least_norm(split: Undivided) -> float:
 
 
 def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
-    """Yield what the answer's own pair proves and, if that is mostly work, others."""
+    """Yield the certificates of pairs near the answer, until one is sharp."""
     mechanics = split.mechanics
     exact, u = mechanics.exact, s.x.astype(Real)
-    u[exact.held] = 0
+    u[exact.fixed] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
     multipliers = np.clip(multipliers, exact.lower, exact.upper)
     states = suggested(exact, u, multipliers)
-    tidied = at_bounds(exact, states, multipliers), states == CLOSED
-    pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), tidied]
-    proven = np.inf
+    complementary = at_bounds(exact, states, multipliers), states == CLOSED
+    pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), complementary]
+    bound = np.inf
     for pair in pairs:
-        found = _proved(split, s.x, u, *pair)
-        yield found
-        if is_sharp(found):
+        outcome = _proved(split, s.x, u, *pair)
+        yield outcome
+        if is_sharp(outcome):
             return
-        proven = min(proven, found.bound if isinstance(found, Certificate) else np.inf)
+        if isinstance(outcome, Certificate):
+            bound = min(bound, outcome.bound)
     exchangeable = mechanics.kernel.shape[1] > 0
-    if exchangeable and GOOD < proven <= NEAR:
-        v, mu, states = exchanged(mechanics, states, EXCHANGES)
+    if exchangeable and SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
+        v, mu, states = exchanged(mechanics, states, EXCHANGE_ROUNDS)
         yield _proved(split, s.x, v, mu, states == CLOSED)
 
 
@@ -256,17 +267,17 @@ def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
 
 
 def _proved(split: Undivided, *pair: Any) -> Certificate | str:
-    """Evaluate the proof, or say why there is none."""
+    """Return the certificate of a pair, or the reason why there is none."""
     try:
         return proof(split, *pair)
     except UncertifiableError as e:
         return str(e)
 
 
-def is_sharp(found: Certificate | str) -> bool:
-    """Whether another pair would not prove much more."""
-    return isinstance(found, Certificate) and (
-        found.work <= NEARLY * found.distance**2 or found.bound <= GOOD
+def is_sharp(outcome: Certificate | str) -> bool:
+    """Return True if another pair could not improve a certificate much."""
+    return isinstance(outcome, Certificate) and (
+        outcome.work <= SHARP_WORK * outcome.distance**2 or outcome.bound <= SHARP_BOUND
     )
 
 
@@ -274,12 +285,12 @@ def proof(
     split: Undivided, claimed: Vector | Extended, u: Extended,
     multipliers: Extended, closed: Any,
 ) -> Certificate:  # fmt: skip
-    """Evaluate (4) and (3) for the pair that mending u and λ yields.
+    """Evaluate (4) and (3) for an admissible pair near u and λ.
 
     Raises
     ------
     UncertifiableError
-        When they cannot be mended.
+        When there is no such pair.
 
     """
     mechanics = split.mechanics
@@ -297,13 +308,13 @@ def proven(
     split: Split, exact: Exact, G: Extended, *, claimed: Vector | Extended,
     u: Extended, at_rows: Extended, multipliers: Extended,
 ) -> Certificate:  # fmt: skip
-    """Evaluate (4) and (3) for an admissible pair, wherever its parts are.
+    """Evaluate (4) and (3) for an admissible pair, on one process or on ranks.
 
     Parameters
     ----------
-    exact : the rows, on the components of `at_rows`
-    G : (m, p) what the motions do to the rows that contact feels
-    u, at_rows : û (n,), and at the components (w,) of the rows
+    exact : the rows, restricted to the components of `at_rows`
+    G : (m, p) change of the gaps by the rigid motions that contact feels
+    u, at_rows : û (n,), and its values at the components (w,) of the rows
 
     Raises
     ------
@@ -316,7 +327,7 @@ def proven(
     work = float(works.sum())
     at_u = split.residual(u)
     near = neighbour(split, at_u.rho + split.pulled(lam))
-    drift = still(split, claimed - u)
+    drift = without_rigid_motion(split, claimed - u)
     moved = split.spread(drift)
     K_moved = split.product(moved)
     u_u, u_d, d_d, moved_moved, moved_d = split.total(*(
@@ -325,19 +336,20 @@ def proven(
             (moved, K_moved), (moved, near.Kd),
         )
     ))  # fmt: skip
-    held, _ = held_and_loose(G, relative(exact.interior(lam)))
+    supported, _ = supported_and_floating(G, relative(exact.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
-    if u_u < 4 * d_d:  # û may be zero, for which θ = 0, and far from the answer
+    # a small û, even zero with θ = 0, says nothing about the θ of the error
+    if u_u < 4 * d_d:
         theta = max(theta, split.residual(split.averaged(at_u.v - near.d)).theta)
         off = split.excess(drift)
-    apart, left = _root(d_d), near.left + length(split, noise)
-    total, nearest = apart + left, max(apart - left, 0.0)
+    computed, left = _root(d_d), near.left + length(split, noise)
+    total, nearest = computed + left, max(computed - left, 0.0)
     square = total * total + 2 * work
-    known = split.rounding(held)
-    reach = _reach(split, exact, G, held, lam, -motion, square)
-    unbalanced = np.abs(held.T @ near.unbalanced[:p])
-    scattered = np.abs(held.T) @ split.scattered(noise)[:p]
+    known = split.rounding(supported)
+    reach = _reach(split, exact, G, supported, lam, -motion, square)
+    unbalanced = np.abs(supported.T @ near.unbalanced[:p])
+    scattered = np.abs(supported.T) @ split.scattered(noise)[:p]
     pull = (unbalanced + scattered).astype(np.float64)
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
@@ -348,25 +360,25 @@ def proven(
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
     from_middle = _root(moved_moved + moved_d + 0.25 * d_d)
-    further = np.abs(held.T @ split.along(claimed - u)[:p]).astype(np.float64)
+    further = np.abs(supported.T @ split.along(claimed - u)[:p]).astype(np.float64)
     gamma = reach.within(2 * gap) + further
     in_K = known.stored(from_middle + around, gamma, theta)
-    if off is not None:  # K_T does not feel bodies that move with their supports
-        turned = np.abs(held.T @ split.along(off[0])[:p]).astype(np.float64)
+    if off is not None:  # K_T has no energy in bodies that move with their supports
+        turned = np.abs(supported.T @ split.along(off[0])[:p]).astype(np.float64)
         pull_off = _root(2 * gap) * length(split, off[0]) + gamma @ turned
         in_K = float(np.hypot(in_K, _root(off[1] + 2 * pull_off)))
     stretch = _root(1 + theta)
-    # ‖M‖ − around: never below ‖û‖ − √(2g) or ‖u_λ‖ − √(2g), but for what was left
+    # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the rest of the solve
     least = _root(u_u - u_d + 0.25 * d_d) - around
-    found = Certificate(
+    certificate = Certificate(
         u=u, multipliers=lam, off=near.d, norm=_root(u_u), distance=total, work=work,
         sliding=float(works[~exact.contact].sum()), rounding=rounding, claimed=in_K,
         stretch=stretch, least=least / stretch, moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
     )  # fmt: skip
-    if not np.isfinite(found.error):
+    if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large for arithmetic")
-    return found
+    return certificate
 
 
 def _root(square: float) -> float:
@@ -376,10 +388,13 @@ def _root(square: float) -> float:
 def _charge(
     reach: _Reach, known: Rounding, pull: Vector, theta: float, square: float
 ) -> float:
-    """Charge the rounding terms (R3) of (4): q at its smallest fixed point.
+    """Bound the rounding terms (R3) of (4) by a fixed point iteration.
 
-    pull : (h,) sizes of Rᵀ(ρ − TᵀK_T d) along the motions that are held
-    square : 2g without it
+    The terms depend on the errors, which depend on the terms. Each step is rounded up
+    by 1 %, so that the iteration ends above the fixed point.
+
+    pull : (h,) sizes of Rᵀ(ρ − TᵀK_T d) along the supported motions
+    square : 2g without these terms
     """
 
     def charged(square: float) -> float:
@@ -396,35 +411,35 @@ def _charge(
 
 
 class _Reach(NamedTuple):
-    """How far the rigid motions of û and u* can be apart, by the errors of the pair."""
+    """Bounds of the rigid motions of û − u*, as functions of the errors of the pair."""
 
-    gaps: Vector  #: (h,) without errors
-    error: Vector  #: (h,) per ‖û − u*‖
-    square: Vector  #: (h,) per sum of the squares of both errors
+    gaps: Vector  #: (h,) constant term
+    error: Vector  #: (h,) factor of ‖û − u*‖
+    square: Vector  #: (h,) factor of the sum of the squares of both errors
 
     def within(self, square: float) -> Vector:
-        """Bound the motions where the squares of both errors have this sum."""
+        """Bound the motions (h,) for a given sum of the squares of both errors."""
         return np.asarray(
             self.gaps + self.error * np.sqrt(square) + self.square * square
         )
 
 
 def _reach(
-    split: Split, exact: Exact, G: Extended, held: NDArray[np.float64], lam: Extended,
-    gaps: Extended, square: float,
+    split: Split, exact: Exact, G: Extended, supported: NDArray[np.float64],
+    lam: Extended, gaps: Extended, square: float,
 ) -> _Reach:  # fmt: skip
-    """Bound the rigid part γ of û − u* by what contact allows.
+    """Bound the rigid part γ of û − u* by the contact conditions (R4).
 
-    Any nonnegative combination y of the inequalities (R4) that yields ±γₖ bounds it.
-    One that seems cheap at `square` is taken, where Bᵢdiag(K)⁻¹Bᵢᵀ stands for the
-    compliance of a row; then ‖Σ±yᵢBᵢ‖ is measured in the dual norm. Motions that λ̂ does
-    not hold are left aside as those that contact does not feel: what rounding makes of
-    K along them is not part of the problem.
+    Any combination y ≥ 0 of the inequalities (R4) that equals ±γₖ is a bound. It is
+    chosen to be small at `square` with Bᵢdiag(K)⁻¹Bᵢᵀ for the compliance of a row; then
+    ‖Σ±yᵢBᵢ‖ is evaluated in the dual norm. Motions that λ̂ does not support are
+    disregarded like those that contact does not feel: the rounding of K along them is
+    not part of the problem.
     """
-    if not held.shape[1]:
+    if not supported.shape[1]:
         return _Reach(*np.zeros((3, 0)))
     tiny = np.finfo(float).tiny
-    phi, motions = np.sqrt(exact.loose.astype(np.float64)), G.astype(np.float64)
+    phi, motions = np.sqrt(exact.compliance.astype(np.float64)), G.astype(np.float64)
     down, up = lam > exact.lower, lam < exact.upper
     below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
     above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
@@ -434,8 +449,8 @@ def _reach(
     cost = opened + np.sqrt(square) * soft + square * pressed + tiny
     columns = (np.vstack([-motions[up], motions[down]]) / cost[:, None]).T
     size = np.abs(columns).max()
-    found = np.zeros((3, held.shape[1]))
-    for k, motion in enumerate(held.T):
+    bounds = np.zeros((3, supported.shape[1]))
+    for k, motion in enumerate(supported.T):
         for target in (motion, -motion):
             y = _combination(columns / size, target) / size / cost
             forces = np.zeros_like(lam)
@@ -446,17 +461,17 @@ def _reach(
                 length(split, split.pulled(forces)),
                 (pressed * y).max(initial=0.0),
             )
-            found[:, k] = np.maximum(found[:, k], bound)
-    # what the combinations miss of ±γₖ is at most MISSED of the largest
-    return _Reach(*(v + 2 * MISSED * v.sum() for v in found))
+            bounds[:, k] = np.maximum(bounds[:, k], bound)
+    # combinations equal ±γₖ up to COMBINATION_RESIDUAL of the largest motion
+    return _Reach(*(v + 2 * COMBINATION_RESIDUAL * v.sum() for v in bounds))
 
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
-    """Find y ≥ 0 with  columns·y = target  (p,); infinite where none is found."""
-    from scipy.optimize import nnls  # late: it takes long, and workers need none
+    """Return y ≥ 0 with  columns·y = target  (p,); inf if none is found."""
+    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
 
     try:
         y, left = nnls(columns, target)
     except RuntimeError:  # it has an iteration limit
         left = np.inf
-    return y if left <= MISSED else np.full(columns.shape[1], np.inf)
+    return y if left <= COMBINATION_RESIDUAL else np.full(columns.shape[1], np.inf)

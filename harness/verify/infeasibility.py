@@ -7,15 +7,14 @@ lb ≤ x ≤ ub and satisfies them if
 
 since cᵀx ≤ bᵀy + hᵀz at every feasible x. In the convention of `harness.qp` the second
 sum is that of z_box = −c, and a multiplier on an absent bound, cⱼ > 0 without lbⱼ or
-cⱼ < 0 without ubⱼ, makes V infinite, however small it is: x may be as large as it likes
-along j. So an approximate ray proves nothing. It is mended first, so that cⱼ = 0 holds
-exactly where it has to: either in rational arithmetic, or by an enclosure of a solution
-that is proven to exist. V is then evaluated in rational arithmetic, from the doubles of
-the QP as they are.
+cⱼ < 0 without ubⱼ, makes V infinite, however small it is, since xⱼ is unbounded. An
+approximate ray therefore proves nothing. It is corrected first, so that cⱼ = 0 holds
+exactly for these j: in rational arithmetic, or by an enclosure of an exact ray that is
+proven to exist. V is then evaluated in rational arithmetic from the doubles of the QP.
 
-A right-hand side is itself a rounded number. So V counts only where it exceeds
-`ROUNDING` of the sum of its absolute terms. That ratio, the margin, is the same in all
-units of rows and variables.
+Right-hand sides are rounded numbers. So −V has to exceed `MIN_MARGIN` times the sum of
+the absolute terms of V. That ratio, the margin, does not depend on the units of rows
+and variables.
 """
 
 from __future__ import annotations
@@ -41,32 +40,34 @@ from mortarbench.harness.verify.rational import (
     solutions,
 )
 
-#: least margin: redundant rows whose right-hand sides were rounded, each after a sum of
-#: thousands of terms, contradict one another by less
-ROUNDING = 1e-12
-#: multipliers below this part of the largest, in scaled rows, are left out; solvers
-#: that iterate leave such in rows that have no part in the contradiction
+#: Least margin of a proof. Redundant rows whose right-hand sides are rounded sums of
+#: thousands of terms contradict one another by less.
+MIN_MARGIN = 1e-12
+#: Multipliers below these parts of the largest, in scaled rows, are dropped in turn:
+#: iterative solvers leave small ones in rows that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
-CANCELLED = 1e-3  #: of its terms: a smaller cⱼ may be meant to vanish
-MOST_ENTRIES = 10**6  #: of A and G, beyond which nothing is proven
-MOST_ELIMINATED = 40  #: pivots of an elimination in rational arithmetic: a second
-MOST_TABLEAU = 1500  #: entries of a linear program in rational arithmetic: seconds
-MOST_DENSE = 1500  #: rows and columns of an enclosure
-FAR = 1e6  #: sizes of right-hand sides; bounds beyond are left out of the first search
-LP_SECONDS = 20.0  #: for the search of a ray
+MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
+MAX_ENTRIES = 10**6  #: of A and G; nothing is proven for larger QPs
+MAX_PIVOTS = 40  #: of an elimination in rational arithmetic, which takes about 1 s
+MAX_TABLEAU = 1500  #: entries of a rational linear program, which takes seconds
+MAX_ENCLOSURE = 1500  #: rows and columns of an enclosure
+#: Bounds beyond this multiple of the largest right-hand side are left out of the first
+#: search: costs of such different sizes hide one another.
+MAX_BOUND_RATIO = 1e6
+LP_SECONDS = 20.0  #: time limit of the search for a ray
 EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
 class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
-    rows: NDArray[np.int64]  #: (k,) that carry one
+    rows: NDArray[np.int64]  #: (k,) with a nonzero multiplier
     centre: Any  #: (k,) fractions
-    radius: Any  #: (k,) fractions: the ray is within these of the centre
-    vanish: NDArray[np.bool_]  #: (n,) where c is known to be exactly zero
+    radius: Any  #: (k,) fractions: |ray − centre| is at most this
+    vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
 
 
-#: margins of the rays that `_searched` found
+#: Margins from `_searched`, None without a proof; they do not depend on the point.
 _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 
 
@@ -74,28 +75,27 @@ _MARGINS: WeakKeyDictionary[QP, float | None] = WeakKeyDictionary()
 def infeasibility_margin(qp: QP, s: Solution) -> float | None:
     """Return the margin of a proof that `qp` has no feasible point; None without one.
 
-    The multipliers of `s`, which claims infeasibility, are tried first. Where these
-    prove nothing, others are searched for, once for each QP. Sets other than bounds are
-    replaced by the smallest box around them: without a point in it there is none in
-    them.
+    The multipliers of `s`, which claims infeasibility, are tried first. If these prove
+    nothing, others are searched for, once per QP. Sets other than bounds are relaxed to
+    their smallest enclosing box, whose infeasibility implies theirs.
 
     Returns
     -------
-    −V over the sum of the absolute terms of V, above `ROUNDING`
+    −V over the sum of the absolute terms of V, above `MIN_MARGIN`
 
     """
-    told = np.concatenate([s.y, s.z])
+    claimed = np.concatenate([s.y, s.z])
     if not qp.b.size + qp.h.size:
         return None
     M = csr_array(vstack([csr_array(qp.A), csr_array(qp.G)]), dtype=float)
-    if M.nnz > MOST_ENTRIES or not np.isfinite(M.data).all():
+    if M.nnz > MAX_ENTRIES or not np.isfinite(M.data).all():
         return None
     M.eliminate_zeros()
     row, column = _equilibrated(M)
     boxed = replace(qp, sets=(Box(*hull(qp.sets, qp.q.size)),))
     margin = None
-    if np.isfinite(told).all() and told.any():
-        margin = _margin_near(boxed, M, column, told)
+    if np.isfinite(claimed).all() and claimed.any():
+        margin = _margin_near(boxed, M, column, claimed)
     if margin is None:
         if qp not in _MARGINS:
             _MARGINS[qp] = _searched(boxed, M, row, column)
@@ -129,19 +129,21 @@ def _margin_near(qp: QP, M: csr_array, column: Vector, w: Vector) -> float | Non
         if rows.size in tried:
             continue
         tried.add(rows.size)
-        for ray in _mended(qp, M[rows], rows, w[rows]):
+        for ray in _corrected(qp, M[rows], rows, w[rows]):
             margin = _margin(qp, M[rows], ray)
             if margin is not None:
                 return margin
     return None
 
 
-def _mended(qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector) -> Iterator[Ray]:
-    """Generate rays near w whose c vanishes exactly where it has to.
+def _corrected(
+    qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector
+) -> Iterator[Ray]:
+    """Yield rays near w with cⱼ = 0 exactly where required.
 
-    That is on variables without bounds, and on those where c is small and has the wrong
-    sign for the only bound. First the ray as it is, then with c = 0 wherever it is
-    small, then only where the sign is wrong.
+    It is required for variables without bounds, and for those with a single bound if cⱼ
+    is small and of the wrong sign. The ray itself comes first, then one with cⱼ = 0
+    wherever it is small, then one with cⱼ = 0 where required only.
 
     M, w : of the rows that carry a multiplier
     """
@@ -149,13 +151,13 @@ def _mended(qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector) -> Iterato
     zero = 0 * exact
     c = rational_product(M, exact)
     terms = abs(M).T @ np.abs(w)
-    known = np.array([not value for value in c])
-    yield Ray(rows, exact, zero, known)
+    vanishes = np.array([not value for value in c])
+    yield Ray(rows, exact, zero, vanishes)
     rounded = np.array([float(value) for value in c])
     free = np.isinf(qp.lb) & np.isinf(qp.ub)
-    small = np.abs(rounded) <= CANCELLED * terms
+    small = np.abs(rounded) <= MAX_CANCELLED * terms
     wrong = ((rounded > 0) & np.isinf(qp.lb)) | ((rounded < 0) & np.isinf(qp.ub))
-    for vanish in (small | free, small & (wrong | known) | free):
+    for vanish in (small | free, small & (wrong | vanishes) | free):
         vanish = vanish & (terms > 0)
         if not vanish.any():
             continue
@@ -163,30 +165,31 @@ def _mended(qp: QP, M: csr_array, rows: NDArray[np.int64], w: Vector) -> Iterato
         radius = _enclosure(part, w, rounded[vanish], terms[vanish])
         if radius is not None:
             yield Ray(rows, exact, rational(radius), vanish)
-        if min(part.shape) <= MOST_ELIMINATED and max(part.shape) <= MOST_DENSE:
+        if min(part.shape) <= MAX_PIVOTS and max(part.shape) <= MAX_ENCLOSURE:
             order = np.lexsort([-np.abs(w), rows >= qp.b.size])  # pivots come first
             solve = solutions(
                 rational(part.toarray().T[:, order]), rational(np.zeros(part.shape[1]))
             )
-            assert solve is not None  # zero is one
-            mended = exact.copy()
-            mended[order] = solve(exact[order])
-            yield Ray(rows, mended, zero, vanish)
+            assert solve is not None  # 0 is a solution
+            corrected = exact.copy()
+            corrected[order] = solve(exact[order])
+            yield Ray(rows, corrected, zero, vanish)
 
 
 def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | None:
-    """Bound the change of w (k,) that makes Mᵀw = c vanish exactly; None without one.
+    """Bound a change of w (k,) that makes Mᵀw = 0 exact; None if none is proven.
 
     With columns scaled by their terms and rows by w, let X be an approximate right
     inverse of Mᵀ, and α < 1 a bound of ‖I − MᵀX‖∞ with its rounding. Then MᵀX is
     regular, and δ = −X(MᵀX)⁻¹c solves Mᵀ(w + δ) = 0, |δ| ≤ |X|·1·‖c‖∞/(1 − α).
 
-    M : (k, n) of the variables where c has to vanish
+    M : (k, n) columns of the variables with cⱼ = 0
+    c : (n,) Mᵀw
     """
     k, n = M.shape
-    if n > k or k > MOST_DENSE:
+    if n > k or k > MAX_ENCLOSURE:
         return None
-    # powers of two, so that scaling is no rounding
+    # powers of two, so that scaling is exact
     unit, weight = (2.0 ** np.floor(np.log2(v)) for v in (terms, np.abs(w)))
     ratio = weight / unit[:, None]
     B = M.toarray().T * ratio
@@ -203,7 +206,7 @@ def _enclosure(M: csr_array, w: Vector, c: Vector, terms: Vector) -> Vector | No
 
 
 def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
-    """Return the least margin of the rays of an enclosure; None below `ROUNDING`."""
+    """Return the least margin of all rays of an enclosure; None below `MIN_MARGIN`."""
     m = qp.b.size
     if (ray.centre < ray.radius)[ray.rows >= m].any():
         return None
@@ -223,17 +226,16 @@ def _margin(qp: QP, M: csr_array, ray: Ray) -> float | None:
             if np.isinf(bound):
                 return None
             products.append(-end * Fraction(bound))
-        value += max(products)  # a convex function of c, so that it is at an end
+        value += max(products)  # convex in c, so that an end is the maximum
         terms += max(map(abs, products))
-    return float(-value / terms) if -value > Fraction(ROUNDING) * terms else None
+    return float(-value / terms) if -value > Fraction(MIN_MARGIN) * terms else None
 
 
 def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]:
-    """Generate multipliers w of the rows of M with the largest margin.
+    """Yield multipliers w of the rows of M with the largest margin.
 
-    A linear program minimises V where the sum of its absolute terms is at most one.
-    Bounds far beyond all right-hand sides are left out at first, since costs of such
-    different sizes hide one another.
+    A linear program minimises V subject to a sum of absolute terms of at most one. The
+    first one omits large bounds, see `MAX_BOUND_RATIO`.
 
     row, column : factors, see `_equilibrated`
     """
@@ -244,7 +246,9 @@ def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]
     size = np.abs(rhs).max() or bounds.min(initial=np.inf)
     rhs, lb, ub, bounds = (v / size for v in (rhs, lb, ub, bounds))
     scaled = csr_array(diags_array(row) @ M @ diags_array(column))
-    reaches = {FAR, bounds.max()} if (bounds > FAR).any() else {FAR}
+    reaches = {MAX_BOUND_RATIO}
+    if (bounds > MAX_BOUND_RATIO).any():
+        reaches.add(bounds.max())
     for reach in sorted(reaches):
         w = _solved(scaled, qp.b.size, rhs, lb, ub, reach)
         if w is not None:
@@ -254,19 +258,19 @@ def _rays(qp: QP, M: csr_array, row: Vector, column: Vector) -> Iterator[Vector]
 def _solved(
     M: csr_array, m: int, rhs: Vector, lb: Vector, ub: Vector, reach: float
 ) -> Vector | None:
-    """Solve the linear program of `_rays`; None where its minimum is not negative.
+    """Solve the linear program of `_rays`; None if its minimum is not negative.
 
     M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
-    reach : of bounds that take part
+    reach : largest bound that takes part
     """
-    from scipy.optimize import linprog  # here: it takes long to load
+    from scipy.optimize import linprog  # late: it is slow to import
 
     n, k = M.shape[1], M.shape[0]
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))
     eye = csr_array(eye_array(n))
     cost = np.concatenate([rhs, -rhs[:m], ub[upper], -lb[lower]])
-    # unknowns are terms of V, or nearly: units in which the program is well scaled
-    unit = np.maximum(np.abs(cost), 1 / FAR)
+    # unknowns in units of the terms of V, in which the program is well scaled
+    unit = np.maximum(np.abs(cost), 1 / MAX_BOUND_RATIO)
     balance = hstack([M.T, -M[:m].T, eye[:, upper], -eye[:, lower]])
     balance = csr_array(balance @ diags_array(1 / unit))
     largest = np.asarray(abs(balance).max(axis=1).toarray()).ravel()
@@ -291,21 +295,21 @@ def _solved(
 
 
 def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
-    """Find a ray whose margin exceeds `ROUNDING`, in rational arithmetic.
+    """Return a ray whose margin exceeds `MIN_MARGIN`, in rational arithmetic, or None.
 
-    Where a small QP has one, this finds it: by Farkas' lemma one exists exactly if no
-    feasible point is left when right-hand sides and bounds give way by `ROUNDING` of
-    themselves.
+    For a small QP the search is complete: by Farkas' lemma a ray exists if and only if
+    no point remains feasible when all right-hand sides and bounds are relaxed by
+    `MIN_MARGIN` of their size.
     """
     m, k, n = qp.b.size, M.shape[0], M.shape[1]
     lower, upper = (np.flatnonzero(np.isfinite(v)) for v in (qp.lb, qp.ub))
     unknowns = k + m + lower.size + upper.size
-    if (n + 1) * unknowns > MOST_TABLEAU:
+    if (n + 1) * unknowns > MAX_TABLEAU:
         return None
     rows, eye = M.toarray(), np.eye(n)
     columns = np.hstack([rows.T, -rows[:m].T, eye[:, upper], -eye[:, lower]])
     rhs = rational(np.concatenate([qp.b, qp.h, -qp.b, qp.ub[upper], -qp.lb[lower]]))
-    rhs = rhs + Fraction(ROUNDING) * abs(rhs)
+    rhs = rhs + Fraction(MIN_MARGIN) * abs(rhs)
     w = nonnegative_solution(
         np.vstack([rational(columns), rhs]), rational(np.append(np.zeros(n), -1.0))
     )
@@ -317,9 +321,10 @@ def _exact_ray(qp: QP, M: csr_array) -> Ray | None:
 
 
 def _equilibrated(M: csr_array) -> tuple[Vector, Vector]:
-    """Return factors of rows and columns, powers of two, that make entries about one.
+    """Return powers of two that scale rows and columns to entries of about one.
 
-    Ruiz (2001): both are divided by the root of their largest entry, again and again.
+    Ruiz (2001): rows and columns are repeatedly divided by the square root of their
+    largest entry.
     """
     row, column = np.ones(M.shape[0]), np.ones(M.shape[1])
     size = abs(M)

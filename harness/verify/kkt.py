@@ -128,6 +128,22 @@ def kkt_residuals(qp: QP, s: Solution, *, generous: bool = False) -> Residuals:
 
     generous : use the largest scale of energy that can be justified, and subtract all
         rounding from energies
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import QP, Solution, Status
+    >>> from mortarbench.harness import kkt_residuals
+    >>> qp = QP.from_arrays(np.eye(2), [-1, -1], lb=0)
+    >>> s = Solution(
+    ...     status=Status.SOLVED, x=np.array([1.0, 1.0 + 1e-6]), y=np.zeros(0),
+    ...     z=np.zeros(0), z_box=np.zeros(2),
+    ... )
+    >>> kkt_residuals(qp, s).worst <= 1e-5  # verified at tolerance 1e-6
+    True
+    >>> kkt_residuals(qp, s).worst <= 1e-7  # but not at 1e-8
+    False
+
     """
     t, most_rounding = _terms(qp, s), np.inf if generous else NEGLIGIBLE
     E, X = _scales(

@@ -1,4 +1,4 @@
-"""The clock: one solver on one QP, once, in this process."""
+"""Timing of one solver on one QP in this process."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from mortarbench.harness.sets.box import Box
 from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
-SAMPLE_SECONDS = 0.005  #: a timed sample is not much shorter than this
-MOST_INNER = 100
-MOST_ASSEMBLED = 3000  #: rows of an operator P that is multiplied out
-LARGEST_COUNT = 2**53
-LONGEST_MESSAGE = 1900  #: characters
-_LONGEST_NAME = 60  #: characters of a file's name in a message
+SAMPLE_SECONDS = 0.005  #: least duration of a sample, nearly; see `measure`
+MAX_INNER_LOOPS = 100  #: repetitions within a sample
+MAX_ASSEMBLED_ROWS = 3000  #: of an operator P that is assembled for a solver
+MAX_COUNT = 2**53  #: beyond, integers are not exact in other programs
+MAX_MESSAGE = 1900  #: characters of a solver's message
+_MAX_NAME = 60  #: characters of a file name in a message
 
 _VECTORS = ("x", "y", "z", "z_box")
 
 
 class Timed(NamedTuple):
-    """What a solver returned, and what that cost."""
+    """A solution, and the cost of computing it."""
 
-    solution: Solution  #: float vectors of the right shapes, whatever happened
+    solution: Solution  #: always with float vectors of the right shapes
     cost: Measurement
-    first_seconds: float | None = None  #: of the first time, where there were others
+    first_seconds: float | None = None  #: of the first solve, if it was repeated
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
@@ -60,34 +60,36 @@ def measure(
     starts: Callable[[], None] = lambda: None,
     ends: Callable[[], None] = lambda: None,
 ) -> Timed:
-    """Let `solver` prepare and solve `qp`, both timed; asking it first is preparing.
+    """Prepare and solve `qp` with `solver`, and time both.
 
-    Nothing that the solver does wrong raises: an exception, a missing library or a
-    malformed answer becomes the status and message of a solution without a point.
+    Errors of the solver do not raise: an exception, a missing library or a malformed
+    answer becomes the status and message of a solution without a point. The call of
+    `declines` counts as preparation. An operator P that the solver cannot use as such
+    (`harness.needs_matrices`) is assembled if it has at most MAX_ASSEMBLED_ROWS rows,
+    which counts as preparation as well.
 
-    An operator P that the solver cannot use as such (`harness.needs_matrices`) is
-    multiplied out where it has at most MOST_ASSEMBLED rows: that is preparing, too.
-
-    prepare : where that is a step of a sequence, see `harness.plugin.Chained`
-    sample_seconds : what takes less is prepared afresh and solved again until all that
-        takes as long; the answer is the first, the times are the mean of the others,
-        since the first meets cold caches. Each time the QP is made of other objects,
-        so that nothing is found again by who it is
-    starts, ends : called just before the clock starts, and when it has stopped
+    prepare : in place of ``solver.prepare``, for a step of a sequence; see
+        `harness.plugin.Chained`
+    sample_seconds : a faster solve is repeated, including its preparation, until all
+        repetitions take as long. The answer is that of the first one, the times are
+        means of the others, since the first one runs with cold caches. Every repetition
+        gets a QP of new objects, so that a solver cannot recognise it by identity
+    starts, ends : called just before the clock starts, and after it has stopped
     """
-    ask = _Asked(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
+    preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
         starts()
-        try:  # only the solver's own code: a bug of ours must not pass for its failure
-            answer, seconds, peaks = _timed(ask, qp)
+        try:  # only code of the solver, so that no bug here counts as its failure
+            answer, seconds, peaks = _timed(preparation, qp)
             first = sum(seconds)
             inner = _inner(first, sample_seconds)
             if inner > 1:
-                again = [
-                    _timed(ask, _fresh_copy(qp), peaks=False)[1] for _ in range(inner)
+                repeated = [
+                    _timed(preparation, _fresh_copy(qp), peaks=False)[1]
+                    for _ in range(inner)
                 ]
                 seconds = tuple(
-                    sum(phase) / inner for phase in zip(*again, strict=True)
+                    sum(phase) / inner for phase in zip(*repeated, strict=True)
                 )
         except _DeclinedError as e:
             return _without_point(qp, Status.DECLINED, one_line(e))
@@ -114,8 +116,8 @@ def measure(
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What of a solver is timed as preparing: whether it takes a QP, and `prepare`."""
+class _Preparation:
+    """The timed preparation of a solver: `declines`, assembly of P, and `prepare`."""
 
     solver: Solver
     prepare: Prepare
@@ -133,20 +135,20 @@ class _Asked:
 
 
 class ReasonError(Exception):
-    """A solver declares or returns no usable reason to decline."""
+    """Error for a solver whose `accepts` or `declines` has a wrong type."""
 
 
 def reason_to_decline(solver: Solver, qp: QP) -> str | None:
-    """Return the reason why `solver` does not take `qp`, or None if it does.
+    """Return the reason why `solver` does not accept `qp`, or None if it does.
 
-    A set of a kind that the solver does not declare in `accepts` is one: without a
-    declaration it accepts bounds alone.
+    A set whose class is not in `accepts` is a reason. Without that declaration, a
+    solver accepts bounds only.
 
     Raises
     ------
     ReasonError
-        When `accepts` is not a tuple of classes, or `declines` returns anything else,
-        such as False.
+        When `accepts` is not a tuple of classes, or `declines` returns neither None nor
+        a text, such as False.
 
     """
     accepted = getattr(solver, "accepts", (Box,))
@@ -168,41 +170,41 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
 
 
 def _explicit(qp: QP) -> QP:
-    """Multiply an operator P out, where it is small."""
+    """Return the QP with its operator P as a matrix, or decline if P is large."""
     n = qp.q.size
-    if n > MOST_ASSEMBLED or too_large(n, 3):
+    if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
         raise _DeclinedError(
             f"{NEEDS_MATRICES}; P is an operator of {n} rows, and is multiplied out up "
-            f"to {MOST_ASSEMBLED} where memory allows"
+            f"to {MAX_ASSEMBLED_ROWS} where memory allows"
         )
     return replace(qp, P=assembled(qp.P))
 
 
 class _DeclinedError(Exception):
-    """A solver does not take a QP; the message is its reason."""
+    """Refusal of a QP by a solver; the message is the reason."""
 
 
 def _timed(
     prepare: Prepare, qp: QP, *, peaks: bool = True
 ) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
-    """Prepare and solve once: the answer, and both phases' seconds and peaks in MiB."""
+    """Prepare and solve once; return the answer, seconds and peaks (MiB) of both."""
     reset = peaks and _reset_peak()
     start = perf_counter()
     solve = prepare(qp)
     ready = perf_counter()
     prepare_peak = memory_mib("VmHWM") if reset else None
     reset = peaks and _reset_peak()
-    again = perf_counter()
+    resumed = perf_counter()
     answer = solve()
     end = perf_counter()
     solve_peak = memory_mib("VmHWM") if reset else None
     if isinstance(qp.P, SerialisableOperator):
         qp.P.forget()
-    return answer, (ready - start, end - again), (prepare_peak, solve_peak)
+    return answer, (ready - start, end - resumed), (prepare_peak, solve_peak)
 
 
 def _fresh_copy(qp: QP) -> QP:
-    """Return the same QP in objects of its own; the numbers are shared."""
+    """Return a QP of new objects that share the numbers of this one."""
 
     def other(M: Any) -> Any:
         if isinstance(M, tuple):
@@ -220,23 +222,23 @@ def _fresh_copy(qp: QP) -> QP:
 
 
 def _with_parts(whole: T, other: Callable[[Any], Any]) -> T:
-    """Copy a dataclass, each attribute replaced by `other` of it."""
-    new = copy(whole)  # not checked once more: that takes longer than a small solve
+    """Copy a dataclass, with `other` applied to each attribute."""
+    new = copy(whole)  # without the checks of __init__, which can exceed a small solve
     vars(new).update({name: other(part) for name, part in vars(whole).items()})
     return new
 
 
 def _inner(seconds: float, sample_seconds: float) -> int:
-    """Choose how often to repeat so that a sample takes `sample_seconds`."""
+    """Return the number of repetitions for a sample of `sample_seconds`."""
     if seconds >= sample_seconds / 2:
         return 1
-    return min(ceil(sample_seconds / max(seconds, 1e-9)), MOST_INNER)
+    return min(ceil(sample_seconds / max(seconds, 1e-9)), MAX_INNER_LOOPS)
 
 
 def memory_mib(key: str, process: int | str = "self") -> float | None:
-    """Read VmRSS (resident memory) or VmHWM (its peak); None where it cannot be had.
+    """Return VmRSS (resident memory) or VmHWM (its peak) in MiB; None if unavailable.
 
-    ``ru_maxrss`` is no substitute: it is inherited from the parent, even by exec.
+    ``ru_maxrss`` is not a substitute: it is inherited from the parent, even by exec.
     """
     try:
         lines = Path(f"/proc/{process}/status").read_text().splitlines()
@@ -247,7 +249,7 @@ def memory_mib(key: str, process: int | str = "self") -> float | None:
 
 
 def _reset_peak() -> bool:
-    """Make VmHWM start again from what is resident now; False where that fails."""
+    """Reset VmHWM to the resident memory; return False if that fails."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # proc(5)
     except OSError:
@@ -261,45 +263,46 @@ def _without_point(qp: QP, status: Status, message: str) -> Timed:
 
 
 def one_line(message: object) -> str:
-    """Give what a solver says as one line that any file can hold."""
+    """Return a text as one line of limited length, with lone surrogates escaped."""
     whole = " ".join(str(message).split())
     text = whole.encode(errors="backslashreplace").decode()
-    return text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}…"
+    return text if len(text) <= MAX_MESSAGE else f"{text[:MAX_MESSAGE]}…"
 
 
 def failure(solver: Solver, e: BaseException) -> str:
-    """Describe an exception of a solver in one line that ends with its place.
+    """Describe an exception of a solver in one line, with file name and line number.
 
-    The place is the last call in the file of the solver's class, without its folder:
-    ``KeyError: 'rho' (mine.py:24)``. An exception from elsewhere has no place.
+    These are of the last call in the file of the solver's class, as in ``KeyError:
+    'rho' (mine.py:24)``. They are omitted if the file is not part of the traceback.
     """
-    line = one_line(f"{type(e).__name__}: {_said(e)}")
+    line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))
     calls = [
         at for frame, at in walk_tb(e.__traceback__) if frame.f_code.co_filename == file
     ]
     if not calls:
         return line
-    return f"{line} ({shortened(one_line(Path(file).name), _LONGEST_NAME)}:{calls[-1]})"
+    return f"{line} ({shortened(one_line(Path(file).name), _MAX_NAME)}:{calls[-1]})"
 
 
 def _file_of(kind: type) -> str:
-    """Find the file of a class by its methods; empty if no file has them.
+    """Return the file that defines the methods of a class, or "".
 
-    A class that cloudpickle copied has a module of another process.
+    The module of the class does not help: after a copy by cloudpickle, it may exist in
+    another process only.
     """
     for one in kind.__mro__:
         for part in vars(one).values():
             if not isinstance(part, FunctionType) or part.__module__ != one.__module__:
                 continue
             file: str = unwrap(part).__code__.co_filename
-            if Path(file).is_file():  # methods that dataclasses generate have none
+            if Path(file).is_file():  # methods generated by dataclasses have no file
                 return file
     return ""
 
 
-def _said(e: BaseException) -> str:
-    """Show an exception of a solver, whose own code may fail again at that."""
+def _text_of(e: BaseException) -> str:
+    """Return the text of an exception, whose __str__ may itself raise."""
     try:
         return str(e)
     except Exception:
@@ -307,21 +310,21 @@ def _said(e: BaseException) -> str:
 
 
 def _checked(answer: object, qp: QP) -> Solution:
-    """Turn whatever a solver returned into a solution that fits `qp`."""
+    """Return a solution that fits `qp`, whatever the solver returned."""
     if not isinstance(answer, Solution):
         message = f"returned {type(answer).__name__}, expected Solution"
         return Solution.without_point(qp, Status.FAILED, message)
-    try:  # reading the solver's objects runs its code
+    try:  # attributes of the solver's objects may run its code
         if (mismatch := answer.mismatch(qp)) is not None:
             return Solution.without_point(qp, Status.FAILED, mismatch)
         return _plain(answer)
     except Exception as e:
-        message = one_line(f"malformed Solution: {_said(e)}")
+        message = one_line(f"malformed Solution: {_text_of(e)}")
         return Solution.without_point(qp, Status.FAILED, message)
 
 
 def _plain(s: Solution) -> Solution:
-    """Replace whatever compares or prints like the right type by the right type."""
+    """Convert all fields to plain types."""
     history, objection = usable_history(s.history)
     vectors = {name: _numbers(name, getattr(s, name)) for name in _VECTORS}
     iterations = None if s.iterations is None else _count("iterations", s.iterations)
@@ -341,7 +344,7 @@ def _plain(s: Solution) -> Solution:
 
 
 def _numbers(name: str, values: object) -> Vector:
-    """Take a vector of real numbers for what it is; nothing is made one."""
+    """Return a vector of doubles; other types than real numbers are refused."""
     array = np.asarray(values)
     if array.dtype.kind not in "biuf":
         raise ValueError(f"{name} has dtype {array.dtype}, expected real numbers")
@@ -350,15 +353,15 @@ def _numbers(name: str, values: object) -> Vector:
 
 def _count(name: str, value: Any) -> int:
     count = int(value)
-    if not 0 <= count <= LARGEST_COUNT:
-        got = count if abs(count) < 10 * LARGEST_COUNT else "a number far out of range"
+    if not 0 <= count <= MAX_COUNT:
+        got = count if abs(count) < 10 * MAX_COUNT else "a number far out of range"
         raise ValueError(f"{name} = {got}, expected 0 to 2**53")
     return count
 
 
 @contextmanager
 def _garbage_collection_off() -> Iterator[None]:
-    """Collect now rather than somewhere inside the measurement."""
+    """Collect garbage now, and disable collection during the measurement."""
     gc.collect()
     was_on = gc.isenabled()
     gc.disable()

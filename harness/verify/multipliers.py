@@ -1,4 +1,4 @@
-"""Multipliers of a point that comes without them.
+"""Multipliers for a point without multipliers.
 
 At x, with g = Px + q, the multipliers minimise
 
@@ -6,16 +6,17 @@ At x, with g = Px + q, the multipliers minimise
 
 where sⱼ is the slack of a row or bound, E the scale of energy of `harness.verify.kkt`
 and 1/wᵢ that of the stationarity residual; z_box has the sign of its bound. The second
-sum is what complementarity measures. It takes the place of a threshold between active
-and inactive rows: a row that is nearly active may bear as much as its slack permits.
+sum is the complementarity residual. It replaces a threshold between active and inactive
+rows: a nearly active row may have a multiplier as large as its slack permits.
 
-A convex set of another kind bears the part z = (v − Π(v))/τ of a force f, v = x + τf:
-this is normal at Π(v), and as τ grows, less of f is left and more in complementarity.
-The multipliers of rows are first fitted as if such a set bore any force, then by
-Newton's method for f − z, whose derivative is that of Π.
+A convex set of another kind contributes z = (v − Π(v))/τ with v = x + τf for a force f.
+This is normal to the set at Π(v). As τ grows, the rest of f becomes smaller and the
+complementarity residual larger. The multipliers of rows are first fitted as if such
+sets could balance any force, then by Newton's method for f − z, with the derivative of
+Π.
 
-Existence is what counts. Multipliers with small residuals prove the point, however they
-were found, so the best of several weightings is returned, judged by `kkt_residuals`.
+Multipliers with small residuals prove a point, regardless of their origin. So several
+weightings are tried, and those with the smallest `kkt_residuals` are returned.
 """
 
 from __future__ import annotations
@@ -36,14 +37,16 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import energy_at, kkt_residuals
 from mortarbench.harness.verify.optimum import EPS
 
-#: A row is left out if its multiplier, by as much as moves the stationarity residual by
-#: tol, moves complementarity by more than this many tol: it cannot help.
-FARTHEST = 100.0
-#: The first half are careful ones. With 8, rows that act on balls alone leave 6e-7
+#: A row takes part if a multiplier that moves the stationarity residual by tol moves
+#: complementarity by at most this many tol: multipliers of farther rows cannot help.
+MAX_COMPLEMENTARITY_RATIO = 100.0
+#: Steps of Newton's method, the first half of them careful (`_Bearing`). With 8, rows
+#: that act on balls alone leave 6e-7
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
 STEP = 2.0**-26  #: of difference quotients of Π
-RANK = 1e-12  #: of the largest column: what is left of a column that depends on others
+#: Rest of a dependent column after elimination, relative to the largest column.
+RANK_TOLERANCE = 1e-12
 MAX_ENTRIES = 2**25  #: of the dense least-squares matrix: 256 MiB
 
 
@@ -54,10 +57,10 @@ class _Scales(NamedTuple):
     E: float  #: of complementarity, divides
 
     def reach(self) -> float:
-        """Return E/S² with the largest force S.
+        """Return τ = E/S² of a natural map, with the largest force S.
 
-        As τ of a natural map: where a limit is as far from x as τ moves it, half of the
-        error is left in the force and half in complementarity.
+        At a distance of x from a limit that τf bridges, the error is divided equally
+        between stationarity and complementarity.
         """
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
@@ -70,7 +73,7 @@ def with_multipliers(
     z: Vector | None = None,
     z_box: Vector | None = None,
 ) -> Solution:
-    """Complete a point by the best multipliers where they are None; others stay.
+    """Complete a point with the best multipliers in place of None.
 
     Raises
     ------
@@ -124,23 +127,26 @@ def _worst(qp: QP, s: Solution) -> float:
 
 @dataclass(frozen=True, eq=False)
 class _Bearing:
-    """Sets other than bounds at x, and a force near which they are linearised."""
+    """Sets other than bounds at x, linearised at a force."""
 
     sets: Sequence[ConvexSet]
-    block: NDArray[np.bool_]  #: (n,) their variables; none where their force is known
+    block: NDArray[
+        np.bool_
+    ]  #: (n,) mask of their variables; none if their force is known
     x: Vector  #: (n,)
     tau: float  #: of the natural map
-    force: Vector | None = None  #: (n,); None if the sets bear any force
-    #: whether the derivative is applied to the residual, too: slower than Newton's
-    #: method, but it comes near from farther off
+    force: Vector | None = None  #: (n,); None if the sets can balance any force
+    #: apply the derivative to the residual as well: this converges more slowly than
+    #: Newton's method, but from farther away
     is_careful: bool = True
-    #: whether a force beyond the natural map is left, rather than all of it borne
+    #: leave the part of a force that the natural map leaves, rather than none of it
     is_shared: bool = False
 
     def borne(self, force: Vector, *, shared: bool = True) -> Vector:
-        """Return the part (n,) of a force that is normal to the sets, near x or at x.
+        """Return the part (n,) of a force that is normal to the sets near x.
 
-        shared : leave what the natural map leaves, by as much as x is off their limits
+        shared : project by the natural map, which leaves a part of the force if x is
+            off a limit; otherwise, take all that is normal at some point
         """
         total = np.zeros(self.x.size)
         if self.block.any():
@@ -151,7 +157,7 @@ class _Bearing:
         return total
 
     def rest(self, g: Vector) -> Vector:
-        """Return what the sets leave of −g (n,), linearised."""
+        """Return the part of g (n,) that the linearised sets do not balance."""
         if not self.block.any() or self.force is None:
             return np.where(self.block, 0.0, g)
         borne = self.borne(self.force)
@@ -236,15 +242,15 @@ def _least_squares(
     y is eliminated by an orthonormal basis of the range of w·free, which may have
     dependent columns; these get no multiplier.
     """
-    from scipy.optimize import nnls  # late: it takes long, and workers need none
+    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)
     size = np.abs(np.diag(R))
-    rank = int((size > RANK * size[:1].sum()).sum())
+    rank = int((size > RANK_TOLERANCE * size[:1].sum()).sum())
     Q, R = Q[:, :rank], R[:rank, :rank]
     norms = np.linalg.norm(w * columns, axis=0)
-    norms[norms == 0] = 1  # sets bear all of it
+    norms[norms == 0] = 1  # sets balance all of it
     C, target = w * columns / norms, -scales.w * g
     price = np.divide(
         np.abs(slack), scales.E * norms, out=np.zeros(slack.size), where=slack != 0
@@ -268,11 +274,15 @@ def _least_squares(
 
 
 def _near(slack: Vector, norms: Vector, E: float) -> NDArray[np.int64]:
-    """List rows or bounds whose multiplier could help, see `FARTHEST`.
+    """Return the rows or bounds whose multiplier could help.
+
+    See `MAX_COMPLEMENTARITY_RATIO`.
 
     norms : ‖w·aⱼ‖
     """
-    return np.flatnonzero((norms > 0) & (slack <= FARTHEST * E * norms))
+    return np.flatnonzero(
+        (norms > 0) & (slack <= MAX_COMPLEMENTARITY_RATIO * E * norms)
+    )
 
 
 def _share(force: Vector, slack: Vector, scales: _Scales) -> Vector:

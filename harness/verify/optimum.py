@@ -80,7 +80,7 @@ class Optimum:
 
     qp: QP  #: the QP that was solved, with P as a matrix
     value: float  #: f*
-    doubt: float  #: bound of the error of f*, plus the rounding of a right answer
+    doubt: float  #: bound of the error of f*, plus the rounding of an exact answer
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
     own: Vector  #: (n,) the same without any energy, see `own_sizes`

@@ -1,9 +1,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Products of stored matrices with vectors, in extended precision where these are.
+"""Products of sparse matrices of doubles with vectors of extended precision.
 
-Entries are extended one by one: a copy of a stiffness in extended precision would take
-more than twice its memory, and longer than the product. Compiled when the package is
-installed; `products.pyi` has the types.
+Entries are converted one by one: a copy of a stiffness matrix in extended precision
+would need more than twice its memory, and more time than the product. Compiled when the
+package is installed; `products.pyi` has the types.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ ctypedef fused real:
     long double
 
 cdef enum:
-    MODES = 6  # of a rigid body in space
+    MODES = 6  # rigid motions of a body in space
 
 
 def times_columns(
@@ -58,10 +58,10 @@ def projected_products(
     const double[:, ::1] R, const long long[::1] starts,
     const real[::1] v, real[::1] found,
 ):
-    """Put PMP v_s of parts v_s (n,) of v (N,) into the same places of `found` (N,).
+    """Write PMP v_s, for parts v_s (n,) of v (N,), to the same places of `found` (N,).
 
-    P = I − RRᵀ; M (n, n) by columns (CSC) and orthonormal R (n, r), r ≤ 6, are doubles.
-    The parts begin at `starts`; where one is zero, `found` stays as it is.
+    P = I − RRᵀ; M (n, n) in CSC format and orthonormal R (n, r), r ≤ 6, are doubles.
+    The parts begin at `starts`; `found` is not changed where a part is zero.
     """
     cdef Py_ssize_t n = indptr.shape[0] - 1, s, first, i, j, k
     part = np.empty(n, dtype=np.double if real is double else np.longdouble)

@@ -1,4 +1,4 @@
-"""Linear algebra in rational arithmetic, where rounding must not decide."""
+"""Linear algebra in rational arithmetic, without rounding."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from scipy.sparse import csr_array
 
 
 def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
-    """Solve Mx = b by Gauss-Jordan elimination; None where there is no solution.
+    """Solve Mx = b by Gauss-Jordan elimination; return None without a solution.
 
     M, b : arrays of fractions
 
     Returns
     -------
-    the map from a guess to the solution in which unknowns without a pivot are as there
+    a function of a guess: the solution whose unknowns without a pivot are those of the
+    guess
 
     """
     rows, pivots = np.column_stack([M, b]), list[int]()
@@ -46,11 +47,11 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 
 
 def nonnegative_solution(M: Any, b: Any) -> Any | None:
-    """Find w ≥ 0 with Mw = b by the simplex method; None where there is none.
+    """Return w ≥ 0 with Mw = b from the simplex method, or None if there is none.
 
-    Phase one, which minimises the sum of one artificial variable per row. Bland's rule
-    (1977), the first column that gains and of the rows that bind the one whose variable
-    comes first, never returns to a basis, so that degenerate steps end.
+    It is phase one, which minimises the sum of an artificial variable per row. Bland's
+    rule (1977) takes the first column with a negative cost and, of the binding rows,
+    the one whose basic variable comes first. No basis recurs, so degenerate steps end.
 
     M, b : arrays of fractions
     """
@@ -78,7 +79,7 @@ def nonnegative_solution(M: Any, b: Any) -> Any | None:
 
 
 def rational(v: Any) -> Any:
-    """Give an array of doubles as one of fractions."""
+    """Convert an array of doubles to fractions, exactly."""
     exact = np.empty(v.shape, dtype=object)
     exact.ravel()[:] = [Fraction(float(value)) for value in v.ravel()]
     return exact

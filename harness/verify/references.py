@@ -1,11 +1,10 @@
-"""The reference service: the solution of a case to more digits than solvers reach.
+"""Reference solutions of contact problems, to more digits than solvers reach.
 
-The closed rows are identified by the injected reference solve, which is none of the
-solvers under test, on the dual of the contact rows;
-`harness.verify.active_set_refinement` does the rest in extended precision. The result
-is believed no more than a solver's: `harness.verify.certificate` bounds its error. What
-is kept on file is only which rows are closed, and it is a guess like any other when it
-is read.
+The injected reference solve, which is none of the solvers under test, identifies the
+closed rows from the dual of the contact rows. `harness.verify.active_set_refinement`
+then computes the solution in extended precision, and `harness.verify.certificate`
+bounds its error, as for any answer. Only the states of the rows are cached in a file.
+They are an initial guess when they are read.
 """
 
 from __future__ import annotations
@@ -30,42 +29,42 @@ from mortarbench.harness.verify.active_set_refinement import (
     predicted,
     unconstrained_guess,
 )
-from mortarbench.harness.verify.admissible import DENSE
+from mortarbench.harness.verify.admissible import MAX_DENSE_ROWS
 from mortarbench.harness.verify.certificate import UncertifiableError, proof
 from mortarbench.harness.verify.substructured import Undivided
 
-TRUSTED = 1e-7  #: bound up to which a solution from stored rows is one
+MAX_CACHED_BOUND = 1e-7  #: largest error bound of a solution from cached rows
 
 
 class UnsolvedError(Exception):
-    """Why there is no reference solution."""
+    """Failure of the reference solve; the message is the reason."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReferencePoint:
-    """A solution of the elastic problem, and the proof of its error."""
+    """A solution of the elastic problem, and a certified bound of its error."""
 
     u: Extended  #: (n,) admissible
-    multipliers: Extended  #: (m,) of the rows of contact and friction
+    multipliers: Extended  #: (m,) of contact, then of friction rows
     equilibrium: Extended  #: u_λ (n,)
-    states: States  #: (m,) which rows were closed, and at which bound the others are
+    states: States  #: (m,) closed, or at a bound of the multiplier
     norm: float  #: ‖u‖_K
     bound: float  #: certified relative error, as `Certificate.bound`
 
     @property
     def active(self) -> NDArray[np.bool_]:
-        """Which rows are closed, (m,)."""
+        """Mask (m,) of the closed rows."""
         return np.asarray(self.states == CLOSED)
 
 
 def reference_point(
     mechanics: Mechanics, solve: Reference, folder: Path | None = None
 ) -> ReferencePoint:
-    """Solve the elastic problem behind a case, or look the solution up.
+    """Solve the elastic problem behind a case, starting from cached states if any.
 
-    solve : identifies the closed rows, on  min ½λᵀFλ − dᵀλ,  RᵀBᵀλ = Rᵀf,  where λ ≥ 0
-        of the contact and |λ| ≤ g of the friction
-    folder : keeps the states of the rows, one file under the digest of each problem
+    solve : identifies the closed rows from  min ½λᵀFλ − dᵀλ,  RᵀBᵀλ = Rᵀf,  with λ ≥ 0
+        for contact and |λ| ≤ g for friction
+    folder : cache of the states, a file per problem; None for no cache
 
     Raises
     ------
@@ -79,7 +78,7 @@ def reference_point(
     stored = _stored(path, rows) if path is not None and path.exists() else None
     if stored is not None:
         point = _solved(mechanics, stored)
-        if point.bound <= TRUSTED:
+        if point.bound <= MAX_CACHED_BOUND:
             return point
     point = _solved(mechanics, _identified(mechanics, solve))
     if path is not None:
@@ -89,7 +88,7 @@ def reference_point(
 
 
 def _stored(path: Path, rows: int) -> States | None:
-    """Read the states of the rows; None where the file is not what it was."""
+    """Read cached states of the rows; None if the file is damaged."""
     try:
         states = read_arrays(path, ("states",))["states"]
     except InputError:
@@ -103,25 +102,30 @@ def _solved(mechanics: Mechanics, guess: States) -> ReferencePoint:
     guess = np.where(exact.contact & (guess == UPPER), CLOSED, guess).astype(np.int8)
     u, lam, states = exchanged(mechanics, guess)
     try:
-        found = proof(Undivided(mechanics), u, u, lam, states == CLOSED)
+        certificate = proof(Undivided(mechanics), u, u, lam, states == CLOSED)
     except UncertifiableError as e:
         raise UnsolvedError(
             f"the reference solve found no admissible pair: {e}"
         ) from None
     return ReferencePoint(
-        u=found.u, multipliers=found.multipliers, equilibrium=found.equilibrium,
-        states=states, norm=found.norm, bound=found.bound,
+        u=certificate.u, multipliers=certificate.multipliers,
+        equilibrium=certificate.equilibrium, states=states, norm=certificate.norm,
+        bound=certificate.bound,
     )  # fmt: skip
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> States:
-    """Guess the states of the rows; of none or very many, from the bodies alone."""
+    """Guess the states of the rows by the dual QP.
+
+    Without rows, or with more than are dense, the guess follows from the displacement
+    without contact.
+    """
     inverse = mechanics.inverse
     R, exact = mechanics.motions.felt.toarray().astype(np.float64), mechanics.exact
     f, B = -mechanics.primal.q, mechanics.rows
     lb, ub = (v.astype(np.float64) for v in (exact.lower, exact.upper))
     m = exact.c.size
-    if not m or (m > DENSE and not R.shape[1]):
+    if not m or (m > MAX_DENSE_ROWS and not R.shape[1]):
         return unconstrained_guess(mechanics)
     qp = QP(
         P=inverse.congruence(B), q=exact.c.astype(np.float64) - B @ inverse(f),

@@ -1,5 +1,5 @@
-/* Scales and errors of KKT residuals, number by number. `scales.pyx` applies them to
-   arrays; solvers call them in loops of their own. */
+/* Scales and errors of KKT residuals for single numbers. `scales.pyx` applies them to
+   arrays; solvers call them in their own loops. */
 
 #ifndef SCALES_H
 #define SCALES_H
@@ -66,8 +66,8 @@ FORMULA own_size(double Px, double curvature, double x)
     return TERMS_FACTOR * (fabs(x) + minimum_shift(Px, curvature, x));
 }
 
-/* What the violation of a row or bound is compared with: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, where bᵢ ≠ 0,
-   own terms that are smaller; `sizes` and `own` are the sums of both kinds of sizes. */
+/* The scale of the violation of a row or bound: |bᵢ| + Σ|aᵢⱼ|Xⱼ or, if bᵢ ≠ 0, the terms of
+   the row itself if these are smaller; `sizes` and `own` are the sums for both. */
 FORMULA row_scale(double rhs, double sizes, double own)
 {
     return rhs > 0 ? least(rhs + sizes, TERMS_FACTOR * rhs + own) : rhs + sizes;
@@ -80,7 +80,7 @@ FORMULA ratio(double error, double scale)
     return error == 0 ? 0 : size;
 }
 
-/* What an error exceeds its rounding by; rounding beyond all bounds does not count. */
+/* The excess of an error over its rounding; infinite rounding does not count. */
 FORMULA beyond(double error, double rounding)
 {
     return largest(fabs(error) - (rounding < INFINITY ? rounding : 0), 0);

@@ -1,31 +1,29 @@
-"""K as a sum over subdomains, and the small problems that the certificate solves there.
+"""Stiffness as a sum over subdomains, and the local problems of the certificate.
 
-The certificate (`harness.verify.certificate`) is written for a stiffness that is torn,
+The certificate (`harness.verify.certificate`) is formulated for a stiffness
 
     K = TᵀK_T T + E,      K_T = diag(K_1 … K_S),
 
-where every K_s has the rigid motions of its subdomain as its exact kernel, and E is
-rounding. Of admissible û and λ̂ it asks for the residual  ρ = Kû − f + Bᵀλ̂  on the
-components that no support holds, in extended precision and with the stored K, and for
-some d with
+where the kernel of every K_s is exactly the rigid motions of its subdomain, and E is
+rounding. For admissible û and λ̂ it needs the residual  ρ = Kû − f + Bᵀλ̂  on the
+components without support, in extended precision and with the stored K, and a d with
 
     TᵀK_T d = ρ                                                                  (5)
 
-as nearly as doubles allow; what is left of (5) is measured. A body in one piece is one
-subdomain, T = I, with its supports eliminated: d = K⁺ρ (`Undivided`). Of bodies that
-are torn, forces b with Tᵀb = ρ that balance in every subdomain, R_Tᵀb = 0, come from
-balancing domain decomposition (Mandel 1993): they are shared in proportion to the
-stiffness W of the copies,
+to double precision; the residual of (5) is measured. An undivided body is a single
+subdomain, T = I, with its supports eliminated: d = K⁺ρ (`Undivided`). For decomposed
+bodies, forces b with Tᵀb = ρ in balance on every subdomain, R_Tᵀb = 0, are those of
+balancing domain decomposition (Mandel 1993), which weights copies by their stiffness W,
 
     b = WT(TᵀWT)⁻¹ρ − ZR_T μ,   R_TᵀZR_T μ = R_TᵀWT(TᵀWT)⁻¹ρ,
       Z = W − WT(TᵀWT)⁻¹TᵀW
 
-where (TᵀWT)⁻¹ is put to zero where a support holds, so that TᵀZ = 0 elsewhere: Z spans
-the forces of gluing and supports. Then K_T d = b is one small Neumann problem for each
-subdomain. The sparse coarse matrix R_TᵀZR_T has three rows for each subdomain of the
-plane. It is singular along motions of the whole that only contact can hold; along these
-λ̂ balances the load, see `harness.verify.admissible.balanced`. Multipliers of gluing and
-supports that a solver may have found are not looked at.
+where (TᵀWT)⁻¹ is set to zero on fixed components, so that TᵀZ = 0 on the others: the
+range of Z contains the forces of gluing and supports. Then K_T d = b is a small Neumann
+problem on each subdomain. The sparse coarse matrix R_TᵀZR_T has three rows per
+subdomain in the plane. It is singular along motions of whole bodies that only contact
+resists; λ̂ balances the load along these (`harness.verify.admissible.balanced`). The
+multipliers of gluing and supports in an answer are not used.
 """
 
 from __future__ import annotations
@@ -51,26 +49,28 @@ from mortarbench.harness.mechanics import (
 from mortarbench.harness.qp import Vector
 from mortarbench.harness.verify.products import times_columns
 
-#: by how much energies in K and in K_T may differ more than those of û do: it is among
-#: the softest displacements, for which they differ most
+#: Safety factor of the relative difference of energies in K and K_T, estimated at û. It
+#: is largest for the softest displacements, and û is close to these.
 SAFETY = 16
-#: units in the last place that a sum over one row of K is off by in a sample, with
-#: signs at random. Sums in extended precision are off by 0.4 to 0.5, as a standard
-#: deviation, and the stored K u from TᵀK_T T u by 0.2 to 3.6
-RANDOM = 4.0
-#: the same with the sign of u, as a slender body needs, whose few soft modes a sample
-#: at random may miss: with ¼, a bound of a plate 60 : ½ was exceeded by 1 %
-SMOOTH = 1.0
-ROUNDS = 6  #: of refining d, at most
-#: what is left of d, relative to it, where refining ends: far below what bounds show
-REFINED = 1e-6
+#: Error of a sum over one row of K in `sample`, in units in the last place, with random
+#: signs. The measured standard deviation is 0.4 to 0.5 for sums in extended precision,
+#: and 0.2 to 3.6 for the stored K u against TᵀK_T T u.
+RANDOM_ULPS = 4.0
+#: The same with the sign of u. A slender body has few soft modes, which random signs
+#: may miss: with ¼, the error of a plate 60 : ½ exceeded its bound by 1 %.
+SMOOTH_ULPS = 1.0
+MAX_REFINEMENTS = 6  #: of d
+#: Relative size of a correction of d that ends the refinement. Bounds are reported to
+#: fewer digits.
+REFINEMENT_TOLERANCE = 1e-6
 
 
 class Split(Protocol):
-    """K = TᵀK_T T + E for the certificate: products, solves, and sums over all of it.
+    """Operations of the certificate with K = TᵀK_T T + E.
 
-    Vectors of components (n,) are extended, and zero where a support holds. Columns of
-    R are the rigid motions that no support holds: first those that contact feels.
+    Vectors of components (n,) have extended precision, and are zero on fixed
+    components. Columns of R are the rigid motions that the supports leave, first those
+    that contact feels.
     """
 
     def along(self, v: Extended) -> Extended:
@@ -80,7 +80,7 @@ class Split(Protocol):
         """Return Rα (n,)."""
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f with the stored K, and what it is the same product for."""
+        """Return Ku − f with the stored K, and K_T v for v = T(u − Rα)."""
 
     def pulled(self, multipliers: Extended) -> Extended:
         """Return Bᵀλ (n,)."""
@@ -92,7 +92,7 @@ class Split(Protocol):
         """Return Tᵀb (n,)."""
 
     def averaged(self, v: Extended) -> Extended:
-        """Average copies v (N,) of components (n,), subdomains moved to agree most."""
+        """Average copies v (N,) of components (n,), after `Sharing.matched`."""
 
     def product(self, v: Extended) -> Extended:
         """Return K_T v (N,)."""
@@ -103,68 +103,68 @@ class Split(Protocol):
     def total(self, *numbers: float) -> list[float]:
         """Add numbers over all subdomains."""
 
-    def rounding(self, held: NDArray[np.float64]) -> Rounding:
-        """Return what E does along the motions `held` (p, h), felt by contact."""
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
+        """Bound E along the `supported` motions (p, h), of those that contact feels."""
 
     def excess(self, w: Extended) -> tuple[Extended, float]:
-        """Return Ew (n,) and |wᵀEw| for w, not zero at supports, without motion R."""
+        """Return Ew (n,) and |wᵀEw| for w with Rᵀw = 0, nonzero on fixed components."""
 
     def scattered(self, v: Extended) -> Extended:
-        """Return √((R∘R)ᵀ(v∘v)) (r,): Rᵀv for v (n,) with random signs."""
+        """Return √((R∘R)ᵀ(v∘v)) (r,), the size of Rᵀv for v (n,) with random signs."""
 
     def noise(self, u: Extended) -> Extended:
-        """Return a sample (n,) of what rounding does to Ku − f in `residual`."""
+        """Return a sample (n,) of the rounding of Ku − f in `residual`."""
 
 
 class Residual(NamedTuple):
-    """The residual of a displacement u, and the same without its rigid motion Rα."""
+    """Residual of a displacement u, and its product without the rigid motion Rα."""
 
     rho: Extended  #: (n,)  Ku − f
     v: Extended  #: (N,)  T(u − Rα)
     Kv: Extended  #: (N,)  K_T v
-    theta: float  #: estimate of how far vᵀKv and vᵀTᵀK_T Tv differ, relative
+    theta: float  #: estimated relative difference of the energies of u in K and K_T
 
 
 class Rounding(NamedTuple):
     """Effect of E along h rigid motions R."""
 
-    strain: Vector  #: (h,) dual norms of ER
-    curvature: NDArray[np.float64]  #: (h, h) at least |RᵀER|
+    strain: Vector  #: (h,) dual norms of the columns of ER
+    curvature: NDArray[np.float64]  #: (h, h) upper bounds of |RᵀER|
 
     def work(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound |eᵀEe| of e = e' + Rγ from ‖e'‖, sizes of γ, and |e'ᵀEe'| ≤ θ‖e'‖²."""
+        """Bound |eᵀEe| for e = e' + Rγ by ‖e'‖, |γ| (h,) and |e'ᵀEe'| ≤ θ‖e'‖²."""
         rigid = 2 * size * (gamma @ self.strain) + gamma @ self.curvature @ gamma
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) likewise; ‖e'‖ is that of the torn K."""
+        """Bound √(eᵀKe) likewise; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
 class Neighbour(NamedTuple):
-    """The u_λ near a displacement û, by its distance d = Tû − u_λ."""
+    """The equilibrium u_λ near a displacement û, given by d = Tû − u_λ."""
 
-    d: Extended  #: (N,) as far as it was solved for
+    d: Extended  #: (N,) computed part
     Kd: Extended  #: (N,) K_T d
-    left: float  #: energy norm of the rest of d
+    left: float  #: bound of the energy norm of the rest
     unbalanced: Extended  #: (r,)  Rᵀ(ρ − TᵀK_T d)
 
 
-def still(split: Split, v: Extended) -> Extended:
-    """Take the rigid motions out of v (n,)."""
+def without_rigid_motion(split: Split, v: Extended) -> Extended:
+    """Subtract the rigid motions from v (n,):  v − RRᵀv."""
     alpha = split.along(v)
     return v - split.motion(alpha) if alpha.size else v
 
 
 def neighbour(split: Split, rho: Extended) -> Neighbour:
-    """Solve (5), refined; what the last step would have changed is left.
+    """Solve (5) with iterative refinement.
 
-    The rest after k steps is a sum of further ones, each at most q times the one
-    before: steps add up to no more than the first one over 1 − q.
+    The step that would come next is not added, but bounds the rest: if each step is at
+    most q times the one before, the remaining ones add up to at most size/(1 − q).
     """
     d = Kd = split.spread(0 * rho)
     rest, before = rho, np.inf
-    for _ in range(ROUNDS):
+    for _ in range(MAX_REFINEMENTS):
         unbalanced = split.along(rest)
         balanced = rest - split.motion(unbalanced) if unbalanced.size else rest
         step = split.solve(balanced).astype(Real)
@@ -172,7 +172,7 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
         square, whole = split.total(float(step @ pull), float(d @ Kd))
         size = np.sqrt(max(square, 0.0))
         q = size / before if before else 0.0
-        if before < np.inf and size <= REFINED * np.sqrt(max(whole, 0.0)):
+        if before < np.inf and size <= REFINEMENT_TOLERANCE * np.sqrt(max(whole, 0.0)):
             break
         d, Kd, before = d + step, Kd + pull, size
         rest = rho - split.joined(Kd)
@@ -180,8 +180,8 @@ def neighbour(split: Split, rho: Extended) -> Neighbour:
 
 
 def length(split: Split, force: Extended) -> float:
-    """Return the dual norm of forces (n,), by d of what balances of them."""
-    d = split.solve(still(split, force)).astype(Real)
+    """Return the dual norm of forces (n,), less their part along rigid motions."""
+    d = split.solve(without_rigid_motion(split, force)).astype(Real)
     square = split.total(float(d @ split.product(d)))[0]
     return float(np.sqrt(max(square, 0.0)))
 
@@ -191,23 +191,25 @@ def sample(
 ) -> Extended:
     """Return a sample (n,) of the rounding of a product with u in the precision `real`.
 
-    Each sum is off by a few units in the last place of the root of the sum of the
-    squares of its terms, `variances` (n,): RANDOM of them with a sign of its own, so
-    that no mode is left out, and SMOOTH with the sign of u, which is softer than most.
-    Signs are a hash of the component (n,), the same on all ranks that have it. It is
-    splitmix64's: smooth modes do no work with signs that alternate more evenly than at
-    random.
+    The error of each sum is a few units in the last place of √`variances`, the root of
+    the sum of the squares of its terms: RANDOM_ULPS with a random sign, so that all
+    modes occur, and SMOOTH_ULPS with the sign of u, which is softer than most modes.
+    The random sign is a hash of the component number (n,), so that ranks agree on it.
+    The hash is that of splitmix64, because signs that alternate more evenly than at
+    random do no work along smooth modes.
     """
     x = components.astype(np.uint64) + np.uint64(1)
     for shift, by in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         x = (x ^ (x >> np.uint64(shift))) * np.uint64(by)
-    sign = np.where(x >> np.uint64(63), RANDOM, -RANDOM) + SMOOTH * np.sign(u)
+    sign = np.where(
+        x >> np.uint64(63), RANDOM_ULPS, -RANDOM_ULPS
+    ) + SMOOTH_ULPS * np.sign(u)
     sizes = np.sqrt(np.maximum(variances, 0)).astype(Real)
     return np.asarray(sign * (np.finfo(real).eps * sizes))
 
 
 class _Stored(ABC):
-    """Bodies in one process: the stored K, and R."""
+    """Bodies in one process, with the stored K and R."""
 
     def __init__(self, mechanics: Mechanics) -> None:
         self.mechanics = mechanics
@@ -230,12 +232,15 @@ class _Stored(ABC):
         return np.asarray(self.R @ alpha)
 
     def free(self, v: Extended) -> Extended:
-        """Put v (n,) to zero where a support holds, in place."""
-        v[self.mechanics.exact.held] = 0
+        """Set v (n,) to zero on fixed components, in place."""
+        v[self.mechanics.exact.fixed] = 0
         return v
 
     def stored(self, u: Extended) -> tuple[Extended, float, Extended]:
-        """Return Ku; of u − Rα, vᵀKv; and u − Rα. KRα is known to more digits."""
+        """Return Ku, and vᵀKv and v for v = u − Rα.
+
+        Ku is Kv + (KR)α: KR was computed with twice the digits, since its terms cancel.
+        """
         K, motions = csc_array(self.mechanics.primal.P), self.mechanics.motions
         deformed = u
         if self.R.shape[1]:
@@ -255,7 +260,7 @@ class _Stored(ABC):
     def excess(self, w: Extended) -> tuple[Extended, float]:
         """Return Kw − TᵀK_T Tw on free components, and the difference of energies.
 
-        Bodies that w moves far with their supports leave Kw as sums that cancel.
+        If w moves bodies far together with their supports, the terms of Kw cancel.
         """
         K, v = csr_array(self.mechanics.primal.P), self.spread(w)
         Kw, Kv = cancelling(K, w[:, None])[:, 0], self.product(v)
@@ -269,10 +274,10 @@ class _Stored(ABC):
 
 
 class Undivided(_Stored):
-    """Bodies in one piece: T = I, and K_T = PKP with P = I − RRᵀ."""
+    """Undivided bodies: T = I, and K_T = PKP with P = I − RRᵀ."""
 
     def residual(self, u: Extended) -> Residual:
-        """Return Ku − f; K_T shares the norm of K: θ = 0."""
+        """Return Ku − f; θ = 0, since K_T has the norm of K."""
         Ku, _, deformed = self.stored(u)
         rho = self.free(Ku + self.mechanics.primal.q)
         return Residual(rho, deformed, self.product(deformed), 0.0)
@@ -282,92 +287,99 @@ class Undivided(_Stored):
         return u
 
     def joined(self, b: Extended) -> Extended:
-        """Return b where no support holds."""
+        """Return b with zeros on fixed components."""
         return self.free(b.copy())
 
     def averaged(self, v: Extended) -> Extended:
-        """Return v where no support holds."""
+        """Return v with zeros on fixed components."""
         return self.free(v.copy())
 
     def product(self, v: Extended) -> Extended:
         """Apply PKP with P = I − RRᵀ."""
         K = csc_array(self.mechanics.primal.P)
-        v = self.mechanics.still(v)
+        v = self.mechanics.without_rigid_motion(v)
         Kv = times_columns(K.data, K.indices, K.indptr, v, v.size)
-        return self.mechanics.still(Kv)
+        return self.mechanics.without_rigid_motion(Kv)
 
     def solve(self, rho: Extended) -> Vector:
         """Return K⁺ρ."""
-        return np.asarray(self.mechanics.relaxed(rho), dtype=np.float64)
+        return np.asarray(self.mechanics.apply_inverse(rho), dtype=np.float64)
 
     def noise(self, u: Extended) -> Extended:
-        """Return a sample of the rounding of Ku without rigid motion."""
+        """Return a sample of the rounding of Kv, v = u − Rα."""
         K = csc_array(self.mechanics.primal.P).power(2)
-        deformed = still(self, u)
+        deformed = without_rigid_motion(self, u)
         variances = K @ deformed.astype(np.float64) ** 2
         return self.free(sample(variances, deformed, np.arange(u.size), Real))
 
-    def rounding(self, held: NDArray[np.float64]) -> Rounding:
-        """Return ER, which is KR but for what P takes out of it."""
+    def rounding(self, supported: NDArray[np.float64]) -> Rounding:
+        """Return bounds of ER, which is KR up to the projection P."""
         motions = self.mechanics.motions
-        along = np.abs(held.T @ np.asarray(motions.felt.T @ motions.KR) @ held)
-        strain = [length(self, motions.KR @ k) for k in held.T]
+        along = np.abs(
+            supported.T @ np.asarray(motions.felt.T @ motions.KR) @ supported
+        )
+        strain = [length(self, motions.KR @ k) for k in supported.T]
         return Rounding(np.array(strain), along.astype(np.float64))
 
 
-class Among(Protocol):
-    """How what some subdomains have is added to what others have elsewhere.
+class Reduction(Protocol):
+    """Completion of sums over subdomains that are stored elsewhere.
 
-    Components are those that these subdomains have copies of, (n,); coarse unknowns are
-    those of all subdomains, (r,).
+    Components (n,) are those of the local subdomains; coarse unknowns (r,) are those of
+    all subdomains.
     """
 
     def completed(self, v: Any, at: Any = None) -> Any:
-        """Add what is elsewhere of the components `at` (t,), or of all (n,)."""
+        """Add the other contributions to components `at` (t,), or to all (n,)."""
 
     def gathered(self, alpha: Vector) -> Vector:
-        """Put coefficients of own rigid motions together with all others: (r,)."""
+        """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
 
-    def own(self, alpha: Vector) -> Vector:
-        """Take the coefficients of own rigid motions out of all (r,)."""
+    def local_part(self, alpha: Vector) -> Vector:
+        """Return the coefficients of the local rigid motions among all (r,)."""
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S  (r, r), with M and S added up over all.
+        """Return  M − Sᵀ diag(scale) S  (r, r), with M and S summed over all.
 
-        S : (t, own) its rows are of the components `at`
+        S : (t, local) with rows for the components `at`
         """
 
 
 class Sharing:
-    """Shares forces ρ among subdomains, balanced in each; factorised once.
+    """Distribution of forces ρ over subdomains, in balance on each.
 
-    Z acts on interfaces and supports only: elsewhere W − WT(TᵀWT)⁻¹TᵀW vanishes.
+    Z acts only on interfaces and fixed components: for a component with a single copy,
+    W − WT(TᵀWT)⁻¹TᵀW vanishes.
     """
 
     def __init__(
-        self, parts: Substructures, held: NDArray[np.int64], loose: Any, among: Among
+        self,
+        parts: Substructures,
+        fixed: NDArray[np.int64],
+        floating: Any,
+        reduction: Reduction,
     ) -> None:
         """Set up the coarse problem.
 
         Parameters
         ----------
-        held : components that supports hold
-        loose : (r, q) coefficients of R_T of the motions that no support holds
-        among : sums over subdomains that are elsewhere
+        fixed : prescribed components
+        floating : (r, q) coefficients in R_T of the motions that the supports leave
+        reduction : completes sums over subdomains
 
         """
-        self._parts, self._among, self._loose = parts, among, loose
+        self._parts, self._reduction, self._floating = parts, reduction, floating
         squares = csr_array(parts.spread)
         squares.data = squares.data**2
         self._squares = squares
-        total = among.completed(squares.T @ parts.weight)
-        #: (N,) shares D of copies in their components, which add up to one: TᵀDT = 1
+        total = reduction.completed(squares.T @ parts.weight)
+        #: (N,) weights D of the copies of a component, a partition of unity: TᵀDT = I
         self.part = parts.weight / (squares @ total)
-        jointly = among.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
-        jointly[held] = True
+        jointly = reduction.completed(squares.T @ np.ones(squares.shape[0])) > 1 + 1e-9
+        jointly[fixed] = True
         rows = np.flatnonzero(squares @ jointly.astype(np.float64) > 1e-9)
         inverse = 1 / total
-        inverse[held] = 0
+        inverse[fixed] = 0
         T, R = csr_array(parts.spread[rows]), csr_array(parts.kernel[rows])
         touched = np.zeros(total.size, dtype=bool)
         touched[T.indices] = True
@@ -383,34 +395,38 @@ class Sharing:
 
     @cached_property
     def _coarse(self) -> Callable[[Vector], Vector]:
-        coarse = self._among.coarse(self._RWR, self._TWR, self._inverse, self._at)
-        return _coarse_solve(coarse, self._loose)
+        coarse = self._reduction.coarse(self._RWR, self._TWR, self._inverse, self._at)
+        return _coarse_solve(coarse, self._floating)
 
     def variances(self, v: Extended) -> Vector:
         """Return (K∘K)(u∘u) (n,), with the squares of v = Tu in every subdomain."""
         squares = self._parts.squared_product(v.astype(np.float64) ** 2)
-        return np.asarray(self._among.completed(self._squares.T @ squares))
+        return np.asarray(self._reduction.completed(self._squares.T @ squares))
 
     def __call__(self, rho: Vector) -> Vector:
-        """Return b (N,) with Tᵀb = ρ (n,) on the components that nothing holds."""
-        parts, among = self._parts, self._among
+        """Return b (N,) in balance with Tᵀb = ρ (n,) on free components."""
+        parts, reduction = self._parts, self._reduction
         b = self.part * (parts.spread @ rho)
-        for _ in range(2):  # the second time for the digits that the first one lost
-            mu = among.own(self._coarse(among.gathered(parts.kernel.T @ b)))
-            jumps = self._inverse * among.completed(self._TWR @ mu, self._at)
+        for _ in range(2):  # the second pass restores digits that the first one cancels
+            mu = reduction.local_part(
+                self._coarse(reduction.gathered(parts.kernel.T @ b))
+            )
+            jumps = self._inverse * reduction.completed(self._TWR @ mu, self._at)
             b[self._rows] -= self._WR @ mu - self._w * (self._T @ jumps)
         return np.asarray(b)
 
     def matched(self, v: Extended) -> Extended:
-        """Move subdomains rigidly until the copies v (N,) differ least, as Z weighs.
+        """Subtract the rigid motions Rα that minimise the jumps of v (N,), as Z weighs.
 
-        α with RᵀZ(v − Rα) = 0, as forces are balanced; copies that a support holds
-        differ from zero.
+        RᵀZ(v − Rα) = 0 is the coarse problem of the balance of forces. On fixed
+        components the jump is the difference from zero.
         """
-        x, among = v[self._rows].astype(np.float64), self._among
-        pulls = among.completed(self._T.T @ (self._w * x), self._at)
-        apart = x - self._T @ (self._inverse * pulls)
-        alpha = among.own(self._coarse(among.gathered(self._WR.T @ apart)))
+        x, reduction = v[self._rows].astype(np.float64), self._reduction
+        pulls = reduction.completed(self._T.T @ (self._w * x), self._at)
+        jumps = x - self._T @ (self._inverse * pulls)
+        alpha = reduction.local_part(
+            self._coarse(reduction.gathered(self._WR.T @ jumps))
+        )
         return np.asarray(v - self._parts.kernel @ alpha)
 
 
@@ -421,7 +437,7 @@ def scaled_rows(M: csr_array, scale: Vector) -> csr_array:
 
 
 def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
-    """Return x ↦ A⁺x, with as many components held as `kernel` (r, q) has columns."""
+    """Return x ↦ A⁺x for A with the given kernel (r, q), by fixing q components."""
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     free = np.setdiff1d(np.arange(A.shape[0]), pins)
     factor = splu(

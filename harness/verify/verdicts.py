@@ -1,4 +1,4 @@
-"""From what a solver returned to a record: our verdict, residuals and quantities."""
+"""Records of answers: verdict, residuals, certificates and physical quantities."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness.digest import hex_digest
-from mortarbench.harness.distributed.failures import agreed
-from mortarbench.harness.distributed.vectors import DistributedColumns, Emitted, Ranks
+from mortarbench.harness.distributed.failures import run_collectively
+from mortarbench.harness.distributed.vectors import (
+    DistributedColumns,
+    DistributedQP,
+    Ranks,
+)
 from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Case
 from mortarbench.harness.qp import QP, no_rows
@@ -31,7 +35,7 @@ from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
 from mortarbench.harness.verify.optimum import Proves, decided
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 
-#: first part of what a run_id digests; it names a measurement, whatever is stored of it
+#: Version of the data in a run_id, independent of the schema of records.
 IDENTITY = 1
 
 
@@ -48,10 +52,10 @@ def new_record(
     accuracy: float | None = None,
     session: str = "",
 ) -> Record:
-    """Make the record of a measurement before it is made.
+    """Return the record of a measurement that has not begun.
 
-    options : every option of the solver, defaults resolved
-    environment : digest
+    options : all options of the solver, including defaults
+    environment : its digest
     mode, accuracy, session : see `Record`
     """
     options = plain(options)
@@ -91,14 +95,14 @@ def judged(
     qp: QP,
     s: Solution,
     prove: Proves | None = None,
-    found: Mapping[str, Any] | None = None,
+    values: Mapping[str, Any] | None = None,
 ) -> Record:
-    """Fill in what a solver's answer `s` is worth on `qp`, by our own evaluation.
+    """Return a record with the claims of an answer `s`, its residuals and the verdict.
 
-    prove : finds the optimum of `qp` where residuals cannot decide
-    found : residuals and objective, where ranks have evaluated them together
+    prove : returns the proven optimum of `qp` if residuals cannot decide
+    values : residuals and objective, if ranks have evaluated them
     """
-    record = record.but(
+    record = record.replace(
         sizes=qp.sizes,
         claimed=s.status.value,
         message=s.message,
@@ -107,16 +111,16 @@ def judged(
         reported=s.reported,
     )
     if s.status is Status.DECLINED:
-        return record.but(verdict=Verdict.DECLINED)
-    if found is not None:
-        residuals = Residuals(*(found[name] for name in Residuals._fields))
-        objective = found["objective"]
+        return record.replace(verdict=Verdict.DECLINED)
+    if values is not None:
+        residuals = Residuals(*(values[name] for name in Residuals._fields))
+        objective = values["objective"]
     else:
         with np.errstate(all="ignore"):  # a point may hold NaN, inf, or 1e300
             residuals = kkt_residuals(qp, s)
             objective = qp.objective(s.x)
     tol, error, margin = record.judged_at, None, None
-    if s.status is Status.INFEASIBLE and found is None:
+    if s.status is Status.INFEASIBLE and values is None:
         margin = infeasibility_margin(qp, s)
         record = noted(
             record,
@@ -128,7 +132,7 @@ def judged(
     if prove is not None and margin is None:
         error = decided(qp, s, residuals, tol, prove)
     decided_by = "residuals" if error is None else "reference"
-    return record.but(
+    return record.replace(
         verdict=verdict(
             s.status, residuals, tol, error=error, infeasible=margin is not None
         ),
@@ -140,50 +144,52 @@ def judged(
 
 
 def quantities_of(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Evaluate what a point means physically; with a note, if that is impossible."""
+    """Evaluate the physical quantities of a point; if that fails, return a note."""
     if not has_point(s):
         return {}, ""
     try:
         with np.errstate(all="ignore"):  # a point may hold 1e300
             return plain(case.quantities(s)), ""
-    except Exception as e:  # the family's code; its fault must not lose the record
+    except Exception as e:  # code of the family must not lose the record
         return {}, note_of("quantities", e)
 
 
 def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
-    """Bound the error of a point: fields of its record; with a note, if impossible.
+    """Bound the error of a point; return fields of its record, and a note on failure.
 
-    energy_bound covers the answer itself, û and u_λ of `harness.verify.certificate`.
-    certificate: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` = √(2λ̂ᵀ(c − Bû)),
-    `answer` (the bound of the answer alone) and `moved` = ‖u − û‖, all relative to a
-    lower bound of ‖u*‖; `friction`, the part that friction has in `work`; `seminorm`, 1
-    where bodies can move rigidly, which nothing bounds.
+    ``energy_bound`` bounds the errors of the answer and of û and u_λ
+    (`harness.verify.certificate`). ``certificate`` has its components, relative to a
+    lower bound of ‖u*‖: `pair` = √(2(J − D)), `distance` = ‖û − u_λ‖, `work` =
+    √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer alone), `moved` = ‖u − û‖, and
+    `friction`, the frictional part of `work`; `seminorm` is 1 if bodies can move
+    rigidly, which is not bounded.
     """
     if case.mechanics is None or not has_point(s):
         return {}, ""
-    mechanics, loaded = case.mechanics, LATE in sys.modules
+    mechanics, was_loaded = case.mechanics, LATE_IMPORT in sys.modules
 
     def certificate() -> Certificate:
-        return certify(mechanics, mechanics.back(s))
+        return certify(mechanics, mechanics.to_primal(s))
 
-    told = _certified(certificate)
-    if not loaded and LATE in sys.modules:  # and that is no part of the time
-        told = _certified(certificate)
-    return told
+    result = _certified(certificate)
+    if not was_loaded and LATE_IMPORT in sys.modules:  # measured again, without import
+        result = _certified(certificate)
+    return result
 
 
-def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str, Any]:
-    """Evaluate an answer on all ranks together; each has its slice of the solution.
+def evaluated_by_ranks(
+    emitted: DistributedQP, s: Solution, ranks: Ranks
+) -> dict[str, Any]:
+    """Evaluate an answer on all ranks, from the local slices of the solution.
 
-    By a share of its own, without what the solver has made of the first one. All ranks
-    call it. What one of them cannot do, none of them does (`harness.distributed
-    .failures`).
+    It uses a new share of the QP, which the solver has not touched. All ranks call it,
+    and a failure on one rank is a failure on all (`harness.distributed.failures`).
 
     Returns
     -------
-    `values`: objective and residuals, None where they cannot be evaluated in parts;
-    `bounds`: fields of `certified`, and `quantities`, each None where it needs the
-    whole; `recover_seconds` that quantities took; `notes` on what failed.
+    `values`: objective and residuals, None if they need the whole QP; `bounds`: fields
+    of `certified`, and `quantities`, None if they need the whole QP; `recover_seconds`:
+    time of the quantities; `notes` on failures.
 
     """
     found: dict[str, Any] = {
@@ -191,22 +197,24 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
         "notes": list[str](),
     }  # fmt: skip
     try:
-        found["values"] = agreed(ranks, lambda: _values_by_ranks(emitted, s, ranks))
+        found["values"] = run_collectively(
+            ranks, lambda: _values_by_ranks(emitted, s, ranks)
+        )
         if found["values"] is None:
             return found
-        answered = agreed(ranks, lambda: emitted.answer(s))
+        answered = run_collectively(ranks, lambda: emitted.answer(s))
     except Exception as e:
         return {**found, "notes": [note_of("evaluation by ranks", e)]}
     if (certifiable := answered.certifiable) is not None:
         found["bounds"], note = _certified(
-            lambda: agreed(ranks, lambda: certify_over_ranks(*certifiable))
+            lambda: run_collectively(ranks, lambda: certify_over_ranks(*certifiable))
         )
         found["notes"] += filter(None, [note])
     if (results := answered.quantities) is not None:
         start = perf_counter()
         try:
             with np.errstate(all="ignore"):
-                found["quantities"] = plain(agreed(ranks, results))
+                found["quantities"] = plain(run_collectively(ranks, results))
             found["recover_seconds"] = perf_counter() - start
         except Exception as e:
             found["quantities"] = {}
@@ -215,12 +223,12 @@ def evaluated_by_ranks(emitted: Emitted, s: Solution, ranks: Ranks) -> dict[str,
 
 
 def _values_by_ranks(
-    emitted: Emitted, s: Solution, ranks: Ranks
+    emitted: DistributedQP, s: Solution, ranks: Ranks
 ) -> dict[str, float] | None:
-    """Evaluate objective and residuals; None where they are not finite.
+    """Evaluate objective and residuals; None if they are not finite.
 
-    And where some scale of energy is one that only the whole knows, which a distributed
-    vector refuses by a TypeError.
+    Also None if a scale of energy needs the whole QP: a distributed vector raises
+    TypeError for operations that its slice does not determine.
     """
     qp = emitted.share().qp
     qp = replace(qp, G=DistributedColumns(no_rows(qp.q.size), ranks))
@@ -234,44 +242,44 @@ def _values_by_ranks(
     return {"objective": float(objective), **residuals._asdict()}
 
 
-LATE = "scipy.optimize"  #: which `certify` imports for some bodies; it takes long
+LATE_IMPORT = "scipy.optimize"  #: slow import of `certify` for some bodies
 
 
 def _certified(certificate: Callable[[], Certificate]) -> tuple[dict[str, Any], str]:
     start = perf_counter()
     try:
-        found = certificate()
+        bound = certificate()
     except UncertifiableError as e:
         seconds = perf_counter() - start
         return {"certify_seconds": seconds}, f"no energy_bound: {e}"
-    except Exception as e:  # the family's code; its fault must not lose the record
+    except Exception as e:  # code of the family must not lose the record
         return {}, note_of("energy_bound", e)
     return {
-        "energy_bound": found.bound,
-        "certificate": found.parts,
+        "energy_bound": bound.bound,
+        "certificate": bound.parts,
         "certify_seconds": perf_counter() - start,
     }, ""
 
 
 def has_point(s: Solution) -> bool:
-    """Whether there are variables, and all four vectors are finite."""
+    """Return True if there are variables, and all four vectors are finite."""
     return bool(s.x.size) and all(
         np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box)
     )
 
 
 def note_of(what: str, e: Exception) -> str:
-    """Say in one line what could not be computed of a record."""
+    """Return a note of one line on a value that could not be computed."""
     return " ".join(f"no {what}: {type(e).__name__}: {e}".split())
 
 
 def noted(record: Record, *notes: str) -> Record:
     """Add notes to the message of a record."""
-    return record.but(message="; ".join(filter(None, [record.message, *notes])))
+    return record.replace(message="; ".join(filter(None, [record.message, *notes])))
 
 
 def plain(data: Any) -> Any:
-    """Convert to what JSON knows; anything else is shown by its repr."""
+    """Convert to plain data for JSON; other objects are replaced by their repr."""
     match data:
         case np.ndarray() | np.generic():
             return plain(data.tolist())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness.errors import InputError, say
-from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ def run(registries: Registries, options: Namespace) -> int:
         raise InputError(
             f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
         ) from None
-    with full_disk_told(options.out):
+    with report_full_disk(options.out):
         written = measured_paper(registries, options.out, options.quick, say)
     print(*(file for file in written if file.suffix == ".html"), sep="\n")
     return 0

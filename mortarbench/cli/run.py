@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mortarbench.harness.errors import some
-from mortarbench.harness.files.durable import full_disk_told
+from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.suite.solver_options import given_options
 from mortarbench.registries import Registries
 
@@ -50,7 +50,7 @@ def run(registries: Registries, options: Namespace) -> int:
     pages: list[Path] = []
     said: tuple[str, ...] = ()
     if found.records:
-        with full_disk_told(found.folder):
+        with report_full_disk(found.folder):
             written = report(found.folder, registries=registries)
         pages = [file for file in written.files if file.suffix == ".html"]
         said = written.said

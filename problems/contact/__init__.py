@@ -1,1 +1,1 @@
-"""Contact of elastic bodies: which sides may touch, and the rows that say so."""
+"""Contact of elastic bodies: contact sides, their rows, friction and load steps."""

@@ -1,11 +1,12 @@
-"""Whether supports and contacts can balance the loads on bodies, before any solve.
+"""Check of the balance of loads on bodies by supports and contacts, before any solve.
 
 The potential energy has a lower bound if and only if no rigid motion r that the
-supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains from the load
-(fᵀr > 0). With Z a basis of the motions that the supports allow, Farkas' lemma says the
-same of forces: there are contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.  Their best
-approximation in the sense of least squares leaves, by Moreau's decomposition, a
-remainder that *is* such a motion, and the part of the load that nothing balances.
+supports allow (B_D r = 0) and that closes no gap (B r ≤ 0) gains energy from the load
+(fᵀr > 0). Let Z be a basis of the motions that the supports allow. By Farkas' lemma, an
+equivalent condition is the existence of contact forces λ ≥ 0 with  Zᵀ(f − Bᵀλ) = 0.
+The residual of the non-negative least-squares problem for λ is, by Moreau's
+decomposition, itself such a motion r, and at the same time the unbalanced part of the
+load.
 """
 
 from __future__ import annotations
@@ -21,88 +22,105 @@ from mortarbench.harness import Friction, InputError, Matrix
 from mortarbench.problems.contact.bodies import UnassembledBodies
 from mortarbench.problems.fem.elasticity import rigid_motions
 
-#: part of the load that may be left: rounding of coordinates, normals and tractions
-UNBALANCED = 1e-6
-_SLIGHT = 1e-3  #: parts of a motion that are not worth a word
+#: largest unbalanced share of the load that is attributed to rounding of coordinates,
+#: normals and tractions
+MAX_IMBALANCE = 1e-6
+#: components of a motion below this share of the largest one are not reported
+_MIN_MOTION = 1e-3
 _AXES = "xyz"
 
 Floats = NDArray[np.float64]
 
 
-class _Moving(NamedTuple):
-    """How a body moves."""
+class _BodyMotion(NamedTuple):
+    """Rigid motion of one body."""
 
     name: str
     centre: Floats  #: (dim,) of its nodes, m
     velocity: Floats  #: (dim,) of the centre
-    turn: float  #: anticlockwise, as a velocity at a `size` from the centre
+    rotation: (
+        float  #: anticlockwise, as the velocity at distance `size` from the centre
+    )
+
+
+def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
+    """Return True if supports and closed, sticking contact leave no rigid motion.
+
+    rows : (m, n) normal rows, and tangential rows of contacts with friction
+    """
+    R, _, _ = _motions(bodies)
+    allowed = _kernel(bodies.B_D @ R)
+    return not _kernel(csr_array(rows) @ R @ allowed).shape[1]
 
 
 def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
-    """Refuse loads that neither supports nor contacts can balance.
+    """Raise an error for loads that neither supports nor contacts can balance.
 
     B : (m, n) contact rows at u = 0
 
     Raises
     ------
     InputError
-        With the body, and the direction or the point about which it turns.
+        When some body can move. The message names the body, and the direction or the
+        centre of rotation of the motion.
 
     """
     R, centres, size = _motions(bodies)
-    allowed = _kernel(bodies.B_D @ R)
-    if not allowed.shape[1]:  # the supports hold every body
+    allowed = _kernel(bodies.B_D @ R)  # Z = R·allowed
+    if not allowed.shape[1]:  # the supports fix every body
         return
     load, closing = R.T @ bodies.f, csr_array(B) @ R
-    least = UNBALANCED * np.abs(bodies.f).sum()
-    of_body, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
+    threshold = MAX_IMBALANCE * np.abs(bodies.f).sum()
+    modes, dim = R.shape[1] // len(bodies.names), bodies.mesh.dim
+    # translations along an axis first: their message is the simpler one
     sliding = [
         (b, axis)
         for b in range(len(bodies.names))
         for axis in range(dim)
-        if abs(load[k := of_body * b + axis]) > least
-        and _slides(bodies, R[:, k], B, np.sign(load[k]))
+        if abs(load[k := modes * b + axis]) > threshold
+        and _is_free_motion(bodies, R[:, k], B, np.sign(load[k]))
     ]
     if sliding:
         first = sliding[0][0]
         axes = [_AXES[axis] for b, axis in sliding if b == first]
         raise InputError(
-            _text([bodies.names[first]], f"its load in {' and '.join(axes)}")
+            _message([bodies.names[first]], f"its load in {' and '.join(axes)}")
         )
-    left = allowed @ _remainder(allowed.T @ load, closing @ allowed)
-    if np.linalg.norm(left) <= least:
+    # the residual of least squares is a motion that closes no gap and gains energy
+    motion = allowed @ _unbalanced_load(allowed.T @ load, closing @ allowed)
+    if np.linalg.norm(motion) <= threshold:
         return
-    parts = left.reshape(-1, of_body)
+    parts = motion.reshape(-1, modes)
     moving = [
-        _Moving(name, centre, part[:dim], float(part[dim]))
+        _BodyMotion(name, centre, part[:dim], float(part[dim]))
         for name, centre, part in zip(bodies.names, centres, parts, strict=True)
-        if np.abs(part).max() > _SLIGHT * np.abs(parts).max()
+        if np.abs(part).max() > _MIN_MOTION * np.abs(parts).max()
     ]
-    raise InputError(_named(moving, size))
+    raise InputError(_imbalance_message(moving, size))
 
 
 def check_friction(
     bodies: UnassembledBodies, B: Matrix, friction: Friction, step: int, share: float
 ) -> None:
-    """Refuse a load that friction with its bounds cannot hold.
+    """Raise an error for a load that friction with its bounds cannot balance.
 
-    With forces λ_n ≥ 0 of the contact rows B and |λ_t| ≤ g of the rows T of friction,
-    Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0 has to have a solution. A linear program minimises the sum
-    of what is left.
+    There must be forces λ_n ≥ 0 of the contact rows B and |λ_t| ≤ g of the friction
+    rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program minimises the 1-norm of
+    this residual.
 
-    step, share : number of the load step, and its part of the load
+    step, share : number of the load step, and the share of the load that acts in it
 
     Raises
     ------
     InputError
-        With the part of the load that nothing holds.
+        When no such forces exist. The message states the unbalanced share of the load.
 
     """
     R, _, _ = _motions(bodies)
     allowed = _kernel(bodies.B_D @ R)
     if not allowed.shape[1] or not friction.bound.size:
         return
-    from scipy.optimize import linprog  # late, as above
+    from scipy.optimize import linprog  # imported here: seldom needed, slow to load
 
     motions = R @ allowed
     forces = np.hstack([(csr_array(M) @ motions).T for M in (B, friction.T)])
@@ -110,24 +128,25 @@ def check_friction(
     rows = B.shape[0]
     limits = [(0, None)] * rows + [(-g, g) for g in friction.bound]
     size = np.abs(bodies.f).sum() * share
-    found = linprog(
+    # unknowns: λ_n, λ_t, and the positive and negative parts of the residual
+    program = linprog(
         np.append(np.zeros(forces.shape[1]), np.ones(2 * len(eye))),
         A_eq=np.hstack([forces, eye, -eye]), b_eq=load,
         bounds=limits + [(0, None)] * (2 * len(eye)), method="highs",
     )  # fmt: skip
-    if found.x is not None and found.fun > UNBALANCED * size:
+    if program.x is not None and program.fun > MAX_IMBALANCE * size:
         raise InputError(
             f"load step {step}: friction cannot hold the load; within the bound of "
-            f"Tresca's law nothing balances {found.fun / size:.2%} of it; expected "
+            f"Tresca's law nothing balances {program.fun / size:.2%} of it; expected "
             "supports that hold the bodies, or a larger bound"
         )
 
 
 def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
-    """Return R (n, r bodies), the centres (bodies, dim) of the turns, and a size, m.
+    """Return R (n, r bodies), the centres (bodies, dim) of rotation, and a length, m.
 
-    Of each body: translations, and turns about its centre that move what is `size` away
-    by 1, so that loads along all of them are forces.
+    The columns of each body are translations, and rotations about its centre that move
+    points at distance `size` by 1. With this scaling, all entries of Rᵀf are forces.
     """
     size = float(np.ptp(bodies.mesh.points, axis=0).max())
     parts = bodies.points_of_bodies
@@ -139,22 +158,24 @@ def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:
 
 
 def _kernel(A: Floats) -> Floats:
-    """Orthonormal basis of the kernel of A (m, k), (k, r)."""
-    _, sizes, turn = np.linalg.svd(A, full_matrices=True)
-    rank = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
-    return np.asarray(turn[rank:].T)
+    """Return an orthonormal basis (k, r) of the kernel of A (m, k)."""
+    _, singular_values, Vt = np.linalg.svd(A, full_matrices=True)
+    rank = int((singular_values > 1e-9 * singular_values.max(initial=0.0)).sum())
+    return np.asarray(Vt[rank:].T)
 
 
-def _slides(bodies: UnassembledBodies, r: Floats, B: Matrix, sign: float) -> bool:
-    """Whether the motion sign·r is allowed by the supports and closes no gap."""
+def _is_free_motion(
+    bodies: UnassembledBodies, r: Floats, B: Matrix, sign: float
+) -> bool:
+    """Return True if the supports allow the motion sign·r and it closes no gap."""
     closing = sign * (B @ r)
     free = not (bodies.B_D @ r).any()
     return free and bool((closing <= 1e-9).all())
 
 
-def _remainder(load: Floats, closing: Floats) -> Floats:
-    """Return what is left of a load (k,) by the best forces λ ≥ 0 on rows (m, k)."""
-    from scipy.optimize import nnls  # late: only bodies that supports do not hold
+def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
+    """Return the residual (k,) of least squares over λ ≥ 0 on rows `closing` (m, k)."""
+    from scipy.optimize import nnls  # imported here: only floating bodies need it
 
     sizes = np.linalg.norm(closing, axis=1)
     rows = closing[sizes > 1e-12 * sizes.max(initial=0.0)]
@@ -163,33 +184,33 @@ def _remainder(load: Floats, closing: Floats) -> Floats:
     A = (rows / np.linalg.norm(rows, axis=1)[:, None]).T
     try:
         forces, _ = nnls(A, load, maxiter=100 * A.shape[1])
-    except RuntimeError:  # no answer within so many steps: nothing is known to be left
+    except RuntimeError:  # the iteration limit proves no imbalance: accept the load
         return np.zeros_like(load)
     return np.asarray(load - A @ forces)
 
 
-def _named(moving: list[_Moving], size: float) -> str:
-    """Say in words what nothing balances."""
-    turning = max(moving, key=lambda body: abs(body.turn))
+def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
+    """Return the message about an unbalanced force or moment."""
+    turning = max(moving, key=lambda body: abs(body.rotation))
     sliding = max(moving, key=lambda body: float(np.abs(body.velocity).max()))
     most = float(np.abs(sliding.velocity).max())
-    if abs(turning.turn) <= _SLIGHT * most:
+    if abs(turning.rotation) <= _MIN_MOTION * most:
         axes = [
             axis
             for axis, v in zip(_AXES, sliding.velocity, strict=False)
-            if abs(v) > _SLIGHT * most
+            if abs(v) > _MIN_MOTION * most
         ]
         names = [body.name for body in moving]
         whose = "its" if len(names) == 1 else "their"
-        return _text(names, f"{whose} load in {' and '.join(axes)}")
-    (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.turn
-    return _text(  # about the point that has no velocity
+        return _message(names, f"{whose} load in {' and '.join(axes)}")
+    (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.rotation
+    return _message(  # the centre of rotation is the point without velocity
         [turning.name],
         f"the moment of its load: it can turn about ({x - vy:.4g}, {y + vx:.4g}) m",
     )
 
 
-def _text(names: list[str], what: str) -> str:
+def _message(names: list[str], what: str) -> str:
     who = "bodies" if len(names) > 1 else "body"
     return (
         f"{who} {' and '.join(map(repr, names))}: nothing balances {what}; expected a "

@@ -1,4 +1,4 @@
-"""Elastic bodies that may touch: everything about a contact problem but its rows."""
+"""Elastic bodies in contact: all data of a contact problem except its contact rows."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_facets, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """Two sides that may touch."""
+    """A pair of sides that may touch."""
 
     slave: Nodes  #: chain of nodes; each may get a contact row
     master: Nodes  #: chain of nodes, its body on the left; empty for a rigid one
@@ -38,22 +38,22 @@ class ContactPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactSides:
-    """The sides of bodies that may touch, and nothing else of the bodies."""
+    """The contact sides of bodies, without the bodies' interior."""
 
-    mesh: Mesh  #: their nodes, without cells, m
+    mesh: Mesh  #: nodes of the sides, m; no cells
     body_of_node: NDArray[np.int64]  #: (N,)
     names: tuple[str, ...]  #: of all bodies
     pairs: tuple[ContactPair, ...]
-    length: float  #: l, m, as of `Bodies`
-    force: float  #: F₀, N/m, as of `Bodies`
+    length: float  #: l, unit of length of `Bodies`, m
+    force: float  #: F₀, unit of force of `Bodies`, N/m
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class UnassembledBodies:
-    """Bodies numbered one after another, their supports, load and contact sides.
+    """Bodies without their stiffness: mesh, materials, supports, load, contact sides.
 
-    f and the moduli are non-dimensional: lengths by `length`, forces per thickness by
-    `force`.
+    Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
+    divided by `length`, forces per thickness by `force`.
 
     Raises
     ------
@@ -63,14 +63,14 @@ class UnassembledBodies:
     """
 
     mesh: Mesh  #: of all bodies, m
-    body: NDArray[np.int64]  #: (E,) of each cell
+    body: NDArray[np.int64]  #: (E,) body of each cell
     names: tuple[str, ...]
     materials: tuple[Material, ...]
     plane: Plane | None  #: None in space
-    length: float  #: l, m
-    force: float  #: F₀, N/m
-    f: Vector  #: (n,) full load
-    B_D: csr_array  #: (m_E, n) one unit entry per prescribed component
+    length: float  #: l, unit of length, m
+    force: float  #: F₀, unit of force, N/m
+    f: Vector  #: (n,) full load of eq. (1)
+    B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
     pairs: tuple[ContactPair, ...]  #: sides that may touch
 
     def __post_init__(self) -> None:
@@ -86,13 +86,13 @@ class UnassembledBodies:
 
     @property
     def interface(self) -> Nodes:
-        """Displacement components that contact rows can touch, ascending."""
+        """Displacement components with entries in contact rows, ascending."""
         sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
         return np.unique(dofs_of(np.concatenate(sides), self.mesh.dim))
 
     @property
     def rigid(self) -> NDArray[np.float64]:
-        """Orthonormal rigid motions of every body on its own, (n, r bodies)."""
+        """Orthonormal rigid motions of each body, ignoring supports, (n, r bodies)."""
         return np.asarray(block_diag(*map(rigid_modes, self.points_of_bodies)))
 
     @property
@@ -103,9 +103,9 @@ class UnassembledBodies:
 
     @property
     def mesh_size(self) -> float:
-        """Mean distance of neighbours on the slave sides, in lengths `length`.
+        """Mean distance between neighbouring nodes of the slave sides, over `length`.
 
-        Where there are none, on all sides.
+        Without contact pairs, the mean over the whole boundary.
         """
         mesh, slaves = self.mesh, [pair.slave for pair in self.pairs]
         chains = slaves or boundary_facets(mesh.cells, mesh.dim)
@@ -120,7 +120,7 @@ class UnassembledBodies:
 
     @property
     def moduli(self) -> Vector:
-        """Young's modulus of each body, (bodies,), as K has it: without dimension."""
+        """Young's modulus of each body, (bodies,), non-dimensional as in K."""
         return np.array([m.E for m in self.materials]) * (self.length / self.force)
 
     @property
@@ -131,9 +131,9 @@ class UnassembledBodies:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Bodies(UnassembledBodies):
-    """Bodies with their stiffness, non-dimensional: K' = K·l/F₀ and u' = u/l."""
+    """Bodies with their stiffness matrix, non-dimensional: K' = K·l/F₀, u' = u/l."""
 
-    K: csc_array  #: (n, n)
+    K: csc_array  #: (n, n) stiffness matrix of eq. (1)
 
 
 def assemble(
@@ -152,51 +152,51 @@ def assemble(
 
     Parameters
     ----------
-    body : (E,) of each cell
-    names, materials : per body
-    units : (l, F₀) of the non-dimensional QPs, m and N/m
+    body : (E,) body of each cell
+    names, materials : one per body
+    units : (l, F₀), the units of the non-dimensional QPs, m and N/m
     fixed : displacement components that are zero
     load : (n,) nodal forces: N/m in the plane, N in space
 
     """
     length, force = units
-    return assembled(
+    return assemble_stiffness(
         UnassembledBodies(
             mesh=mesh, body=body, names=names, materials=materials, plane=plane,
             length=length, force=force, f=load / force,
-            B_D=supports(mesh, fixed), pairs=pairs,
+            B_D=support_rows(mesh, fixed), pairs=pairs,
         )
     )  # fmt: skip
 
 
-def supports(mesh: Mesh, fixed: Nodes) -> csr_array:
-    """Return the rows (m_E, n) of prescribed components."""
+def support_rows(mesh: Mesh, fixed: Nodes) -> csr_array:
+    """Return B_D (m_E, n), the rows of prescribed components."""
     return csr_array(eye_array(mesh.dofs, format="csr")[fixed])
 
 
-def assembled(bodies: UnassembledBodies) -> Bodies:
-    """Assemble their stiffness."""
-    known = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
+def assemble_stiffness(bodies: UnassembledBodies) -> Bodies:
+    """Return the bodies with their stiffness matrix assembled."""
+    data = {part.name: getattr(bodies, part.name) for part in fields(bodies)}
     D = bodies.elasticity * (bodies.length / bodies.force)
-    return Bodies(**known, K=stiffness(bodies.mesh, D, bodies.body))
+    return Bodies(**data, K=stiffness(bodies.mesh, D, bodies.body))
 
 
-def floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
-    """Factorise K with all its rigid modes, as Dirichlet rows in B need it.
+def factorise_floating(bodies: Bodies, *, condense: bool = True) -> GeneralisedInverse:
+    """Factorise K with all its rigid modes, for duals with Dirichlet rows in B.
 
-    Condensed onto what constraints can touch, or else (the paper's way) with one solve
-    per constraint row of each load step.
+    condense : compute (K⁺)_cc on the components c with entries in B once; otherwise, as
+        in the paper, BK⁺Bᵀ of eq. (3) takes one solve per row of B in each load step
     """
     parts = bodies.points_of_bodies
     kernels = [rigid_modes(part) for part in parts]
     fixing = [dofs_of(fixing_nodes(part), bodies.mesh.dim) for part in parts]
-    touched = np.union1d(bodies.interface, bodies.B_D.indices)
-    interface = Interface(touched, bodies.mesh.points) if condense else None
+    constrained = np.union1d(bodies.interface, bodies.B_D.indices)
+    interface = Interface(constrained, bodies.mesh.points) if condense else None
     return floating_inverse(bodies.K, kernels, fixing, interface)
 
 
-def clamped(bodies: Bodies) -> GeneralisedInverse:
-    """Factorise K without the prescribed components, which must hold every body.
+def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
+    """Factorise K without the prescribed components, which must fix every body.
 
     Raises
     ------
@@ -204,20 +204,24 @@ def clamped(bodies: Bodies) -> GeneralisedInverse:
         When a rigid motion of some body is left.
 
     """
-    held = bodies.B_D.indices
+    prescribed = bodies.B_D.indices
     # not left to the factorisation: rounding may make a singular K look regular
-    if np.linalg.matrix_rank(bodies.rigid[held]) < bodies.rigid.shape[1]:
+    if np.linalg.matrix_rank(bodies.rigid[prescribed]) < bodies.rigid.shape[1]:
         raise InputError(
             "the supports leave a rigid motion of some body, so dual-bounds does not "
             "exist; expected form primal or dual"
         )
-    free = np.setdiff1d(np.arange(bodies.mesh.dofs), held)
+    free = np.setdiff1d(np.arange(bodies.mesh.dofs), prescribed)
     interface = Interface(bodies.interface, bodies.mesh.points)
     return regular_inverse(bodies.K, free, interface)
 
 
-def supported(bodies: Bodies) -> GeneralisedInverse:
-    """Factorise K without the prescribed components, and what else a body needs."""
+def factorise_supported(bodies: Bodies) -> GeneralisedInverse:
+    """Factorise K without the prescribed components; bodies may float.
+
+    Further components are fixed where the supports leave rigid motions, see
+    `problems.fem.inverse.supported_inverse`.
+    """
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
     interface = Interface(bodies.interface, bodies.mesh.points)
     return supported_inverse(bodies.K, free, bodies.rigid, interface)

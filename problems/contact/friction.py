@@ -1,17 +1,17 @@
-"""Laws of friction, and the rows of one problem with a given bound.
+"""Laws of friction, their discretisation, and the fixed point of Coulomb's law.
 
-On a side that slips the tangential traction is as large as the law allows, against the
-slip; on one that sticks it is smaller, and there is no slip:
+The tangential traction q is bounded. Where the sides slip, q opposes the slip and is at
+its bound; where |q| is smaller, they stick:
 
     |q| ≤ bound + mu·p
 
-with a given bound (Tresca) or the pressure p (Coulomb). A row of the discretisation
-carries a force: its bound is that of the traction times the share of the side, ∫N_j,
-that it stands for, and mu times the multiplier of its contact row.
+with a constant `bound` (Tresca) or a multiple of the pressure p (Coulomb). A discrete
+row carries a force λ_t with  |λ_t| ≤ g = bound·∫N_j + mu·λ_n,  where ∫N_j is the length
+of slave side that belongs to its node and λ_n the multiplier of its contact row.
 
-Coulomb's law has no potential. It is solved as a sequence of Tresca's, each with the
-bound mu·λ_n of the one before (Haslinger 1983, Math. Methods Appl. Sci. 5): a fixed
-point, and a contraction where mu is small.
+Coulomb's law has no potential. It is solved by fixed-point iteration over problems of
+Tresca's type, each with the bound g = mu·λ_n of its predecessor's solution (Haslinger
+1983, Math. Methods Appl. Sci. 5), a contraction for small mu.
 """
 
 from __future__ import annotations
@@ -31,27 +31,33 @@ from mortarbench.problems.fem.mesh import Nodes
 
 T = TypeVar("T")
 
-SETTLED = 1e-10  #: ‖g − mu·λ_n‖/‖g‖ at the end of a fixed point
-MOST_ITERATES = 1000  #: Tresca problems of a fixed point
-PATIENCE = 30  #: of them that need not come nearer to it
+#: residual ‖g − mu·λ_n‖/‖g‖ at which the fixed point counts as converged
+FIXED_POINT_TOLERANCE = 1e-10
+MAX_ITERATES = 1000  #: Tresca problems per fixed point
+#: Tresca problems without a new smallest residual before the iteration is given up
+MAX_STAGNATION = 30
 
 
 @dataclass(frozen=True)
 class FrictionLaw:
-    """The law between two sides: |q| ≤ bound + mu·p, or no friction at all."""
+    """The law between two sides, |q| ≤ bound + mu·p; by default no friction.
+
+    >>> FrictionLaw("coulomb", mu=0.3).acts
+    True
+    """
 
     kind: str = "none"  #: "none", "tresca" or "coulomb"
-    bound: float = 0.0  #: of Tresca's, a traction, Pa
-    mu: float = 0.0  #: of Coulomb's, the coefficient
+    bound: float = 0.0  #: bound of Tresca's law on the traction, Pa
+    mu: float = 0.0  #: coefficient of Coulomb's law
 
     @property
     def acts(self) -> bool:
-        """Whether there is friction; with a bound of zero, too."""
+        """True for a law other than "none", even with a bound of zero."""
         return self.kind != "none"
 
 
 def law_of(params: Mapping[str, Any]) -> FrictionLaw:
-    """Read the keys friction, bound and mu of a case, checked already."""
+    """Return the law of the keys friction, bound and mu, which were checked before."""
     kind = str(params["friction"])
     return FrictionLaw(
         kind,
@@ -64,17 +70,17 @@ def friction_of(
     bodies: UnassembledBodies | ContactSides,
     rows: ContactRows,
     laws: Sequence[FrictionLaw],
-    before: Vector,
-    pressed: Vector,
+    slip_origin: Vector,
+    normal_forces: Vector,
 ) -> Friction:
-    """Take the friction of linearised contact, without dimensions.
+    """Return the discrete friction of linearised contact, non-dimensional.
 
     Parameters
     ----------
     laws : one per pair
-    before : (n,) displacement where the slip begins
-    pressed : (places,) normal force of each slave node, which Coulomb's law bounds
-        friction by
+    slip_origin : (n,) displacement from which slip is measured
+    normal_forces : (places,) normal force of each slave node, for the bound of
+        Coulomb's law
 
     """
     if not rows.row.size:
@@ -87,63 +93,63 @@ def friction_of(
     )
     cohesion = bound * rows.share[rows.row] / bodies.force
     return Friction(
-        T=rows.T, bound=cohesion + mu * pressed[place], start=rows.T @ before,
-        row=rows.row, cohesion=cohesion, mu=mu,
+        T=rows.T, bound=cohesion + mu * normal_forces[place],
+        start=rows.T @ slip_origin, row=rows.row, cohesion=cohesion, mu=mu,
     )  # fmt: skip
 
 
-def settled(
+def coulomb_fixed_point(
     first: Friction, normal: Callable[[Friction], Vector], step: int
 ) -> list[Friction]:
-    """Settle Coulomb's law: the friction of each problem of its fixed point.
+    """Iterate to the fixed point of Coulomb's law; return the friction of each problem.
 
-    All but the last say how far they are from it, `Friction.unsettled`.
+    The residuals of all but the last are stored as `Friction.unsettled`.
 
     Parameters
     ----------
-    first : with the bound that it begins from
-    normal : solves the problem with the bound of a friction, and returns the
-        multipliers λ_n (m,) of the contact rows
-    step : number of the load step, which refusals name
+    first : friction with the initial bound
+    normal : solves the problem with the bound of a friction; returns the multipliers
+        λ_n (m,) of the contact rows
+    step : number of the load step, for messages
 
     Raises
     ------
     InputError
-        When the bounds do not settle, or hold no equilibrium: `normal` raises
-        ArithmeticError.
+        When the iteration does not converge, or `normal` raises ArithmeticError since
+        no equilibrium exists with some bound.
 
     """
-    found, residuals, friction = list[Friction](), list[float](), first
-    while len(found) < MOST_ITERATES:
+    iterates, residuals, friction = list[Friction](), list[float](), first
+    while len(iterates) < MAX_ITERATES:
         try:
             forces = normal(friction)
         except ArithmeticError as e:
             raise InputError(
-                f"load step {step}: no equilibrium was found with the "
-                f"{len(found) + 1}. bound of Coulomb's law: friction cannot hold the "
+                f"load step {step}: no equilibrium was found with bound "
+                f"{len(iterates) + 1} of Coulomb's law: friction cannot hold the "
                 f"load; expected supports or friction that hold the bodies: {e}"
             ) from None
         residuals.append(friction.residual(forces))
-        if residuals[-1] <= SETTLED:
-            return [*found, friction]
-        found.append(replace(friction, unsettled=residuals[-1]))
-        if len(found) - int(np.argmin(residuals)) > PATIENCE:
+        if residuals[-1] <= FIXED_POINT_TOLERANCE:
+            return [*iterates, friction]
+        iterates.append(replace(friction, unsettled=residuals[-1]))
+        if len(iterates) - int(np.argmin(residuals)) > MAX_STAGNATION:
             break
-        friction = replace(friction, bound=friction.demanded(forces))
+        friction = replace(friction, bound=friction.demanded(forces))  # g ← mu·λ_n
     raise InputError(
-        f"the friction of load step {step} does not settle: after {len(found)} Tresca "
-        f"problems ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
+        f"Coulomb's law does not converge in load step {step}: after {len(iterates)} "
+        f"Tresca problems, ‖g − mu·λ_n‖/‖g‖ is {residuals[-1]:.1e}, and was "
         f"{min(residuals):.1e} at best; expected a smaller mu, or friction=tresca"
     )
 
 
-def iterate_of(problems: Sequence[T], iterate: int, step: int) -> T:
-    """Choose a problem of the fixed point of a load step: 1, 2, …; 0 is the last.
+def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
+    """Return an iterate of the fixed point of a load step: 1, 2, …; 0 is the last.
 
     Raises
     ------
     PastEndError
-        When there are fewer.
+        When the fixed point has fewer iterates.
 
     """
     if iterate > len(problems):
@@ -155,14 +161,15 @@ def iterate_of(problems: Sequence[T], iterate: int, step: int) -> T:
 
 
 def forces_at_nodes(normal: Vector, place: Nodes, places: int) -> Vector:
-    """Return the normal force (places,) of each slave node; zero without a row.
+    """Return the normal force (places,) of each slave node; zero for nodes without row.
 
     Parameters
     ----------
     normal : (m,) multipliers of the contact rows
-    place : (m,) slave node of each, see `ContactRows`
+    place : (m,) slave node of each row, see `ContactRows`
 
     """
     force = np.zeros(places)
+    # solutions to a tolerance may have multipliers below zero, bounds must not
     force[place] = np.maximum(normal, 0.0)
     return force

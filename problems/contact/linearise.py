@@ -1,4 +1,4 @@
-"""The contact rows of a set of bodies by the method that the keys of a case name."""
+"""Contact rows of several pairs, by the method that the keys of a case select."""
 
 from __future__ import annotations
 
@@ -29,28 +29,33 @@ def linearisation(
     contact: str,
     basis: Any,
     laws: Sequence[FrictionLaw] = (),
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> Callable[[Vector], ContactRows]:
-    """Return the map from a displacement (n,) in m to the rows of all pairs.
+    """Return the map from a displacement (n,) in m to the contact rows of all pairs.
 
-    It raises InputError where at u = 0 there is no row at all.
+    The map raises InputError when it yields no row at u = 0.
 
-    laws : of friction, one per pair; none for no friction at all
-    kept : of node-to-segment contact: see `closest_segments`; −1 for the closest one
+    contact : "nts" (node to segment) or "mortar"
+    basis : of the multipliers of mortar contact, "dual" or "standard"
+    laws : law of friction of each pair; empty: no friction
+    fixed_segments : (places,) for node-to-segment contact, the segment of each slave
+        node as in `closest_segments`; −1: the closest one at each u
     """
     pairs = len(bodies.pairs)
     methods: list[Callable[..., ContactRows]] = [
         node_to_segment if contact == "nts" else partial(mortar, basis=basis)
     ] * pairs
-    if kept is not None:
-        parts = _of_pairs(bodies, kept)
-        methods = [partial(node_to_segment, kept=part) for part in parts]
-    rough = [law.acts for law in laws] or [False] * pairs
+    if fixed_segments is not None:
+        parts = _split_by_pair(bodies, fixed_segments)
+        methods = [partial(node_to_segment, fixed_segments=part) for part in parts]
+    has_friction = [law.acts for law in laws] or [False] * pairs
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
             rows(bodies.mesh.points, u, *pair, tangential=tangential)
-            for rows, pair, tangential in zip(methods, bodies.pairs, rough, strict=True)
+            for rows, pair, tangential in zip(
+                methods, bodies.pairs, has_friction, strict=True
+            )
         ]
         if not any(part.c.size for part in parts) and not u.any():
             raise InputError(
@@ -59,18 +64,19 @@ def linearisation(
             )
         if len(parts) == 1:
             return parts[0]
-        before = np.cumsum([0, *(part.c.size for part in parts)])
-        chains = np.cumsum([0, *(pair.slave.size for pair in bodies.pairs)])
+        # rows and slave nodes are numbered pair by pair
+        first_row = np.cumsum([0, *(part.c.size for part in parts)])
+        first_place = np.cumsum([0, *(pair.slave.size for pair in bodies.pairs)])
         return ContactRows(
             B=csr_array(vstack([part.B for part in parts])),
             c=np.concatenate([part.c for part in parts]),
             T=csr_array(vstack([part.T for part in parts])),
             row=np.concatenate(
-                [p.row + k for p, k in zip(parts, before, strict=False)]
+                [p.row + k for p, k in zip(parts, first_row, strict=False)]
             ),
             share=np.concatenate([part.share for part in parts]),
             place=np.concatenate(
-                [p.place + k for p, k in zip(parts, chains, strict=False)]
+                [p.place + k for p, k in zip(parts, first_place, strict=False)]
             ),
         )
 
@@ -78,50 +84,54 @@ def linearisation(
 
 
 def contact_stiffness(
-    bodies: Bodies, kept: Nodes | None = None
+    bodies: Bodies, fixed_segments: Nodes | None = None
 ) -> Callable[[Vector, Vector], tuple[NDArray[np.float64], Nodes]]:
     """Return the map from u (n,) in m and λ (m,) in N/m to the blocks −λ_i g_i''(u).
 
-    The rows are those of node-to-segment contact, one for every slave node, see
-    `problems.contact.node_to_segment.geometric_stiffness`.
+    The rows are those of node-to-segment contact, one per slave node; the blocks are
+    those of `problems.contact.node_to_segment.geometric_stiffness`.
 
-    kept : as of `linearisation`
+    fixed_segments : see `linearisation`
     """
-    segments = [None] * len(bodies.pairs) if kept is None else _of_pairs(bodies, kept)
+    segments = (
+        [None] * len(bodies.pairs)
+        if fixed_segments is None
+        else _split_by_pair(bodies, fixed_segments)
+    )
 
     def blocks(u: Vector, multipliers: Vector) -> tuple[NDArray[np.float64], Nodes]:
-        forces = _of_pairs(bodies, multipliers)
-        found = [
+        forces = _split_by_pair(bodies, multipliers)
+        per_pair = [
             geometric_stiffness(bodies.mesh.points, u, *pair, force, own)
             for pair, force, own in zip(bodies.pairs, forces, segments, strict=True)
         ]
-        values, components = zip(*found, strict=True)
+        values, components = zip(*per_pair, strict=True)
         return np.concatenate(values), np.concatenate(components)
 
     return blocks
 
 
 def closest_segments(bodies: Bodies, u: Vector) -> Nodes:
-    """Find for each slave node of all pairs the closest segment of its master.
+    """Return the closest master segment of each slave node of all pairs.
 
     u : (n,) displacement, m
 
     Returns
     -------
-    (places,) first nodes of the segments, as places in the chains of the masters
+    (places,) first node of each segment, as a position in its master's chain
 
     """
-    found = []
+    segments = []
     for pair in bodies.pairs:
         x = current_positions(bodies.mesh.points, u, pair.slave, "slave")
         line = current_surface(bodies.mesh.points, u, pair.master, "master")
-        found.append(closest_points(x, line).segment)
-    return np.concatenate(found)
+        segments.append(closest_points(x, line).segment)
+    return np.concatenate(segments)
 
 
-def _of_pairs(
+def _split_by_pair(
     bodies: UnassembledBodies | ContactSides, values: NDArray[Any]
 ) -> list[NDArray[Any]]:
-    """Split what there is one of per slave node by the pairs."""
+    """Split an array with one entry per slave node into one array per pair."""
     ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]
     return np.split(values, ends)

@@ -2,55 +2,55 @@
 
 Source: Popp, Gee and Wall, "A finite deformation mortar contact formulation using a
 primal-dual active set strategy", Int. J. Numer. Meth. Engng 79 (2009) 1354-1391; for
-slave elements covered in part: Popp, Seitz, Gee and Wall, Comput. Methods Appl. Mech.
-Engrg. 264 (2013) 67-80; "normal field" and "ray" are our words.
+partly covered slave elements: Popp, Seitz, Gee and Wall, Comput. Methods Appl. Mech.
+Engrg. 264 (2013) 67-80. The terms "normal field" and "ray" are used here only.
 
 On the slave segment between the nodes 1 and 2 let ξ ∈ [−1, 1], N_1 = (1 − ξ)/2,
 N_2 = (1 + ξ)/2, and let ν(ξ) = N_1 n_1 + N_2 n_2 interpolate the averaged normals of
 the nodes. The ray from x(ξ) along n = ν/|ν| meets the master at x(ξ) + g n, which
 defines the gap g(ξ) (positive: open) and the master's shape functions N^m_l(ξ) there.
-The contact traction is Σ λ_j Φ_j ν, the impenetrability holds in the weak sense
-∫ Φ_j |ν| g ≥ 0, and linearised with rays and normals held it is, for every slave node
-j,
+The contact traction is Σ λ_j Φ_j ν, and the weak non-penetration condition is
+∫ Φ_j |ν| g ≥ 0. Linearised at u^k with fixed rays and normals, it reads for every slave
+node j
 
-    Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + the same of u^k,
+    Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + (the left-hand side at u^k),
     D_jk = ∫ Φ_j N_k ν,   M_jl = ∫ Φ_j N^m_l ν,   g̃_j = ∫ Φ_j |ν| g.
 
 *Balance.* At every Gauss point a row pulls the slave by Φ_j ν at x(ξ) and the master by
-−Φ_j ν at x(ξ) + g n, on the same line. So the forces of a row balance and have no
-moment, to rounding, on curved sides as well. (With n_j outside of the integrals the
-moments are O(h²). A body that contact alone holds then turns until a row far from the
-contact, at the end of an arc, balances those of the rows that press.) That ν is not
-normalised is a weight of 1 − O(h²). The integrals for D are of polynomials with it,
-which the Gauss points integrate exactly: no division of the slave by the master's nodes
-changes D, and a row of the dual basis pulls the slave along n_j.
+−Φ_j ν at x(ξ) + g n, on the same line. So the forces of a row are in equilibrium and
+have no moment, up to rounding, on curved sides as well. (With n_j outside the integrals
+the moments are O(h²). A body supported by contact alone then rotates until a row far
+from the contact, at the end of an arc, balances the moments of the active rows.) Not
+normalising ν amounts to a weight of 1 − O(h²). The integrands of D are then
+polynomials, which the Gauss points integrate exactly: D does not depend on where the
+master's nodes divide the slave, and a row of the dual basis pulls the slave along n_j.
 
 The integrals run over the part of the slave that the master covers. They are sums over
-*integration segments*, the overlap of one slave with one master segment, where the
-integrand is smooth: three Gauss points each.
+*integration segments*, the overlaps of one slave with one master segment, where the
+integrand is smooth, with three Gauss points each.
 
 *Overlap.* A point p lies on the ray of ξ if f(ξ) = (x(ξ) − p) × (N_1 n_1 + N_2 n_2)
 vanishes, a quadratic of ξ. The rays of the two nodes enclose the points with
-f(−1) ≥ 0 ≥ f(1) (on the near side of the point where they meet); the master segment is
-clipped by these two lines, and the ends of what is left are projected by the one root
-that then lies in [−1, 1].
+f(−1) ≥ 0 ≥ f(1) (on the near side of their intersection). The master segment is clipped
+by these two lines, and its remaining ends are projected by the unique root of f in
+[−1, 1].
 
 *Basis.* "standard" is Φ_j = N_j. "dual" is biorthogonal on the covered part of each
-segment, ∫ Φ_j N_k = δ_jk ∫ N_k, so that D is diagonal on straight sides, and on curved
-ones but for O(h). With the mean ξ̄ and the variance v of ξ over the covered part, and
-N̄_j = N_j(ξ̄), the one linear solution is
+segment, ∫ Φ_j N_k = δ_jk ∫ N_k, so that D is diagonal on straight sides, and diagonal
+up to O(h) on curved ones. With the mean ξ̄ and the variance v of ξ over the covered
+part, and N̄_j = N_j(ξ̄), the only linear solution is
 
     Φ_1 = N̄_1 − κ (ξ − ξ̄),   Φ_2 = N̄_2 + κ (ξ − ξ̄),   κ = 2 N̄_1 N̄_2 / v
 
 (for a fully covered segment 2N_1 − N_2 and 2N_2 − N_1).
 
-The tangential rows of friction are the same with (−ν_y, ν_x) for ν; across a gap their
-forces have a moment. A constant bound of the traction is multiplied by ∫ N_j |ν| for
-each row, with either basis.
+The tangential rows of friction have (−ν_y, ν_x) in place of ν; across an open gap their
+forces have a moment. With either basis, the bound of a row is the constant bound of the
+traction times ∫ N_j |ν|.
 
-Each row is divided by ∫ N_j |ν| over the covered part: so B is dimensionless, g̃ a
-length, and λ a nodal force per thickness as with node-to-segment, up to O(h²) on curved
-sides.
+Each row is divided by ∫ N_j |ν| over the covered part. Thus B is dimensionless, g̃ a
+length, and λ a nodal force per thickness as in node-to-segment contact, up to O(h²) on
+curved sides.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ from scipy.sparse import coo_array, csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.segment_search import Reach, facing
+from mortarbench.problems.contact.segment_search import Reach, facing_segments
 from mortarbench.problems.contact.surface import (
     Points,
     Surface,
@@ -74,10 +74,12 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-#: shorter integration segments, in ξ, are noise of the projection and are left out
-NEGLIGIBLE = 1e-8
-#: normals of a straight side differ by as much
-ROUNDED = 4 * np.finfo(float).eps
+#: integration segments shorter than this, in ξ, are rounding of the projection and are
+#: left out
+MIN_SEGMENT = 1e-8
+#: averaged normals of a straight side differ by at most this: smaller components of
+#: ν − n_j count as zero, so that B is as sparse there as with one normal
+NORMAL_ROUNDING = 4 * np.finfo(float).eps
 ABSCISSAE, WEIGHTS = np.polynomial.legendre.leggauss(3)
 
 Basis = Literal["dual", "standard"]
@@ -85,27 +87,27 @@ Basis = Literal["dual", "standard"]
 
 @dataclass(frozen=True, eq=False)
 class Mortar:
-    """Mortar integrals of a pair of sides, numbered along their chains.
+    """Mortar integrals of a pair of sides, with nodes numbered along their chains.
 
-    The columns of D and M are components of displacement, see `dofs_of`.
+    The columns of D and M are displacement components in the order of `dofs_of`.
     """
 
     D: csr_array  #: (s, 2s) ∫ Φ_j N_k ν, m
     M: csr_array  #: (s, 2v) ∫ Φ_j N^m_l ν, m
     gap: Vector  #: (s,) g̃_j = ∫ Φ_j |ν| g, m²
-    cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 where no master is in reach
+    cover: Vector  #: (s,) ∫ N_j |ν|, m; 0 for nodes without a master within reach
 
 
 class Overlaps(NamedTuple):
-    """Integration segments: where a master segment covers a slave segment."""
+    """Integration segments: overlaps of slave segments with master segments."""
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
-    xi: NDArray[np.float64]  #: (p, 2) ends on the slave segment, ascending
+    xi: NDArray[np.float64]  #: (p, 2) ends in ξ of the slave segment, ascending
 
 
 class GaussPoints(NamedTuple):
-    """Quadrature on the integration segments."""
+    """Gauss points of the integration segments."""
 
     slave: Nodes  #: (p,) slave segment, ascending
     master: Nodes  #: (p,) master segment
@@ -126,7 +128,7 @@ def mortar(
     reach: Reach = Reach(),  # noqa: B008 - frozen
     tangential: bool = False,
 ) -> ContactRows:
-    """Linearise the weak non-penetration of two sides at u; one row per covered node.
+    """Linearise the weak non-penetration condition at u, with a row per covered node.
 
     Parameters
     ----------
@@ -134,10 +136,10 @@ def mortar(
     u : (2N,) displacement u^k at which to linearise, m
     slave, master : (s,), (v,) chains of nodes, their bodies on the left
     basis : of the multiplier, "dual" or "standard"
-    reach : which integration segments count. Without the limit on the angle, rays that
-        graze a far master give the dual basis, which is negative in places, negative
-        weighted gaps between bodies that are apart
-    tangential : whether friction needs tangential rows
+    reach : limits of angle and distance of integration segments. Without a limit on the
+        angle, rays can graze a distant master; as the dual basis is negative in places,
+        weighted gaps would then be negative between bodies that are apart
+    tangential : add tangential rows for friction
 
     Raises
     ------
@@ -150,7 +152,7 @@ def mortar(
     integrals = integrate(s, m, basis, reach)
     j = np.flatnonzero(integrals.cover)
     B = _rows(integrals, j, (slave, master), points.shape)
-    T = _turned(B if tangential else B[:0])
+    T = _rotated(B if tangential else B[:0])
     return ContactRows(
         B, integrals.gap[j] / integrals.cover[j] + B @ u,
         T, np.arange(T.shape[0]), integrals.cover[j], j,
@@ -158,25 +160,27 @@ def mortar(
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
-    """Compute D, M and the weighted gaps."""
-    at = cast_rays(slave, master, overlaps(slave, master), reach)
-    N = _shape(at.xi)
-    phi = _dual(at) if basis == "dual" else N
+    """Integrate D, M, the weighted gaps and the covered lengths."""
+    gauss = cast_rays(slave, master, overlaps(slave, master), reach)
+    N = _shape(gauss.xi)
+    phi = _dual(gauss) if basis == "dual" else N
     s, v = len(slave.x), len(master.x)
-    j, k = slave.facets[at.slave], master.facets[at.master]  # (p, 2) nodes
-    weighted = phi * at.weight[..., None]  # (p, 3, 2)
+    j, k = slave.facets[gauss.slave], master.facets[gauss.master]  # (p, 2) nodes
+    weighted = phi * gauss.weight[..., None]  # (p, 3, 2)
     overlap = np.einsum("pgj,pgk->pjk", weighted, N)
-    if basis == "dual":  # what cancels in sums over the segments, left out
+    if basis == "dual":  # summed over a slave segment, ∫Φ_jN_k = δ_jk ∫Φ_j exactly
         overlap = np.eye(2) * weighted.sum(axis=1)[:, None]
-    own = slave.node_normal[j]  # (p, 2, 2)
-    bent = at.field[:, :, None] - own[:, None]  # ν − n_j
-    bent[np.abs(bent) <= ROUNDED] = 0
-    D = overlap[..., None] * own[:, :, None]
-    D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * bent, N)
-    pull = weighted[..., None] * at.field[:, :, None]  # (p, 3, 2, 2)
-    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * at.beta - 1))
-    measure = at.weight * np.linalg.norm(at.field, axis=-1)
-    gap = np.einsum("pgj,pg->pj", phi, measure * at.gap)
+    # ∫Φ_j N_k ν = n_j ∫Φ_j N_k + ∫Φ_j N_k (ν − n_j)
+    n_j = slave.node_normal[j]  # (p, 2, 2)
+    deviation = gauss.field[:, :, None] - n_j[:, None]
+    deviation[np.abs(deviation) <= NORMAL_ROUNDING] = 0
+    D = overlap[..., None] * n_j[:, :, None]
+    D += np.einsum("pgjx,pgk->pjkx", weighted[..., None] * deviation, N)
+    # M with the same ν and weights as D, so that the forces of a row balance
+    pull = weighted[..., None] * gauss.field[:, :, None]  # (p, 3, 2, 2)
+    M = np.einsum("pgjx,pgl->pjlx", pull, _shape(2 * gauss.beta - 1))
+    measure = gauss.weight * np.linalg.norm(gauss.field, axis=-1)
+    gap = np.einsum("pgj,pg->pj", phi, measure * gauss.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
     return Mortar(
         _sum(D, j, j, (s, s)), _sum(M, j, k, (s, v)),
@@ -185,38 +189,45 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
 
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:
-    """Find the integration segments, before any filter."""
-    e, m = facing(slave, master)
+    """Return all integration segments, without limits of angle and distance."""
+    e, m = facing_segments(slave, master)
     nodes = slave.facets.T[:, e]
     x, n = slave.x[nodes], slave.node_normal[nodes]  # (2, p, 2)
     A, B = master.start[m], master.end[m]
+    # the part [low, high] of the master segment AB between the lines along the normals
     low, high = np.zeros(len(e)), np.ones(len(e))
     for side, (x_j, n_j) in zip((1.0, -1.0), zip(x, n, strict=True), strict=True):
         f_A, f_B = side * cross(x_j - A, n_j), side * cross(x_j - B, n_j)  # ≥ 0 inside
-        splits = (f_A < 0) != (f_B < 0)
+        splits = (f_A < 0) != (f_B < 0)  # the line crosses AB, at `place`
         place = f_A / np.where(splits, f_A - f_B, 1.0)
+        # a segment that is outside as a whole becomes empty: low = 1, high = 0
         low = np.where(f_A < 0, np.where(splits, np.maximum(low, place), 1.0), low)
         high = np.where(f_B < 0, np.where(splits, np.minimum(high, place), 0.0), high)
     ends = np.stack(
         [project(x, n, A + t[:, None] * (B - A)) for t in (low, high)], axis=1
     )
+    # both sides run anticlockwise around their bodies, so that ξ decreases along AB
     ends = np.sort(np.clip(ends, -1.0, 1.0), axis=1)
-    kept = (low < high) & (ends[:, 1] - ends[:, 0] > NEGLIGIBLE)
-    return Overlaps(e[kept], m[kept], ends[kept])
+    valid = (low < high) & (ends[:, 1] - ends[:, 0] > MIN_SEGMENT)
+    return Overlaps(e[valid], m[valid], ends[valid])
 
 
 def project(x: Points, n: Points, p: Points) -> Vector:
-    """Project points p (k, 2) along the normal fields of segments onto these.
+    """Project points p (k, 2) along normal fields onto slave segments; return ξ (k,).
 
-    x and n are (2, k, 2), the ends and their normals. With x(ξ) = x_0 + ξ x_1 and
-    n(ξ) = n_0 + ξ n_1, (x(ξ) − p) × n(ξ) = q_2 ξ² + q_1 ξ + q_0. Returned is the root
-    at which it falls, the only one in [−1, 1] where p lies between the end normals;
-    where no ray meets p it is finite but means nothing.
+    x and n (2, k, 2) are the ends of the segments and the normals there. With
+    x(ξ) = a_0 + p + ξ a_1 and n(ξ) = b_0 + ξ b_1,
+
+        f(ξ) = (x(ξ) − p) × n(ξ) = q_2 ξ² + q_1 ξ + q_0.
+
+    The root returned is the one with f′ ≤ 0, the only root in [−1, 1] where p lies
+    between the lines along the end normals. Where no ray meets p, the value is finite
+    but meaningless.
     """
     a_0, a_1 = (x[0] + x[1]) / 2 - p, (x[1] - x[0]) / 2
     b_0, b_1 = (n[0] + n[1]) / 2, (n[1] - n[0]) / 2
     q_2, q_1, q_0 = cross(a_1, b_1), cross(a_0, b_1) + cross(a_1, b_0), cross(a_0, b_0)
-    # (−q_1 − √…)/(2 q_2) without its cancellation
+    # (−q_1 − √…)/(2 q_2), rewritten: for q_2 → 0 it would cancel
     root = np.sqrt(np.maximum(q_1**2 - 4 * q_2 * q_0, 0.0)) - q_1
     return 2 * q_0 / np.where(root > 0, root, np.inf)
 
@@ -224,7 +235,7 @@ def project(x: Points, n: Points, p: Points) -> Vector:
 def cast_rays(
     slave: Surface, master: Surface, parts: Overlaps, reach: Reach
 ) -> GaussPoints:
-    """Place Gauss points, cast their rays, and leave out the segments out of reach."""
+    """Cast rays from the Gauss points; leave out segments beyond the reach."""
     e, m, ends = parts
     half = (ends[:, 1] - ends[:, 0]) / 2
     xi = ends.mean(axis=1)[:, None] + half[:, None] * ABSCISSAE
@@ -233,33 +244,34 @@ def cast_rays(
     x = slave.start[e][:, None] + N[..., 1:] * edge[:, None]
     field = N[..., :1] * slave.node_normal[j][:, None]
     field += N[..., 1:] * slave.node_normal[k][:, None]
-    n = unit(field, slave.normal[e][:, None])
+    n = unit(field, slave.normal[e][:, None])  # opposite end normals: ν may vanish
 
     A, B = master.start[m][:, None], master.end[m][:, None]
-    f_A, f_B = cross(x - A, n), cross(x - B, n)  # of opposite signs: the ray hits AB
+    f_A, f_B = cross(x - A, n), cross(x - B, n)  # opposite signs: the ray hits AB
     beta = np.clip(f_A / (f_A - f_B), 0.0, 1.0)
     gap = np.einsum("pgx,pgx->pg", A + beta[..., None] * (B - A) - x, n)
 
-    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])  # at the middle
-    kept = (cosine <= reach.cosine) & (
-        np.abs(gap).max(axis=1) <= reach.within(slave, master)
+    cosine = np.einsum("px,px->p", n[:, 1], master.normal[m])  # at the middle point
+    near = (cosine <= reach.cosine) & (
+        np.abs(gap).max(axis=1) <= reach.max_distance(slave, master)
     )
+    # dx = half·|edge|/2 dt on t ∈ [−1, 1]
     weight = WEIGHTS * (half * np.linalg.norm(edge, axis=1) / 2)[:, None]
-    return GaussPoints(*(a[kept] for a in (e, m, xi, beta, field, gap, weight)))
+    return GaussPoints(*(a[near] for a in (e, m, xi, beta, field, gap, weight)))
 
 
-def _dual(at: GaussPoints) -> NDArray[np.float64]:
-    """Evaluate the dual basis of the covered part of each slave segment, (p, 3, 2)."""
-    w = at.weight
-    total = np.bincount(at.slave, w.sum(axis=1))
+def _dual(gauss: GaussPoints) -> NDArray[np.float64]:
+    """Evaluate the dual basis Φ_1, Φ_2 on each slave segment, (p, 3, 2)."""
+    w = gauss.weight
+    total = np.bincount(gauss.slave, w.sum(axis=1))
 
     def mean(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        sums = np.bincount(at.slave, (w * values).sum(axis=1))
-        return (sums[at.slave] / total[at.slave])[:, None]
+        sums = np.bincount(gauss.slave, (w * values).sum(axis=1))
+        return (sums[gauss.slave] / total[gauss.slave])[:, None]
 
-    centre = mean(at.xi)
-    offset = at.xi - centre
-    offset = offset - mean(offset)  # the first mean is rounded, v may be small
+    centre = mean(gauss.xi)
+    offset = gauss.xi - centre
+    offset = offset - mean(offset)  # correct the rounding of ξ̄: v may be tiny
     N = _shape(centre)
     slope = 2 * N[..., 0] * N[..., 1] / mean(offset**2) * offset
     return N + np.stack([-slope, slope], axis=-1)
@@ -273,43 +285,43 @@ def _shape(xi: NDArray[np.float64]) -> NDArray[np.float64]:
 def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
     """Add values (p, 2) at nodes (p, 2) into a vector (count,)."""
     total = np.bincount(nodes.ravel(), values.ravel(), minlength=count)
-    return total.astype(np.float64)  # of no values NumPy makes integers
+    return total.astype(np.float64)  # bincount of an empty array has integers
 
 
 def _sum(
     vectors: NDArray[np.float64], rows: Nodes, nodes: Nodes, shape: tuple[int, int]
 ) -> csr_array:
-    """Add vectors (p, 2, 2, dim) into a matrix at rows (p, 2) × nodes (p, 2).
+    """Assemble vectors (p, 2, 2, dim) at rows (p, 2) × nodes (p, 2) into a matrix.
 
-    shape : counts of rows and nodes; a node has a column for each component
+    shape : numbers of rows and of nodes; each node has dim columns
     """
     dim = vectors.shape[-1]
     i = np.repeat(rows, 2 * dim, axis=1)
     j = np.tile(dofs_of(nodes, dim).reshape(-1, 2 * dim), (1, 2))
-    at = (i.ravel(), j.ravel())
-    return csr_array(coo_array((vectors.ravel(), at), (shape[0], dim * shape[1])))
+    indices = (i.ravel(), j.ravel())
+    return csr_array(coo_array((vectors.ravel(), indices), (shape[0], dim * shape[1])))
 
 
 def _rows(
     integrals: Mortar, j: Nodes, sides: tuple[Nodes, Nodes], shape: tuple[int, int]
 ) -> csr_array:
-    """Build (D u_s − M u_m)_j / cover_j for the slave nodes j as a matrix on u.
+    """Assemble (D u_s − M u_m)_j / cover_j for slave nodes j as a matrix acting on u.
 
-    shape : of all nodes (N, dim)
+    shape : (N, dim) of all nodes
     """
     N, dim = shape
     D, M = integrals.D[j].tocoo(), integrals.M[j].tocoo()
     row = np.concatenate([D.row, M.row])
     slave, master = (dofs_of(side, dim) for side in sides)
-    at = (row, np.concatenate([slave[D.col], master[M.col]]))
+    indices = (row, np.concatenate([slave[D.col], master[M.col]]))
     values = np.concatenate([D.data, -M.data]) / integrals.cover[j][row]
-    B = csr_array(coo_array((values, at), (len(j), N * dim)))
+    B = csr_array(coo_array((values, indices), (len(j), N * dim)))
     B.eliminate_zeros()
     return B
 
 
-def _turned(B: csr_array) -> csr_array:
-    """Turn the vector (x, y) that a row (m, 2N) has at a node to (−y, x)."""
+def _rotated(B: csr_array) -> csr_array:
+    """Rotate the entries (x, y) of each row (m, 2N) at each node to (−y, x)."""
     y = B.indices % 2
     T = csr_array(
         (np.where(y, -B.data, B.data), B.indices + 1 - 2 * y, B.indptr), B.shape

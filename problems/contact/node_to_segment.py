@@ -1,30 +1,31 @@
 """Node-to-segment non-penetration, linearised at a given displacement.
 
-Each slave node is kept on the outer side of the master boundary. With its closest point
-x_c = Σ N_a x_a on the master in the current configuration x = X + u^k and the master's
-outward normal n there, the gap is g = (x_s − x_c)·n (positive: open), and to first
-order in the total displacement u, with slave and parameters held,
+Each slave node must stay on the outer side of the master boundary. With its closest
+point x_c = Σ N_a x_a on the master in the current configuration x = X + u^k and the
+master's outward normal n there, the gap is g = (x_s − x_c)·n (positive: open). To first
+order in the total displacement u, with N_a and n fixed at u^k,
 
     (x_s − x_c)·n ≥ 0    ⟺    B u ≤ c,    B = [−n at s, +N_a n at a],  c = g + B u^k
 
-(the paper's B_M u ≤ c_M; its "Mortar" is this pointwise condition, which fails the
-contact patch test; problems.contact.mortar passes it). The normal is that of the
-segment that holds the closest point, and where that is a vertex the averaged normal of
-the segments that meet. Where the closest point is inside a segment, x_s − x_c ∥ n, and
-the forces Bᵀλ have no moment.
+This is the paper's B_M u ≤ c_M (Section 2). The paper calls the method "Mortar", but
+the condition is pointwise and fails the contact patch test; problems.contact.mortar
+passes it. n is the normal of the segment that contains the closest point, or at a
+vertex the averaged normal of the two segments. Where the closest point is inside a
+segment, x_s − x_c ∥ n, and the forces Bᵀλ have no moment.
 
 Friction acts along the tangent t = (−n_y, n_x), on the tangential motion
 
     T u,    T = [−t at s, +N_a t at a],
 
-so that −Tᵀλ_t are the forces of friction where −Bᵀλ are those of the contact.
+so that the friction forces are −Tᵀλ_t, as the contact forces are −Bᵀλ.
 
-Beyond the end of the master its last node is the closest point, with the normal of the
+Beyond an end of the master, its last node is the closest point, with the normal of the
 last segment.
 
-A slave node may be told to keep a segment: it is kept on the outer side of its whole
-line, wherever the closest point is. At a vertex where the master bends inwards, a node
-may find no rest otherwise: the force of either segment pushes it onto the other one.
+A slave node can be assigned to a fixed segment: it then stays on the outer side of the
+whole line through that segment, wherever its closest point is. Newton's method needs
+this at a re-entrant vertex of the master, where the force of either segment pushes the
+node onto the other one and the closest segment alternates between iterations.
 """
 
 from __future__ import annotations
@@ -47,26 +48,27 @@ from mortarbench.problems.contact.surface import (
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import Nodes, dofs_of, nodal_lengths
 
-ON_VERTEX = 1e-9  #: closest points nearer to a segment's end than this are the vertex
+#: distance in ξ from an end of a segment within which a closest point is the vertex
+VERTEX_TOLERANCE = 1e-9
 
 
 class ContactRows(NamedTuple):
-    """The linear inequalities B u ≤ c on the total displacement u, and its slip T u."""
+    """Linear inequalities B u ≤ c on the total displacement u, and the slip T u."""
 
-    B: csr_array  #: (m_I, n) dimensionless
-    c: Vector  #: (m_I,) m
-    T: csr_array  #: (k, n) tangential rows, of d − 1 directions each; often none
-    row: Nodes  #: (k,) the contact row that each of them belongs to
-    share: Vector  #: (m_I,) of the slave side that a row stands for, ∫N_j, m
-    place: Nodes  #: (m_I,) number of its node in the slave chain
+    B: csr_array  #: (m_I, n) B_M of eq. (5), dimensionless
+    c: Vector  #: (m_I,) c_M of eq. (5), m
+    T: csr_array  #: (k, n) tangential rows, dim − 1 per contact row, or k = 0
+    row: Nodes  #: (k,) contact row of each tangential row
+    share: Vector  #: (m_I,) length ∫N_j of the slave side that belongs to the row, m
+    place: Nodes  #: (m_I,) position of the row's node in the slave chain
 
 
 class ClosestPoints(NamedTuple):
-    """Closest points on a chain of nodes."""
+    """Closest points of s positions on a chain of nodes."""
 
-    segment: Nodes  #: (s,) the closest point lies between this node and the next
-    xi: Vector  #: (s,) its place there, 0 at the first node and 1 at the second
-    normal: Points  #: (s, 2) outward unit normal of the master there
+    segment: Nodes  #: (s,) first node of the segment with the closest point
+    xi: Vector  #: (s,) coordinate on the segment, 0 at its first node, 1 at its second
+    normal: Points  #: (s, 2) outward unit normal of the master at the closest point
 
 
 def node_to_segment(
@@ -76,11 +78,11 @@ def node_to_segment(
     master: Nodes,
     *,
     tangential: bool = False,
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> ContactRows:
-    """Linearise the non-penetration of the slave nodes into the master boundary at u.
+    """Linearise the non-penetration condition of all slave nodes at u.
 
-    Every slave node has a row.
+    Returns one contact row per slave node, see the module's docstring for B, c and T.
 
     Parameters
     ----------
@@ -88,30 +90,32 @@ def node_to_segment(
     u : (n,) displacement u^k at which to linearise, m
     slave : (s,) chain of nodes, its body on the left
     master : (v,) chain of nodes, its body on the left
-    tangential : whether friction needs tangential rows
-    kept : (s,) first node, in the master chain, of the segment that a slave node keeps;
-        −1 where it is the closest one
+    tangential : add tangential rows for friction
+    fixed_segments : (s,) position in the master chain of the first node of each slave
+        node's fixed segment; −1: the closest segment
 
     Raises
     ------
     InputError
-        When a position is not finite or a chain needed has no segment.
+        When a position is not finite or the master has no segment of positive length.
 
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, kept)
-    N = np.stack([1 - at.xi, at.xi], axis=1)
-    ends = np.stack([at.segment, at.segment + 1], axis=1)
+    closest = _projections(x, line, fixed_segments)
+    N = np.stack([1 - closest.xi, closest.xi], axis=1)
+    ends = np.stack([closest.segment, closest.segment + 1], axis=1)
     foot = np.einsum("sa,sax->sx", N, line.x[ends])
-    gap = np.einsum("sx,sx->s", x - foot, at.normal)
+    gap = np.einsum("sx,sx->s", x - foot, closest.normal)
 
-    node = np.column_stack([slave, master[ends]])  # s, 1, 2
+    # (m, 3) stencil of each row: the slave node and both ends of the segment
+    node = np.column_stack([slave, master[ends]])
     weight = np.column_stack([-np.ones(len(slave)), N])
-    B = rows_along(node, weight, at.normal, points.size)
+    B = rows_along(node, weight, closest.normal, points.size)
+    # friction has the weights of its contact row along the tangents
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
-        directions = tangents(at.normal)
+        directions = tangents(closest.normal)
         row = np.repeat(np.arange(slave.size), directions.shape[1])
         along = directions.reshape(-1, points.shape[1])
         T = rows_along(node[row], weight[row], along, points.size)
@@ -125,40 +129,41 @@ def geometric_stiffness(
     slave: Nodes,
     master: Nodes,
     multipliers: Vector,
-    kept: Nodes | None = None,
+    fixed_segments: Nodes | None = None,
 ) -> tuple[NDArray[np.float64], Nodes]:
-    """Differentiate the forces Bᵀλ of the slave nodes, λ held: −λ g''(u), per node.
+    """Differentiate the forces Bᵀλ of the slave nodes at fixed λ: −λ g''(u) per node.
 
-    With the edge e = x_2 − x_1 of the segment and d = x_s − x_1 the gap is the area
-    a = d_x e_y − d_y e_x over the length L = |e|, and
+    With the edge e = x_2 − x_1 of the segment and d = x_s − x_1, the gap is g = a/L
+    with the area a = d_x e_y − d_y e_x and the length L = |e|, and
 
         g'' = a''/L − (a' L'ᵀ + L' a'ᵀ)/L² − a L''/L² + 2a L' L'ᵀ/L³.
 
-    Where the closest point is a vertex of the master, whose averaged normal has no
-    derivative of its own here, it is taken to be zero.
+    Where the closest point is a vertex of the master, the derivative is taken to be
+    zero: that of the averaged normal is not implemented.
 
     Parameters
     ----------
-    points, u, slave, master, kept : as of `node_to_segment`
+    points, u, slave, master, fixed_segments : see `node_to_segment`
     multipliers : (s,) λ, N/m
 
     Returns
     -------
-    blocks (s, 6, 6), Pa, and the displacement components (s, 6) that they are of: those
-    of the slave node and of both ends of its segment
+    blocks (s, 6, 6), Pa, and their displacement components (s, 6): those of the slave
+    node and of both ends of its segment
 
     """
     x = current_positions(points, u, slave, "slave")
     line = current_surface(points, u, master, "master")
-    at = _opposite(x, line, kept)
-    x_1, x_2 = line.x[at.segment], line.x[at.segment + 1]
+    closest = _projections(x, line, fixed_segments)
+    x_1, x_2 = line.x[closest.segment], line.x[closest.segment + 1]
     d, e = x - x_1, x_2 - x_1
     L = np.linalg.norm(e, axis=1)
     t, area = e / L[:, None], cross(d, e)
-    one, turn = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])  # a = dᵀ turn e
+    one, J = np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]])  # a = dᵀJe
     in_d, in_e = np.hstack([one, -one, 0 * one]), np.hstack([0 * one, -one, one])
-    area_1 = (e @ turn.T) @ in_d + (d @ turn) @ in_e  # (s, 6)
-    area_2 = in_d.T @ turn @ in_e
+    # suffixes _1, _2: first and second derivatives by the six components
+    area_1 = (e @ J.T) @ in_d + (d @ J) @ in_e  # (s, 6)
+    area_2 = in_d.T @ J @ in_e  # a'' is this plus its transpose
     length_1 = t @ in_e
     across = (one - t[:, :, None] * t[:, None, :]) / L[:, None, None]
     length_2 = in_e.T @ across @ in_e
@@ -169,49 +174,56 @@ def geometric_stiffness(
     mixed, (L, area) = outer(area_1, length_1), (v[:, None, None] for v in (L, area))
     gap_2 = (area_2 + area_2.T) / L - (mixed + mixed.transpose(0, 2, 1)) / L**2
     gap_2 += area * (2 * outer(length_1, length_1) / L**3 - length_2 / L**2)
-    inside = (at.xi > 0) & (at.xi < 1)
-    if kept is not None:
-        inside |= kept >= 0
+    inside = (closest.xi > 0) & (closest.xi < 1)
+    if fixed_segments is not None:
+        inside |= fixed_segments >= 0
     blocks = -np.where(inside, multipliers, 0.0)[:, None, None] * gap_2
-    nodes = np.column_stack([slave, master[at.segment], master[at.segment + 1]])
+    nodes = np.column_stack(
+        [slave, master[closest.segment], master[closest.segment + 1]]
+    )
     return blocks, dofs_of(nodes, 2).reshape(-1, 6)
 
 
 def closest_points(x: Points, line: Surface) -> ClosestPoints:
-    """Find the closest points of x (s, 2) on a chain and its outward normals there."""
+    """Return the closest points of x (s, 2) on a chain, with outward normals."""
     segment, xi = nearest(x, line)
     first, second = line.facets.T[:, segment]
-    at_first, at_second = xi <= ON_VERTEX, xi >= 1 - ON_VERTEX
+    # snap to vertices, whose normal is the average: rounding must not select a segment
+    at_first, at_second = xi <= VERTEX_TOLERANCE, xi >= 1 - VERTEX_TOLERANCE
     xi = np.where(at_first, 0.0, np.where(at_second, 1.0, xi))
     normal = np.where(at_first[:, None], line.node_normal[first], line.normal[segment])
     normal = np.where(at_second[:, None], line.node_normal[second], normal)
     return ClosestPoints(first, xi, normal)
 
 
-def _opposite(x: Points, line: Surface, kept: Nodes | None) -> ClosestPoints:
-    """Find what the slave nodes x (s, 2) stand against: the closest, or what is kept.
+def _projections(
+    x: Points, line: Surface, fixed_segments: Nodes | None
+) -> ClosestPoints:
+    """Return closest points of slave nodes x (s, 2), or feet on their fixed segments.
 
-    On the line of a segment that is kept, ξ may be outside of [0, 1].
+    On the line of a fixed segment, ξ may be outside of [0, 1].
     """
-    at = closest_points(x, line)
-    if kept is None or not (own := kept >= 0).any():
-        return at
-    segment = np.where(own, kept, at.segment)
+    closest = closest_points(x, line)
+    if fixed_segments is None or not (is_fixed := fixed_segments >= 0).any():
+        return closest
+    segment = np.where(is_fixed, fixed_segments, closest.segment)
     start = line.x[segment]
     edge = line.x[segment + 1] - start
     xi = np.einsum("sx,sx->s", x - start, edge) / np.einsum("sx,sx->s", edge, edge)
     length = np.linalg.norm(edge, axis=1)[:, None]
     across = -tangents(edge)[:, 0] / length
     return ClosestPoints(
-        segment, np.where(own, xi, at.xi), np.where(own[:, None], across, at.normal)
+        segment,
+        np.where(is_fixed, xi, closest.xi),
+        np.where(is_fixed[:, None], across, closest.normal),
     )
 
 
 def rows_along(node: Nodes, weight: Vector, direction: Points, size: int) -> csr_array:
-    """Build rows that weight the displacements of equally many nodes along a direction.
+    """Assemble rows of weighted displacements along a direction, (m, size).
 
-    Row r is Σ_a weight_ra · direction_r at the components of node_ra: node and weight
-    are (m, k), direction is (m, dim), the result (m, size) without stored zeros.
+    Row r has the entries weight_ra · direction_r at the components of node_ra, for
+    `node` and `weight` (m, k) and `direction` (m, dim). Zeros are not stored.
     """
     (m, k), dim = node.shape, direction.shape[1]
     if not m:

@@ -13,7 +13,7 @@ from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.problems.contact.bodies import Bodies, ContactSides
 from mortarbench.problems.contact.sides import (
-    ACTIVE,
+    ACTIVE_THRESHOLD,
     active,
     bodies_of,
     contact_sides,
@@ -22,19 +22,19 @@ from mortarbench.problems.contact.sides import (
 from mortarbench.problems.fem.mesh import as_vectors
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises
 
-#: stresses in Voigt's notation
+#: names of stress components in Voigt's notation
 IN_PLANE = ("sxx", "syy", "sxy")
 IN_SPACE = ("sxx", "syy", "szz", "syz", "sxz", "sxy")
 
 
-class Inside(NamedTuple):
-    """What is reported of the inside of bodies, away from their contact."""
+class BulkResults(NamedTuple):
+    """Results of the bodies apart from their contact."""
 
     nodes: int
     elements: int
-    supports: int  #: prescribed components
-    energy: float  #: ½uᵀKu − fᵀu, J/m
-    #: (bodies,) the largest patch-recovered von Mises stress, Pa
+    supports: int  #: number of prescribed components
+    energy: float  #: ½uᵀKu − fᵀu of eq. (1), J/m
+    #: (bodies,) largest patch-recovered von Mises stress of each body, Pa
     max_von_mises: Sequence[float]
 
 
@@ -42,91 +42,94 @@ def quantities(
     bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Report counts, energy, contact forces and stresses, as `results_of`.
+    """Return counts, energy, contact forces and stresses, see `results_of`.
 
-    stresses : at the nodes (N,), where they are not those of linear elasticity
+    stresses : nodal stresses (N,) by name; default: those of linear elasticity
     """
     l, owner = bodies.length, bodies.body_of_node
     stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
-    inside = Inside(
+    bulk = BulkResults(
         nodes=len(bodies.mesh.points), elements=len(bodies.mesh.cells),
         supports=primal.b.size, energy=primal.objective(s.x) * bodies.force * l,
         max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
     )  # fmt: skip
-    return results_of(inside, bodies, primal, s, friction)
+    return results_of(bulk, bodies, primal, s, friction)
 
 
 def results_of(
-    inside: Inside, bodies: Bodies | ContactSides, primal: QP, s: Solution,
+    bulk: BulkResults, bodies: Bodies | ContactSides, primal: QP, s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> dict[str, Any]:  # fmt: skip
-    """Report counts, energy, contact forces and stresses.
+    """Return counts, energy, contact forces and stresses by name.
 
-    energy: ½uᵀKu − fᵀu, J/m. contact_force: on the body of the master (of the slave
-    where the master is rigid), −ΣBᵀλ of contact and friction, N/m; absent where several
-    pairs may touch, since a sum over them has no meaning: `contacts` has each force.
-    max_von_mises: per body, of the patch-recovered stress, Pa. contacts: per pair, see
-    `pair_results`. With friction those of `frictional`, too.
+    energy: ½uᵀKu − fᵀu, J/m. contact_force: the force −ΣBᵀλ of contact and friction on
+    the master's body (on the slave's if the master is rigid), N/m; absent with several
+    pairs, where a sum over pairs is meaningless and `contacts` has the single forces.
+    max_von_mises: largest patch-recovered stress per body, Pa. contacts: results per
+    pair, see `pair_results`. With friction also the items of `friction_quantities`.
 
     Parameters
     ----------
-    bodies, primal, s, friction : of the whole, or of the nodes of the sides alone; of P
-        the diagonal is asked for, where there is friction
+    bodies, primal, s, friction : of all nodes, or of the nodes of the sides alone; with
+        friction, the diagonal of P is used
 
     """
     forces = contact_forces(bodies, primal, s, friction)
     normal = s.z[: primal.h.size]
     return {
-        "nodes": inside.nodes,
-        "elements": inside.elements,
-        "dofs": bodies.mesh.dim * inside.nodes,
-        "equality_rows": inside.supports,
+        "nodes": bulk.nodes,
+        "elements": bulk.elements,
+        "dofs": bodies.mesh.dim * bulk.nodes,
+        "equality_rows": bulk.supports,
         "contact_rows": primal.h.size,
         "active": int(active(normal).sum()),
-        "energy": inside.energy,
+        "energy": bulk.energy,
         **_contact_force(bodies, forces),
         "multiplier_sum": float(normal.sum() * bodies.force),
         "max_von_mises": {
             name: float(largest)
-            for name, largest in zip(bodies.names, inside.max_von_mises, strict=True)
+            for name, largest in zip(bodies.names, bulk.max_von_mises, strict=True)
         },
         "contacts": pair_results(bodies, primal, s, friction),
-    } | (frictional(bodies, primal, s, friction) if friction.bound.size else {})
+    } | (
+        friction_quantities(bodies, primal, s, friction) if friction.bound.size else {}
+    )
 
 
 def _contact_force(
     bodies: Bodies | ContactSides, forces: NDArray[np.float64]
 ) -> dict[str, list[float]]:
-    """Sum the forces of the only pair on one of its bodies; empty for several pairs."""
+    """Return the total force of a single pair on one body; {} for several pairs."""
     if len(bodies.pairs) > 1:
         return {}
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
+    # contact forces act on both bodies: sum those on one of them, or they cancel
     loaded = owner == owner[(master if master.size else slave)[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
 
-def frictional(
+def friction_quantities(
     bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
-    """Report what friction does.
+    """Return counts of friction states, the residual of Coulomb's law, dissipation.
 
-    open, stick, slip: numbers of rows of pairs with friction, which are not active, or
-    active and below the bound, or at it. sliding_without_contact: rows that are not
-    active and yet carry shear, which Tresca's law allows, and which are not open;
-    shear_without_contact: their part of Σ|λ_t|. friction_residual: ‖g − mu·λ_n‖/‖g‖ of
-    Coulomb's law, 0 of Tresca's. dissipation: Σ g|Tu − s|, the work of the friction in
-    this step, J/m.
+    open, stick, slip: numbers of rows that are inactive, active below the bound, and
+    active at the bound. sliding_without_contact: number of inactive rows that carry
+    shear, which Tresca's law allows; they do not count as open. shear_without_contact:
+    their share of Σ|λ_t|. friction_residual: ‖g − mu·λ_n‖/‖g‖ for Coulomb's law, 0 for
+    Tresca's. dissipation: Σ g|Tu − s|, the work of friction in this step, J/m.
     """
     state = states(primal, s, friction)
     shear = np.abs(s.z[primal.h.size :])
-    unpressed = state == SLIDING
+    without_contact = state == SLIDING
     slip = friction.T @ s.x - friction.start
+    shear_alone = float(shear[without_contact].sum() / (shear.sum() or 1.0))
     return {
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
-        "sliding_without_contact": int(unpressed.sum()),
-        "shear_without_contact": float(shear[unpressed].sum() / (shear.sum() or 1.0)),
+        "sliding_without_contact": int(without_contact.sum()),
+        "shear_without_contact": shear_alone,
         "friction_residual": friction.residual(s.z[: primal.h.size]),
         "dissipation": float(friction.bound @ np.abs(slip))
         * bodies.force * bodies.length,
@@ -139,23 +142,23 @@ def pair_results(
     s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> dict[str, dict[str, Any]]:
-    """Report each contact pair by its name.
+    """Return the results of each contact pair by its name.
 
-    force: on each of its bodies, N/m. largest_pressure: at a slave node, Pa.
-    smallest_gap: m; below zero where bodies overlap. half_width: half the length of the
-    undeformed slave side that belongs to nodes under pressure, m.
+    force: force on each of its bodies, N/m. largest_pressure: largest value at a slave
+    node, Pa. smallest_gap: m; negative where bodies overlap. half_width: half the
+    length of the undeformed slave side that belongs to nodes under pressure, m.
     """
-    found = {}
+    results = {}
     sides = contact_sides(bodies, primal, s, friction)
     for pair, side in zip(bodies.pairs, sides, strict=True):
         slave, master = bodies_of(bodies, pair)
         total = side.force.sum(axis=0)
         force = {slave: total.tolist()}
         if pair.master.size:
-            force = {master: (0.0 - total).tolist()} | force
+            force = {master: (0.0 - total).tolist()} | force  # 0.0 − x: no −0
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
-        pressed = side.pressed(ACTIVE * largest)
-        found[side.name] = {
+        pressed = side.pressed(ACTIVE_THRESHOLD * largest)
+        results[side.name] = {
             "force": force,
             "largest_pressure": float(side.pressure.max()),
             "smallest_gap": (
@@ -163,7 +166,7 @@ def pair_results(
             ),
             "half_width": float(side.length[pressed].sum() / 2),
         }
-    return found
+    return results
 
 
 def fields(
@@ -171,9 +174,10 @@ def fields(
     stresses: Mapping[str, Vector] | None = None,
     subdomains: NDArray[np.int64] | None = None,
 ) -> Fields:  # fmt: skip
-    """Collect the deformed state for pictures; stresses as of `quantities`.
+    """Return the deformed state for pictures, in SI units.
 
-    subdomains : (E,) of each cell, of bodies that are torn
+    stresses : see `quantities`
+    subdomains : (E,) subdomain of each cell, if the bodies are decomposed
     """
     u = s.x * bodies.length
     sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
@@ -197,16 +201,20 @@ def contact_forces(
     s: Solution,
     friction: Friction = NO_FRICTION,
 ) -> NDArray[np.float64]:
-    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m."""
+    """Return the forces −Bᵀλ of contact and friction on the nodes (N, dim), N/m.
+
+    The sign is that of f − Bᵀλ in eq. (6) of the paper.
+    """
     B, _ = contact_rows(primal, friction)
     return as_vectors(-(B.T @ s.z) * bodies.force, bodies.mesh.dim)
 
 
 def nodal_stresses(bodies: Bodies, u: Vector) -> dict[str, Vector]:
-    """Recover the stresses at the nodes (N,) from the displacement in m, Pa.
+    """Recover nodal stresses (N,) by name, Pa, from the displacement u (n,), m.
 
-    sxx, syy, sxy; szz = ν(σ_x + σ_y) in plane strain, where it is not zero; in space
-    all six; von_mises of these, so that it is recovered from no averages of its own.
+    In the plane sxx, syy and sxy, with szz = ν(σ_x + σ_y) in plane strain; in space all
+    six components. von_mises is computed from the recovered components rather than
+    recovered by itself, so that all names are consistent.
     """
     stress = recover(bodies.mesh, centre_stress(bodies.mesh, bodies.D, u))
     nu = np.array([m.nu for m in bodies.materials])[bodies.body_of_node]

@@ -1,4 +1,4 @@
-"""Contact with a rigid plane, linear in the displacement."""
+"""Contact with a rigid plane: rows that are exactly linear in the displacement."""
 
 from __future__ import annotations
 
@@ -9,12 +9,14 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_lengths
 
 
-def above_plane(mesh: Mesh, side: Nodes, *, tangential: bool = False) -> ContactRows:
-    """Keep the nodes of a side above the plane where the last coordinate is zero.
+def rigid_plane_rows(
+    mesh: Mesh, side: Nodes, *, tangential: bool = False
+) -> ContactRows:
+    """Return rows that keep the nodes of a side where the last coordinate is ≥ 0.
 
-    In the plane that is  −u_y ≤ y, exactly; the slip is u_x.
+    In two dimensions a row is −u_y ≤ y, without linearisation, and the slip is u_x.
 
-    tangential : whether friction needs tangential rows
+    tangential : add tangential rows for friction
     """
     m, last = side.size, mesh.dim - 1
     row = np.repeat(np.arange(m if tangential else 0), last)

@@ -1,15 +1,16 @@
 """Load steps with re-linearised contact, and Coulomb's law in each (paper, Section 2).
 
-A load step begins where the one before has ended. Its contact rows are linearised at
-that solution, and `relin` − 1 more times at its own; each linearisation is a `Stage`,
-and its QP is posed by whoever holds the bodies: one process undivided ones
-(`problems.duality.undivided`), ranks their subdomains (`problems.duality.divided`).
-With relin = 1 this is the paper's scheme, of first order in 1/steps.
+A load step starts from the solution of its predecessor. Its contact rows are linearised
+at that solution, and `relin` − 1 more times at its own; each linearisation is a
+`Stage`. The QP of a stage is posed on undivided bodies by one process
+(`problems.duality.undivided`), or on subdomains by MPI ranks
+(`problems.duality.divided`). relin = 1 is the paper's scheme, of first order in
+1/steps.
 
-With friction, slip is that of the load step (``quasi-static``: T(u − u_prev), which
-depends on the path), or of the whole load at once (``static``: T u). Coulomb's law is
-the fixed point of problems with a given bound, g ← mu·λ_n from the solution of the one
-before on; each stage is settled. It begins from the normal forces of the stage before.
+With friction, slip is measured from the solution of the preceding load step
+(``quasi-static``: T(u − u_prev), which depends on the path) or from the undeformed
+state (``static``: T u). Each stage iterates Coulomb's law to its fixed point,
+g ← mu·λ_n, starting with the normal forces of the stage before.
 """
 
 from __future__ import annotations
@@ -22,46 +23,68 @@ from typing import Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from mortarbench.harness import Friction, Solution, Vector
-from mortarbench.problems.contact.friction import FrictionLaw, iterate_of, settled
+from mortarbench.problems.contact.friction import (
+    FrictionLaw,
+    coulomb_fixed_point,
+    select_iterate,
+)
 from mortarbench.problems.fem.mesh import Nodes
 
 
 class Forces(NamedTuple):
-    """Forces at single components, without dimensions; zero at all others."""
+    """Non-dimensional nodal forces at some components; zero at all others."""
 
-    component: Nodes  #: (k,) each once
+    component: Nodes  #: (k,) without repetitions
     value: Vector  #: (k,)
 
 
 class State(NamedTuple):
-    """The state that a stage begins at, by displacements as its problem takes them."""
+    """Initial state of a stage, with displacements of w components."""
 
-    u: Vector  #: (w,) where contact is linearised
-    before: Vector  #: (w,) where the slip begins
-    #: (places,) normal force of each slave node, which Coulomb's law begins from
-    pressed: Vector
-
-
-def same(left: State) -> State:
-    """Begin where the stage before has ended, the slip where that began."""
-    return left
+    u: Vector  #: (w,) displacement at which contact is linearised
+    slip_origin: Vector  #: (w,) displacement from which slip is measured
+    #: (places,) normal force of each slave node, for the first bound of Coulomb's law
+    normal_forces: Vector
 
 
-def slip_anew(left: State) -> State:
-    """Begin where the stage before has ended, the slip there, too."""
-    return left._replace(before=left.u)
+def continue_slip(end: State) -> State:
+    """Return the end of the preceding stage as initial state, with its slip origin."""
+    return end
+
+
+def restart_slip(end: State) -> State:
+    """Return the end of the preceding stage, with slip measured from there."""
+    return end._replace(slip_origin=end.u)
+
+
+def with_normal_forces(
+    begin: Callable[[State], State], force: float
+) -> Callable[[State], State]:
+    """Start Coulomb's law of each stage from the same normal force at every slave node.
+
+    The normal forces of the previous stage bound friction by what the previous load
+    needed. Where friction alone supports a body, that bound cannot balance a larger
+    load, and the first problem of the fixed point would have no solution.
+    """
+
+    def begin_with(end: State) -> State:
+        state = begin(end)
+        return state._replace(normal_forces=np.full_like(state.normal_forces, force))
+
+    return begin_with
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Stage:
     """One linearisation of a load step."""
 
-    step: int  #: of the load, 1, 2, …
-    part: float  #: of the forces that acts
-    forces: Forces
-    fixed: Nodes  #: components that supports hold at zero
-    laws: tuple[FrictionLaw, ...] = ()  #: of each pair; none for no friction at all
-    begin: Callable[[State], State] = same  #: where, of what the stage before left
+    step: int  #: number of the load step, 1, 2, …
+    part: float  #: load factor: share of `forces` that acts
+    forces: Forces  #: full load
+    fixed: Nodes  #: components that supports prescribe as zero
+    laws: tuple[FrictionLaw, ...] = ()  #: law of each pair; empty: no friction
+    #: map from the end of the preceding stage to the initial state of this one
+    begin: Callable[[State], State] = continue_slip
 
 
 def load_steps(
@@ -73,127 +96,129 @@ def load_steps(
     *,
     quasi_static: bool = True,
 ) -> tuple[Stage, ...]:
-    """List the stages of a load that grows evenly, each step linearised `relin` times.
+    """Return the stages of a load that grows in equal steps, `relin` stages per step.
 
-    quasi_static : whether slip is that of the step
+    quasi_static : measure slip from the preceding load step; False: from rest
     """
     return tuple(
         Stage(
             step=k, part=k / steps, forces=forces, fixed=fixed, laws=laws,
-            begin=slip_anew if quasi_static and not i else same,
+            # relinearisations of a step keep its slip origin
+            begin=restart_slip if quasi_static and not i else continue_slip,
         )
         for k in range(1, steps + 1) for i in range(relin)
     )  # fmt: skip
 
 
-class Posed(Protocol):
-    """A linearised contact problem, and its dual with any bound of the friction."""
+class LinearisedProblem(Protocol):
+    """A linearised contact problem, whose dual takes any bound of friction."""
 
     @property
     def friction(self) -> Friction:
-        """That of its rows, with the first bound."""
+        """Friction of the rows, with the initial bound."""
 
     def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
-        """Solve the dual with the bound of a friction.
+        """Solve the dual with the bound of `friction`.
 
-        start : solution with another bound
+        start : solution with another bound, as initial guess
         """
 
-    def normal(self, s: Solution) -> Vector:
+    def normal_multipliers(self, s: Solution) -> Vector:
         """Return the multipliers λ_n (m,) of the contact rows."""
 
-    def left(self, s: Solution) -> tuple[Vector, Vector]:
-        """Return u (w,) and the normal forces (places,) that a solution has."""
+    def end_state(self, s: Solution) -> tuple[Vector, Vector]:
+        """Return u (w,) and the normal forces (places,) of a solution."""
 
 
-P = TypeVar("P", bound=Posed)
+P = TypeVar("P", bound=LinearisedProblem)
 
 
-class Problem(NamedTuple, Generic[P]):
-    """A problem of a stage, with the bound of its friction."""
+class Iterate(NamedTuple, Generic[P]):
+    """Iterate of the fixed point of a stage: its problem and a bound of friction."""
 
-    posed: P
-    friction: Friction
-    solution: Callable[[], Solution]  #: of the dual
+    problem: P
+    friction: Friction  #: with the bound of this iterate
+    solution: Callable[[], Solution]  #: solve the dual, once
 
 
 @dataclass(frozen=True, eq=False)
 class LoadPath(Generic[P]):
-    """The stages of one analysis; what was solved once is remembered.
+    """Load path: the stages of one analysis, solved on demand, each only once.
 
     Raises
     ------
     ArithmeticError
-        When a solve is not accurate.
+        When a reference solve is not accurate.
     InputError
-        When a fixed point of Coulomb's law does not settle, has less iterates, or comes
-        to bounds that hold no equilibrium.
+        When a fixed point of Coulomb's law does not converge, has fewer iterates than
+        requested, or reaches bounds without an equilibrium.
 
     """
 
     stages: Sequence[Stage]
-    pose: Callable[[Stage, State], P]
-    rest: State  #: where the first stage begins
-    _done: list[tuple[State, list[Problem[P]]]] = field(
+    linearise: Callable[[Stage, State], P]
+    initial: State  #: initial state of the first stage
+    _history: list[tuple[State, list[Iterate[P]]]] = field(
         default_factory=list, init=False
     )
 
-    def problem(self, step: int, iterate: int = 0) -> Problem[P]:
-        """Pose a load step (1, 2, …), as last linearised.
+    def problem(self, step: int, iterate: int = 0) -> Iterate[P]:
+        """Return the problem of a load step (1, 2, …) in its last linearisation.
 
-        iterate : which problem of the fixed point of Coulomb's law, 1, 2, …; 0: the
-            last one
+        iterate : number of the iterate of Coulomb's law, 1, 2, …; 0: the last one
         """
-        return iterate_of(self.problems(self.last_of(step)), iterate, step)
+        return select_iterate(self.problems(self.last_of(step)), iterate, step)
 
     def iterates(self, step: int) -> int:
-        """Count the problems of the fixed point of a step; 1 without Coulomb's law."""
+        """Count the iterates of Coulomb's law in a load step; 1 for other laws."""
         return len(self.problems(self.last_of(step)))
 
     def last_of(self, step: int) -> int:
-        """Return the number of the last stage of a load step, from 0 on."""
+        """Return the index (0, 1, …) of the last stage of a load step."""
         return max(i for i, stage in enumerate(self.stages) if stage.step == step)
 
-    def problems(self, i: int) -> list[Problem[P]]:
-        """Pose stage i (0, 1, …): the problems of its fixed point."""
-        while len(self._done) <= i:
-            stage = self.stages[len(self._done)]
-            state = stage.begin(self._left())
-            posed = self.pose(stage, state)
-            self._done.append((state, _fixed_point(posed, stage)))
-        return self._done[i][1]
+    def problems(self, i: int) -> list[Iterate[P]]:
+        """Return the iterates of stage i (0, 1, …); solve earlier ones first."""
+        while len(self._history) <= i:
+            stage = self.stages[len(self._history)]
+            state = stage.begin(self._end_state())
+            linearised = self.linearise(stage, state)
+            self._history.append((state, _fixed_point(linearised, stage)))
+        return self._history[i][1]
 
-    def _left(self) -> State:
-        """Return what the last stage that was posed leaves to the next one."""
-        if not self._done:
-            return self.rest
-        begun, (*_, last) = self._done[-1]
-        u, pressed = last.posed.left(last.solution())
-        return State(u, begun.before, pressed)
+    def _end_state(self) -> State:
+        """Return the state at the end of the last stage solved so far."""
+        if not self._history:
+            return self.initial
+        begin, (*_, last) = self._history[-1]
+        u, normal_forces = last.problem.end_state(last.solution())
+        return State(u, begin.slip_origin, normal_forces)
 
 
-def _fixed_point(posed: P, stage: Stage) -> list[Problem[P]]:
-    """Settle Coulomb's law; without it, the problem is the only one."""
+def _fixed_point(linearised: P, stage: Stage) -> list[Iterate[P]]:
+    """Iterate Coulomb's law to its fixed point; other laws have a single iterate."""
     if not any(law.mu for law in stage.laws):
-        first = posed.friction
-        return [Problem(posed, first, cache(lambda: posed.solve(first)))]
-    found = list[Solution]()
+        first = linearised.friction
+        return [Iterate(linearised, first, cache(lambda: linearised.solve(first)))]
+    solutions = list[Solution]()
 
     def normal(friction: Friction) -> Vector:
-        found.append(posed.solve(friction, found[-1] if found else None))
-        return posed.normal(found[-1])
+        # the bound changes little between iterates: start from the last solution
+        start = solutions[-1] if solutions else None
+        solutions.append(linearised.solve(friction, start))
+        return linearised.normal_multipliers(solutions[-1])
 
-    def known(s: Solution) -> Callable[[], Solution]:
+    def constant(s: Solution) -> Callable[[], Solution]:
         return lambda: s
 
-    frictions = settled(posed.friction, normal, stage.step)
+    frictions = coulomb_fixed_point(linearised.friction, normal, stage.step)
     return [
-        Problem(posed, friction, known(s))
-        for friction, s in zip(frictions, found, strict=True)
+        Iterate(linearised, friction, constant(s))
+        for friction, s in zip(frictions, solutions, strict=True)
     ]
 
 
 def forces_of(f: Vector) -> Forces:
-    """List the components of a load (n,) that are not zero."""
+    """Return the non-zero components of a load (n,)."""
     component = np.flatnonzero(f)
     return Forces(component, f[component])

@@ -1,6 +1,6 @@
-"""A contact side in the current configuration: facets, normals and nodal areas.
+"""Contact sides in the current configuration: facets, normals and nodal areas.
 
-In the plane facets are the segments of a chain of nodes.
+In the plane, facets are the segments of a chain of nodes.
 """
 
 from __future__ import annotations
@@ -15,18 +15,19 @@ from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
 
 Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
 
-#: a segment this much shorter than the longest of its chain has no direction
-DEGENERATE = 1e-12
+#: segments shorter than this times the longest of their chain count as points: the
+#: direction of their edge is rounding
+MIN_RELATIVE_LENGTH = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Facets with their body on the left; those without extent are left out.
+    """Facets with the body on their left; facets of zero length are left out.
 
-    With the unit tangent t of a segment its outward normal is (t_y, −t_x). The normal
-    of a node is the normalised sum of those of the segments before and after it, at an
-    end of the chain that of the only one (Popp, Gee and Wall 2009, their averaged
-    nodal normal, in two dimensions and without weights).
+    A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
+    a node is the normalised sum of the normals of its segments, one at an end of the
+    chain and two elsewhere (the averaged nodal normal of Popp, Gee and Wall 2009, in
+    two dimensions and without weights).
     """
 
     x: Points  #: (v, dim) nodes, m
@@ -36,12 +37,12 @@ class Surface:
 
     @property
     def start(self) -> Points:
-        """First end of each segment, (f, dim)."""
+        """Position of the first node of each segment, (f, dim)."""
         return self.x[self.facets[:, 0]]
 
     @property
     def end(self) -> Points:
-        """Second end of each segment, (f, dim)."""
+        """Position of the second node of each segment, (f, dim)."""
         return self.x[self.facets[:, 1]]
 
     @property
@@ -51,24 +52,24 @@ class Surface:
 
     @property
     def areas(self) -> Vector:
-        """Area that belongs to each node, ∫N_j (v,): in the plane a length, m."""
+        """Nodal areas ∫N_j (v,); in the plane lengths, m."""
         return nodal_lengths(self.x)
 
     @property
     def extent(self) -> float:
-        """Diagonal of the box around the nodes, m."""
+        """Diagonal of the bounding box of the nodes, m."""
         return float(np.linalg.norm(np.ptp(self.x, axis=0)))
 
 
 def current_surface(points: Points, u: Vector, chain: Nodes, name: str) -> Surface:
-    """Place a chain of nodes at X + u.
+    """Return the surface of a chain of nodes at X + u.
 
     Parameters
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement, m
     chain : (v,) nodes, the body on their left
-    name : of the side, for the message
+    name : name of the side, for messages
 
     Raises
     ------
@@ -80,7 +81,7 @@ def current_surface(points: Points, u: Vector, chain: Nodes, name: str) -> Surfa
 
 
 def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Points:
-    """Return X + u of some nodes, (len(nodes), dim); refuse what is not finite."""
+    """Return X + u of some nodes, (len(nodes), dim); raise InputError unless finite."""
     x = points[nodes] + as_vectors(u, points.shape[1])[nodes]
     if not np.isfinite(x).all():
         k = int(np.flatnonzero(~np.isfinite(x).all(axis=1))[0])
@@ -92,16 +93,17 @@ def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Poi
 
 
 def surface(x: Points, name: str) -> Surface:
-    """Compute segments and normals of a chain (v, 2)."""
+    """Return the segments and normals of a chain at positions x (v, 2)."""
     edge = np.diff(x, axis=0)
     length = np.sqrt(np.einsum("ex,ex->e", edge, edge))
-    first = np.flatnonzero(length > DEGENERATE * length.max(initial=0.0))
+    first = np.flatnonzero(length > MIN_RELATIVE_LENGTH * length.max(initial=0.0))
     if not len(first):
         raise InputError(
             f"contact {name}: {len(x)} node(s) and no segment of positive length, "
             "expected a chain of at least two nodes"
         )
     normal = -tangents(edge[first] / length[first, None])[:, 0]
+    # nodes of skipped segments take the normals of the nearest segments left
     after = np.searchsorted(first, np.arange(len(x)))
     before = np.maximum(after - 1, 0)
     after = np.minimum(after, len(first) - 1)
@@ -111,19 +113,18 @@ def surface(x: Points, name: str) -> Surface:
 
 
 def tangents(normal: Points) -> Points:
-    """Return unit vectors (…, dim − 1, dim) across normals (…, dim).
+    """Return unit tangents (…, dim − 1, dim) of normals (…, dim).
 
-    In the plane that is the normal turned anticlockwise, (−n_y, n_x).
+    In the plane, the normal rotated anticlockwise by a right angle, (−n_y, n_x).
     """
     return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None, :]
 
 
 def unit(vectors: Points, otherwise: Points) -> Points:
-    """Normalise vectors (…, dim) of order one; those that vanish become `otherwise`.
+    """Normalise vectors (…, dim) of order one; replace zero vectors by `otherwise`.
 
-    Two opposite normals have no mean: there the chain folds back onto itself, and
-    the caller says which normal stands in.
+    The sum of two opposite normals is zero: there the chain folds back onto itself.
     """
     length = np.sqrt(np.einsum("...x,...x->...", vectors, vectors))[..., None]
-    vanishes = length <= DEGENERATE
+    vanishes = length <= MIN_RELATIVE_LENGTH
     return np.where(vanishes, otherwise, vectors / np.where(vanishes, 1.0, length))

@@ -1,4 +1,4 @@
-"""From a contact problem to the case of each form, and to what ranks emit of it."""
+"""Cases of a contact problem in each form."""
 
 from __future__ import annotations
 
@@ -25,24 +25,28 @@ from mortarbench.harness import (
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.results import fields, quantities
-from mortarbench.problems.duality.divided import described, layout_of
-from mortarbench.problems.duality.dualisation import dual_bounds, dualise, posed
+from mortarbench.problems.duality.decomposed import cached_layout, decompose
+from mortarbench.problems.duality.dualisation import dual_bounds, dualise, primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
+)
+from mortarbench.problems.duality.monolithic import monolithic_path
 from mortarbench.problems.duality.problem import (
-    AtSides,
     Choice,
     ContactProblem,
     DisplacedMesh,
+    InterfaceState,
 )
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
-)
-from mortarbench.problems.duality.undivided import whole_path
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 from mortarbench.problems.fem.mesh import Mesh, Nodes
-from mortarbench.problems.feti.own_bodies import certified_by
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
+from mortarbench.problems.feti.local_bodies import certifier
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    DecomposedProblem,
+    on_one_process,
+)
 
 FORMS = ("primal", "dual", "dual-bounds")
 
@@ -53,61 +57,63 @@ Factorise = Callable[[], GeneralisedInverse]
 def case_of(
     problem: ContactProblem, form: str, choice: Choice, reference: Reference
 ) -> Case:
-    """Emit the QP of a contact problem that is chosen, in one of FORMS."""
-    of = problem.bodies
-    path, parts = whole_path(problem, reference), None
+    """Return the case of a selected QP of a contact problem, in one of FORMS."""
+    elastic = problem.bodies
+    path, decomposed = monolithic_path(problem, reference), None
     whole, friction, _ = path.problem(choice.step, choice.iterate)
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:
         contact = Contact(*contact_rows(primal, friction), friction.bound)
         stage = problem.stages[path.last_of(choice.step)]
-        layout = layout_of(of, choice.size)
-        parts = described(of, layout, choice.glue, stage, contact)
-    bodies = of.assembled
+        layout = cached_layout(elastic, choice.size)
+        decomposed = decompose(elastic, layout, choice.glue, stage, contact)
+    bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:
-        found = FoundInWhole(AtSides(bodies, primal, s, friction), bodies, count)
-        return {**quantities(bodies, primal, s, friction), **problem.results(found)}
+        solution = MonolithicSolution(
+            InterfaceState(bodies, primal, s, friction), bodies, count
+        )
+        return {**quantities(bodies, primal, s, friction), **problem.results(solution)}
 
     case = contact_case(
-        bodies, primal, form, parts=parts,
-        floating=lambda: of.floating, clamped=lambda: of.clamped,
-        supported=lambda: of.supported, quantities=results, friction=friction,
+        bodies, primal, form, parts=decomposed,
+        floating=lambda: elastic.floating, clamped=lambda: elastic.clamped,
+        supported=lambda: elastic.supported, quantities=results, friction=friction,
     )  # fmt: skip
-    return case if problem.exact is None else beside(case, problem.exact)
+    return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
 
-def beside(case: Case, exact: NDArray[np.float64]) -> Case:
-    """Draw the exact tractions beside the contact, see `ContactProblem.exact`."""
+def with_exact_tractions(case: Case, exact: NDArray[np.float64]) -> Case:
+    """Return a case whose pictures include the exact tractions of `ContactProblem`."""
     solved = case.fields
     assert solved is not None
 
     def fields(s: Solution) -> Fields:
-        found = solved(s)
-        (side,) = found.contacts
-        return replace(found, contacts=(replace(side, exact=exact),))
+        result = solved(s)
+        (side,) = result.contacts
+        return replace(result, contacts=(replace(side, exact=exact),))
 
     return replace(case, fields=fields)
 
 
 @dataclass(frozen=True, eq=False)
-class FoundInWhole:
-    """An answer to the problem of undivided bodies; see `Found`."""
+class MonolithicSolution:
+    """Solution for undivided bodies; see `ContactSolution`."""
 
-    sides: AtSides
+    sides: InterfaceState
     bodies: Bodies
     problems: int
 
     def at(self, component: Nodes) -> Vector:
-        """Return the displacement at components (k,)."""
+        """Return the nondimensional displacement at components (k,)."""
         return self.sides.solution.x[component]
 
     def largest(self, value: float) -> float:
-        """Return the value, there being no other rank."""
+        """Return the value: there is a single process."""
         return value
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Give the bodies, one after another."""
+        """Yield the displaced bodies, one after another."""
         bodies, u = self.bodies, self.sides.solution.x * self.bodies.length
         for b in range(len(bodies.names)):
             mesh = Mesh(bodies.mesh.points, bodies.mesh.cells[bodies.body == b], {})
@@ -124,65 +130,64 @@ def contact_case(
     supported: Factorise,
     quantities: Callable[[Solution], Mapping[str, Any]],
     friction: Friction = NO_FRICTION,
-    parts: ProblemInParts | None = None,
+    parts: DecomposedProblem | None = None,
 ) -> Case:
-    """Emit the primal QP of a contact problem in one of FORMS.
+    """Return the case of a primal QP of contact in one of FORMS.
 
     Parameters
     ----------
-    floating, clamped : factorise K with its rigid modes, and without the prescribed
-        components; called where the form needs it
-    supported : as clamped, but of bodies, too, that contact alone holds; called when an
-        answer is to be certified
-    quantities : physical results from a solution of the primal problem; its z holds
-        the multipliers of the contact rows, then those of the friction
-    friction : with a given bound; its work is a part of the energy that the objective
-        stands for
-    parts : the same in subdomains, whose dual is emitted then
+    floating, clamped : factorise K with its rigid modes, and without the fixed
+        components; called only if the form needs it
+    supported : like clamped, also for bodies that only contact supports; called to
+        certify an answer
+    quantities : physical results of a solution of the primal problem; its z holds the
+        multipliers of the contact rows, then those of friction
+    friction : with a given bound; its work is part of the objective
+    parts : the decomposed problem; if given, its dual is returned
 
     """
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, in_parts, subdomains = None, None, None
+    seconds, certify_by_subdomains, subdomains = None, None, None
     if parts is not None:
         start = perf_counter()
-        own = on_one_process(parts)
-        pieces, in_parts = own.torn_bodies, certified_by(own, primal.P)
-        new = torn_dual(pieces, primal, friction)
+        local = on_one_process(parts)
+        decomposed, certify_by_subdomains = local.decomposed, certifier(local, primal.P)
+        transformed = feti_dual(decomposed, primal, friction)
         seconds = perf_counter() - start
         subdomains = parts.layout.label
-        matrices = torn_matrices(pieces, new.qp)
-        decomposition = torn_quantities(pieces, new.qp)
+        matrices = feti_matrices(decomposed, transformed.qp)
+        decomposition = decomposition_quantities(decomposed, transformed.qp)
     elif form == "primal":
-        new = posed(primal, friction)
+        transformed = primal_form(primal, friction)
     else:
         inverse = floating() if form == "dual" else clamped()
         start = perf_counter()
         transform = dualise if form == "dual" else dual_bounds
-        new = transform(primal, inverse, friction=friction)
-        # the factor may be there already, from another load step: it is charged for
+        transformed = transform(primal, inverse, friction=friction)
+        # the factor may exist already from another load step; its time counts anyway
         seconds = inverse.seconds + perf_counter() - start
-        matrices = _paper(new.qp, primal, friction, form, inverse)
+        matrices = _paper(transformed.qp, primal, friction, form, inverse)
     energy = bodies.force * bodies.length
     return Case(
-        qp=new.qp,
-        recover=lambda s: new.recover(s).x * bodies.length,
-        quantities=lambda s: {**quantities(new.recover(s)), **decomposition},
+        qp=transformed.qp,
+        recover=lambda s: transformed.recover(s).x * bodies.length,
+        quantities=lambda s: {**quantities(transformed.recover(s)), **decomposition},
         fields=lambda s: fields(
-            bodies, primal, new.recover(s), friction, subdomains=subdomains
+            bodies, primal, transformed.recover(s), friction, subdomains=subdomains
         ),
-        scale=new.sign * energy,
-        constant=new.constant * energy,
+        scale=transformed.sign * energy,
+        constant=transformed.constant * energy,
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=primal, back=new.recover, factorise=supported,
+            primal=primal, to_primal=transformed.recover, factorise=supported,
             mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
             scale=energy, grid=Grid(
                 bodies.mesh.points, bodies.mesh.cells, bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction, in_parts=in_parts,
+            friction=friction, certify_by_subdomains=certify_by_subdomains,
         ),
         unsettled=friction.unsettled,
     )  # fmt: skip
@@ -191,7 +196,7 @@ def contact_case(
 def _paper(
     dual: QP, primal: QP, friction: Friction, form: str, inverse: GeneralisedInverse
 ) -> dict[str, Any]:
-    """Name the matrices of the dual as the paper does, (2)-(5)."""
+    """Return the matrices of the dual under their names in the paper, (2)-(5)."""
     B, c = contact_rows(primal, friction)
     if form == "dual":
         B, c = csr_array(vstack([primal.A, B])), np.append(primal.b, c)

@@ -1,12 +1,12 @@
-"""Dualisation: transforms of a QP, each with its way back (paper, Section 3).
+"""Dualisation: transforms of a QP, each with its inverse (paper, Section 3).
 
 The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I.  Each transform
-returns the new problem together with a function that takes a solution of the new
-problem to a solution (point and all multipliers) of the old one.
+returns the new problem together with a function that maps a solution of it to a
+solution (point and all multipliers) of the primal problem.
 
-Friction with a given bound adds Σ g|Tu − s| to the objective. Its rows come last in B
-and c, with T and s, and their multipliers are bounded, |λ_t| ≤ g: of boxes a dual
-remains a QP, and z of the old problem holds them below those of the contact.
+Friction with a given bound g adds Σ g|Tu − s| to the objective. Its rows T, s come last
+in B and c, and their multipliers satisfy |λ_t| ≤ g, so that the dual remains a QP. In z
+of the primal problem they follow the multipliers of the contact rows.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from mortarbench.problems.fem.inverse import GeneralisedInverse
 
 
 class Transformed(NamedTuple):
-    """A transformed QP, its way back, and the relation between the objectives."""
+    """A transformed QP with its inverse map and the relation of the objectives."""
 
     qp: QP
     recover: Callable[[Solution], Solution]
-    sign: float  #: old objective = sign·new objective + constant, at the solutions
+    sign: float  #: primal objective = sign·new objective + constant, at the solutions
     constant: float
-    #: old point (n,), right where constraints can touch it; cheaper than `recover`
-    touched: Callable[[Solution], Vector]
+    #: primal point (n,), valid at the interface only; cheaper than `recover`
+    interface_displacement: Callable[[Solution], Vector]
 
 
-def posed(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
-    """Pose the problem as the QP that it is itself, with the work of the friction.
+def primal_form(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
+    """Return the primal problem as a QP, including the work of friction.
 
-    Its way back drops the variables of `harness.mechanics.with_friction` and takes λ_t
-    from the two rows of each; where the bound is zero, there is no force.
+    The inverse map drops the variables of `harness.mechanics.with_friction` and takes
+    λ_t as the difference of the multipliers of their two rows; λ_t = 0 where g = 0.
     """
     qp, n, m = with_friction(primal, friction), primal.q.size, primal.h.size
     if not friction.bound.size:
         return Transformed(qp, lambda s: s, 1.0, 0.0, lambda s: s.x)
-    moving = friction.bound > 0
+    has_friction = friction.bound > 0
 
     def recover(s: Solution) -> Solution:
         tangential = np.zeros(friction.bound.size)
         forwards, backwards = s.z[m:].reshape(2, -1)
-        tangential[moving] = forwards - backwards
+        tangential[has_friction] = forwards - backwards
         z = np.append(s.z[:m], tangential)
         return replace(s, x=s.x[:n], z=z, z_box=np.zeros(n))
 
@@ -61,22 +61,22 @@ def dualise(
     free: Vector | None = None,
     friction: Friction = NO_FRICTION,
 ) -> Transformed:
-    """Turn the primal QP into its dual, equations (2)-(5) of the paper.
+    """Return the dual of a primal QP, equations (2)-(5) of the paper.
 
     ::
 
         min ½λᵀFλ − dᵀλ   subject to   λ_I ≥ 0,  RᵀBᵀλ = Rᵀf
         F = BK⁺Bᵀ,  d = BK⁺f − c,  B = [B_E; B_I],  c = [c_E; c_I]
 
-    The way back is (6):  u = K⁺(f − Bᵀλ) − Rα  with α the multipliers of RᵀBᵀλ = Rᵀf.
-    (The paper's (4) has Rᵀb for Rᵀf.) The multipliers of the bounds are Bu − c, and at
-    the solutions  ½uᵀKu − fᵀu = −(½λᵀFλ − dᵀλ) − ½fᵀK⁺f.
+    The inverse map is (6),  u = K⁺(f − Bᵀλ) − Rα,  with α the multipliers of
+    RᵀBᵀλ = Rᵀf. (Equation (4) of the paper has Rᵀb instead of Rᵀf.) The multipliers of
+    the bounds are Bu − c, and at the solutions  ½uᵀKu − fᵀu = −(½λᵀFλ − dᵀλ) − ½fᵀK⁺f.
 
     Parameters
     ----------
-    primal : P = K; no finite bounds
+    primal : QP with P = K and no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
-    free : K⁺f (n,), where it is known already
+    free : K⁺f (n,), if already computed
     friction : with a given bound; its rows follow those of the contact
 
     """
@@ -87,23 +87,25 @@ def dualise(
     free = inverse(f) if free is None else free
     structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
     lb, ub = _bounds(primal, friction)
-    everything = np.full(m_E, np.inf)
-    lb, ub = np.append(-everything, lb), np.append(everything, ub)
+    unbounded = np.full(m_E, np.inf)
+    lb, ub = np.append(-unbounded, lb), np.append(unbounded, ub)
     qp = _dual(structure, c, inverse, free, lb, ub)
     if R.shape[1]:
         qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
 
     def recover(s: Solution) -> Solution:
-        u = inverse(f - B.T @ s.x)
+        u = inverse(f - B.T @ s.x)  # (6)
         if R.shape[1]:
             u = u - R @ s.y
         return replace(s, x=u, y=s.x[:m_E], z=s.x[m_E:], z_box=np.zeros(u.size))
 
-    def touched(s: Solution) -> Vector:
+    def interface_displacement(s: Solution) -> Vector:
         u = free - inverse.at_constraints(B.T @ s.x)
         return u - R @ s.y if R.shape[1] else u
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
+    return Transformed(
+        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
+    )
 
 
 def dual_bounds(
@@ -112,28 +114,28 @@ def dual_bounds(
     free: Vector | None = None,
     friction: Friction = NO_FRICTION,
 ) -> Transformed:
-    """Dualise the contact rows alone: λ ≥ 0 is the only constraint.
+    """Return the dual with respect to the contact rows alone, with λ ≥ 0 only.
 
     ::
 
         min ½λᵀFλ − dᵀλ   subject to   λ ≥ 0,    F = B_I K⁺B_Iᵀ,  d = B_I K⁺f − c_I
 
-    The way back is  u = K⁺(f − B_Iᵀλ);  the multipliers of the supports are the
-    reactions, from stationarity.
+    The inverse map is  u = K⁺(f − B_Iᵀλ).  The multipliers of the supports, the
+    reactions, follow from stationarity.
 
     Parameters
     ----------
-    primal : its equality rows hold single components at zero, by unit entries
-    clamped : K⁺ that is zero on these components
-    free : K⁺f (n,), where it is known already
+    primal : QP whose equality rows are unit vectors with zero right-hand side
+    clamped : K⁺ that is zero at these components
+    free : K⁺f (n,), if already computed
     friction : with a given bound; its rows follow those of the contact
 
     """
     f = -primal.q
     B, c = contact_rows(primal, friction)
     free = clamped(f) if free is None else free
-    held = np.unique(csr_array(primal.A).indices).astype(np.int64)
-    structure = Structure(K=primal.P, B=B, fixed=held)
+    fixed = np.unique(csr_array(primal.A).indices).astype(np.int64)
+    structure = Structure(K=primal.P, B=B, fixed=fixed)
     qp = _dual(structure, c, clamped, free, *_bounds(primal, friction))
 
     def recover(s: Solution) -> Solution:
@@ -141,14 +143,16 @@ def dual_bounds(
         reactions = -primal.A @ (primal.P @ u - f + B.T @ s.x)
         return replace(s, x=u, y=reactions, z=s.x, z_box=np.zeros(u.size))
 
-    def touched(s: Solution) -> Vector:
+    def interface_displacement(s: Solution) -> Vector:
         return free - clamped.at_constraints(B.T @ s.x)
 
-    return Transformed(qp, recover, -1.0, -0.5 * float(f @ free), touched)
+    return Transformed(
+        qp, recover, -1.0, -0.5 * float(f @ free), interface_displacement
+    )
 
 
-def bounded(dual: QP, friction: Friction) -> QP:
-    """Return a dual with other bounds of its friction; the way back is the same."""
+def with_friction_bound(dual: QP, friction: Friction) -> QP:
+    """Return a dual with other friction bounds; its inverse map is the same."""
     g = friction.bound
     if not g.size:
         return dual
@@ -159,7 +163,7 @@ def bounded(dual: QP, friction: Friction) -> QP:
 
 
 def _bounds(primal: QP, friction: Friction) -> tuple[Vector, Vector]:
-    """Bound the multipliers:  λ_n ≥ 0,  −g ≤ λ_t ≤ g."""
+    """Return the bounds of the multipliers,  λ_n ≥ 0  and  −g ≤ λ_t ≤ g."""
     m = primal.h.size
     return (
         np.append(np.zeros(m), -friction.bound),
@@ -175,7 +179,7 @@ def _dual(
     lb: Vector,
     ub: Vector,
 ) -> QP:
-    """Emit  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  lb ≤ λ ≤ ub."""
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  lb ≤ λ ≤ ub; `free` is K⁺f."""
     m, B = c.size, structure.B
     return QP(
         P=inverse.congruence(B), q=c - B @ free,

@@ -11,32 +11,33 @@ the total displacement, so that errors are relative to u and not to an increment
 
     min ½uᵀK u + (r − K u^j)ᵀu   subject to   B_D u = 0,   B u ≤ c.                (1)
 
-*K* is the tangent Π''(u^j) where that is positive definite on what the supports leave,
-which a Cholesky factorisation tells. Where it is not, the negative eigenvalues of the
-tangents of single cells are raised (`problems.fem.finite_strain.convexified`). The
-second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the iteration
-before ("geometric" contact stiffness), may join the tangent; without them the
-convergence is linear where both sides deform. To K is added ρB_DᵀB_D, which changes
-nothing where u = 0 on the supports and makes K positive definite as a whole: under
-compression the tangent is not singular but indefinite on rotations. What it stays
-singular on are translations that the supports leave, exactly.
+*K* is the tangent Π''(u^j) if that is positive definite on the motions that the
+supports allow, which a Cholesky factorisation shows. Otherwise the negative eigenvalues
+of the tangents of single cells are raised (`problems.fem.finite_strain.convexified`).
+The second derivatives of the gaps, −Σ λ_i g_i''(u^j) with the multipliers of the
+previous iteration ("geometric" contact stiffness), may be added to the tangent; without
+them convergence is linear if both sides deform. The term ρB_DᵀB_D is added to K. It
+vanishes where u = 0 on the supports and makes K definite on rotations, on which the
+tangent of a compressed body is indefinite rather than singular. The kernel that remains
+consists exactly of the translations that the supports allow.
 
 *Line search*: with the solution u of (1), d = u − u^j and a weight w above ‖λ‖∞, d is a
 descent direction of the exact penalty function (Nocedal and Wright, (18.27))
 
     φ(u) = Π(u) + w Σ max(0, −g_i(u)),
 
-and the step is the first of 1, ½, ¼, … that decreases it enough (Armijo). A full step
-that halves the least residual so far is taken without, as curved constraints may make φ
-grow near the solution (Maratos effect); that can happen a finite number of times only.
+and the step length is the first of 1, ½, ¼, … that satisfies Armijo's condition. A
+full step that halves the smallest residual so far is accepted without it, because
+curved constraints may increase φ near the solution (Maratos effect). This can happen
+only finitely often.
 
-*Vertices*: where the master bends inwards, a slave node may be pushed to and fro
-between two segments. When the iteration comes to no end, nodes that press keep the
-segments that are the closest there, and may leave them by a little on their lines.
+*Vertices*: where the master surface is concave, a slave node may alternate between two
+segments. If the iteration does not converge, pressing nodes keep their closest segments
+and may slide slightly beyond them along their lines.
 
-*Convergence*: equilibrium and gaps at the new u, with the multipliers of the QP, to
-SETTLED; see `NewtonPath.residual`. *Load*: where that is not reached, the load step is
-halved and what is left of it follows, down to its part 2^−HALVINGS.
+*Convergence*: `NewtonPath.residual`, of equilibrium and gaps at the new u with the
+multipliers of the QP, is at most TOLERANCE. *Load*: if that is not reached, the load
+step is halved, repeatedly down to the fraction 2^−MAX_HALVINGS.
 """
 
 from __future__ import annotations
@@ -61,19 +62,19 @@ from mortarbench.harness import (
     kkt_residuals,
 )
 from mortarbench.harness.errors import PastEndError
-from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
+from mortarbench.problems.duality.monolithic import MAX_REFERENCE_RESIDUAL, primal_qp
 from mortarbench.problems.duality.problem import Linearise
-from mortarbench.problems.duality.undivided import REFERENCE, primal_qp
 from mortarbench.problems.fem.finite_strain import (
     Cells,
-    Evaluated,
+    EnergyDerivatives,
     InvertedCellError,
     assemble,
-    clip,
-    convexified,
+    clip_eigenvalues,
+    convex_tangent,
     evaluate,
 )
 from mortarbench.problems.fem.fixing import fixing_nodes
@@ -84,19 +85,23 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.mesh import dofs_of
 
-SETTLED = 1e-9  #: residual of equilibrium and gaps at the end of a step
-ROUNDING = 2 * float(np.finfo(float).eps)  #: of the forces |K||u| within cells
-MOST_ITERATIONS = 60  #: of Newton's method at one load
-KEEP_AFTER = 20  #: of them after which nodes that press keep their segments
-HALVINGS = 8  #: of a load step
-SHORTEST = 2.0**-16  #: step of the line search
-NOISE = 8 * float(np.finfo(float).eps)  #: of the merit function, relative to energies
-ARMIJO = 1e-4  #: part of the predicted decrease that a step has to bring
-ABOVE = 1.5  #: weight of the penalty over the largest multiplier
-TURNING = 1e-8  #: part of a rigid motion that is a rotation, beyond rounding
+TOLERANCE = 1e-9  #: of `NewtonPath.residual` at the end of a load step
+#: rounding of nodal forces relative to |K||u|: strains are differences of displacements
+FORCE_ROUNDING = 2 * float(np.finfo(float).eps)
+MAX_ITERATIONS = 60  #: of Newton's method at one load
+KEEP_AFTER = 20  #: iterations after which pressing nodes keep their segments
+MAX_HALVINGS = 8  #: of a load step
+MIN_STEP = 2.0**-16  #: of the line search
+#: rounding of the merit function relative to the energies; without it, steps near the
+#: solution, whose decrease is below rounding, are rejected
+MERIT_ROUNDING = 8 * float(np.finfo(float).eps)
+ARMIJO_FRACTION = 1e-4  #: required share of the predicted decrease
+#: weight of the penalty relative to the largest multiplier; above 1 it is exact
+PENALTY_FACTOR = 1.5
+MAX_ROTATION = 1e-8  #: rotational share of a rigid motion that counts as rounding
 
 #: displacement (n,) in m, multipliers (m,) in N/m → blocks (m, k, k) in Pa of
-#: −Σ λ_i g_i''(u), and the components (m, k) that they are of
+#: −Σ λ_i g_i''(u), and their components (m, k)
 Curvature = Callable[[Vector, Vector], tuple[NDArray[np.float64], NDArray[np.int64]]]
 
 
@@ -104,59 +109,59 @@ class Gaps(NamedTuple):
     """The gaps of the contact rows as functions of the displacement."""
 
     linearise: Linearise
-    curvature: Curvature | None = None  #: left out where there is none
-    #: at a displacement (n,) in m, the gaps for which the slave nodes (places,) named
-    #: keep the segments that are the closest there; none where there is no such choice
-    keeping: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
+    curvature: Curvature | None = None  #: None without contact stiffness
+    #: returns, for a displacement (n,) in m and a mask (places,) of slave nodes, gaps
+    #: with these nodes kept on their closest segments; None if there are no segments
+    keep_segments: Callable[[Vector, NDArray[np.bool_]], Gaps] | None = None
 
 
 class NoEquilibriumError(ArithmeticError):
-    """Newton's method has not come to an equilibrium at some load."""
+    """Newton's method found no equilibrium at some load."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Iteration:
-    """One iteration of Newton's method: its QP, and what came of it."""
+    """One iteration of Newton's method: its QP and the result."""
 
-    #: with K and f of (1), f = K u^j − r; all else of the undeformed bodies
+    #: bodies with K and f of (1), f = K u^j − r; otherwise undeformed
     tangent: Bodies
     primal: QP
     rows: ContactRows
     gaps: Gaps
-    u: Vector  #: u^j (n,), without dimensions
+    u: Vector  #: u^j (n,), nondimensional
     load_factor: float  #: κ
-    constant: float  #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, what (1) lacks of Π's model
-    clipped: int  #: cells whose tangent was made positive semidefinite
+    constant: float  #: Π(u^j) − rᵀu^j + ½u^jᵀK u^j, the constant of the model (1) of Π
+    clipped: int  #: number of cells with a tangent made positive semidefinite
     answer: Solution  #: of (1)
-    length: float = 1.0  #: of the step that was taken
-    residual: float = np.inf  #: after it
+    length: float = 1.0  #: accepted step length
+    residual: float = np.inf  #: after the step
 
 
 class Configuration(NamedTuple):
-    """A displacement, with everything that is evaluated there."""
+    """A displacement with all quantities evaluated there."""
 
     u: Vector
     rows: ContactRows
-    gap: Vector  #: (m,) without dimensions
-    cells: Evaluated
+    gap: Vector  #: (m,) nondimensional
+    cells: EnergyDerivatives
     energy: float  #: Π
     r: Vector  #: (n,) Π'
 
 
 @dataclass(frozen=True, eq=False)
 class NewtonPath:
-    """The load steps of one analysis at finite strain; what was solved is remembered.
+    """The load steps of one analysis at finite strain; solved steps are cached.
 
     Raises
     ------
     InputError
-        When a load step has no equilibrium that the method finds, or less iterations
-        than are asked for, or the supports leave a body to rotate.
+        If the method finds no equilibrium of a load step, if a step has fewer
+        iterations than requested, or if the supports allow a body to rotate.
 
     """
 
-    bodies: Bodies  #: K is that of the undeformed bodies
-    cells: Cells  #: without dimensions, as K is
+    bodies: Bodies  #: with K of the undeformed bodies
+    cells: Cells  #: nondimensional, like K
     gaps: Gaps
     reference: Reference
     steps: int = 1
@@ -164,38 +169,38 @@ class NewtonPath:
     _parts: list[int] = field(default_factory=list, init=False)
 
     def iteration(self, k: int, newton: int = 0) -> Iteration:
-        """Pose step k (1 … steps): its iteration 1, 2, …, or the last one for 0."""
-        found = self.iterations(k)
-        if newton > len(found):
+        """Return iteration 1, 2, … of step k (1 … steps), or the last one for 0."""
+        iterations = self.iterations(k)
+        if newton > len(iterations):
             raise PastEndError(
-                f"newton={newton}: step {k} has {len(found)} Newton iterations; "
+                f"newton={newton}: step {k} has {len(iterations)} Newton iterations; "
                 "expected at most that, or 0 for the last"
             )
-        return found[newton - 1]
+        return iterations[newton - 1]
 
     def iterations(self, k: int) -> list[Iteration]:
-        """List the Newton iterations of step k at its full load."""
+        """Return the Newton iterations of step k at its full load."""
         while len(self._steps) < k:
-            found, parts = self._stepped(len(self._steps) + 1)
+            found, parts = self._load_step(len(self._steps) + 1)
             self._steps.append(found)
             self._parts.append(parts)
         return self._steps[k - 1]
 
     def parts(self, k: int) -> int:
-        """Count the parts that the load of step k came in; 1 without a cut-back."""
+        """Return the number of parts of load step k; 1 if it was not halved."""
         self.iterations(k)
         return self._parts[k - 1]
 
     def state(self, at: Iteration, s: Solution) -> tuple[float, float, float]:
         """Evaluate Π, the residual and the largest penetration at a solution of a QP.
 
-        Without dimensions; s is of `at.primal`. The penetration is that of the closest
-        segments, whichever are kept.
+        All are nondimensional; s solves `at.primal`. The penetration refers to the
+        closest segments, even where nodes keep others.
 
         Raises
         ------
         InvertedCellError
-            When a cell is inverted there.
+            If a cell is inverted there.
 
         """
         lam = self._at_places(replace(at, answer=s))
@@ -204,12 +209,12 @@ class NewtonPath:
         penetration = float((-gap).max(initial=0.0))
         return reached.energy, self.residual(reached, lam, at.load_factor), penetration
 
-    def _stepped(self, k: int) -> tuple[list[Iteration], int]:
-        """Go from step k − 1 to step k, in halves of what is left where it fails."""
-        if self._unfit:
-            raise InputError(self._unfit)
+    def _load_step(self, k: int) -> tuple[list[Iteration], int]:
+        """Solve step k from the end of step k − 1; halve the increment on failure."""
+        if self._kernel_defect:
+            raise InputError(self._kernel_defect)
         reached, target = (k - 1) / self.steps, k / self.steps
-        least = (target - reached) / 2**HALVINGS
+        least = (target - reached) / 2**MAX_HALVINGS
         size, parts = target - reached, 0
         u, lam = self._start(k)
         while True:
@@ -217,7 +222,7 @@ class NewtonPath:
                 target if reached + size > target - least / 2 else reached + size
             )
             try:
-                found = self._solved(load_factor, u, lam)
+                iterations = self._solve_load(load_factor, u, lam)
             except NoEquilibriumError as e:
                 size /= 2
                 if size < least:
@@ -229,28 +234,30 @@ class NewtonPath:
                 continue
             parts += 1
             if load_factor == target:
-                return found, parts
-            reached, (u, lam) = load_factor, self._end(found)
+                return iterations, parts
+            reached, (u, lam) = load_factor, self._end(iterations)
 
     def _advice(self, load_factor: float) -> str:
-        """Name a problem with an equilibrium where a load has none that is found.
+        """Return advice for a load at which no equilibrium is found.
 
-        Entries of F = I + ∂u/∂X are known to the rounding of 1: of cells of size h that
-        leaves forces of about h|K|·1, whatever the load. Beside a tiny load they are
-        more than SETTLED.
+        The entries of F = I + ∂u/∂X carry the rounding error of 1. In cells of size h
+        this causes forces of about eps·h|K|·1 at any load, and for a tiny load they
+        exceed TOLERANCE.
         """
         h = float(np.sqrt(self.cells.volumes.sum(axis=1).mean()))
         rounded = h * self._free_norm(
             abs(self.bodies.K) @ np.ones(self.bodies.mesh.dofs)
         )
         share = (
-            ROUNDING * rounded / (load_factor * self._free_norm(self.bodies.f) or 1.0)
+            FORCE_ROUNDING
+            * rounded
+            / (load_factor * self._free_norm(self.bodies.f) or 1.0)
         )
-        if share <= SETTLED:
+        if share <= TOLERANCE:
             return "a smaller load, or supports that hold the bodies better"
         return (
             f"a larger load, or kinematics=linear: of strains this small, rounding "
-            f"leaves {share:.0e} of the forces, and {SETTLED:g} is asked for"
+            f"leaves {share:.0e} of the forces, and {TOLERANCE:g} is asked for"
         )
 
     def _start(self, k: int) -> tuple[Vector, Vector]:
@@ -258,8 +265,8 @@ class NewtonPath:
             return np.zeros(self.bodies.mesh.dofs), np.zeros(self._places)
         return self._end(self.iterations(k - 1))
 
-    def _end(self, found: list[Iteration]) -> tuple[Vector, Vector]:
-        last = found[-1]
+    def _end(self, iterations: list[Iteration]) -> tuple[Vector, Vector]:
+        last = iterations[-1]
         return last.answer.x, self._at_places(last)
 
     @property
@@ -267,49 +274,56 @@ class NewtonPath:
         return sum(pair.slave.size for pair in self.bodies.pairs)
 
     def _at_places(self, at: Iteration) -> Vector:
-        """Return the multiplier (places,) of each slave node; zero without a row."""
+        """Return multipliers (places,) of all slave nodes; zero without a row."""
         force = np.zeros(self._places)
         force[at.rows.place] = np.maximum(at.answer.z, 0.0)
         return force
 
-    def _solved(self, load_factor: float, u: Vector, lam: Vector) -> list[Iteration]:
-        """Iterate at one load, from u and the multipliers (places,).
+    def _solve_load(
+        self, load_factor: float, u: Vector, lam: Vector
+    ) -> list[Iteration]:
+        """Return the iterations at one load, from u and the multipliers (places,).
 
-        Where that does not settle, nodes that press keep their segments from there on.
+        If the iteration does not converge, pressing nodes keep their segments from then
+        on.
         """
         gaps = self.gaps
         at = self._configuration(u, load_factor, gaps)
         best, weight = self.residual(at, lam, load_factor), 0.0
-        found: list[Iteration] = []
-        while len(found) < MOST_ITERATIONS:
-            stuck = ""
-            if len(found) < KEEP_AFTER or gaps.keeping is None:
-                posed = self._posed(at, lam, load_factor, gaps)
-                lam = self._at_places(posed)
-                weight = max(weight, ABOVE * lam.max(initial=0.0))
+        iterations: list[Iteration] = []
+        while len(iterations) < MAX_ITERATIONS:
+            reason = ""
+            if len(iterations) < KEEP_AFTER or gaps.keep_segments is None:
+                iteration = self._linearise(at, lam, load_factor, gaps)
+                lam = self._at_places(iteration)
+                weight = max(weight, PENALTY_FACTOR * lam.max(initial=0.0))
                 try:
-                    at, length, residual = self._moved(at, posed, lam, weight, best)
+                    at, length, residual = self._line_search(
+                        at, iteration, lam, weight, best
+                    )
                 except NoEquilibriumError as e:
-                    stuck = str(e)
+                    reason = str(e)
                 else:
                     best = min(best, residual)
-                    found.append(replace(posed, length=length, residual=residual))
-                    if length == 1 and residual <= SETTLED + self._rounding(
-                        at, lam, posed
+                    iterations.append(
+                        replace(iteration, length=length, residual=residual)
+                    )
+                    if length == 1 and residual <= TOLERANCE + self._rounding(
+                        at, lam, iteration
                     ):
-                        return found
+                        return iterations
                     continue
-            if gaps.keeping is None:
+            if gaps.keep_segments is None:
                 raise NoEquilibriumError(
-                    f"at {load_factor:.6g}, iteration {len(found) + 1} ended with a "
-                    f"residual of {best:.1e}: {stuck}"
+                    f"at {load_factor:.6g}, iteration {len(iterations) + 1} ended with "
+                    f"a residual of {best:.1e}: {reason}"
                 )
-            pressing = lam > ACTIVE * lam.max(initial=0.0)
-            gaps = gaps.keeping(at.u * self.bodies.length, pressing)
+            pressing = lam > ACTIVE_THRESHOLD * lam.max(initial=0.0)
+            gaps = gaps.keep_segments(at.u * self.bodies.length, pressing)
             at = self._configuration(at.u, load_factor, gaps)
             best = self.residual(at, lam, load_factor)
         raise NoEquilibriumError(
-            f"at {load_factor:.6g}, {MOST_ITERATIONS} iterations left a residual of "
+            f"at {load_factor:.6g}, {MAX_ITERATIONS} iterations left a residual of "
             f"{best:.1e}"
         )
 
@@ -324,45 +338,45 @@ class NewtonPath:
         )
 
     def residual(self, at: Configuration, lam: Vector, load_factor: float) -> float:
-        """Measure equilibrium and contact at u, with multipliers (places,).
+        """Return the residual of equilibrium and contact for multipliers (places,).
 
-        The larger of ‖r + Bᵀλ‖ on the free components, over that of the load or of Bᵀλ;
-        the largest penetration; and the largest gap under a multiplier, times its part
-        of the largest one. Gaps are in lengths of the bodies.
+        It is the largest of: ‖r + Bᵀλ‖ on the free components, relative to the larger
+        norm of load and Bᵀλ; the largest penetration; and the largest |g_i| λ_i / max λ
+        (complementarity). Gaps are in units of the length of the bodies.
         """
         pressing = lam[at.rows.place]
         contact = at.rows.B.T @ pressing
-        left = self._free_norm(at.r + contact) / self._forces(at, lam, load_factor)
-        most = pressing.max(initial=0.0) or 1.0
+        imbalance = self._free_norm(at.r + contact) / self._forces(at, lam, load_factor)
+        largest = pressing.max(initial=0.0) or 1.0
         penetration = float((-at.gap).max(initial=0.0))
-        apart = float((pressing / most * np.abs(at.gap)).max(initial=0.0))
-        return max(left, penetration, apart)
+        complementarity = float((pressing / largest * np.abs(at.gap)).max(initial=0.0))
+        return max(imbalance, penetration, complementarity)
 
     def _forces(self, at: Configuration, lam: Vector, load_factor: float) -> float:
-        """Return the larger norm of the load and of Bᵀλ; 1 where there is neither."""
+        """Return the larger norm of the load and of Bᵀλ; 1 if both are zero."""
         contact = at.rows.B.T @ lam[at.rows.place]
         load = self._free_norm(load_factor * self.bodies.f)
         return max(load, self._free_norm(contact)) or 1.0
 
     def _free_norm(self, force: Vector) -> float:
-        """Return the norm of a force (n,) on the components that no support holds."""
+        """Return the norm of a force (n,) on the unsupported components."""
         free = np.ones(force.size, dtype=bool)
         free[self.bodies.B_D.indices] = False
         return float(np.linalg.norm(force[free]))
 
-    def _rounding(self, at: Configuration, lam: Vector, posed: Iteration) -> float:
-        """Bound what rounding leaves of `residual`.
+    def _rounding(self, at: Configuration, lam: Vector, iteration: Iteration) -> float:
+        """Return a bound of the rounding error of `residual`.
 
-        The strains of a cell are differences of displacements, which are known to their
-        own rounding: of forces Ku it leaves a part of |K||u|.
+        The strains of a cell are differences of displacements, so that the forces Ku
+        carry a rounding error proportional to |K||u|, however small they are.
         """
-        rounded = self._free_norm(abs(posed.tangent.K) @ np.abs(at.u))
-        return ROUNDING * rounded / self._forces(at, lam, posed.load_factor)
+        rounded = self._free_norm(abs(iteration.tangent.K) @ np.abs(at.u))
+        return FORCE_ROUNDING * rounded / self._forces(at, lam, iteration.load_factor)
 
-    def _posed(
+    def _linearise(
         self, at: Configuration, lam: Vector, load_factor: float, gaps: Gaps
     ) -> Iteration:
-        """Pose (1) and solve it."""
+        """Assemble the QP (1) at a configuration and solve it."""
         K, inverse, clipped = self._convex(at, lam, gaps.curvature)
         tangent = replace(self.bodies, K=K, f=K @ at.u - at.r)
         primal = primal_qp(tangent, at.rows)
@@ -376,19 +390,20 @@ class NewtonPath:
     def _convex(
         self, at: Configuration, lam: Vector, curvature: Curvature | None
     ) -> tuple[csc_array, GeneralisedInverse, int]:
-        """Make the tangent positive definite where it is not, and factorise it.
+        """Return a positive definite tangent with its factor and the clipped cells.
 
-        Where contact stiffness is part of it, its own negative eigenvalues go first.
+        If the tangent is indefinite, the negative eigenvalues of the contact stiffness
+        are removed first, then those of the tangents of cells.
         """
-        held = self.bodies.B_D
-        found: list[tuple[csc_array, GeneralisedInverse]] = []
+        supports = self.bodies.B_D
+        factorised: list[tuple[csc_array, GeneralisedInverse]] = []
         contact = self._contact_stiffness(at, lam, curvature)
 
         def positive(K: csc_array) -> bool:
             K = csc_array(K + contact)
-            K = csc_array(K + K.diagonal().max() * (held.T @ held))
+            K = csc_array(K + K.diagonal().max() * (supports.T @ supports))
             try:
-                found.append((K, self._inverse(K)))
+                factorised.append((K, self._inverse(K)))
             except np.linalg.LinAlgError:
                 return False
             return True
@@ -397,12 +412,12 @@ class NewtonPath:
         if contact.nnz and not positive(assemble(self.cells, tangents)):
             contact = self._contact_stiffness(at, lam, curvature, convex=True)
         clipped = 0
-        if not found:
+        if not factorised:
             try:
-                _, clipped = convexified(self.cells, tangents, positive)
+                _, clipped = convex_tangent(self.cells, tangents, positive)
             except ArithmeticError as e:
                 raise NoEquilibriumError(str(e)) from None
-        return *found[-1], clipped
+        return *factorised[-1], clipped
 
     def _contact_stiffness(
         self,
@@ -412,34 +427,38 @@ class NewtonPath:
         *,
         convex: bool = False,
     ) -> csc_array:
-        """Assemble −Σ λ_i g_i'', without dimensions; empty where it is left out."""
+        """Assemble −Σ λ_i g_i'', nondimensional; empty without contact stiffness."""
         n = at.u.size
         if curvature is None:
             return csc_array((n, n))
         l, F = self.bodies.length, self.bodies.force
         blocks, dofs = curvature(at.u * l, lam[at.rows.place] * F)
         if convex:
-            blocks, _ = clip(blocks)
+            blocks, _ = clip_eigenvalues(blocks)
         i, j = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, (1, dofs.shape[1]))
         return csc_array((blocks.ravel() * l / F, (i.ravel(), j.ravel())), shape=(n, n))
 
     def _inverse(self, K: csc_array) -> GeneralisedInverse:
         tangent = replace(self.bodies, K=K)
-        return clamped(tangent) if self._held else guided(tangent)
+        return (
+            factorise_clamped(tangent)
+            if self._is_supported
+            else sliding_inverse(tangent)
+        )
 
     @cached_property
-    def _held(self) -> bool:
-        """Whether the supports alone hold every body."""
-        return not motions_left(self.bodies).shape[1]
+    def _is_supported(self) -> bool:
+        """True if the supports exclude all rigid motions."""
+        return not free_rigid_motions(self.bodies).shape[1]
 
     @cached_property
-    def _unfit(self) -> str:
-        """Say why the tangent's kernel is not translations; empty where it is."""
+    def _kernel_defect(self) -> str:
+        """Reason why the kernel of the tangent is not translations; empty if it is."""
         try:
-            translations_left(self.bodies)
+            free_translations(self.bodies)
         except InputError as e:
             return str(e)
-        if self.gaps.curvature is not None and not self._held:
+        if self.gaps.curvature is not None and not self._is_supported:
             return (
                 "contact_stiffness=geometric where contact alone holds a body is not "
                 "built: its translations change the contact forces; expected "
@@ -448,7 +467,7 @@ class NewtonPath:
         return ""
 
     def _solve(self, primal: QP, inverse: GeneralisedInverse) -> Solution:
-        transform = dual_bounds if self._held else dualise
+        transform = dual_bounds if self._is_supported else dualise
         new = transform(primal, inverse)
         if not new.qp.q.size:
             none = np.zeros(0)
@@ -459,34 +478,36 @@ class NewtonPath:
             s = self.reference(new.qp)
         except ArithmeticError as e:
             raise NoEquilibriumError(f"its QP was not solved: {e}") from None
-        if not (worst := kkt_residuals(new.qp, s).worst) <= REFERENCE:
+        if not (worst := kkt_residuals(new.qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
             raise NoEquilibriumError(
                 f"its reference solve left a residual of {worst:.1e}, more than "
-                f"{REFERENCE:g}"
+                f"{MAX_REFERENCE_RESIDUAL:g}"
             )
         return new.recover(s)
 
-    def _moved(
-        self, at: Configuration, posed: Iteration, lam: Vector, weight: float,
+    def _line_search(
+        self, at: Configuration, iteration: Iteration, lam: Vector, weight: float,
         best: float,
     ) -> tuple[Configuration, float, float]:  # fmt: skip
-        """Search along the step: the new configuration, the length, the residual."""
-        load_factor = posed.load_factor
-        d = posed.answer.x - at.u
+        """Return the new configuration, the step length and the residual."""
+        load_factor = iteration.load_factor
+        d = iteration.answer.x - at.u
         merit = _merit(at, weight)
-        noise = NOISE * (abs(at.cells.energy) + abs(at.energy))
+        noise = MERIT_ROUNDING * (abs(at.cells.energy) + abs(at.energy))
         slope = float(at.r @ d) - weight * float(np.maximum(-at.gap, 0.0).sum())
         length, inverted = 1.0, None
-        while length >= SHORTEST:
+        while length >= MIN_STEP:
             try:
-                new = self._configuration(at.u + length * d, load_factor, posed.gaps)
+                new = self._configuration(
+                    at.u + length * d, load_factor, iteration.gaps
+                )
             except InvertedCellError as e:
                 inverted = e
             else:
                 residual = self.residual(new, lam, load_factor)
                 if (length == 1 and residual <= best / 2) or (
                     _merit(new, weight)
-                    <= merit + ARMIJO * length * min(slope, 0.0) + noise
+                    <= merit + ARMIJO_FRACTION * length * min(slope, 0.0) + noise
                 ):
                     return new, length, residual
             length /= 2
@@ -496,51 +517,51 @@ class NewtonPath:
 
 
 def _merit(at: Configuration, weight: float) -> float:
-    """Evaluate φ."""
+    """Return the merit function φ at a configuration."""
     return at.energy + weight * float(np.maximum(-at.gap, 0.0).sum())
 
 
-def motions_left(bodies: Bodies) -> NDArray[np.float64]:
-    """Return an orthonormal basis (n, r) of the rigid motions that the supports leave.
+def free_rigid_motions(bodies: Bodies) -> NDArray[np.float64]:
+    """Return an orthonormal basis (n, r) of the rigid motions that the supports allow.
 
-    Of the undeformed bodies; exact for translations, whatever the deformation.
+    They refer to the undeformed bodies; translations are exact for any deformation.
     """
     rigid = bodies.rigid
-    held = rigid[bodies.B_D.indices]
-    return np.asarray(rigid @ null_space(held)) if held.size else rigid
+    fixed = rigid[bodies.B_D.indices]
+    return np.asarray(rigid @ null_space(fixed)) if fixed.size else rigid
 
 
-def translations_left(bodies: Bodies) -> list[NDArray[np.float64]]:
-    """Find per body an orthonormal basis (2N_body, r) of the translations left.
+def free_translations(bodies: Bodies) -> list[NDArray[np.float64]]:
+    """Return per body an orthonormal basis (2N_body, r) of its free translations.
 
     Raises
     ------
     InputError
-        When a rotation is left: the tangent at finite strain may be indefinite there,
-        and what holds the body (contact) is no part of it.
+        If a body can rotate: the tangent may be indefinite on rotations, and the
+        contact that supports the body is not part of it.
 
     """
-    owner, found = bodies.body_of_node, []
-    held = np.zeros(bodies.mesh.dofs, dtype=bool)
-    held[bodies.B_D.indices] = True
+    owner, bases = bodies.body_of_node, []
+    fixed = np.zeros(bodies.mesh.dofs, dtype=bool)
+    fixed[bodies.B_D.indices] = True
     rigid = bodies.rigid
     for b, name in enumerate(bodies.names):
-        own = dofs_of(np.flatnonzero(owner == b), bodies.mesh.dim)
-        R = rigid[own][:, 3 * b : 3 * b + 3]
-        left = null_space(R[held[own]]) if held[own].any() else np.eye(3)
-        if np.abs(left[2]).max(initial=0.0) > TURNING:
+        dofs = dofs_of(np.flatnonzero(owner == b), bodies.mesh.dim)
+        R = rigid[dofs][:, 3 * b : 3 * b + 3]
+        remaining = null_space(R[fixed[dofs]]) if fixed[dofs].any() else np.eye(3)
+        if np.abs(remaining[2]).max(initial=0.0) > MAX_ROTATION:
             raise InputError(
                 f"kinematics=finite: the supports leave body {name!r} to rotate, where "
                 "a stressed body has a stiffness of either sign; expected supports "
                 "that leave translations at most"
             )
-        found.append(R @ left)
-    return found
+        bases.append(R @ remaining)
+    return bases
 
 
-def guided(tangent: Bodies) -> GeneralisedInverse:
-    """Factorise K with the translations that its supports leave, as `dual` needs it."""
-    kernels = translations_left(tangent)
+def sliding_inverse(tangent: Bodies) -> GeneralisedInverse:
+    """Factorise K for the form `dual`, with its free translations as kernel."""
+    kernels = free_translations(tangent)
     owner, points = tangent.body_of_node, tangent.mesh.points
     dim, none = tangent.mesh.dim, np.zeros(0, dtype=np.int64)
     fixing = [

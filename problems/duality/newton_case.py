@@ -1,4 +1,4 @@
-"""From one Newton iteration at finite strain to the case of each form."""
+"""Cases of one Newton iteration at finite strain, in each form."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from mortarbench.harness import Case, Fields, Reference, Solution, Vector
-from mortarbench.problems.contact.bodies import Bodies, clamped, supported
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    factorise_clamped,
+    factorise_supported,
+)
 from mortarbench.problems.contact.linearise import (
     closest_segments,
     contact_stiffness,
@@ -19,7 +23,12 @@ from mortarbench.problems.contact.linearise import (
 )
 from mortarbench.problems.contact.results import fields, quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.newton import Gaps, Iteration, NewtonPath, guided
+from mortarbench.problems.duality.newton import (
+    Gaps,
+    Iteration,
+    NewtonPath,
+    sliding_inverse,
+)
 from mortarbench.problems.duality.problem import Linearise
 from mortarbench.problems.fem.finite_strain import (
     Cells,
@@ -36,10 +45,10 @@ def newton_path(
     bodies: Bodies, linearise: Linearise, params: Mapping[str, Any],
     reference: Reference, steps: int = 1,
 ) -> NewtonPath:  # fmt: skip
-    """Prepare the load steps of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
+    """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
-    linearise : of the contact rows, by the method that params name, if there is any
-    params : material; of contact, contact_stiffness where they choose the method
+    linearise : linearisation of contact by the method in params, if any
+    params : keys of the case: material, and contact, contact_stiffness where they apply
     """
     gaps = Gaps(linearise)
     if params.get("contact") == "nts":
@@ -50,21 +59,23 @@ def newton_path(
 
 
 def _node_to_segment(bodies: Bodies, linearise: Linearise, stiffness: str) -> Gaps:
-    """Collect the gaps of slave nodes to segments, which have second derivatives."""
+    """Return the gaps of slave nodes to segments, with second derivatives."""
     geometric = stiffness == "geometric"
 
-    def keeping(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
+    def keep_segments(u: Vector, pressing: NDArray[np.bool_]) -> Gaps:
         kept = np.where(pressing, closest_segments(bodies, u), -1)
         return Gaps(
-            linearisation(bodies, "nts", None, kept=kept),
+            linearisation(bodies, "nts", None, fixed_segments=kept),
             contact_stiffness(bodies, kept) if geometric else None,
         )
 
-    return Gaps(linearise, contact_stiffness(bodies) if geometric else None, keeping)
+    return Gaps(
+        linearise, contact_stiffness(bodies) if geometric else None, keep_segments
+    )
 
 
 def cells_without_units(bodies: Bodies, material: str) -> Cells:
-    """Prepare the cells of bodies in lengths l and forces F₀, as their K is."""
+    """Return the cells of bodies in units of l and F₀, like their K."""
     l, F = bodies.length, bodies.force
     mesh = replace(bodies.mesh, points=bodies.mesh.points / l)
     laws = [hyperelastic(material, m, unit=F / l) for m in bodies.materials]
@@ -78,15 +89,15 @@ def newton_case(
     newton: int,
     results: Callable[[Iteration, Solution], Mapping[str, Any]] = lambda _, s: {},
 ) -> Case:
-    """Emit the QP of a Newton iteration in one of `problems.duality.case_forms.FORMS`.
+    """Return the case of a Newton iteration in one of the FORMS of `case_forms`.
 
-    Its objective stands for the quadratic model of the potential Π about the iterate;
-    the quantity `energy` is Π itself. K is definite on what the supports hold, so that
-    all forms are of one QP: only translations are left to `dual`.
+    Its objective is the quadratic model of the potential Π about the iterate; the
+    quantity `energy` is Π itself. The kernel of K contains only translations, also in
+    the form `dual`, so that all forms belong to the same QP.
 
     Parameters
     ----------
-    step, newton : as of `NewtonPath.iteration`
+    step, newton : see `NewtonPath.iteration`
     results : further quantities from a solution of the primal problem
 
     """
@@ -94,7 +105,7 @@ def newton_case(
     iterations = path.iterations(step)
     bodies, primal = at.tangent, at.primal
     unit = bodies.length * bodies.force
-    found = {
+    step_quantities = {
         "newton": newton or len(iterations),
         "newton_iterations": len(iterations),
         "load_parts": path.parts(step),
@@ -107,16 +118,17 @@ def newton_case(
 
     def collected(s: Solution) -> Mapping[str, Any]:
         stresses = cauchy_stresses(path.cells, bodies, s.x)
-        told = quantities(bodies, primal, s, stresses=stresses)
-        return told | path_state(path, at, s) | found | dict(results(at, s))
+        values = quantities(bodies, primal, s, stresses=stresses)
+        return values | path_state(path, at, s) | step_quantities | dict(results(at, s))
 
     case = contact_case(
         bodies, primal, form,
-        floating=lambda: guided(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies), quantities=collected,
+        floating=lambda: sliding_inverse(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies), quantities=collected,
     )  # fmt: skip
     assert case.mechanics is not None
-    back, constant = case.mechanics.back, at.constant * unit
+    back, constant = case.mechanics.to_primal, at.constant * unit
 
     def drawn(s: Solution) -> Fields:
         s = back(s)
@@ -132,10 +144,10 @@ def newton_case(
 
 
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
-    """Evaluate the nonlinear problem at an answer; NaN where it inverts a cell.
+    """Return nonlinear quantities of an answer; NaN if it inverts a cell.
 
-    energy: Π, J/m. residual: of equilibrium and contact, see
-    `NewtonPath.residual`. penetration: the largest one, m.
+    energy: Π, J/m. residual: of equilibrium and contact, see `NewtonPath.residual`.
+    penetration: the largest one, m.
     """
     try:
         energy, residual, penetration = path.state(at, s)
@@ -150,9 +162,9 @@ def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
 
 
 def cauchy_stresses(cells: Cells, bodies: Bodies, u: Vector) -> dict[str, Vector]:
-    """Recover Cauchy's stresses at the nodes (N,), Pa; NaN where one is inverted.
+    """Recover the Cauchy stresses at the nodes (N,), Pa; NaN if a cell is inverted.
 
-    u : (n,) without dimensions
+    u : (n,) nondimensional
     """
     stress = cauchy_stress(cells, u) * (bodies.force / bodies.length)
     if not np.isfinite(strain_energy(cells, u)):
@@ -163,7 +175,7 @@ def cauchy_stresses(cells: Cells, bodies: Bodies, u: Vector) -> dict[str, Vector
 
 
 def translations(bodies: Bodies) -> Vector:
-    """Return orthonormal translations of every body on its own, (n, 2 bodies)."""
+    """Return the orthonormal translations of each body, (n, 2·bodies)."""
     owner = bodies.body_of_node
     sizes = np.bincount(owner, minlength=len(bodies.names))
     return np.asarray(

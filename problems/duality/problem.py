@@ -1,7 +1,7 @@
-"""A contact problem as a family states it: once, and nothing assembled.
+"""The description of a contact problem by its family, before assembly.
 
-Of it follow the QPs of undivided bodies (`problems.duality.undivided`) and those of
-subdomains, on one process or on several ranks (`problems.duality.divided`).
+The QPs of undivided bodies (`problems.duality.monolithic`) and of decomposed bodies, on
+one process or several ranks (`problems.duality.decomposed`), are derived from it.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
     UnassembledBodies,
-    assembled,
-    clamped,
-    floating,
-    supported,
-    supports,
+    assemble_stiffness,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
@@ -45,7 +45,7 @@ from mortarbench.problems.feti.structured import Layout
 from mortarbench.problems.feti.subdivision import (
     Subdivision,
     half_discs_in_blocks,
-    mesh_in_parts,
+    mesh_in_subdomains,
 )
 from mortarbench.problems.feti.tearing import compact_blocks
 
@@ -53,7 +53,7 @@ Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m →
 
 
 class Shape(Protocol):
-    """Bodies without material, meshed when somebody asks for the mesh."""
+    """Geometry of bodies; the mesh is generated on first use."""
 
     @property
     def dim(self) -> int:
@@ -69,10 +69,10 @@ class Shape(Protocol):
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by their names, of which no mesh needs to be made."""
+        """Chains of nodes by name, available without the mesh."""
 
     def layout(self, size: int) -> Subdivision:
-        """Cut the bodies; what `size` means depends on the shape."""
+        """Return the subdivision for a size, whose meaning depends on the shape."""
 
 
 B = TypeVar("B", StructuredGrid, HalfDisc)
@@ -80,7 +80,7 @@ B = TypeVar("B", StructuredGrid, HalfDisc)
 
 @dataclass(frozen=True, eq=False)
 class _Joined(Generic[B]):
-    """Bodies of known shape in the plane, numbered one after another."""
+    """Plane bodies of parametric shape, numbered one after another."""
 
     parts: tuple[B, ...]
     dim = 2
@@ -101,12 +101,12 @@ class _Joined(Generic[B]):
 
     @cached_property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by their names."""
+        """Chains of nodes by name."""
         return joined_sides(self.parts)
 
 
 class StructuredGrids(_Joined[StructuredGrid]):
-    """Structured grids; subdomains of at most size² cells."""
+    """Structured grids; subdomains have at most size² cells."""
 
     def layout(self, size: int) -> Layout:
         """Cut each grid into blocks of at most `size` cells a side."""
@@ -117,9 +117,9 @@ class HalfDiscs(_Joined[HalfDisc]):
     """Half discs; subdomains are blocks of rings and sectors."""
 
     def layout(self, size: int) -> Subdivision:
-        """Cut each into blocks about as long as wide, of at most size² cells.
+        """Cut each half disc into blocks of at most size² cells, aspect ratio near 1.
 
-        The triangles at a centre are the last ring.
+        The triangles at the centre form the last ring.
         """
         blocks = [compact_blocks(disc.lengths(), size) for disc in self.parts]
         return half_discs_in_blocks(self.parts, blocks)
@@ -127,11 +127,11 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 @dataclass(frozen=True, eq=False)
 class Meshed:
-    """A mesh of any kind; `size` is the number of all subdomains, by METIS."""
+    """An unstructured mesh; `size` is the number of subdomains, cut by METIS."""
 
     mesh: Mesh
     body: NDArray[np.int64]
-    named: Nodes  #: nodes that supports and contact name
+    named: Nodes  #: nodes of supports and contact
 
     @property
     def dim(self) -> int:
@@ -140,166 +140,171 @@ class Meshed:
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by their names."""
+        """Chains of nodes by name."""
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
         """Cut the bodies by graph partitioning."""
         label = graph_partition(self.mesh.points, self.mesh.cells, self.body, size)
-        return mesh_in_parts(self.mesh, label, self.body, self.named)
+        return mesh_in_subdomains(self.mesh, label, self.body, self.named)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ElasticBodies:
-    """Bodies with their materials, supports, full load and contact sides."""
+    """Elastic bodies with materials, supports, full load and contact sides."""
 
     shape: Shape
     names: tuple[str, ...]
-    materials: tuple[Material, ...]  #: of each body
+    materials: tuple[Material, ...]  #: one per body
     plane: Plane | None  #: None in space
-    length: float  #: l, m: lengths of QPs are multiples of it
-    force: float  #: F₀, N/m
-    fixed: Nodes  #: components that are zero
+    length: float  #: l, m: unit of length of the QPs
+    force: float  #: F₀, N/m: unit of force of the QPs
+    fixed: Nodes  #: components with u = 0
     forces: Forces
     pairs: tuple[ContactPair, ...]
 
     @cached_property
     def assembled(self) -> Bodies:
-        """The bodies in one piece, with their stiffness."""
-        return assembled(self.whole)
+        """The undivided bodies with their stiffness matrix."""
+        return assemble_stiffness(self.whole)
 
     @cached_property
     def whole(self) -> UnassembledBodies:
-        """The bodies in one piece, without any stiffness."""
+        """The undivided bodies without stiffness matrix."""
         mesh = self.shape.mesh
         f = np.zeros(mesh.dofs)
         f[self.forces.component] = self.forces.value
         return UnassembledBodies(
             mesh=mesh, body=self.shape.body, names=self.names,
             materials=self.materials, plane=self.plane, length=self.length,
-            force=self.force, f=f, B_D=supports(mesh, self.fixed),
+            force=self.force, f=f, B_D=support_rows(mesh, self.fixed),
             pairs=self.pairs,
         )  # fmt: skip
 
     @cached_property
-    def is_held(self) -> bool:
-        """True where supports leave no rigid motion of any body."""
+    def is_supported(self) -> bool:
+        """True if the supports exclude all rigid motions of every body."""
         rigid = self.whole.rigid
         return bool(np.linalg.matrix_rank(rigid[self.fixed]) == rigid.shape[1])
 
     @cached_property
     def floating(self) -> GeneralisedInverse:
-        """K⁺ with all rigid motions."""
-        return floating(self.assembled)
+        """K⁺ and the kernel R of all rigid motions."""
+        return factorise_floating(self.assembled)
 
     @cached_property
     def clamped(self) -> GeneralisedInverse:
-        """K⁺ without the prescribed components; InputError if these hold too little."""
-        return clamped(self.assembled)
+        """K⁺, zero at fixed components; InputError if bodies can still move."""
+        return factorise_clamped(self.assembled)
 
     @cached_property
     def supported(self) -> GeneralisedInverse:
-        """K⁺ like `clamped`, also for bodies that contact alone holds."""
-        return supported(self.assembled)
+        """K⁺ as `clamped`, also for bodies that only contact supports."""
+        return factorise_supported(self.assembled)
 
 
-def stated(bodies: UnassembledBodies) -> ElasticBodies:
-    """State bodies that there is a mesh of already; their own stiffness is kept."""
+def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
+    """Return elastic bodies from meshed ones; keeps their stiffness, if any."""
     fixed = bodies.B_D.indices
     named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
-    found = ElasticBodies(
+    result = ElasticBodies(
         shape=Meshed(bodies.mesh, bodies.body, named), names=bodies.names,
         materials=bodies.materials, plane=bodies.plane, length=bodies.length,
         force=bodies.force, fixed=fixed, forces=forces_of(bodies.f), pairs=bodies.pairs,
     )  # fmt: skip
-    vars(found)["whole"] = bodies
+    vars(result)["whole"] = bodies
     if isinstance(bodies, Bodies):
-        vars(found)["assembled"] = bodies
-    return found
+        vars(result)["assembled"] = bodies
+    return result
 
 
-class AtSides(NamedTuple):
-    """The contact: data and solution at least at the nodes of the sides."""
+class InterfaceState(NamedTuple):
+    """Data and solution of contact, at least at the nodes of the contact sides."""
 
     bodies: Bodies | ContactSides
-    primal: QP  #: of the nodes of the sides at least; of P, the diagonal with friction
+    primal: (
+        QP  #: at these nodes; of P only the diagonal is used, and only with friction
+    )
     solution: Solution
     friction: Friction
 
 
 class DisplacedMesh(NamedTuple):
-    """Some cells of one body with their displacement."""
+    """Cells of one body with their displacement."""
 
     body: int
     mesh: Mesh  #: N nodes
-    inner: NDArray[np.bool_]  #: (N,) those that are not there for their neighbours only
+    inner: NDArray[
+        np.bool_
+    ]  #: (N,) False for nodes of the layers of neighbouring cells
     u: Vector  #: (2N,) m
 
 
-class Found(Protocol):
-    """An answer to a contact problem; on ranks, all of them call what they call."""
+class ContactSolution(Protocol):
+    """Solution of a contact problem; ranks call its members together."""
 
     @property
-    def sides(self) -> AtSides:
-        """The contact."""
+    def sides(self) -> InterfaceState:
+        """State of the contact interface."""
 
     @property
     def problems(self) -> int:
-        """Number of Tresca problems that Coulomb's law took; 1 without it."""
+        """Number of Tresca problems solved for Coulomb's law; 1 without it."""
 
     def at(self, component: Nodes) -> Vector:
-        """Return u, without dimension, at components (k,) of the whole."""
+        """Return the nondimensional displacement at global components (k,)."""
 
     def meshes(self) -> Iterator[DisplacedMesh]:
-        """Give all cells, some at a time."""
+        """Yield the displaced meshes that together form all bodies."""
 
     def largest(self, value: float) -> float:
-        """Return the largest of the numbers of all ranks."""
+        """Return the maximum of a value over all ranks."""
 
 
-def nothing_more(found: Found) -> dict[str, Any]:
-    """Report nothing besides what all elastic bodies report."""
+def no_further_results(found: ContactSolution) -> dict[str, Any]:
+    """Return no quantities beyond those of all elastic bodies."""
     return {}
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ContactProblem:
-    """Elastic bodies, how they touch, and how the load comes on them."""
+    """Elastic bodies with their contact law and the stages of their load."""
 
     bodies: ElasticBodies
     stages: tuple[Stage, ...]
-    #: of bodies or their sides, and laws of friction: displacement in m → rows
+    #: returns, for bodies or their contact sides and laws of friction, the map from a
+    #: displacement in m to contact rows
     linearise: Callable[
         [UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise
     ]
-    #: normal force of each slave node that the first bound of Coulomb's law is of
-    pressed: float = 0.0
-    #: reports more of an answer than of all elastic bodies
-    results: Callable[[Found], Mapping[str, Any]] = nothing_more
-    #: (k, 3) x, m, exact pressure and shear, Pa, of the slave side, where it is known
+    #: normal force per slave node for the first friction bound of Coulomb's law
+    initial_force: float = 0.0
+    #: quantities of a solution beyond those of all elastic bodies
+    results: Callable[[ContactSolution], Mapping[str, Any]] = no_further_results
+    #: (k, 3) x in m, exact pressure and shear in Pa on the slave side; None if unknown
     exact: NDArray[np.float64] | None = None
 
 
 class Choice(NamedTuple):
-    """The QP of a contact problem that is emitted."""
+    """Selection of one QP of a contact problem."""
 
-    step: int = 1  #: of the load
-    iterate: int = 0  #: of the fixed point of Coulomb's law, 1, 2, …; 0: the last one
-    size: int = 0  #: of subdomains, as of `Shape.layout`; 0: undivided bodies
+    step: int = 1  #: load step, from 1
+    iterate: int = 0  #: of the fixed point of Coulomb's law, from 1; 0: the last one
+    size: int = 0  #: of subdomains, see `Shape.layout`; 0: undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
 
 
-#: keys of a case that choose among the QPs of one problem
+#: keys of a case that select one of the QPs of a problem
 CHOICES = ("step", "iterate", "feti", "parts", "glue")
 
 
-def chosen(form: str, params: Mapping[str, Value]) -> Choice:
-    """Return what keys say of the QP that is emitted.
+def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
+    """Return the QP that the keys of a case select.
 
     Raises
     ------
     InputError
-        Where subdomains are asked for in another form than the dual.
+        If subdomains are requested in a form other than the dual.
 
     """
     p: Any = params
@@ -314,23 +319,23 @@ def chosen(form: str, params: Mapping[str, Value]) -> Choice:
     )
 
 
-def remembered(
+def cached_problem(
     state: Callable[[Mapping[str, Any]], ContactProblem],
 ) -> Callable[[Mapping[str, Value]], ContactProblem]:
-    """State a problem once for all QPs that keys choose of it; keep the last few."""
-    kept = lru_cache(maxsize=4)(lambda items: state(dict(items)))
+    """Cache the last few problems by the keys that do not select among their QPs."""
+    cached = lru_cache(maxsize=4)(lambda items: state(dict(items)))
 
     @wraps(state)
     def problem(params: Mapping[str, Value]) -> ContactProblem:
-        return kept(tuple((k, v) for k, v in params.items() if k not in CHOICES))
+        return cached(tuple((k, v) for k, v in params.items() if k not in CHOICES))
 
     return problem
 
 
-def by_keys(
+def keyed_linearisation(
     params: Mapping[str, Any],
 ) -> Callable[[UnassembledBodies | ContactSides, Sequence[FrictionLaw]], Linearise]:
-    """Linearise contact by the method that the keys `contact` and `basis` name."""
+    """Return the linearisation that the keys `contact` and `basis` select."""
     return lambda bodies, laws: linearisation(
         bodies, params["contact"], params["basis"], laws
     )

@@ -1,4 +1,4 @@
-"""The paper's experiments: what its figures and tables show, measured here."""
+"""The experiments behind the figures and tables of the paper."""
 
 from __future__ import annotations
 
@@ -32,14 +32,13 @@ def paper_experiment(
     baseline: Reference,
     reference: Reference,
 ) -> Experiment:
-    """Measure all of it, single-threaded if the caller has seen to that.
+    """Run all experiments; the caller sets the number of threads.
 
     Parameters
     ----------
-    solve, baseline : ours of the dual QPs, and what the paper would take; part of what
-        is timed
-    reference : solves where not the time but the accuracy of the model is studied
-    environment : recorded with the measurements
+    solve, baseline : our solver of the dual QPs and that of the paper; both are timed
+    reference : solver for the experiments on accuracy, not timed
+    environment : stored with the measurements
     say : called with one line before each experiment
 
     """

@@ -1,7 +1,7 @@
-"""The clock of the experiments: contestants take turns in one process.
+"""Timing of experiments: methods take turns in one process.
 
-Taking turns makes a drift of the machine hit all alike. Every sample is kept; what is
-made of them (medians, intervals) is the business of reports.
+Turns spread a drift of the machine evenly over all methods. Every sample is stored;
+reports compute medians and intervals.
 """
 
 from __future__ import annotations
@@ -12,35 +12,35 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter
 
-Laps = Mapping[str, float]  #: part of the work → seconds
+Laps = Mapping[str, float]  #: name of a part → seconds
 Contestant = Callable[[], Laps]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rounds:
-    """How often to measure: `most` times, fewer where that takes too long."""
+    """Number of repeats: `most`, or fewer if they take too long."""
 
     most: int
     least: int = 5
-    seconds: float = 20.0  #: after which no round begins, once there are `least`
+    seconds: float = 20.0  #: no round starts later than this, once `least` are done
 
 
 class Stopwatch:
-    """Sums the seconds since the last lap under the names of the parts."""
+    """Stopwatch that sums seconds by the name of a part."""
 
     def __init__(self) -> None:
         self.laps: dict[str, float] = {}
         self._last = perf_counter()
 
     def lap(self, part: str) -> None:
-        """Book the time since the last lap on `part`."""
+        """Add the time since the last lap to `part`."""
         now = perf_counter()
         self.laps[part] = self.laps.get(part, 0.0) + now - self._last
         self._last = now
 
 
-def whole(work: Callable[[], object], part: str = "all") -> Contestant:
-    """Time all of `work` as one part."""
+def timed_as_one(work: Callable[[], object], part: str = "all") -> Contestant:
+    """Return a contestant that times `work` as a single part."""
 
     def timed() -> Laps:
         start = perf_counter()
@@ -53,9 +53,9 @@ def whole(work: Callable[[], object], part: str = "all") -> Contestant:
 def race(
     contestants: Mapping[str, Contestant], rounds: Rounds, *, warm: bool = True
 ) -> list[dict[str, str | int | float]]:
-    """Measure in turn; one row (method, part, repeat, seconds) for each lap.
+    """Time methods in turns; return a row (method, part, repeat, seconds) per lap.
 
-    warm : call each once before, so that caches and compilation are not measured
+    warm : True to run each once before, so that cold caches do not count
 
     """
     if warm:
@@ -77,7 +77,7 @@ def race(
 
 @contextmanager
 def _no_collection() -> Iterator[None]:
-    """Keep Python's garbage collector from running within."""
+    """Disable the garbage collector of Python within the context."""
     enabled = gc.isenabled()
     gc.collect()
     gc.disable()

@@ -1,4 +1,4 @@
-"""Parts of the pipeline timed alone: assembly, contact rows, generalised inverse."""
+"""Timing of single parts: assembly, contact rows, generalised inverse."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mortarbench.harness import Value
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.experiments.clock import Laps, Stopwatch, race, whole
+from mortarbench.problems.experiments.clock import Laps, Stopwatch, race, timed_as_one
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.fem.elasticity import (
     elasticity_matrix,
@@ -30,12 +30,12 @@ Rows = Iterator[dict[str, Value]]
 
 
 def beam(Nr: int) -> Mesh:
-    """Mesh the rectangle alone: 8Nr × Nr cells."""
+    """Return the mesh of the rectangle alone, 8Nr × Nr cells."""
     return rectangle((0.0, 0.5), (LENGTH, 0.25), (8 * Nr, Nr))
 
 
 def counts(Nr: int, Nh: int) -> Rows:
-    """Count the parameters of a problem as Table 1 does, per body."""
+    """Yield the sizes of each body as in Table 1."""
     bodies = model(Nr, Nh, 2 * Nh, "strain")
     (pair,) = bodies.pairs
     for b, (name, N, chain) in enumerate(
@@ -53,30 +53,34 @@ def counts(Nr: int, Nh: int) -> Rows:
 
 
 def assembly(plan: Plan) -> Rows:
-    """Time the stiffness matrix of the rectangle, Figure 3."""
+    """Time the assembly of the stiffness matrix of the rectangle, Figure 3."""
     D = elasticity_matrix(BEAM, "strain")
     for Nr in plan.assembly:
         mesh = beam(Nr)
         pattern = sparsity(mesh)
         contestants = {
-            "triplets": whole(partial(stiffness_by_triplets, mesh, D)),
-            "compiled": whole(partial(stiffness, mesh, D)),
-            "compiled-reused": whole(partial(stiffness, mesh, D, pattern=pattern)),
+            "triplets": timed_as_one(partial(stiffness_by_triplets, mesh, D)),
+            "compiled": timed_as_one(partial(stiffness, mesh, D)),
+            "compiled-reused": timed_as_one(
+                partial(stiffness, mesh, D, pattern=pattern)
+            ),
         }
         for row in race(contestants, plan.assembly_rounds):
             yield {"Nr": Nr, "n": mesh.dofs} | row
 
 
 def contact(plan: Plan) -> Rows:
-    """Time one linearisation of the contact at u = 0, Figure 4."""
+    """Time one linearisation of contact at u = 0, Figure 4."""
     for Nr in plan.contact[0]:
         for Nh in plan.contact[1]:
-            bodies = model(Nr, Nh, 2, "strain")  # the ring's layers do not matter
+            bodies = model(
+                Nr, Nh, 2, "strain"
+            )  # the number of layers of the ring does not enter
             (pair,) = bodies.pairs
             points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
             contestants = {
-                "nts": whole(partial(node_to_segment, points, u, *pair)),
-                "mortar": whole(partial(mortar, points, u, *pair)),
+                "nts": timed_as_one(partial(node_to_segment, points, u, *pair)),
+                "mortar": timed_as_one(partial(mortar, points, u, *pair)),
             }
             size = {"master": len(pair.master) - 1, "slave": len(pair.slave) - 1}
             for row in race(contestants, plan.contact_rounds):
@@ -84,7 +88,7 @@ def contact(plan: Plan) -> Rows:
 
 
 def inverse(plan: Plan) -> Rows:
-    """Time building K⁺ of the rectangle and applying it to a vector, Figure 5."""
+    """Time the construction of K⁺ of the rectangle and a product with it, Figure 5."""
     D = elasticity_matrix(BEAM, "strain") * (LENGTH / LOAD)
     random = np.random.default_rng(2024)
     for Nr in plan.inverse:
@@ -97,7 +101,7 @@ def inverse(plan: Plan) -> Rows:
         rows = race(contestants, plan.inverse_rounds)
         if mesh.dofs <= plan.dense:
             pinv = {"pinv": partial(_pinv, K, v)}
-            # apart, so that its gigabytes do not push the others out of the caches
+            # in a race of its own: its gigabytes would evict the caches of the others
             rows += race(pinv, plan.inverse_rounds, warm=False)
         for row in rows:
             yield {"Nr": Nr, "n": mesh.dofs} | row
@@ -107,8 +111,8 @@ def _cholesky(
     mesh: Mesh, K: Any, v: NDArray[np.float64], fixing: Callable[..., Nodes]
 ) -> Laps:
     watch = Stopwatch()
-    held = dofs_of(fixing(mesh.points), mesh.dim)
-    inverse = floating_inverse(K, [rigid_modes(mesh.points)], [held])
+    fixing_dofs = dofs_of(fixing(mesh.points), mesh.dim)
+    inverse = floating_inverse(K, [rigid_modes(mesh.points)], [fixing_dofs])
     watch.lap("build")
     inverse(v)
     watch.lap("multiply")
@@ -122,7 +126,7 @@ def _spectral(mesh: Mesh, points: NDArray[np.float64]) -> Nodes:
 def _pinv(K: Any, v: NDArray[np.float64]) -> Laps:
     dense = K.toarray()
     watch = Stopwatch()
-    P = np.linalg.pinv(dense)  # by singular values, as Matlab's
+    P = np.linalg.pinv(dense)  # by singular values, as in MATLAB
     watch.lap("build")
     P @ v
     watch.lap("multiply")

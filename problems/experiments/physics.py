@@ -1,4 +1,4 @@
-"""What the paper does not show: how accurate its stepping is, and its contact rows."""
+"""Accuracy of the load stepping and of the contact rows, beyond the paper."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from mortarbench.harness import Reference, Value
-from mortarbench.problems.contact.bodies import Bodies, clamped
+from mortarbench.problems.contact.bodies import Bodies, factorise_clamped
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
-from mortarbench.problems.duality.undivided import WholePath, path_of
+from mortarbench.problems.duality.monolithic import MonolithicPath, load_path
 from mortarbench.problems.experiments.parts import Rows
 from mortarbench.problems.experiments.plan import Plan
 from mortarbench.problems.families.hertz import HertzCylinder
@@ -19,9 +19,10 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
-SETTLED = (2, 8)  #: steps, linearisations of each: further ones change nothing
+#: (steps, linearisations per step) of a converged path: more of either change nothing
+CONVERGED = (2, 8)
 
-#: of the figures → keys of a case
+#: name of contact rows in figures → keys of a case
 ROWS: Mapping[str, Mapping[str, Value]] = {
     "nts": {"contact": "nts"},
     "mortar": {"contact": "mortar", "basis": "dual"},
@@ -30,50 +31,49 @@ ROWS: Mapping[str, Mapping[str, Value]] = {
 
 
 def stepping(plan: Plan, solve: Reference) -> Rows:
-    """Measure what is left of the stepping's error, for 1/steps → 0, and by `relin`.
+    """Yield results at the full load for several numbers of steps and of `relin`.
 
-    A row (steps, relin, tip_x, tip_y in m, energy in J/m, force_x, force_y in N/m) for
-    each way to the full load. The last one is settled: contact holds as linearised at
-    the solution itself, which is what all the others approach.
+    A row holds steps, relin, tip_x, tip_y in m, energy in J/m, and force_x, force_y in
+    N/m. The last row is converged: contact is linearised at the solution itself. All
+    others approach it.
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
-    inverse, linearise = clamped(bodies), linearisation(bodies, "nts", "dual")
+    inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
     ways = [(s, r) for r in plan.relin for s in plan.stepping]
-    for steps, relin in (*ways, SETTLED):
-        path = path_of(bodies, linearise, lambda: inverse, solve, steps, relin)
+    for steps, relin in (*ways, CONVERGED):
+        path = load_path(bodies, linearise, lambda: inverse, solve, steps, relin)
         yield {"steps": steps, "relin": relin} | _results(bodies, path, steps)
 
 
-def _results(bodies: Bodies, path: WholePath, step: int) -> dict[str, Value]:
+def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value]:
     primal, s = path.primal(step), path.answer(step)
-    found = quantities(bodies, primal, s)
+    values = quantities(bodies, primal, s)
     sides = bodies.mesh.boundaries
     tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
-    force = found["contact_force"]
+    force = values["contact_force"]
     return {
-        "tip_x": float(tip[0]), "tip_y": float(tip[1]), "energy": found["energy"],
+        "tip_x": float(tip[0]), "tip_y": float(tip[1]), "energy": values["energy"],
         "force_x": force[0], "force_y": force[1],
     }  # fmt: skip
 
 
 def pressures(plan: Plan, solve: Reference) -> Rows:
-    """Follow the contact along the arc through the load steps, by either method.
+    """Yield contact pressures along the arc for each load step and contact method.
 
-    A row (contact, step, node, angle in degrees, length in m, force in N/m, pressure
-    in Pa) for each slave node. angle: of the undeformed node around the ring's centre,
-    from the right foot on. length: that of the arc which belongs to the node, ∫N_j.
-    force: what presses on it, ‖(Bᵀλ)_j‖, there being no friction; pressure: force per
-    length.
+    A row holds contact, step, node, angle in degrees, length in m, force in N/m and
+    pressure in Pa of one slave node. angle: of the undeformed node about the centre of
+    the ring, from the right foot. length: share of the arc, ∫N_j. force: the normal
+    force ‖(Bᵀλ)_j‖. pressure: force per length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
-    inverse = clamped(bodies)
+    inverse = factorise_clamped(bodies)
     slave = bodies.pairs[0].slave
     points = bodies.mesh.points[slave]
     angles = np.degrees(np.arctan2(points[:, 1], points[:, 0] - 1.0))
     lengths = nodal_lengths(points)
     for contact in ("nts", "mortar"):
         linearise = linearisation(bodies, contact, "dual")
-        path = path_of(bodies, linearise, lambda: inverse, solve, plan.steps)
+        path = load_path(bodies, linearise, lambda: inverse, solve, plan.steps)
         for step in range(1, plan.steps + 1):
             s = path.answer(step)
             on_nodes = (path.primal(step).G.T @ s.z).reshape(-1, 2)[slave]
@@ -88,29 +88,29 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
 
 
 def verification(plan: Plan, solve: Reference) -> Rows:
-    """Compare contact rows with exact solutions: the patch test and Hertz's pressure.
+    """Yield errors against exact solutions: the patch test and Hertz's pressure.
 
-    A row (problem, contact, n, error) for each mesh; n: elements along the upper block,
-    or per half width of the contact. error: max|σ_y + p|/p, or that of the pressure
-    in L2, both relative.
+    A row holds problem, contact, n and error for one mesh. n: elements along the upper
+    block, or per half width of the contact. error: max|σ_y + p|/p, or the relative L2
+    error of the pressure.
     """
     for contact, keys in ROWS.items():
         for upper in plan.patch:
-            given = {"upper": upper, "lower": upper + upper // 2, **keys}
-            error = _error(ContactPatch(), given, "stress_error", solve)
+            params = {"upper": upper, "lower": upper + upper // 2, **keys}
+            error = _error(ContactPatch(), params, "stress_error", solve)
             yield {"problem": "patch", "contact": contact, "n": upper, "error": error}
         for n in plan.hertz:
-            given = {"n": n, "m": max(3 * n // 4, 1), **keys}
-            error = _error(HertzCylinder(), given, "pressure_l2_error", solve)
+            params = {"n": n, "m": max(3 * n // 4, 1), **keys}
+            error = _error(HertzCylinder(), params, "pressure_l2_error", solve)
             yield {"problem": "hertz", "contact": contact, "n": n, "error": error}
 
 
 def _error(
     family: ContactPatch | HertzCylinder,
-    given: Mapping[str, Value],
+    keys: Mapping[str, Value],
     name: str,
     solve: Reference,
 ) -> float:
-    params: dict[str, Any] = {**family.defaults, **given}
+    params: dict[str, Any] = {**family.defaults, **keys}
     case = family.build("dual", params, solve)
     return float(case.quantities(solve(case.qp))[name])

@@ -1,4 +1,4 @@
-"""Which sizes and how many repeats: the paper's sweeps, and a shorter look at them."""
+"""Sizes and repeats of the experiments: those of the paper, and shorter ones."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mortarbench.problems.experiments.clock import Rounds
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
-    """The parameters of all experiments; the paper leaves most of its sizes unsaid."""
+    """Parameters of all experiments; the paper does not give most of its sizes."""
 
     assembly: tuple[int, ...]  #: Nr of Figure 3
     assembly_rounds: Rounds

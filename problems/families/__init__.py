@@ -1,1 +1,1 @@
-"""Families of contact problems, one per module, and what only they share."""
+"""Families of contact problems, one per module, with their base classes."""

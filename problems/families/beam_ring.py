@@ -13,34 +13,34 @@ from mortarbench.problems.ranges import (
     DECOMPOSITION,
     FRICTION,
     KINEMATICS,
+    MAX_STEPS,
     METHODS,
-    MOST_STEPS,
     PLANES,
     STEPS,
-    declared,
-    fits,
+    check_memory,
     key,
-    without_friction,
+    refuse_friction,
+    schema,
 )
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MOST_NODES = 50_000_000  #: the entries of K are numbered by 32-bit integers
+MAX_NODES = 50_000_000  #: the entries of K are indexed by 32-bit integers
 
 
 class BeamRing(ContactFamily):
     """The paper's benchmark: beam on a half ring, plane elasticity."""
 
     name = "beam-ring"
-    keys = declared(
+    keys = schema(
         Nr=key(10, 1),
         Nh=key(5, 1),
         radial=key(0, 1),
         steps=STEPS,
         step=key(0, 1),
         **METHODS,
-        relin=key(1, 1, MOST_STEPS),
+        relin=key(1, 1, MAX_STEPS),
         **PLANES,
         **FRICTION,
         **DECOMPOSITION,
@@ -55,7 +55,7 @@ class BeamRing(ContactFamily):
     singular = "the work of a point load grows without bound as its cell shrinks"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the keys left out; radial defaults to 2·Nh, step to steps."""
+        """Return all keys; radial defaults to 2·Nh, step to steps."""
         params: dict[str, Any] = {**self.defaults, **given}
         derived = {"radial": 2 * params["Nh"], "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}
@@ -66,17 +66,18 @@ class BeamRing(ContactFamily):
         p: Any = params
         nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1)
         nodes += (12 * p["Nh"] + 1) * (p["radial"] + 1)
-        if nodes > MOST_NODES:
+        if nodes > MAX_NODES:
             raise InputError(
                 f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
-                f"expected at most {MOST_NODES:.2g}"
+                f"expected at most {MAX_NODES:.2g}"
             )
-        fits(self.name, 2 * nodes)
+        check_memory(self.name, 2 * nodes)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; its load steps are linearised anew.
+        """Return the case with every cell halved, which runs its own load steps.
 
-        The arcs of the ring are other polygons. Friction on them is refused.
+        The arcs of the ring are then approximated by other polygons, on which friction
+        is refused.
         """
-        without_friction(self.name, params)
+        refuse_friction(self.name, params)
         return super().refined(params)

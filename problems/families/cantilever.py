@@ -7,28 +7,37 @@ from typing import TYPE_CHECKING, Any
 
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
-from mortarbench.problems.ranges import KINEMATICS, STEPS, declared, fits, key, size
+from mortarbench.problems.ranges import (
+    KINEMATICS,
+    STEPS,
+    check_memory,
+    key,
+    schema,
+    size,
+)
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-THICKEST = 2.0  #: smallest length of the beam over its thickness
-LEAST_LOAD, MOST_LOAD = 1e-3, 1e3  #: PL²/EI; the elastica loses digits beyond
-MOST_NU = 0.4999  #: beyond, the factor of the tangent has few digits left
+MIN_SLENDERNESS = 2.0  #: smallest ratio of length to thickness
+#: PL²/EI; outside these limits, the formula of the elastica loses digits
+MIN_LOAD, MAX_LOAD = 1e-3, 1e3
+#: closer to ½, the Cholesky factor of the tangent loses nearly all digits
+MAX_NU = 0.4999
 
 
 class Cantilever(DeclaredFamily):
     """A slender cantilever under an end load at finite strain: the elastica."""
 
     name = "cantilever"
-    keys = declared(
+    keys = schema(
         slenderness=size(20.0),
         load=size(1.0),
         nx=key(0, 1),
         ny=key(10, 1),
         nu=key(0.3),
         material=KINEMATICS["material"],
-        steps=STEPS.but(1),
+        steps=STEPS.with_default(1),
         step=key(0, 1),
         newton=KINEMATICS["newton"],
     )
@@ -36,8 +45,9 @@ class Cantilever(DeclaredFamily):
     model = "cantilever.newton_step"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the keys left out; nx makes cells half as long as thick."""
+        """Return all keys; the default nx makes cells half as long as thick."""
         params: dict[str, Any] = {**self.defaults, **given}
+        # limited before rounding: slenderness may be up to 1e30
         cells = min(max(2 * params["ny"] * params["slenderness"], 1), 1e9)
         derived = {"nx": round(cells), "step": params["steps"]}
         return params | {k: v for k, v in derived.items() if k not in given}
@@ -46,18 +56,18 @@ class Cantilever(DeclaredFamily):
         """Raise InputError unless every key is in its range."""
         super().check(params)
         p: Any = params
-        if not LEAST_LOAD <= p["load"] <= MOST_LOAD:
+        if not MIN_LOAD <= p["load"] <= MAX_LOAD:
             raise InputError(
-                f"{self.name}: load={p['load']:g} must be between {LEAST_LOAD:g} and "
-                f"{MOST_LOAD:g}: it is PL²/EI"
+                f"{self.name}: load={p['load']:g} must be between {MIN_LOAD:g} and "
+                f"{MAX_LOAD:g}: it is PL²/EI"
             )
-        if p["slenderness"] < THICKEST:
+        if p["slenderness"] < MIN_SLENDERNESS:
             raise InputError(
                 f"{self.name}: slenderness={p['slenderness']:g} must be at least "
-                f"{THICKEST:g}: it is the length over the thickness"
+                f"{MIN_SLENDERNESS:g}: it is the length over the thickness"
             )
-        if not 0 <= p["nu"] <= MOST_NU:
+        if not 0 <= p["nu"] <= MAX_NU:
             raise InputError(
-                f"{self.name}: nu={p['nu']:g} must be between 0 and {MOST_NU:g}"
+                f"{self.name}: nu={p['nu']:g} must be between 0 and {MAX_NU:g}"
             )
-        fits(self.name, 2 * (p["nx"] + 1) * (p["ny"] + 1))
+        check_memory(self.name, 2 * (p["nx"] + 1) * (p["ny"] + 1))

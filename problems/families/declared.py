@@ -1,4 +1,4 @@
-"""Families that are declared: by their keys, and by functions of their models."""
+"""Base classes of families declared by their keys and by functions of their models."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from mortarbench.problems.ranges import (
     check_friction,
     check_kinematics,
     defaults_of,
-    doubled,
-    one_state,
+    double,
+    refuse_finite_strain,
 )
 
 if TYPE_CHECKING:
     from mortarbench.harness import Case, Reference, ReferenceOverRanks, Value
-    from mortarbench.harness.distributed.vectors import Emitted, Ranks
+    from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
     from mortarbench.problems.duality.problem import ContactProblem
 
 
 class DeclaredFamily(Family):
-    """A family with declared keys, whose models are imported when they are needed.
+    """A family with declared keys, whose models are imported on demand.
 
     Attributes
     ----------
-    keys : in the order of canonical names
-    model : "MODULE.FUNCTION" of `problems.models`, which emits the QP. Its parameters
-        are some of form, params and reference, and single keys
-    subdomains : module of `problems.models` whose `in_subdomains` describes the dual
-        that ranks emit, and whose `results` say what they found; empty: one process
-        emits it
-    cells : keys that halving every cell doubles, where no key counts halvings
-    conditions : checks of several keys, by the key that asks for each
+    keys : keys in the order of canonical names
+    model : "MODULE.FUNCTION" of `problems.models` that returns the case. Its parameters
+        are any of form, params and reference, and single keys
+    subdomains : module of `problems.models` whose `in_subdomains` returns the
+        decomposed problem and whose `results` evaluates it on ranks; empty: the dual is
+        always assembled by one process
+    cells : numbers of cells, doubled by refinement if there is no key `halvings`
+    conditions : checks of several keys, by the key whose presence requires each
 
     """
 
@@ -52,7 +52,7 @@ class DeclaredFamily(Family):
     }
 
     def __init_subclass__(cls) -> None:
-        """Take the defaults from the keys."""
+        """Set the defaults of the class from its keys."""
         cls.defaults = MappingProxyType(defaults_of(cls.keys))
 
     def check(self, params: Mapping[str, Value]) -> None:
@@ -69,98 +69,109 @@ class DeclaredFamily(Family):
                 check(self.name, params)
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; arcs are other polygons then.
+        """Return the case with every cell halved, or None if the family has no meshes.
 
-        At finite strain there is none: the QP of another mesh is linearised at another
-        state.
+        Arcs are then approximated by other polygons.
+
+        Raises
+        ------
+        InputError
+            At finite strain, see `refuse_finite_strain`.
+
         """
         if "kinematics" in params:
-            one_state(self.name, params)
+            refuse_finite_strain(self.name, params)
         if "halvings" in params:
             return {**params, "halvings": int(params["halvings"]) + 1}
-        return {**params, **doubled(params, *self.cells)} if self.cells else None
+        return {**params, **double(params, *self.cells)} if self.cells else None
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True if bodies are in subdomains, and need no Newton's method."""
-        cut = params.get("feti") or params.get("parts")
-        return bool(cut) and params.get("kinematics") != "finite"
+        """Return True if bodies are decomposed, without Newton's method."""
+        size = params.get("feti") or params.get("parts")
+        return bool(size) and params.get("kinematics") != "finite"
 
     def emission(
         self, form: str, params: Mapping[str, Value]
-    ) -> Callable[[Ranks, ReferenceOverRanks], Emitted] | None:
-        """Return what has each rank make its share; None where one process must."""
+    ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
+        """Return the function that assembles a rank's share of the dual, or None.
+
+        None means that one process has to assemble the case.
+        """
         if form != "dual" or not self.is_divided(params):
             return None
         return lambda ranks, reference: self.emitted(params, ranks, reference)
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> Emitted:
-        """Emit this rank's share of the dual; called by all ranks."""
-        from mortarbench.problems.feti.emission import dual_on, emitted
+    ) -> DistributedQP:
+        """Return this rank's share of the dual; collective."""
+        from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 
         del reference
         dual = dual_on(_model(f"{self.subdomains}.in_subdomains")(params), ranks)
-        return emitted(dual, _model(f"{self.subdomains}.results")(params, dual))
+        return distributed_qp(dual, _model(f"{self.subdomains}.results")(params, dual))
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Emit the QP in one form."""
+        """Return the case in one form."""
         params = self.complete(params)
         self.check(params)
         emit = _model(self.model)
-        known = {**params, "form": form, "params": params, "reference": reference}
-        case: Case = emit(**{name: known[name] for name in signature(emit).parameters})
+        arguments = {**params, "form": form, "params": params, "reference": reference}
+        case: Case = emit(
+            **{name: arguments[name] for name in signature(emit).parameters}
+        )
         return case
 
 
 class ContactFamily(DeclaredFamily):
-    """A family of elastic bodies in contact, which states its problem once.
+    """A family of elastic bodies in contact, stated once as a `ContactProblem`.
 
     Attributes
     ----------
     problem : "MODULE.FUNCTION" of `problems.models`, from params to a `ContactProblem`
-    model : alike, emits the QP of a Newton iteration where kinematics=finite
+    model : "MODULE.FUNCTION" that returns the QP of a Newton iteration, for
+        kinematics=finite
 
     """
 
     problem: ClassVar[str]
     model = ""
 
-    def stated(self, params: Mapping[str, Value]) -> ContactProblem:
-        """State the problem that complete keys are of."""
-        found: ContactProblem = _model(self.problem)(params)
-        return found
+    def contact_problem(self, params: Mapping[str, Value]) -> ContactProblem:
+        """Return the contact problem of complete keys."""
+        problem: ContactProblem = _model(self.problem)(params)
+        return problem
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Emit the QP in one form."""
+        """Return the case in one form."""
         params = self.complete(params)
         if params.get("kinematics") == "finite":
             return super().build(form, params, reference)
         self.check(params)
         from mortarbench.problems.duality.case_forms import case_of
-        from mortarbench.problems.duality.problem import chosen
+        from mortarbench.problems.duality.problem import qp_choice
 
-        choice = chosen(form, params)
-        return case_of(self.stated(params), form, choice, reference)
+        choice = qp_choice(form, params)
+        return case_of(self.contact_problem(params), form, choice, reference)
 
     def emitted(
         self, params: Mapping[str, Value], ranks: Ranks, reference: ReferenceOverRanks
-    ) -> Emitted:
-        """Emit this rank's share of the dual; called by all ranks."""
-        from mortarbench.problems.duality.divided import emitted_by
-        from mortarbench.problems.duality.problem import chosen
+    ) -> DistributedQP:
+        """Return this rank's share of the dual; collective."""
+        from mortarbench.problems.duality.decomposed import distributed_qp_of
+        from mortarbench.problems.duality.problem import qp_choice
 
         self.check(params)
-        choice = chosen("dual", params)
-        return emitted_by(ranks, self.stated(params), choice, reference)
+        choice = qp_choice("dual", params)
+        return distributed_qp_of(ranks, self.contact_problem(params), choice, reference)
 
 
 def _model(place: str) -> Callable[..., Any]:
-    """Import a function of `problems.models`."""
-    module, _, function = place.partition(".")
-    found = getattr(import_module(f"mortarbench.problems.models.{module}"), function)
-    return found  # type: ignore[no-any-return]
+    """Import the function "MODULE.FUNCTION" of `problems.models`."""
+    module, _, name = place.partition(".")
+    function = getattr(import_module(f"mortarbench.problems.models.{module}"), name)
+    return function  # type: ignore[no-any-return]

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 
 class FromFile(Family):
-    """Any QP from a file: npz, mat (ours or Maros-Mészáros), QPS text or Parquet.
+    """QPs from files: npz, mat (of `export` or Maros-Mészáros), QPS text or Parquet.
 
-    Text and mat files may be compressed: ``file:PATH.qps.gz``.
-    The digest of the file's content is a parameter of the case, so that records say
-    what was measured and a changed file is not taken for it.
+    Text and mat files may be compressed: ``file:PATH.qps.gz``. The digest of the file's
+    content is a parameter of the case: records identify what was measured, and a
+    changed file is another case.
 
-    copies : of a result folder; None: files are read where the path leads
+    copies : copies in a result folder; None: files are read from their own path
     """
 
     name = "file"
-    path_suffix = ""  #: all after ``file:`` is the path
+    path_suffix = ""  #: everything after ``file:`` is the path
     defaults: Mapping[str, Value] = MappingProxyType({"path": "", "sha256": ""})
     forms = ("qp",)
 
@@ -35,7 +35,7 @@ class FromFile(Family):
         self.copies = copies
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in the digest of the file's content."""
+        """Return all keys, with the digest of the file's content."""
         params = {**self.defaults, **given}
         if params["path"] and "sha256" not in given:
             path = str(params["path"])
@@ -46,13 +46,13 @@ class FromFile(Family):
         return params
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there is such a file of a known format."""
+        """Raise InputError unless the file exists and has a known format."""
         if not params["path"]:
             raise InputError("file: path is missing; expected file:PATH")
         self._located(params)
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
-        """Return the file, named by the digest of its content and its format."""
+        """Return the file with the digest of its content and its format."""
         path, sha256 = str(params["path"]), str(params["sha256"])
         suffix = format_of(Path(path))
         if path.lower().endswith(".gz"):
@@ -60,15 +60,15 @@ class FromFile(Family):
         return SourceFile(path=path, sha256=sha256, suffix=suffix)
 
     def with_copies(self, folder: Path) -> FromFile:
-        """Return the family that takes the copies of a result folder."""
+        """Return the family that reads the copies of a result folder."""
         return FromFile(Copies(folder))
 
     def copied_paths(self) -> list[str]:
-        """List the paths of files of which the result folder knows."""
+        """Return the original paths of the files with copies in the result folder."""
         return [] if self.copies is None else self.copies.paths()
 
     def _located(self, params: Mapping[str, Value]) -> Path:
-        """Return the file with the content of the digest: the original, or a copy."""
+        """Return the path of a file with the digest: the original, or its copy."""
         source = self.source_file(params)
         if self.copies is not None:
             return self.copies.locate(source)
@@ -79,7 +79,7 @@ class FromFile(Family):
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Read the QP; its objective in the units of the file is the quantity value."""
+        """Return the QP; the quantity `value` is its objective in the file's units."""
         from mortarbench.harness import Case
         from mortarbench.problems.files.readers import read
 

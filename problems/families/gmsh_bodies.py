@@ -19,14 +19,14 @@ from mortarbench.problems.ranges import (
     GLUES,
     HALVINGS,
     KINEMATICS,
-    LAW,
+    LAW_KEYS,
     SETTINGS,
     check_decomposition,
     check_friction,
     check_kinematics,
-    declared,
     key,
-    minimised,
+    refuse_coulomb,
+    schema,
 )
 
 if TYPE_CHECKING:
@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 
 
 class GmshBodies(ContactFamily):
-    """Bodies of the user: a mesh from gmsh, and a TOML with materials, loads, contacts.
+    """Bodies of a user: a mesh from gmsh, and a TOML with materials, loads, contacts.
 
-    The digest of the content of both files is a parameter of the case, so that a
-    changed file is not taken for the one that was measured.
+    The digest of the content of both files is a parameter of the case, so that changed
+    files are another case.
     """
 
     name = "bodies"
     path_suffix = ".toml"
-    keys = declared(
+    keys = schema(
         path=key(""),
         sha256=key(""),
         **SETTINGS,
@@ -59,7 +59,7 @@ class GmshBodies(ContactFamily):
     conditions = MappingProxyType({"kinematics": check_kinematics})
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Fill in what the file says, its digest, and step, by default steps."""
+        """Return all keys, with those of the file; step defaults to steps."""
         params: dict[str, Value] = {**self.defaults, **given}
         if params["path"]:
             from mortarbench.problems.models.description import read_description
@@ -76,19 +76,19 @@ class GmshBodies(ContactFamily):
         return params if "step" in given else params | {"step": params["steps"]}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range and the files are there."""
+        """Raise InputError unless keys are in range and the files have their digest."""
         from mortarbench.problems.models.description import pair_laws, read_description
 
         p: Any = params
         if not p["path"]:
             raise InputError(f"{self.name}: path is missing; expected bodies:PATH.toml")
         super().check(params)
-        what = "the number of subdomains"
-        check_decomposition(self.name, params, key="parts", what=what)
+        meaning = "the number of subdomains"
+        check_decomposition(self.name, params, key="parts", what=meaning)
         path = Path(p["path"])
         table = read_description(path)
-        own = any(key in entry for entry in table["contacts"] for key in LAW)
-        check_friction(self.name, p, elsewhere=own)
+        has_own = any(key in entry for entry in table["contacts"] for key in LAW_KEYS)
+        check_friction(self.name, p, elsewhere=has_own)
         with located(str(path)):
             pair_laws(table["contacts"], params)
         mesh = path.parent / table["mesh"]
@@ -100,29 +100,29 @@ class GmshBodies(ContactFamily):
 
         finer = super().refined(params)
         laws = [law.kind for law in laws_of(params)]
-        minimised(self.name, laws, "halvings=0, 1 and 2")
+        refuse_coulomb(self.name, laws, "halvings=0, 1 and 2")
         return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:
-        """Name the arcs of contact sides, whose chords halving leaves as they are."""
+        """Return a remark if contact sides are arcs, whose chords refinement keeps."""
         from mortarbench.problems.models.gmsh_bodies import has_arcs
 
         if not has_arcs(params):
             return ""
         return (
             "of the bodies as they are meshed; chords of an arc stay corners: for "
-            "pressures, mesh anew"
+            "pressures, generate a finer mesh"
         )
 
     def build(
         self, form: str, params: Mapping[str, Value], reference: Reference
     ) -> Case:
-        """Emit the QP of one load step in one form.
+        """Return the case of one load step in one form.
 
         Raises
         ------
         InputError
-            Also where rounding leaves the stiffness without a Cholesky factor.
+            When a file is wrong, or rounding makes the Cholesky factorisation fail.
 
         """
         from numpy.linalg import LinAlgError
@@ -136,6 +136,6 @@ class GmshBodies(ContactFamily):
         except (LinAlgError, CholmodNotPositiveDefiniteError):
             raise InputError(
                 f"{path}: the stiffness has no Cholesky factor in double precision; "
-                "expected cells whose sides, and bodies whose E, differ by less"
+                "expected smaller ratios of the sides of cells, and of the moduli E"
             ) from None
         return replace(case, remarks=remarks(Path(path)))

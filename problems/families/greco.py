@@ -10,10 +10,10 @@ from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
-    MOST,
-    declared,
-    fits,
+    MAX_SIZE,
+    check_memory,
     key,
+    schema,
 )
 
 if TYPE_CHECKING:
@@ -24,15 +24,15 @@ class Greco(ContactFamily):
     """GRECO's plate, pushed along a rigid plane with Coulomb friction (SSNV128)."""
 
     name = "greco"
-    keys = declared(n=key(32, 2), mu=key(1.0), iterate=key(0, 0), **DECOMPOSITION)
+    keys = schema(n=key(32, 2), mu=key(1.0), iterate=key(0, 0), **DECOMPOSITION)
     forms = CONTACT_FORMS
     problem = "greco.problem"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are cells and a coefficient of friction."""
+        """Raise InputError unless every key is in its range, and mu not negative."""
         super().check(params)
-        fits(self.name, int(params["n"]) ** 2)
-        if not 0 <= float(params["mu"]) <= MOST:
+        check_memory(self.name, int(params["n"]) ** 2)
+        if not 0 <= float(params["mu"]) <= MAX_SIZE:
             raise InputError(
                 f"{self.name}: mu={params['mu']}; expected a coefficient of friction "
                 "of 0 or more"

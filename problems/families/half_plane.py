@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
-from mortarbench.problems.ranges import choice, declared, fits_dense, key, tangential
+from mortarbench.problems.ranges import (
+    check_dense_memory,
+    check_tangential,
+    choice,
+    key,
+    schema,
+)
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
@@ -17,25 +23,25 @@ class HalfPlane(DeclaredFamily):
     """Line contact without a mesh: Hertz, or Cattaneo and Mindlin with friction."""
 
     name = "half-plane"
-    keys = declared(
+    keys = schema(
         n=key(100, 2),
         law=choice("hertz", "cattaneo"),
         Q=key(0.0),
         peak=key(0.0),
     )
     forms = ("dual",)
-    model = "half_plane.half_planes"
+    model = "half_plane.half_plane_case"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Let the tangential force never have been larger than it is."""
+        """Return all keys; peak defaults to Q, loading without unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the law has these forces, and they do not slide."""
+        """Raise InputError unless the law allows Q and peak, without sliding."""
         super().check(params)
-        fits_dense(self.name, int(params["n"]))
+        check_dense_memory(self.name, int(params["n"]))
         if params["law"] == "cattaneo":
-            tangential(self.name, params)
+            check_tangential(self.name, params)
         elif key := next((key for key in ("Q", "peak") if params[key]), ""):
             raise InputError(
                 f"{self.name}: {key}={params[key]} needs law=cattaneo; law=hertz has "

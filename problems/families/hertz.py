@@ -15,14 +15,14 @@ from mortarbench.problems.ranges import (
     METHODS,
     PLANES,
     STEPS,
+    check_memory,
+    check_tangential,
     choice,
-    declared,
-    fits,
     key,
     positive,
+    refuse_friction,
+    schema,
     size,
-    tangential,
-    without_friction,
 )
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class HertzPlane(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto a rigid plane."""
 
     name = "hertz-plane"
-    keys = declared(
+    keys = schema(
         n=key(10, 1),
         load=size(10.0),
         **PLANES,
@@ -42,27 +42,27 @@ class HertzPlane(ContactFamily):
         **KINEMATICS,
     )
     forms = ("primal", "dual")
-    problem = "hertz.on_plane"
+    problem = "hertz.plane_problem"
     model = "hertz.newton_step"
 
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range."""
         super().check(params)
-        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
+        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
 
 
 class HertzCylinder(ContactFamily):
     """Hertz contact: an elastic half cylinder pressed onto another one."""
 
     name = "hertz-cylinder"
-    keys = declared(
+    keys = schema(
         n=key(10, 1),
         m=key(8, 1),
         load=size(1.0),
         radius=size(1.0),
         ratio=size(1.0),
-        slave=choice("lower", "upper").but("upper"),
-        contact=METHODS["contact"].but("mortar"),
+        slave=choice("lower", "upper").with_default("upper"),
+        contact=METHODS["contact"].with_default("mortar"),
         basis=METHODS["basis"],
         **PLANES,
         halvings=HALVINGS,
@@ -70,47 +70,47 @@ class HertzCylinder(ContactFamily):
         Q=key(0.0),
         peak=key(0.0),
         programme=choice("normal-first", "proportional"),
-        steps=STEPS.but(20),
+        steps=STEPS.with_default(20),
         **DECOMPOSITION,
     )
     forms = ("primal", "dual")
     problem = "hertz.problem"
 
     def complete(self, given: Mapping[str, Value]) -> Mapping[str, Value]:
-        """Let the tangential force never have been larger than it is."""
+        """Return all keys; peak defaults to Q, loading without unloading."""
         return {**self.defaults, "peak": given.get("Q", 0.0), **given}
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range, and used."""
+        """Raise InputError unless every key is in its range and has an effect."""
         super().check(params)
-        fits(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
-        sheared = bool(params["Q"] or params["peak"])
-        together = params["programme"] == "proportional"
-        if sheared:
+        check_memory(self.name, (int(params["n"]) * 2 ** int(params["halvings"])) ** 2)
+        has_shear = bool(params["Q"] or params["peak"])
+        proportional = params["programme"] == "proportional"
+        if has_shear:
             for name, value in (("friction", "coulomb"), ("ratio", 1.0)):
                 if params[name] != value:
                     raise InputError(
                         f"{self.name}: {name}={params[name]} with a tangential force; "
                         f"expected {name}={value}, or no Q and no peak"
                     )
-            tangential(self.name, params)
+            check_tangential(self.name, params)
             positive(self.name, params, ("mu",))
         if params["loading"] == "static" and params["Q"] != params["peak"]:
             raise InputError(
                 f"{self.name}: peak={params['peak']} is not used by loading=static; "
                 "expected loading=quasi-static, which unloads"
             )
-        if together and not (sheared and params["Q"] == params["peak"]):
+        if proportional and not (has_shear and params["Q"] == params["peak"]):
             raise InputError(
                 f"{self.name}: programme=proportional needs Q, and no peak above it"
             )
-        if params["steps"] != self.defaults["steps"] and not together:
+        if params["steps"] != self.defaults["steps"] and not proportional:
             raise InputError(
                 f"{self.name}: steps={params['steps']} is not used by "
                 f"programme={params['programme']}; expected programme=proportional"
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; friction on arcs is refused."""
-        without_friction(self.name, params)
+        """Return the case with every cell halved; raise InputError with friction."""
+        refuse_friction(self.name, params)
         return super().refined(params)

@@ -10,10 +10,10 @@ from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
     CONTACT_FORMS,
     DECOMPOSITION,
+    check_memory,
     choice,
-    declared,
-    fits,
     key,
+    schema,
 )
 
 if TYPE_CHECKING:
@@ -21,17 +21,17 @@ if TYPE_CHECKING:
 
 
 class Obstacle(DeclaredFamily):
-    """A string or membrane over an obstacle, with known exact solution."""
+    """A string or membrane over an obstacle, with an exact solution."""
 
     name = "obstacle"
-    keys = declared(
-        dim=choice(1, 2).but(2),
+    keys = schema(
+        dim=choice(1, 2).with_default(2),
         n=key(20, 2),
         shape=choice("flat", "hemisphere"),
         **DECOMPOSITION,
     )
     forms = CONTACT_FORMS
-    model = "obstacle.over_obstacle"
+    model = "obstacle.obstacle_case"
     subdomains = "obstacle"
     cells = ("n",)
 
@@ -40,8 +40,8 @@ class Obstacle(DeclaredFamily):
         super().check(params)
         if params["shape"] == "hemisphere" and params["dim"] != 2:
             raise InputError(f"{self.name}: shape=hemisphere needs dim=2")
-        fits(self.name, int(params["n"]) ** int(params["dim"]))
+        check_memory(self.name, int(params["n"]) ** int(params["dim"]))
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True for a membrane in subdomains."""
+        """Return True for a decomposed membrane; one process assembles strings."""
         return params["dim"] == 2 and super().is_divided(params)

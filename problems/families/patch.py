@@ -12,14 +12,14 @@ from mortarbench.problems.ranges import (
     FRICTION,
     KINEMATICS,
     METHODS,
+    MIN_STRETCH,
     PLANES,
-    SHORTEST,
+    check_memory,
     choice,
-    declared,
-    doubled,
-    fits,
+    double,
     key,
-    minimised,
+    refuse_coulomb,
+    schema,
     size,
 )
 
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 
 
 class ContactPatch(ContactFamily):
-    """Contact patch test: two blocks on each other under uniform pressure."""
+    """Contact patch test: two stacked blocks under uniform pressure."""
 
     name = "contact-patch"
-    keys = declared(
+    keys = schema(
         lower=key(6, 1),
         upper=key(4, 1),
-        slave=choice("lower", "upper").but("upper"),
+        slave=choice("lower", "upper").with_default("upper"),
         ratio=size(1.0),
-        contact=METHODS["contact"].but("mortar"),
+        contact=METHODS["contact"].with_default("mortar"),
         basis=METHODS["basis"],
         **PLANES,
         **FRICTION,
@@ -50,12 +50,9 @@ class ContactPatch(ContactFamily):
     cells = ("lower", "upper")
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless every key is in its range.
-
-        A stretch must be one that pressure can bring about.
-        """
+        """Raise InputError unless every key is in its range, and stretch below 1."""
         super().check(params)
-        fits(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
+        check_memory(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
         stretch = float(params["stretch"])
         if stretch == self.defaults["stretch"]:
             return
@@ -64,18 +61,18 @@ class ContactPatch(ContactFamily):
                 f"{self.name}: stretch={stretch:g} is not used by kinematics=linear; "
                 "expected no stretch, or kinematics=finite"
             )
-        if not SHORTEST <= stretch < 1:
+        if not MIN_STRETCH <= stretch < 1:
             raise InputError(
-                f"{self.name}: stretch={stretch:g} must be at least {SHORTEST:g} and "
-                "below 1: blocks on each other can only be pressed"
+                f"{self.name}: stretch={stretch:g} must be at least {MIN_STRETCH:g} "
+                "and below 1: stacked blocks can only be compressed"
             )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
-        """Return the case with every cell halved; the odd row of cells is not.
+        """Return the case with every cell halved; raise InputError with Coulomb's law.
 
-        Coulomb's law is refused: its solutions minimise nothing.
+        The number of rows of cells, rounded up to n/2, may not double for odd n.
         """
-        finer = doubled(params, *self.cells)
+        finer = double(params, *self.cells)
         meshes = "/".join(f"{name}={n}" for name, n in finer.items())
-        minimised(self.name, [str(params["friction"])], meshes)
+        refuse_coulomb(self.name, [str(params["friction"])], meshes)
         return super().refined(params)

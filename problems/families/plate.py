@@ -10,11 +10,11 @@ from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
     GLUES,
     PLANES,
+    check_memory,
     choice,
-    declared,
-    fits,
     key,
     positive,
+    schema,
     size,
 )
 
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 
 class Plate(DeclaredFamily):
-    """A clamped plate in subdomains, with jumps of E: linear, to measure FETI on."""
+    """A clamped plate in subdomains, with jumps of E: a linear problem for FETI."""
 
     name = "plate"
-    keys = declared(
+    keys = schema(
         Sx=key(4, 1),
         Sy=key(4, 1),
         n=key(4, 1),
@@ -35,7 +35,7 @@ class Plate(DeclaredFamily):
         height=key(0.0),
         pattern=choice("uniform", "checkerboard", "column"),
         jump=size(1.0),
-        load=choice("point", "edge", "nodal").but("edge"),
+        load=choice("point", "edge", "nodal").with_default("edge"),
         **PLANES,
         supports=choice("rows", "eliminated"),
         **GLUES,
@@ -49,7 +49,7 @@ class Plate(DeclaredFamily):
         """Raise InputError unless every key is in its range."""
         super().check(params)
         p: Any = params
-        fits(self.name, 2 * p["Sx"] * p["Sy"] * p["n"] * (p["ny"] or p["n"]))
+        check_memory(self.name, 2 * p["Sx"] * p["Sy"] * p["n"] * (p["ny"] or p["n"]))
         positive(self.name, p, (name for name in ("width", "height") if p[name]))
         if p["pattern"] == "uniform" and p["jump"] != 1:
             raise InputError(
@@ -63,5 +63,5 @@ class Plate(DeclaredFamily):
             )
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:
-        """Return True: there are always subdomains."""
+        """Return True: the plate is always decomposed."""
         return True

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
-from mortarbench.problems.ranges import declared, fits, key, size
+from mortarbench.problems.ranges import check_memory, key, schema, size
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
@@ -17,43 +17,43 @@ class String(DeclaredFamily):
     """A string over a sine-shaped obstacle: PERMON's first tutorial."""
 
     name = "string"
-    keys = declared(n=key(100, 3))
+    keys = schema(n=key(100, 3))
     forms = ("primal",)
     model = "variational.string"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are three points or more."""
+        """Raise InputError unless there are at least three points."""
         super().check(params)
-        fits(self.name, int(params["n"]))
+        check_memory(self.name, int(params["n"]))
 
 
 class JournalBearing(DeclaredFamily):
-    """The pressure in a journal bearing, not negative: MINPACK-2."""
+    """The non-negative pressure in a journal bearing: MINPACK-2."""
 
     name = "journal-bearing"
-    keys = declared(n=key(50, 2), eccentricity=size(0.1))
+    keys = schema(n=key(50, 2), eccentricity=size(0.1))
     forms = ("primal",)
     model = "variational.journal_bearing"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless the shaft turns inside of the bearing."""
+        """Raise InputError unless the eccentricity is below 1, where surfaces touch."""
         super().check(params)
         if float(params["eccentricity"]) >= 1:
             raise InputError(
                 f"{self.name}: eccentricity={params['eccentricity']} must be below 1"
             )
-        fits(self.name, int(params["n"]) ** 2)
+        check_memory(self.name, int(params["n"]) ** 2)
 
 
 class Torsion(DeclaredFamily):
     """Elastic-plastic torsion of a square bar, bounds on both sides: MINPACK-2."""
 
     name = "torsion"
-    keys = declared(n=key(50, 2), twist=size(5.0))
+    keys = schema(n=key(50, 2), twist=size(5.0))
     forms = ("primal",)
     model = "variational.torsion"
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Raise InputError unless there are two nodes a side and a twist."""
+        """Raise InputError unless there are two nodes per side and a positive twist."""
         super().check(params)
-        fits(self.name, int(params["n"]) ** 2)
+        check_memory(self.name, int(params["n"]) ** 2)

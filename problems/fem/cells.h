@@ -1,15 +1,15 @@
-/* Integrals over single cells, and their sums in the values of a CSC matrix.
+/* Integrals over single cells, summed into the values of a CSC matrix.
 
-   The functions work for n nodes and dim coordinates. They are inlined, so that the loops
-   are unrolled where a caller has constants: as for the quadrilaterals of the paper. */
+   The functions work for n nodes and dim coordinates. They are inlined, so that compilers
+   unroll the loops where callers pass constants, as for the paper's quadrilaterals. */
 
 #include <stddef.h>
 
-#define NODES 8 /* of the largest element */
+#define NODES 8 /* nodes of the largest element */
 #define DIM 3
 
 #if defined(__x86_64__) && defined(__gnu_linux__)
-/* compiled twice, chosen when loaded; without FMA the digits are the same */
+/* compiled twice, selected at load time; without FMA both variants round alike */
 #define CLONED __attribute__((target_clones("avx2", "default")))
 #else
 #define CLONED
@@ -20,20 +20,20 @@
 #define INLINED static inline
 #endif
 
-/* Places of the components of a symmetric tensor, Voigt's notation. */
+/* Indices of the components of a symmetric tensor in Voigt's notation, by dimension. */
 static const int VOIGT[DIM + 1][DIM][DIM] = {
     {{0}}, {{0}}, {{0, 2}, {2, 1}}, {{0, 5, 4}, {5, 1, 3}, {4, 3, 2}},
 };
 
-/* The finite element as data, see problems.fem.elements. */
+/* Finite element as data, see problems.fem.elements. */
 typedef struct {
     int points, pairs;
     const double *gradients; /* (points, dim, n) of the shape functions */
     const double *weights;   /* (points,) */
-    const int *edges;        /* (dim, pairs, 2) first and last node, along each axis */
+    const int *edges;        /* (dim, pairs, 2) first and last nodes of edges per axis */
 } element;
 
-/* adj(J) with J adj(J) = det(J); returns det(J). */
+/* Compute adj(J) with J adj(J) = det(J) I; return det(J). */
 INLINED double adjugate(int dim, const double J[DIM][DIM], double adj[DIM][DIM]) {
     double det = 0;
     if (dim == 2) {
@@ -53,9 +53,9 @@ INLINED double adjugate(int dim, const double J[DIM][DIM], double adj[DIM][DIM])
 /* Integrate BᵀDB of one cell.
 
    x (n, dim) corners, D (v, v) with v = dim(dim + 1)/2 components of strain,
-   Ke (dim, dim, n, n): by components, then by nodes */
+   Ke (dim, dim, n, n), indexed by components, then by nodes */
 INLINED void cell_stiffness(
-    int n, int dim, int pairs, const element *of, const double *x, const double *D,
+    int n, int dim, int pairs, const element *elem, const double *x, const double *D,
     double *Ke
 ) {
     const int v = dim * (dim + 1) / 2;
@@ -64,22 +64,23 @@ INLINED void cell_stiffness(
     for (int e = 0; e < dim * pairs; e++)
         for (int m = 0; m < dim; m++)
             span[e * dim + m] =
-                x[of->edges[2 * e + 1] * dim + m] - x[of->edges[2 * e] * dim + m];
+                x[elem->edges[2 * e + 1] * dim + m] - x[elem->edges[2 * e] * dim + m];
     for (int i = 0; i < dim * dim * n * n; i++)
         Ke[i] = 0;
-    for (int q = 0; q < of->points; q++) {
-        const double *reference = of->gradients + q * dim * n;
+    for (int q = 0; q < elem->points; q++) {
+        const double *reference = elem->gradients + q * dim * n;
+        /* J = ∂x/∂ξ by differences of corners: Σ x_a ∂N_a/∂ξ would cancel digits */
         for (int k = 0; k < dim; k++)
-            for (int m = 0; m < dim; m++) { /* ∂x/∂ξ; differences first, for digits */
-                const int *last = of->edges + 2 * k * pairs + 1;
+            for (int m = 0; m < dim; m++) {
+                const int *last = elem->edges + 2 * k * pairs + 1;
                 double sum = reference[k * n + last[0]] * span[k * pairs * dim + m];
                 for (int e = 1; e < pairs; e++)
                     sum += reference[k * n + last[2 * e]]
                          * span[(k * pairs + e) * dim + m];
                 J[k][m] = sum;
             }
-        /* gradients lack their factor 1/det here, the stresses have it twice */
-        const double weight = of->weights[q] / adjugate(dim, J, adj);
+        /* grad lacks its factor 1/det; it enters twice: w det (1/det)² = w/det */
+        const double weight = elem->weights[q] / adjugate(dim, J, adj);
         for (int m = 0; m < dim; m++)
             for (int a = 0; a < n; a++) {
                 double sum = adj[m][0] * reference[a];
@@ -110,7 +111,7 @@ INLINED void cell_stiffness(
 
 /* Add the block Ke of a cell to the values of a dof pattern.
 
-   Entry (i, k), (j, l) of nodes and components is
+   The entry of components (i, k) and (j, l), node first, is
    Ke[i·node_i + k·part_k + j·node_j + l·part_l];
    nodes (n,), ptr and slot (n, n): see problems.fem.elasticity.Pattern */
 INLINED void scatter(
@@ -130,7 +131,7 @@ INLINED void scatter(
 }
 
 INLINED void sum_cells(
-    int n, int dim, int pairs, const element *of, const double *points, ptrdiff_t E,
+    int n, int dim, int pairs, const element *elem, const double *points, ptrdiff_t E,
     const int *cells, const double *D, const int *material, const int *ptr,
     const int *slot, double *data
 ) {
@@ -141,24 +142,24 @@ INLINED void sum_cells(
         for (int i = 0; i < n; i++)
             for (int m = 0; m < dim; m++)
                 x[i * dim + m] = points[(ptrdiff_t)nodes[i] * dim + m];
-        cell_stiffness(n, dim, pairs, of, x, D + material[e] * v * v, Ke);
+        cell_stiffness(n, dim, pairs, elem, x, D + material[e] * v * v, Ke);
         scatter(n, dim, Ke, n, dim * n * n, 1, n * n, nodes, ptr, slot + e * n * n, data);
     }
 }
 
 /* Sum the stiffness of E cells (E, n); points (N, dim), D (materials, v, v). */
 CLONED static void sum_stiffness(
-    int n, int dim, const element *of, const double *points, ptrdiff_t E,
+    int n, int dim, const element *elem, const double *points, ptrdiff_t E,
     const int *cells, const double *D, const int *material, const int *ptr,
     const int *slot, double *data
 ) {
-    if (n == 4 && dim == 2 && of->pairs == 2)
-        sum_cells(4, 2, 2, of, points, E, cells, D, material, ptr, slot, data);
+    if (n == 4 && dim == 2 && elem->pairs == 2)
+        sum_cells(4, 2, 2, elem, points, E, cells, D, material, ptr, slot, data);
     else
-        sum_cells(n, dim, of->pairs, of, points, E, cells, D, material, ptr, slot, data);
+        sum_cells(n, dim, elem->pairs, elem, points, E, cells, D, material, ptr, slot, data);
 }
 
-/* Sum blocks (E, n·dim, n·dim), numbered by nodes, then by components. */
+/* Sum blocks (E, n·dim, n·dim), indexed by nodes, then by components. */
 static void sum_blocks(
     int n, int dim, const double *blocks, ptrdiff_t E, const int *cells, const int *ptr,
     const int *slot, double *data
@@ -207,7 +208,7 @@ INLINED void cell_tangent(
             K[row * size + column] = K[column * size + row];
 }
 
-/* Integrate the tangents (E, n·dim, n·dim) of all cells, which are zero before. */
+/* Integrate the tangents of all cells into K (E, n·dim, n·dim), initially zero. */
 static void integrate_tangents(
     int n, int dim, int points, const double *gradients, const double *volumes,
     const double *A, ptrdiff_t E, double *K

@@ -1,15 +1,15 @@
-"""Nested dissection of a mesh: in which order a sparse Cholesky factor eliminates it.
+"""Nested dissection of a mesh: elimination order of a sparse Cholesky factorisation.
 
-A set of nodes is cut in two across its longest principal axis; of the second half, the
-nodes with a neighbour in the first separate the two, and are eliminated after both.
-Either half is cut again until few nodes are left (George, SIAM J. Numer. Anal. 10,
-1973; the cuts by coordinates, as in Gilbert, Miller and Teng, SIAM J. Sci. Comput. 19,
-1998). Chosen nodes are eliminated last of all, so that the trailing block of the factor
-is the Schur complement on them.
+A set of nodes is bisected across its longest principal axis. The nodes of the second
+half with a neighbour in the first form the separator, which is eliminated after both
+halves. The halves are bisected recursively down to LEAF_SIZE nodes (George, SIAM J.
+Numer. Anal. 10, 1973; bisection by coordinates as in Gilbert, Miller and Teng, SIAM J.
+Sci. Comput. 19, 1998). Selected nodes are eliminated last of all, so that the trailing
+block of the factor is that of the Schur complement on them.
 
-The sets that are eliminated together, leaves and separators, are the fronts of a
-multifrontal factorisation (`problems.fem.multifrontal`), in postorder: both halves come
-before what separates them.
+Leaves and separators, the sets eliminated together, are the fronts of a multifrontal
+factorisation (`problems.fem.multifrontal`), in postorder: a separator comes after both
+of its halves.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.fem.ordering import borders, dissected, node_graph
+from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
 
-LEAF = 8  #: nodes that are cut no more
+LEAF_SIZE = 8  #: most nodes of a set that is not bisected further
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -32,46 +32,48 @@ Marks = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Fronts:
-    """Sets of positions in an order of elimination, in postorder of their tree.
+    """Fronts: sets of positions in the elimination order, in postorder of their tree.
 
-    Positions number the eliminated in their order. Those of front s are
-    start[s] … start[s + 1] − 1; border[first[s]:first[s + 1]] are the later ones that
-    the matrix or the elimination of earlier ones couples with them, ascending. The
-    `children[s]` roots of subtrees that come last before s are its children.
+    Front s eliminates the positions start[s] … start[s + 1] − 1. Its border,
+    border[first[s]:first[s + 1]], consists of the later positions with entries in its
+    rows, from the matrix or by fill-in, ascending. Its children are the last
+    `children[s]` roots of subtrees before s.
     """
 
     start: Ints  #: (F + 1,)
     first: Ints  #: (F + 1,)
     border: Ints
     children: Ints  #: (F,)
-    roots: Marks  #: (F,) which of them hold the nodes to be eliminated last
+    roots: Marks  #: (F,) True for the fronts of the nodes to be eliminated last
 
 
 def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
-    """Order the nodes (N,) of a mesh, and find the fronts of this order.
+    """Compute an elimination order of the nodes (N,) of a mesh, and its fronts.
 
     Parameters
     ----------
     K : (dN, dN) symmetric pattern in CSC; node i has the d components d·i, d·i + 1, …
-    points : (N, 2) of the nodes
-    last : nodes that come last in their connected component
+    points : (N, 2) positions of the nodes
+    last : nodes to be eliminated last in their connected component
 
     Returns
     -------
-    the nodes in order of elimination, and the fronts of their positions in it
+    the nodes in elimination order, and the fronts of positions in that order
 
     """
     nodes = len(points)
     ptr, idx = node_graph(*index_arrays(K), K.shape[0] // nodes, nodes)
-    ending = np.zeros(nodes, dtype=np.bool_)
-    ending[last] = True
-    order, start, children, roots = dissected(ptr, idx, points, ending, LEAF)
+    is_last = np.zeros(nodes, dtype=np.bool_)
+    is_last[last] = True
+    order, start, children, roots = dissect_components(
+        ptr, idx, points, is_last, LEAF_SIZE
+    )
     first, border = borders(ptr, idx, order, start, children)
     return order.astype(np.int64), Fronts(start, first, border, children, roots)
 
 
-def spread(fronts: Fronts, ends: Ints) -> Fronts:
-    """Replace each position by several, or none: i by ends[i] … ends[i + 1] − 1."""
+def expand_positions(fronts: Fronts, ends: Ints) -> Fronts:
+    """Replace each position i by the positions ends[i] … ends[i + 1] − 1, if any."""
     count = np.diff(ends)[fronts.border]
     above = np.append(0, np.cumsum(count))
     each = np.arange(above[-1]) - np.repeat(above[:-1], count)

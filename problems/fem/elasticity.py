@@ -1,12 +1,12 @@
 """Linear elasticity with multilinear elements, in the plane and in space.
 
-In the plane that is the bilinear quadrilateral of the paper (Section 2); triangles are
-quadrilaterals with two corners in one, see `problems.fem.mesh`.
+In the plane this is the bilinear quadrilateral of the paper (Section 2); triangles are
+degenerate quadrilaterals with two coincident corners, see `problems.fem.mesh`.
 
 Voigt's notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy) in the plane,
-(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) and so on in space. Plane stiffness is per unit
-thickness, so K has the unit of stress (Pa) and forces are in N/m; in space they are N/m
-and N.
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) and likewise for stress in space. Plane stiffness is
+per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m and forces
+are in N.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from mortarbench.problems.fem.kernels import (
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
 
 Plane = Literal["strain", "stress"]
-#: places of the components of a symmetric tensor in Voigt's notation, by dimension
+#: indices of the components of a symmetric tensor in Voigt's notation, by dimension
 VOIGT = {
     2: np.array([[0, 2], [2, 1]]),
     3: np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]]),
@@ -44,7 +44,11 @@ VOIGT = {
 
 @dataclass(frozen=True)
 class Material:
-    """An isotropic linear material."""
+    """An isotropic, linearly elastic material.
+
+    >>> Material(E=210e9, nu=0.3)
+    Material(E=210000000000.0, nu=0.3)
+    """
 
     E: float  #: Young's modulus, Pa
     nu: float  #: Poisson's ratio
@@ -59,31 +63,32 @@ def elasticity_matrix(material: Material, plane: Plane | None) -> Floats:
     factor = E / ((1 + nu) * (1 - 2 * nu))
     D = np.diag([1 - nu] * 3 + [(1 - 2 * nu) / 2] * 3)
     D[:3, :3][~np.eye(3, dtype=bool)] = nu
-    kept = [0, 1, 5] if plane == "strain" else list(range(6))
-    return np.asarray(factor * D[np.ix_(kept, kept)])
+    # plane strain: ε_z = γ_yz = γ_xz = 0
+    components = [0, 1, 5] if plane == "strain" else list(range(6))
+    return np.asarray(factor * D[np.ix_(components, components)])
 
 
-def shape_gradients(corners: Floats, at: Vector) -> tuple[Floats, Vector]:
+def shape_gradients(corners: Floats, xi: Vector) -> tuple[Floats, Vector]:
     """Differentiate the shape functions of cells with respect to x.
 
     Parameters
     ----------
     corners : (E, n, dim) corner positions of the cells
-    at : (dim,) point of the reference cell
+    xi : (dim,) point of the reference cell
 
     Returns
     -------
     (E, n, dim) gradients ∂N_a/∂x and (E,) Jacobian determinants
 
     """
-    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(at)
+    reference = ELEMENTS[corners.shape[2], corners.shape[1]].gradients(xi)
     J = np.einsum("ar,eax->erx", reference, corners)  # ∂x/∂ξ
     gradients: Floats = np.einsum("erx,ar->eax", inverse_transpose(J), reference)
     return gradients, determinant(J)
 
 
 def strain_matrix(gradients: Floats) -> Floats:
-    """Return B (E, v, n·dim) of ε = B u_e, with u_e = (u_x1, u_y1, …) of the nodes."""
+    """Return B (E, v, n·dim) with ε = B u_e and u_e = (u_x1, u_y1, …) at the nodes."""
     E, n, dim = gradients.shape
     B = np.zeros((E, dim * (dim + 1) // 2, n * dim))
     for (i, j), component in np.ndenumerate(VOIGT[dim]):
@@ -101,10 +106,9 @@ def stiffness(
 
     Parameters
     ----------
-    mesh : the body or bodies
-    D : (v, v), or (k, v, v) of k materials
-    material : (E,) of each cell, 0 … k − 1; left out: all 0
-    pattern : of the mesh, where it is known
+    D : (v, v) elasticity matrix, or (k, v, v) for k materials
+    material : (E,) material of each cell, 0 … k − 1; default: 0
+    pattern : sparsity pattern of the mesh, if it was computed before
 
     """
     pattern = pattern or sparsity(mesh)
@@ -120,17 +124,17 @@ def stiffness(
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Where the entries of a stiffness matrix are; depends on the cells alone."""
+    """Sparsity pattern of a stiffness matrix; it depends on the cells alone."""
 
     cells: NDArray[np.int32]  #: (E, c)
-    ptr: NDArray[np.int32]  #: (N + 1,) of the neighbours of each node
-    slot: NDArray[np.int32]  #: (E, c, c) of node b among the neighbours of node a
-    indptr: NDArray[np.int32]  #: (n + 1,) of K
-    indices: NDArray[np.int32]
+    ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
+    slot: NDArray[np.int32]  #: (E, c, c) index of node b among the neighbours of node a
+    indptr: NDArray[np.int32]  #: (n + 1,) of K in CSC
+    indices: NDArray[np.int32]  #: of K in CSC
 
 
 def sparsity(mesh: Mesh) -> Pattern:
-    """Find the pattern of K, once for all values."""
+    """Compute the sparsity pattern of K."""
     cells = np.ascontiguousarray(mesh.cells, dtype=np.int32)
     ptr, idx = node_pattern(cells, len(mesh.points))
     pattern = dof_pattern(ptr, idx, mesh.dim)
@@ -138,18 +142,19 @@ def sparsity(mesh: Mesh) -> Pattern:
 
 
 def cell_dofs(mesh: Mesh) -> NDArray[np.int64]:
-    """List the dofs of each cell, (E, n·dim)."""
+    """Return the dofs of each cell, (E, n·dim)."""
     return dofs_of(mesh.cells, mesh.dim).reshape(-1, mesh.dim * mesh.cells.shape[1])
 
 
 def rigid_motions(points: Floats) -> Floats:
-    """Return the rigid motions (n, r) of one body with the nodes (N, dim).
+    """Return the linearised rigid motions (n, r) of one body with the nodes (N, dim).
 
-    One translation along each axis, then in each plane of two axes (k, l) the
-    linearised rotation about the centroid of the nodes, x_k e_l − x_l e_k: in the plane
-    r = 3, in space 6, and on a line there is the translation alone.
+    These are a translation along each axis, then for each pair of axes (k, l) the
+    linearised rotation about the centroid of the nodes, x_k e_l − x_l e_k. r is 1 on a
+    line, 3 in the plane and 6 in space.
     """
     N, dim = points.shape
+    # about the centroid, rotations are orthogonal to translations
     offset = points - points.mean(axis=0)
     planes = list(combinations(range(dim), 2))
     motions = np.zeros((N, dim, dim + len(planes)))
@@ -160,15 +165,15 @@ def rigid_motions(points: Floats) -> Floats:
 
 
 def rigid_modes(points: Floats) -> Floats:
-    """Return an orthonormal basis R (n, r) of ker K of one body.
+    """Return an orthonormal basis R (n, r) of ker K of one body, for eq. (4).
 
-    In the plane the rigid motions are orthogonal, the analytic formula of the paper; in
-    space rotations are, about the principal axes of the nodes' inertia.
+    The analytic formula: in the plane the rigid motions are orthogonal; in space,
+    rotations about the principal axes of inertia of the nodes are.
     """
     R = rigid_motions(points)
     dim = points.shape[1]
     if R.shape[1] > dim + 1:
-        turns = R[:, dim:]
-        R[:, dim:] = turns @ np.linalg.eigh(turns.T @ turns)[1]
+        rotations = R[:, dim:]
+        R[:, dim:] = rotations @ np.linalg.eigh(rotations.T @ rotations)[1]
     R /= np.linalg.norm(R, axis=0)
     return R

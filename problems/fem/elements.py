@@ -1,6 +1,6 @@
-"""Finite elements as data: reference cells with their shape functions and facets.
+"""Finite elements as data: reference cells with shape functions and facets.
 
-A multilinear element on [−1, 1]^dim follows from its corners ξ_a alone:
+The corners ξ_a determine a multilinear element on [−1, 1]^dim:
 
     N_a(ξ) = Π_k (1 + ξ_ak ξ_k) / 2,   a = 1 … 2^dim,
 
@@ -25,9 +25,9 @@ Floats = NDArray[np.float64]
 class Element:
     """A multilinear element with n corners."""
 
-    kind: str  #: as meshio calls its cells
-    corners: NDArray[np.int64]  #: (n, dim) of the reference cell, each −1 or 1
-    facets: NDArray[np.int64]  #: (f, m) corners of its sides, the cell on their left
+    kind: str  #: name of its cells in meshio
+    corners: NDArray[np.int64]  #: (n, dim) corners of the reference cell, each −1 or 1
+    facets: NDArray[np.int64]  #: (f, m) corners of each facet, the cell on its left
 
     @property
     def dim(self) -> int:
@@ -44,28 +44,28 @@ class Element:
         """Weights of the Gauss points, (q,)."""
         return np.ones(len(self.corners))
 
-    def gradients(self, at: Vector) -> Floats:
-        """Return ∂N_a/∂ξ (n, dim) at a point (dim,) of the reference cell."""
-        factors = 1 + self.corners * at
+    def gradients(self, xi: Vector) -> Floats:
+        """Return ∂N_a/∂ξ (n, dim) at the point ξ (dim,) of the reference cell."""
+        factors = 1 + self.corners * xi
         others = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(self.dim)]
         return np.asarray(self.corners * np.stack(others, axis=-1) / 2**self.dim)
 
     @cached_property
     def table(self) -> Floats:
         """∂N_a/∂ξ_k at all Gauss points, (q, dim, n)."""
-        return np.stack([self.gradients(at).T for at in self.points]).copy()
+        return np.stack([self.gradients(xi).T for xi in self.points]).copy()
 
     @cached_property
     def edges(self) -> NDArray[np.int32]:
-        """First and last corner (dim, n/2, 2) of the edges along each axis."""
-        found = []
+        """First and last corners (dim, n/2, 2) of the edges along each axis."""
+        edges = []
         for k in range(self.dim):
             first = np.flatnonzero(self.corners[:, k] < 0)
             across = self.corners[first]
             across[:, k] = 1
             same = (self.corners == across[:, None]).all(axis=2)
-            found.append(np.stack([first, same.argmax(axis=1)], axis=-1))
-        return np.array(found, dtype=np.int32)
+            edges.append(np.stack([first, same.argmax(axis=1)], axis=-1))
+        return np.array(edges, dtype=np.int32)
 
 
 QUAD = Element(
@@ -81,8 +81,10 @@ HEXAHEDRON = Element(
         [3, 0, 4, 7],
     ]),
 )  # fmt: skip
-#: by dimension and number of corners in a table of cells
-ELEMENTS = {(of.dim, len(of.corners)): of for of in (QUAD, HEXAHEDRON)}
+#: elements by dimension and number of columns of a table of cells
+ELEMENTS = {
+    (element.dim, len(element.corners)): element for element in (QUAD, HEXAHEDRON)
+}
 
 
 def determinant(A: Floats) -> Floats:

@@ -1,9 +1,9 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 # cython: initializedcheck=False
-"""Compiled loops of the multifrontal method, dense work done by BLAS and LAPACK.
+"""Compiled loops of the multifrontal method, with dense work in BLAS and LAPACK.
 
-`problems.fem.multifrontal` says what it is. U = Lᵀ of a front by rows is L of LAPACK,
-by columns.
+See `problems.fem.multifrontal`. The rows of U = Lᵀ of a front, stored row by row, are
+the columns of L in the column-major order of LAPACK.
 """
 
 from libc.stdint cimport int64_t
@@ -27,59 +27,62 @@ def eliminate(
     const int64_t[::1] offset,
     double[::1] rows,
 ):
-    """Write the rows of U front by front; say whether all pivots were positive."""
-    cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, waiting = 0
-    cdef int low, own, left, size, info = 0
+    """Write the rows of U front by front; return False if a pivot is not positive."""
+    cdef Py_ssize_t s, p, q, t, i, child, m, top = 0, depth = 0
+    cdef int low, pivots, rest, size, info = 0
     cdef double one = 1.0, minus = -1.0
     cdef int[::1] place = np.zeros(order.shape[0], dtype=np.int32)  # in the front
     cdef int[::1] to = np.empty(np.diff(first).max(), dtype=np.int32)
     cdef int[::1] stack = np.empty(children.shape[0], dtype=np.int32)
-    # what fronts left, one on another
-    cdef double[::1] store = np.empty(most_waiting(first, children))
+    # stack of the Schur complements of fronts whose parents are still to come
+    cdef double[::1] store = np.empty(peak_storage(first, children))
     cdef double *U
     cdef double *S
     for s in range(children.shape[0]):
-        low, own, left = start[s], start[s + 1] - start[s], first[s + 1] - first[s]
-        size = own + left
+        low, pivots, rest = start[s], start[s + 1] - start[s], first[s + 1] - first[s]
+        size = pivots + rest
+        # S lies above the children's complements on the stack, which it takes up first
         U, S = &rows[0] + offset[s], &store[0] + top
-        for i in range(own):
+        for i in range(pivots):
             place[low + i] = i
-        for i in range(left):
-            place[border[first[s] + i]] = own + i
-            memset(S + i * left + i, 0, (left - i) * sizeof(double))
-        for p in range(low, low + own):
+        for i in range(rest):
+            place[border[first[s] + i]] = pivots + i
+            memset(S + i * rest + i, 0, (rest - i) * sizeof(double))
+        for p in range(low, low + pivots):
             for t in range(indptr[order[p]], indptr[order[p] + 1]):
                 q = position[indices[t]]
                 if q >= p:
                     U[(p - low) * size + place[q]] = data[t]
         for i in range(children[s]):
-            waiting -= 1
-            child = stack[waiting]
+            depth -= 1
+            child = stack[depth]
             m = first[child + 1] - first[child]
             for t in range(m):
                 to[t] = place[border[first[child] + t]]
             top -= m * m
-            add(&store[top], &to[0], m, own, left, U, S)
-        if own:
-            dpotrf(b"L", &own, U, &size, &info)
-            if info or not U[(own - 1) * (<Py_ssize_t> size + 1)] > 0:  # NaN is not
+            add(&store[top], &to[0], m, pivots, rest, U, S)
+        if pivots:
+            dpotrf(b"L", &pivots, U, &size, &info)
+            # not (… > 0): also True for NaN, which dpotrf need not report
+            if info or not U[(pivots - 1) * (<Py_ssize_t> size + 1)] > 0:
                 return False
-        if own and left:
-            dtrsm(b"R", b"L", b"T", b"N", &left, &own, &one, U, &size, U + own, &size)
-            dsyrk(b"L", b"N", &left, &own, &minus, U + own, &size, &one, S, &left)
-        if children[s]:  # to their place: they are done with
-            for i in range(left):
-                t = i * left + i
-                memmove(&store[top + t], S + t, (left - i) * sizeof(double))
-        stack[waiting] = s
-        waiting += 1
-        top += <Py_ssize_t> left * left
+        if pivots and rest:
+            dtrsm(b"R", b"L", b"T", b"N", &rest, &pivots, &one, U, &size, U + pivots,
+                  &size)
+            dsyrk(b"L", b"N", &rest, &pivots, &minus, U + pivots, &size, &one, S, &rest)
+        if children[s]:  # … and is moved to the place of the children's afterwards
+            for i in range(rest):
+                t = i * rest + i
+                memmove(&store[top + t], S + t, (rest - i) * sizeof(double))
+        stack[depth] = s
+        depth += 1
+        top += <Py_ssize_t> rest * rest
     return True
 
 
-def most_waiting(const int[::1] first, const int[::1] children):
-    """Count the numbers that `eliminate` has to keep at a time."""
-    cdef Py_ssize_t s, i, waiting = 0
+def peak_storage(const int[::1] first, const int[::1] children):
+    """Return the largest number of doubles on the stack of `eliminate`."""
+    cdef Py_ssize_t s, i, depth = 0
     cdef int64_t size, top = 0, most = 0
     cdef int64_t[::1] stack = np.empty(children.shape[0], dtype=np.int64)
     for s in range(children.shape[0]):
@@ -87,29 +90,31 @@ def most_waiting(const int[::1] first, const int[::1] children):
         size *= size
         most = max(most, top + size)
         for i in range(children[s]):
-            waiting -= 1
-            top -= stack[waiting]
-        stack[waiting] = size
-        waiting += 1
+            depth -= 1
+            top -= stack[depth]
+        stack[depth] = size
+        depth += 1
         top += size
     return most
 
 
 cdef void add(
-    const double *below, const int *to, Py_ssize_t m, Py_ssize_t own, Py_ssize_t left,
+    const double *below, const int *to, Py_ssize_t m, Py_ssize_t pivots,
+    Py_ssize_t rest,
     double *U, double *S,
 ) noexcept nogil:
-    """Add the upper triangle of what a child left at the places `to` of its front.
+    """Add the upper triangle of a child's Schur complement at the places `to` (m,).
 
-    below (m, m), U (own, own + left), S (left, left)
+    below (m, m) complement of the child; U (pivots, pivots + rest) and
+    S (rest, rest) of the parent front
     """
     cdef Py_ssize_t i, j
     cdef double *row
     for i in range(m):
-        if to[i] < own:
-            row = U + to[i] * (own + left)
+        if to[i] < pivots:
+            row = U + to[i] * (pivots + rest)
         else:
-            row = S + (to[i] - own) * left - own
+            row = S + (to[i] - pivots) * rest - pivots
         for j in range(i, m):
             row[to[j]] += below[i * m + j]
 
@@ -122,43 +127,43 @@ def substitute(
     const double[::1] rows,
     double[:, ::1] x,
 ):
-    """Solve UᵀU x = b in place of b, whose right-hand sides are the rows of x."""
+    """Solve UᵀU x = b in place; the right-hand sides are the rows of x."""
     cdef Py_ssize_t s, t, k, i, fronts = start.shape[0] - 1
-    cdef int own, left, size, unit = 1
+    cdef int pivots, rest, size, unit = 1
     cdef double one = 1.0, minus = -1.0, zero = 0.0
     cdef double[::1] further = np.empty(np.diff(first).max())
     cdef double *v = &further[0]
     cdef double *U
     cdef double *xs
     for t in range(2 * fronts):
-        s = min(t, 2 * fronts - 1 - t)  # up the tree and down again
-        own, left = start[s + 1] - start[s], first[s + 1] - first[s]
-        size = own + left
-        if not own:
+        s = min(t, 2 * fronts - 1 - t)  # forward up the tree, backward down again
+        pivots, rest = start[s + 1] - start[s], first[s + 1] - first[s]
+        size = pivots + rest
+        if not pivots:
             continue
         U = <double *> &rows[0] + offset[s]
         for k in range(x.shape[0]):
             xs = &x[k, start[s]]
             if t < fronts:
-                dtrsv(b"L", b"N", b"N", &own, U, &size, xs, &unit)
-                dgemv(b"N", &left, &own, &minus, U + own, &size, xs, &unit, &zero, v,
-                      &unit)
-                for i in range(left):
+                dtrsv(b"L", b"N", b"N", &pivots, U, &size, xs, &unit)
+                dgemv(b"N", &rest, &pivots, &minus, U + pivots, &size, xs, &unit, &zero,
+                      v, &unit)
+                for i in range(rest):
                     x[k, border[first[s] + i]] += v[i]
             else:
-                for i in range(left):
+                for i in range(rest):
                     v[i] = x[k, border[first[s] + i]]
-                dgemv(b"T", &left, &own, &minus, U + own, &size, v, &unit, &one, xs,
-                      &unit)
-                dtrsv(b"L", b"T", b"N", &own, U, &size, xs, &unit)
+                dgemv(b"T", &rest, &pivots, &minus, U + pivots, &size, v, &unit, &one,
+                      xs, &unit)
+                dtrsv(b"L", b"T", b"N", &pivots, U, &size, xs, &unit)
 
 
-def spread_symmetric(
+def scatter_symmetric(
     const double[:, :] upper, const int[::1] at, double[:, ::1] to
 ):
-    """Write a symmetric matrix, of which the upper triangle is given, at rows `at`.
+    """Copy a symmetric matrix, stored as upper triangle, to rows and columns `at`.
 
-    Rows and columns whose place is negative are left out.
+    Rows and columns with a negative place are skipped.
     """
     cdef Py_ssize_t i, j
     for i in range(at.shape[0]):

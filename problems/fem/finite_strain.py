@@ -6,20 +6,20 @@ points in the reference configuration,
     Π(u) = Σ_e ∫ W(F) dA,     r = ∂Π/∂u = Σ_e ∫ P ∂N/∂X,     K_t = ∂r/∂u
 
 (Wriggers 2008, "Nonlinear Finite Element Methods", Section 4.2). Triangles are
-quadrilaterals with two corners in one, see `problems.fem.mesh`; their F is constant.
+degenerate quadrilaterals, see `problems.fem.mesh`; their F is constant.
 
-Nearly incompressible materials (ν ≥ NEARLY_INCOMPRESSIBLE) lock: four points ask for
-four changes of volume, which eight displacements cannot meet. Their cells take the mean
-dilatation (Q1P0; Simo, Taylor and Pister 1985): with W = w + U(θ) the volumetric part
-sees the average of the cell only,
+Nearly incompressible materials (ν ≥ NEARLY_INCOMPRESSIBLE) lock: the four Gauss points
+impose four conditions on the volume, which eight displacements cannot satisfy. Their
+cells use the mean dilatation (Q1P0; Simo, Taylor and Pister 1985): with W = w + U(θ),
+the volumetric part depends on the average over the cell only,
 
     Π_e = ∫ w(F) dA + V U(θ̄),    θ̄ = 1/V ∫ θ(F) dA,    K_e = ∫ ∂²(w + U′(θ̄)θ) + U″/V ggᵀ
 
-with g = ∫ ∂θ/∂u dA. As Π_e is an energy, K_e is symmetric. Triangles gain nothing by
-it. Under strong compression of a cell Q1P0 is known for hourglass modes.
+with g = ∫ ∂θ/∂u dA. As Π_e is an energy, K_e is symmetric. On triangles it changes
+nothing. Q1P0 is known for hourglass modes under strong compression.
 
-Units are those of the mesh's coordinates and of the moduli, and nothing else: with
-lengths in l and moduli in F₀/l, forces are in F₀ and energies in F₀l.
+Units follow from those of the coordinates and moduli: with lengths in l and moduli in
+F₀/l, forces are in F₀ and energies in F₀l.
 """
 
 from __future__ import annotations
@@ -42,18 +42,21 @@ from mortarbench.problems.fem.elasticity import (
 from mortarbench.problems.fem.elements import Floats, determinant
 from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
-from mortarbench.problems.fem.mesh import Mesh, triangular
+from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
-#: Poisson's ratio from which on cells take the mean dilatation
+#: smallest Poisson's ratio with mean dilatation; below, cells are those of linear
+#: elasticity. Without it, a cantilever with ν = 0.45 is 3.9 % too stiff, and one with
+#: ν = 0.4999 by a factor of 21
 NEARLY_INCOMPRESSIBLE = 0.4
-#: eigenvalues of a cell's tangent below −ROUNDING times its largest are negative
-ROUNDING = 1e-12
-#: what negative ones are raised to, as a part of the cell's largest eigenvalue
-RAISED = 1e-6
+#: eigenvalues of a cell's tangent above −EIGENVALUE_ROUNDING times its largest count as
+#: rounding of the zero eigenvalues of translations
+EIGENVALUE_ROUNDING = 1e-12
+#: replacement of negative eigenvalues, as a share of the cell's largest one
+CLIPPED_EIGENVALUE = 1e-6
 
 
 class InvertedCellError(ArithmeticError):
-    """A cell is turned inside out: J ≤ 0 at one of its quadrature points."""
+    """Raised for an inverted cell: J ≤ 0 at one of its Gauss points."""
 
     def __init__(self, cell: int, determinant: float) -> None:
         self.cell, self.determinant = cell, determinant
@@ -62,19 +65,19 @@ class InvertedCellError(ArithmeticError):
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Cells of hyperelastic bodies: what of them does not depend on u."""
+    """Data of the cells of hyperelastic bodies that do not depend on u."""
 
     mesh: Mesh
-    materials: tuple[Hyperelastic, ...]  #: of the bodies
-    body: NDArray[np.int64]  #: (E,) of each cell
+    materials: tuple[Hyperelastic, ...]  #: one per body
+    body: NDArray[np.int64]  #: (E,) body of each cell
     dofs: NDArray[np.int64]  #: (E, n·dim)
-    gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the Gauss points; second: point
-    volumes: Floats  #: (E, q) that each Gauss point stands for
-    pattern: Pattern  #: of K_t
+    gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the q Gauss points
+    volumes: Floats  #: (E, q) volume of each Gauss point
+    pattern: Pattern  #: sparsity of K_t
 
 
-class Evaluated(NamedTuple):
-    """The strain energy of a state, with its derivatives."""
+class EnergyDerivatives(NamedTuple):
+    """Strain energy of a state, with its derivatives."""
 
     energy: float  #: Π
     forces: Vector  #: (n,)  r = ∂Π/∂u, internal forces
@@ -84,7 +87,7 @@ class Evaluated(NamedTuple):
 def cells_of(
     mesh: Mesh, materials: Sequence[Hyperelastic], body: NDArray[np.int64]
 ) -> Cells:
-    """Prepare the cells of bodies, (E,) numbers `body`, with a material each."""
+    """Return the cells of a mesh, with the material of each body; `body` (E,)."""
     corners = mesh.points[mesh.cells]
     points = [shape_gradients(corners, point) for point in mesh.element.points]
     return Cells(
@@ -101,123 +104,128 @@ def deformation_gradients(cells: Cells, u: Vector) -> Floats:
 
 
 def _deformed(cells: Cells, u: Vector, gradients: Floats) -> Floats:
-    """Return F (E, q, dim, dim) where shape functions have these gradients."""
+    """Return F (E, q, dim, dim) at points with the given shape function gradients."""
     E, _, n, dim = gradients.shape
     moved = u[cells.dofs].reshape(E, 1, n, dim)
     return np.asarray(np.eye(dim) + np.swapaxes(moved, -1, -2) @ gradients)
 
 
 def strain_energy(cells: Cells, u: Vector) -> float:
-    """Return Π(u); infinite where a cell is inverted."""
+    """Return Π(u); infinity if a cell is inverted."""
     F = deformation_gradients(cells, u)
     if (determinant(F) <= 0).any():
         return np.inf
     total = 0.0
-    for material, own in _by_material(cells):
-        theta = material.dilatation(F[own]).value
+    for material, index in _by_material(cells):
+        theta = material.dilatation(F[index]).value
         if mean_dilatation(material):
-            theta = _average(theta, cells.volumes[own])
-        W = material.shear(F[own]).value + material.volumetric(theta)[0]
-        total += float((cells.volumes[own] * W).sum())
+            theta = _average(theta, cells.volumes[index])
+        W = material.shear(F[index]).value + material.volumetric(theta)[0]
+        total += float((cells.volumes[index] * W).sum())
     return total
 
 
-def evaluate(cells: Cells, u: Vector) -> Evaluated:
-    """Return the strain energy with its derivatives.
+def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
+    """Return the strain energy with its first and second derivatives.
 
     Raises
     ------
     InvertedCellError
-        When J ≤ 0 at a Gauss point; with the cell where J is the smallest.
+        When J ≤ 0 at a Gauss point; it names the cell with the smallest J.
 
     """
     F = deformation_gradients(cells, u)
     J = determinant(F).min(axis=1)
     worst = int(np.argmin(J))
-    if not J[worst] > 0:
+    if not J[worst] > 0:  # also NaN
         raise InvertedCellError(worst, float(J[worst]))
     energy, forces = 0.0, np.zeros(u.size)
-    tangents = np.empty((len(J), 8, 8))
-    for material, own in _by_material(cells):
-        volumes, gradients = cells.volumes[own], cells.gradients[own]
-        w, theta = material.shear(F[own]), material.dilatation(F[own])
+    tangents = np.empty((len(J), 8, 8))  # plane strain: four nodes, two components
+    for material, index in _by_material(cells):
+        volumes, gradients = cells.volumes[index], cells.gradients[index]
+        w, theta = material.shear(F[index]), material.dilatation(F[index])
         mean = mean_dilatation(material)
         measure = _average(theta.value, volumes) if mean else theta.value
         U, slope, curvature = material.volumetric(measure)
         energy += float((volumes * (w.value + U)).sum())
         P = w.first + slope[..., None, None] * theta.first
         nodal = _nodal(P, gradients, volumes)
-        forces += np.bincount(cells.dofs[own].ravel(), nodal.ravel(), u.size)
+        forces += np.bincount(cells.dofs[index].ravel(), nodal.ravel(), u.size)
+        # ∂²(w + U′θ)/∂F² at fixed U′; the rest is U″ θ′⊗θ′, or U″/V ggᵀ of the mean
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
             A += np.einsum(
                 "eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first
             )  # fmt: skip
-        tangents[own] = cell_tangents(gradients, volumes, A)
+        tangents[index] = cell_tangents(gradients, volumes, A)
         if mean:
             g = _nodal(theta.first, gradients, volumes)
             part = curvature[:, 0] / volumes.sum(axis=1)
-            tangents[own] += part[:, None, None] * (g[:, :, None] * g[:, None, :])
-    return Evaluated(energy, forces, tangents)
+            tangents[index] += part[:, None, None] * (g[:, :, None] * g[:, None, :])
+    return EnergyDerivatives(energy, forces, tangents)
 
 
 def assemble(cells: Cells, tangents: Floats) -> csc_array:
-    """Sum the tangents of the cells to K_t."""
-    at = cells.pattern
-    data = add_tangents(np.ascontiguousarray(tangents), at.cells, at.ptr, at.slot)
+    """Assemble K_t (n, n) from the tangents of the cells."""
+    pattern = cells.pattern
+    data = add_tangents(
+        np.ascontiguousarray(tangents), pattern.cells, pattern.ptr, pattern.slot
+    )
     n = cells.mesh.dofs
-    return csc_array((data, at.indices, at.indptr), shape=(n, n))
+    return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
 
 
-def convexified(
+def convex_tangent(
     cells: Cells, tangents: Floats, positive: Callable[[csc_array], bool]
 ) -> tuple[csc_array, int]:
-    """Assemble K_t, made positive definite cell by cell where it is not so itself.
+    """Assemble K_t, modified cell by cell if it is not positive definite.
 
-    Of the spectral decomposition of each cell's tangent, negative eigenvalues are
-    raised to a small positive part of the largest one (Teran, Sifakis, Irving and
-    Fedkiw 2005, "Robust quasistatic finite elements and flesh simulation", who take 0).
-    What stays in the kernel of a cell is what was there: translations.
+    The negative eigenvalues of each cell's tangent are then replaced by a small
+    positive share of its largest one (Teran, Sifakis, Irving and Fedkiw 2005, "Robust
+    quasistatic finite elements and flesh simulation", who replace them by 0). Zero
+    eigenvalues are kept, so that translations stay in the kernel of a cell.
 
     Parameters
     ----------
-    tangents : of the cells, see `Evaluated`
-    positive : whether a sum K_t (n, n) is positive definite as the caller needs it: by
-        its Cholesky factor, with the supports
+    tangents : tangents of the cells, see `EnergyDerivatives`
+    positive : predicate that returns True if K_t (n, n) is positive definite together
+        with the supports, by its Cholesky factorisation
 
     Returns
     -------
-    K_t, and the number of cells that were changed, 0 where K_t is exact
+    K_t, and the number of modified cells, 0 if K_t is exact
 
     Raises
     ------
     ArithmeticError
-        When the sum is not positive definite all the same.
+        When even the modified K_t is not positive definite.
 
     """
+    # cells may be indefinite while their sum is not: modify only if necessary
     exact = assemble(cells, tangents)
     if positive(exact):
         return exact, 0
-    clipped, changed = clip(_on_corners(cells.mesh, tangents))
+    clipped, changed = clip_eigenvalues(_on_corners(cells.mesh, tangents))
     K = assemble(cells, clipped)
     if not positive(K):
         raise ArithmeticError(
             f"the tangent is not positive definite with {changed} of {len(tangents)} "
-            "cells made convex; expected supports that hold every body"
+            "cells modified; expected supports that hold every body"
         )
     return K, changed
 
 
-def clip(tangents: Floats) -> tuple[Floats, int]:
-    """Raise the negative eigenvalues of symmetric matrices (E, k, k); count these."""
+def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
+    """Replace negative eigenvalues of matrices (E, k, k); count these matrices."""
     values, vectors = np.linalg.eigh(tangents)
     largest = np.abs(values).max(axis=1, initial=0.0)
-    negative = values < -ROUNDING * largest[:, None]
+    negative = values < -EIGENVALUE_ROUNDING * largest[:, None]
     changed = negative.any(axis=1)
-    raised = np.where(negative, RAISED * largest[:, None], values)[changed]
+    raised = np.where(negative, CLIPPED_EIGENVALUE * largest[:, None], values)[changed]
     vectors = vectors[changed]
     clipped = tangents.copy()
     product = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
+    # symmetric to the last digit
     clipped[changed] = (product + np.swapaxes(product, 1, 2)) / 2
     return clipped, int(changed.sum())
 
@@ -229,17 +237,17 @@ def cauchy_stress(cells: Cells, u: Vector) -> Floats:
     centre = _deformed(cells, u, gradients[:, None])[:, 0]
     inside = deformation_gradients(cells, u)
     stress = np.empty((len(centre), 4))
-    for material, own in _by_material(cells):
-        F, theta = centre[own], material.dilatation(centre[own])
+    for material, index in _by_material(cells):
+        F, theta = centre[index], material.dilatation(centre[index])
         measure = theta.value
         if mean_dilatation(material):
-            at_points = material.dilatation(inside[own]).value
-            measure = _average(at_points, cells.volumes[own])[:, 0]
+            at_points = material.dilatation(inside[index]).value
+            measure = _average(at_points, cells.volumes[index])[:, 0]
         slope = material.volumetric(measure)[1]
         P = material.shear(F).first + slope[:, None, None] * theta.first
         J = determinant(F)
         sigma = P @ np.swapaxes(F, 1, 2) / J[:, None, None]
-        stress[own] = np.column_stack([
+        stress[index] = np.column_stack([
             sigma[:, 0, 0], sigma[:, 1, 1], sigma[:, 0, 1],
             slope * material.thickness_rate(F) / J,
         ])  # fmt: skip
@@ -247,12 +255,12 @@ def cauchy_stress(cells: Cells, u: Vector) -> Floats:
 
 
 def mean_dilatation(material: Hyperelastic) -> bool:
-    """Whether its cells take the mean dilatation (Q1P0)."""
+    """Return True if cells of the material use the mean dilatation (Q1P0)."""
     return material.nu >= NEARLY_INCOMPRESSIBLE
 
 
 def _by_material(cells: Cells) -> list[tuple[Hyperelastic, NDArray[np.int64]]]:
-    """Pair each body's material with its cells."""
+    """Return the material and the cell numbers of each body."""
     return [
         (material, np.flatnonzero(cells.body == b))
         for b, material in enumerate(cells.materials)
@@ -260,7 +268,7 @@ def _by_material(cells: Cells) -> list[tuple[Hyperelastic, NDArray[np.int64]]]:
 
 
 def _average(values: Floats, volumes: Floats) -> Floats:
-    """Return the mean over each cell's points, at each of its points (E, q)."""
+    """Return the mean over each cell, repeated at each of its Gauss points (E, q)."""
     mean = (values * volumes).sum(axis=1) / volumes.sum(axis=1)
     return np.repeat(mean[:, None], volumes.shape[1], axis=1)
 
@@ -273,11 +281,12 @@ def _nodal(P: Floats, gradients: Floats, volumes: Floats) -> Floats:
 
 
 def _on_corners(mesh: Mesh, tangents: Floats) -> Floats:
-    """Put what the last corner of a triangle has to the corner that it repeats.
+    """Add the rows and columns of a triangle's repeated corner to those of its twin.
 
-    The sum over cells is the same; the cell's own eigenvalues are those of a triangle.
+    The assembled sum is unchanged, and the eigenvalues of the block are those of the
+    triangle, instead of a quadrilateral whose two equal corners may separate.
     """
-    moved, cells = tangents.copy(), triangular(mesh.cells)
+    moved, cells = tangents.copy(), is_triangle(mesh.cells)
     moved[cells, 4:6] += moved[cells, 6:]
     moved[cells, :, 4:6] += moved[cells, :, 6:]
     moved[cells, 6:] = 0

@@ -1,7 +1,7 @@
-"""Where to fix a floating body: a few nodes spread over it.
+"""Fixing nodes of a floating body: a few nodes spread over it.
 
-The better they are spread, the better K without them is conditioned; two neighbouring
-corners cost three digits, four nodes at the centres of as many parts next to none.
+K without the rows of these nodes is the better conditioned the further they are apart:
+two neighbouring corners cost three digits, the central nodes of four parts hardly any.
 """
 
 from __future__ import annotations
@@ -15,14 +15,16 @@ from scipy.sparse.linalg import eigsh
 from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 
-PARTS = 4  #: per body; fewer condition worse, more fill the factor
+#: fixing nodes per body: with fewer, K is worse conditioned; with more, the factor has
+#: more fill-in
+PARTS = 4
 
 
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
-    """Choose `parts` (a power of two) of the nodes (N, 2) of one body by geometry.
+    """Choose `parts` (a power of two) fixing nodes of one body, by geometry.
 
-    Recursive bisection across the longest principal axis, down to single nodes at most;
-    of each part, the node nearest to its centroid.
+    The nodes (N, 2) are bisected recursively across the longest principal axis, at most
+    down to single nodes; the node nearest to the centroid of each part is chosen.
     """
     groups = [np.arange(len(points))]
     while len(groups) < parts and all(group.size > 1 for group in groups):
@@ -35,11 +37,11 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
 
 
 def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes:
-    """Choose them by the spectra of the mesh graph, as the paper and its [8] do.
+    """Choose fixing nodes by spectra of the mesh graph, as the paper and its ref. [8].
 
-    Recursive bisection at the median of the Fiedler vector (the second eigenvector of
-    the graph Laplacian); of each part, the node with the largest entry of the Perron
-    vector of its adjacency matrix, its most central one.
+    The nodes are bisected recursively at the median of the Fiedler vector (the second
+    eigenvector of the graph Laplacian). In each part, the node with the largest entry
+    of the Perron vector of the adjacency matrix is chosen, its most central node.
 
     Parameters
     ----------
@@ -54,7 +56,7 @@ def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes
 
 
 def _graph(cells: Nodes, nodes: int) -> csr_array:
-    """Adjacency of nodes that share an edge."""
+    """Return the adjacency matrix of nodes that share an edge."""
     a, b = cells.ravel(), np.roll(cells, -1, axis=1).ravel()
     ones = np.ones(2 * a.size)
     ends = (np.concatenate([a, b]), np.concatenate([b, a]))
@@ -65,8 +67,8 @@ def _graph(cells: Nodes, nodes: int) -> csr_array:
 
 def _bisected(graph: Matrix, group: Nodes) -> tuple[Nodes, Nodes]:
     part = laplacian(graph[group][:, group]).tocsc()
-    shift = -1e-3 / group.size  # just below the zero eigenvalue: L − σI is definite
-    start = np.linspace(-1, 1, group.size)  # eigsh draws one at random otherwise
+    shift = -1e-3 / group.size  # σ just below the zero eigenvalue: L − σI is definite
+    start = np.linspace(-1, 1, group.size)  # by default eigsh draws one at random
     values, vectors = eigsh(part, k=2, sigma=shift, which="LM", v0=start)
     order = group[np.argsort(vectors[:, values.argmax()], kind="stable")]
     return order[: len(order) // 2], order[len(order) // 2 :]

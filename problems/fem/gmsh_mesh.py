@@ -1,4 +1,4 @@
-"""Gmsh's .msh files with physical names, read as plane bodies."""
+"""Reader of plane bodies from gmsh's .msh files with physical names."""
 
 from __future__ import annotations
 
@@ -22,15 +22,19 @@ from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import (
     Nodes,
     boundary_facets,
-    triangular,
+    is_triangle,
 )
 
-_COPIES = 32  #: of a file that its parser may hold
-FLAT = 1e-9  #: largest deviation from a plane z = const, relative to the extent
-DIMENSION = {kind: dim for (dim, _), kind in KINDS.items() if dim < 3}  #: that we read
-FAR = 1e100  #: coordinates whose products overflow
+#: memory of meshio's parser, as a multiple of the size of the file
+_PARSER_FACTOR = 32
+#: largest deviation from a plane z = const, relative to the extent
+FLATNESS_TOLERANCE = 1e-9
+#: dimension of each supported kind of cell
+DIMENSION = {kind: dim for (dim, _), kind in KINDS.items() if dim < 3}
+#: larger coordinates are refused: products of them overflow
+MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items() if kind in DIMENSION}
-#: kinds of cells that start so are of higher order or solid, by the names of meshio
+#: prefixes of meshio's names of cells of higher order, and of solid cells
 _CURVED = ("line", "triangle", "quad")
 _SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
 _SPACE = "three dimensions are not supported yet"
@@ -40,28 +44,28 @@ _SAVED = "only physical groups: Mesh.SaveAll = 0"
 
 
 class NamedMesh(NamedTuple):
-    """A mesh of triangles and quadrilaterals, and its named parts."""
+    """A plane mesh of triangles and quadrilaterals with named parts."""
 
     points: NDArray[np.float64]  #: (N, 2)
     cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
-    surfaces: Mapping[str, Nodes]  #: numbers of the cells of each body
-    curves: Mapping[str, Nodes]  #: (k, 2) edges, the body on their left
-    spots: Mapping[str, Nodes]  #: nodes with the name of a physical point
+    surfaces: Mapping[str, Nodes]  #: cell numbers of each body
+    curves: Mapping[str, Nodes]  #: (k, 2) edges with the body on their left
+    spots: Mapping[str, Nodes]  #: nodes of each physical point
 
 
 def read_msh(path: Path) -> NamedMesh:
     """Read the physical surfaces, curves and points of a .msh file, format 2.2 or 4.1.
 
-    Bodies are numbered one after another, which generalised inverses rely on; within a
-    body, nodes and cells keep their order, triangles and quadrilaterals in the order of
-    the file's blocks. Nodes that are in no cell (such as centres of arcs) are left out.
+    Nodes and cells are numbered body by body, on which generalised inverses rely.
+    Within a body, they keep the order of the file, where triangles and quadrilaterals
+    are in blocks. Nodes without cells (such as centres of arcs) are left out.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is not plane, has other cells than triangles and
-        quadrilaterals of first order, cells without a name or bodies that share nodes
-        or fall apart.
+        When the file cannot be read, is not plane, or contains cells other than
+        first-order triangles and quadrilaterals, cells without a name, bodies that
+        share nodes, or a body of several disconnected parts.
 
     """
     mesh = _read(path)
@@ -70,14 +74,14 @@ def read_msh(path: Path) -> NamedMesh:
             raise InputError(f"{path}: cells of type {block.type}; {_remedy(block)}")
     points = np.asarray(mesh.points, dtype=float)
     extent = np.ptp(points, axis=0).max(initial=0.0)
-    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLAT * extent:
+    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLATNESS_TOLERANCE * extent:
         raise InputError(
             f"{path}: not plane; {_SPACE}: expected all nodes at the same z"
         )
     parts = _named(path, mesh, 2)
     if not parts:
         raise InputError(f"{path}: no named surface with cells; expected {_NAMED}")
-    used = _distinct([np.unique(part) for part in parts.values()])
+    used = _unique_in_order([np.unique(part) for part in parts.values()])
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
     points = points[used, :2]
@@ -86,8 +90,8 @@ def read_msh(path: Path) -> NamedMesh:
     ends = np.cumsum([0] + [len(part) for part in parts.values()])
     surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(parts)}
     _check_apart(path, len(points), cells, surfaces)
-    once = boundary_facets(cells, 2).tolist()
-    directed = {(min(a, b), max(a, b)): (a, b) for a, b in once}
+    edges_of_boundary = boundary_facets(cells, 2).tolist()
+    directed = {(min(a, b), max(a, b)): (a, b) for a, b in edges_of_boundary}
     return NamedMesh(
         points, cells, surfaces,
         curves={
@@ -102,21 +106,22 @@ def read_msh(path: Path) -> NamedMesh:
     )  # fmt: skip
 
 
-def halved(mesh: NamedMesh) -> NamedMesh:
-    """Halve every edge: four triangles or quadrilaterals of each cell.
+def refine(mesh: NamedMesh) -> NamedMesh:
+    """Refine uniformly: bisect every edge, and divide each cell into four.
 
-    New nodes lie on the straight edges, so that all bodies keep their shape. A triangle
-    is cut into four that are similar to it, a quadrilateral about the mean of its
-    corners. Bodies stay numbered one after another.
+    New nodes lie on the straight edges, so that bodies keep their shape. A triangle is
+    divided into four similar ones, a quadrilateral about the mean of its corners. Nodes
+    remain numbered body by body.
     """
     cells, corners = mesh.cells, mesh.cells.T
-    is_quad = ~triangular(cells)
+    is_quad = ~is_triangle(cells)
     edges = np.stack([cells, np.roll(cells, -1, axis=1)], axis=-1)  # (E, 4, 2)
     ends, middle = np.unique(
         np.sort(edges.reshape(-1, 2), axis=1), axis=0, return_inverse=True
     )
     n = len(mesh.points)
-    is_edge = ends[:, 0] != ends[:, 1]  # of a triangle's repeated corner, that corner
+    # the degenerate edge of a triangle has no midpoint but its repeated corner
+    is_edge = ends[:, 0] != ends[:, 1]
     number = np.where(is_edge, n + np.cumsum(is_edge) - 1, ends[:, 0])
     m = number[middle].reshape(-1, 4).T
     centre = n + is_edge.sum() + np.cumsum(is_quad) - 1
@@ -129,12 +134,13 @@ def halved(mesh: NamedMesh) -> NamedMesh:
         np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
         for k in range(4)
     ], axis=-1)  # fmt: skip
-    # the third corner of a triangle stands twice: cut it off once, and take the middles
+    # of the third corner, which a triangle repeats: one child cut off there, and the
+    # triangle of the midpoints in place of the other
     children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
     children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
     fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
     of_edge = {(a, b): k for (a, b), k in zip(ends.tolist(), number, strict=True)}
-    used = _distinct([np.unique(fine[part]) for part in mesh.surfaces.values()])
+    used = _unique_in_order([np.unique(fine[part]) for part in mesh.surfaces.values()])
     renumbered = np.empty(len(points), dtype=np.int64)
     renumbered[used] = np.arange(used.size)
 
@@ -152,7 +158,7 @@ def halved(mesh: NamedMesh) -> NamedMesh:
 
 
 def _remedy(block: Any) -> str:
-    """Say what gmsh should write instead of cells that we do not read."""
+    """Return the expectation of the message about unsupported cells."""
     if block.type.startswith(_SOLID):
         return f"{_SPACE}: expected plane bodies, gmsh -2"
     if block.type.startswith(_CURVED):
@@ -168,41 +174,56 @@ def _read(path: Path) -> Any:
         )
     with opened(path, "a .msh file") as file:
         size = os.fstat(file.fileno()).st_size
-    check_size(f"{path}: what it says", _COPIES * size)
-    with parsing(path, "not a .msh file of format 2.2 or 4.1", _COPIES * size):
-        with redirect_stderr(StringIO()):  # what meshio says of sections that it skips
-            mesh = _parsed(path)
+    check_size(f"{path}: what it says", _PARSER_FACTOR * size)
+    with parsing(path, "not a .msh file of format 2.2 or 4.1", _PARSER_FACTOR * size):
+        with redirect_stderr(StringIO()):  # meshio warns about sections that it skips
+            mesh = _parse(path)
         points = np.asarray(mesh.points, dtype=float)
         cells = [np.asarray(block.data) for block in mesh.cells]
         tags = mesh.cell_data.get("gmsh:physical", [])
         numbers = _numbers(path.read_bytes())
         tagged = [len(tag) for tag in tags] == [len(nodes) for nodes in cells]
-    if points.ndim != 2 or points.shape[1] < 2 or not (abs(points) < FAR).all():
-        raise InputError(f"{path}: coordinates beyond {FAR:g}, or none; expected some")
-    if numbers is not None and (numbers < 1).any():  # which meshio counts from the end
-        raise InputError(f"{path}: cells of nodes below 1; expected their numbers")
+    if (
+        points.ndim != 2
+        or points.shape[1] < 2
+        or not (abs(points) < MAX_COORDINATE).all()
+    ):
+        raise InputError(
+            f"{path}: coordinates beyond {MAX_COORDINATE:g}, or none; expected nodes "
+            "with finite coordinates"
+        )
+    # node numbers start at 1; meshio would take −1 as an index from the end
+    if numbers is not None and (numbers < 1).any():
+        raise InputError(f"{path}: cells with node numbers below 1; expected 1 or more")
     for block, nodes in zip(mesh.cells, cells, strict=True):
         corners = CORNERS.get(block.type, nodes.shape[-1])
         if nodes.ndim != 2 or nodes.shape[1] != corners:
-            raise InputError(f"{path}: {block.type} cells of {nodes.shape[-1]} nodes")
-        # −1 is meshio's number of a node that there is none of
+            raise InputError(
+                f"{path}: {block.type} cells with {nodes.shape[-1]} nodes; expected "
+                f"{corners}"
+            )
+        # meshio numbers nodes that the file does not define as −1
         if nodes.size and not 0 <= nodes.min() <= nodes.max() < len(points):
-            raise InputError(f"{path}: cells of nodes that are not in the file")
+            raise InputError(
+                f"{path}: cells with nodes that are not in the file; expected nodes "
+                "of its section $Nodes"
+            )
     if tags and not tagged:
         raise InputError(f"{path}: not every cell has a tag; expected one for each")
     return mesh
 
 
-def _parsed(path: Path) -> Any:
-    """Parse a file by meshio, which wants every entity of format 4.1 to have a tag.
+def _parse(path: Path) -> Any:
+    """Parse a file by meshio, also with entities that are in no physical group.
 
-    Mesh.SaveAll = 1 writes cells of entities in no physical group, too. Format 2.2 has
-    tag 0 for them, which the text of format 4.1 is given here.
+    With Mesh.SaveAll = 1, gmsh also writes the cells of such entities. Format 2.2 marks
+    them with tag 0; format 4.1 has no tag, on which meshio fails. If so, tag 0 is
+    inserted into a copy of the text.
     """
-    import meshio  # late: workers and other families do without it
+    import meshio  # imported here: workers and other families do not need it
 
     try:
-        return meshio.gmsh.read(path)  # meshio.read would print and exit
+        return meshio.gmsh.read(path)  # meshio.read would print errors and exit
     except ValueError as e:
         if "gmsh:physical" not in str(e):
             raise
@@ -215,7 +236,8 @@ def _parsed(path: Path) -> Any:
     lines = [line.split() for line in entities.split(b"\n") if line.split()]
     points = int(lines[0][0])
     for i, fields in enumerate(lines[1:]):
-        at = 4 if i < points else 7  # tag, position or box, number of physical tags
+        # after tag and position or box: the number of physical tags
+        at = 4 if i < points else 7
         if fields[at] == b"0":
             fields[at : at + 1] = [b"1", b"0"]
     text = b"\n".join([b"", *(b" ".join(fields) for fields in lines), b""])
@@ -226,78 +248,79 @@ def _parsed(path: Path) -> Any:
 
 
 def _numbers(data: bytes) -> NDArray[np.int64] | None:
-    """List the numbers of nodes that the cells of a text name; None if it is binary."""
+    """Return the node numbers in the cells of a text file; None for a binary one."""
     head, _, rest = data.partition(b"$Elements")
     version, kind, _ = head.split(b"$MeshFormat")[1].split(maxsplit=3)[:3]
     if kind != b"0":
         return None
-    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]  # less their number
-    found: list[int] = []
-    left = 0  # cells of the block, in format 4
+    lines = rest.partition(b"$EndElements")[0].split(b"\n")[2:]  # without the count
+    numbers: list[int] = []
+    remaining = 0  # cells of the current block, in format 4
     for fields in (list(map(int, line.split())) for line in lines):
         if not fields:
             continue
         if version.startswith(b"2"):
-            found += fields[3 + fields[2] :]
-        elif left == 0:
-            left = fields[3]
+            numbers += fields[3 + fields[2] :]
+        elif remaining == 0:
+            remaining = fields[3]
         else:
-            found += fields[1:]
-            left -= 1
-    return np.array(found, dtype=np.int64)
+            numbers += fields[1:]
+            remaining -= 1
+    return np.array(numbers, dtype=np.int64)
 
 
-def _named(path: Path, mesh: Any, wanted: int) -> dict[str, Nodes]:
-    """Collect the cells of one dimension by physical names, in order of file."""
+def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
+    """Return the cells of one dimension by physical names, in the file's order."""
     names = {
         int(tag): name
         for name, (tag, dimension) in mesh.field_data.items()
-        if dimension == wanted
+        if dimension == dim
     }
-    found: dict[str, list[Nodes]] = {}
+    cells: dict[str, list[Nodes]] = {}
     tags = mesh.cell_data.get("gmsh:physical", [np.zeros(len(b)) for b in mesh.cells])
     nameless: list[int] = []  # physical tags of cells
     for block, tag in zip(mesh.cells, tags, strict=True):
-        if DIMENSION[block.type] != wanted:
+        if DIMENSION[block.type] != dim:
             continue
         for number in np.unique(tag):
             if int(number) in names:
                 part = np.asarray(block.data, dtype=np.int64)[tag == number]
                 if block.type == "triangle":
                     part = part[:, [0, 1, 2, 2]]
-                found.setdefault(names[int(number)], []).append(part)
-            elif wanted == 2:
+                cells.setdefault(names[int(number)], []).append(part)
+            elif dim == 2:
                 nameless += tag[tag == number].tolist()
     if nameless:
-        # gmsh leaves out what is in no physical group, unless there is none
+        # gmsh omits entities in no physical group, unless there are no groups at all
         is_all = 0 in nameless and mesh.field_data
         more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
         raise InputError(
             f"{path}: {len(nameless)} cells without a name; expected each in a named "
             f"surface: {_NAMED}{more}"
         )
-    return {name: np.concatenate(parts) for name, parts in found.items()}
+    return {name: np.concatenate(parts) for name, parts in cells.items()}
 
 
-def _distinct(parts: list[Nodes]) -> Nodes:
-    """Join the nodes of the parts, each node where it comes first."""
+def _unique_in_order(parts: list[Nodes]) -> Nodes:
+    """Return the distinct nodes of all parts, in the order of first occurrence."""
     nodes = np.concatenate(parts)
     return nodes[np.sort(np.unique(nodes, return_index=True)[1])]
 
 
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
-    """Turn clockwise cells over; refuse flat ones and those that are not convex."""
-    x, triangle = points[cells], triangular(cells)[:, None]
-    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of the diagonals
-    turned = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
-    cells = np.where(twice_area[:, None] < 0, turned, cells)
+    """Reorder clockwise cells; raise InputError for flat and non-convex ones."""
+    x, triangle = points[cells], is_triangle(cells)[:, None]
+    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of both diagonals
+    reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
+    cells = np.where(twice_area[:, None] < 0, reversed_, cells)
     if (flat := twice_area == 0).any():
         x, y = points[cells[flat.argmax()]].mean(axis=0)
         raise InputError(
-            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected corners "
-            "that are apart, in their order around it"
+            f"{path}: the cell around ({x:.6g}, {y:.6g}) has no area; expected "
+            "distinct corners, in their order around it"
         )
     edges = np.roll(points[cells], -1, axis=1) - points[cells]
+    # at every corner of a convex cell, the boundary bends to the left
     corners = cross(np.roll(edges, 1, axis=1), edges)
     if (bad := ((corners <= 0) & ~triangle).any(axis=1)).any():
         x, y = points[cells[bad.argmax()]].mean(axis=0)
@@ -311,13 +334,13 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
 def _check_apart(
     path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes]
 ) -> None:
-    """Refuse bodies that share nodes, and bodies of several parts."""
+    """Raise InputError for bodies that share nodes, or consist of several parts."""
     owner = np.full(nodes, -1)
     names = list(surfaces)
     for i, name in enumerate(names):
         of_body = np.unique(cells[surfaces[name]])
-        if (taken := owner[of_body] >= 0).any():
-            other = names[owner[of_body[taken.argmax()]]]
+        if (shared := owner[of_body] >= 0).any():
+            other = names[owner[of_body[shared.argmax()]]]
             raise InputError(
                 f"{path}: bodies {other!r} and {name!r} share nodes; expected nodes of "
                 "its own for each body"
@@ -337,7 +360,7 @@ def _check_apart(
 def _directed(
     path: Path, name: str, edges: Nodes, boundary: Mapping[Any, tuple[int, int]]
 ) -> Nodes:
-    """Give the edges of a curve the direction that has the body on the left."""
+    """Return the edges of a curve, directed so that the body is on the left."""
     if (edges < 0).any():
         raise InputError(
             f"{path}: curve {name!r} has an edge that bounds no body in the file: gmsh "

@@ -1,20 +1,21 @@
 """Hyperelastic materials in plane strain: energy, stress and tangent from F.
 
 A material is a strain energy W per reference area of the deformation gradient F = ∂x/∂X
-(plane strain: F₃₃ = 1), split into what shear and what a change of volume cost,
+(plane strain: F₃₃ = 1), split into a part for shear and one for dilatation,
 
     W(F) = w(F) + U(θ(F)),        P = ∂W/∂F  (first Piola-Kirchhoff),  A = ∂P/∂F
 
-with a measure θ of the dilatation. The split is what the mean dilatation method needs,
-see `problems.fem.finite_strain`. With Lamé's constants Λ, μ of E and ν:
+with a measure θ of the dilatation. The mean dilatation method needs this split, see
+`problems.fem.finite_strain`. With Lamé's constants Λ, μ of E and ν:
 
     neo-Hooke                 w = μ/2 (F:F − 2 − 2 ln J),    θ = J,     U = Λ/2 ln²θ
     St. Venant-Kirchhoff      w = μ E:E,   E = ½(FᵀF − I),   θ = tr E,  U = Λ/2 θ²
 
 (neo-Hooke as Bonet and Wood 2008, "Nonlinear Continuum Mechanics for Finite Element
 Analysis", Section 6.4; the trace of C in three dimensions is F:F + 1). At F = I both
-are linear elasticity. St. Venant-Kirchhoff softens under compression and has no barrier
-against J → 0: below a uniaxial stretch of 1/√3 its stress falls again.
+tangents are those of linear elasticity. St. Venant-Kirchhoff softens under compression
+and has no barrier against J → 0: below a uniaxial stretch of 1/√3 the magnitude of its
+stress decreases.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.elements import Floats, determinant, inverse_transpose
 
 _I = np.eye(2)
-#: ε_ik ε_jl with the permutation symbol: the second derivative of J = det F
+#: second derivative of J = det F: ε_ik ε_jl with the permutation symbol
 _CURVATURE_OF_J = np.einsum("ik,jl->ijkl", [[0, 1], [-1, 0]], [[0, 1], [-1, 0]])
 
 
 class Derivatives(NamedTuple):
-    """A scalar function of F with its derivatives, at points (…)."""
+    """Values and derivatives of a scalar function of F, at points (…)."""
 
     value: Floats  #: (…)
     first: Floats  #: (…, 2, 2)
@@ -52,29 +53,29 @@ class Hyperelastic(ABC):
 
     @property
     def lame(self) -> float:
-        """Λ, Pa."""
+        """First Lamé constant Λ, Pa."""
         return self.E * self.nu / ((1 + self.nu) * (1 - 2 * self.nu))
 
     @property
     def shear_modulus(self) -> float:
-        """μ, Pa."""
+        """Shear modulus μ, Pa."""
         return self.E / (2 * (1 + self.nu))
 
     @abstractmethod
     def shear(self, F: Floats) -> Derivatives:
-        """Return w with its derivatives, Pa."""
+        """Return w with its derivatives by F, Pa."""
 
     @abstractmethod
     def dilatation(self, F: Floats) -> Derivatives:
-        """Return the measure θ of the change of volume with its derivatives."""
+        """Return the dilatation measure θ with its derivatives by F."""
 
     @abstractmethod
     def volumetric(self, theta: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return U, U′ and U″ of θ (…), Pa."""
+        """Return U(θ), U′(θ) and U″(θ) (…), Pa."""
 
     @abstractmethod
     def thickness_rate(self, F: Floats) -> Floats:
-        """Return ∂θ/∂F₃₃ (…) at F₃₃ = 1; there w has none."""
+        """Return ∂θ/∂F₃₃ (…) at F₃₃ = 1, where ∂w/∂F₃₃ = 0."""
 
     def energy(self, F: Floats) -> Floats:
         """Return W (…), Pa."""
@@ -100,7 +101,7 @@ class Hyperelastic(ABC):
 
 
 class NeoHooke(Hyperelastic):
-    """W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J, compressible neo-Hooke."""
+    """Compressible neo-Hooke, W = μ/2 (I₁ − 3 − 2 ln J) + Λ/2 ln²J."""
 
     def shear(self, F: Floats) -> Derivatives:
         """Return w = μ/2 (F:F − 2 − 2 ln J); NaN where J ≤ 0."""
@@ -109,7 +110,7 @@ class NeoHooke(Hyperelastic):
             log_J = np.log(determinant(F))
         return Derivatives(
             mu * ((F**2).sum((-2, -1)) / 2 - 1 - log_J),
-            mu * (F - back),
+            mu * (F - back),  # ∂ ln J/∂F = F⁻ᵀ
             mu * (np.einsum("ik,jl->ijkl", _I, _I)
                   + np.einsum("...il,...kj->...ijkl", back, back)),
         )  # fmt: skip
@@ -135,11 +136,12 @@ class NeoHooke(Hyperelastic):
 
     def thickness_rate(self, F: Floats) -> Floats:
         """Return J."""
+        # det F = F₃₃ J₂ with the determinant J₂ in the plane
         return determinant(F)
 
 
 class StVenantKirchhoff(Hyperelastic):
-    """W = Λ/2 (tr E)² + μ E:E of Green and Lagrange's strain E = ½(FᵀF − I)."""
+    """St. Venant-Kirchhoff, W = Λ/2 (tr E)² + μ E:E with E = ½(FᵀF − I)."""
 
     def shear(self, F: Floats) -> Derivatives:
         """Return w = μ E:E."""
@@ -154,7 +156,7 @@ class StVenantKirchhoff(Hyperelastic):
 
     def dilatation(self, F: Floats) -> Derivatives:
         """Return θ = tr E."""
-        theta = (F**2).sum((-2, -1)) / 2 - 1
+        theta = (F**2).sum((-2, -1)) / 2 - 1  # tr E = ½ F:F − 1 in the plane
         identity = np.einsum("ik,jl->ijkl", _I, _I)
         return Derivatives(
             theta, F, np.broadcast_to(identity, (*theta.shape, 2, 2, 2, 2))
@@ -167,18 +169,19 @@ class StVenantKirchhoff(Hyperelastic):
 
     def thickness_rate(self, F: Floats) -> Floats:
         """Return 1."""
+        # tr E = … + ½(F₃₃² − 1)
         return np.ones(F.shape[:-2])
 
 
-#: the values of the key `material`
+#: materials by the values of the key `material`
 MATERIALS: Mapping[str, Callable[[float, float], Hyperelastic]] = MappingProxyType(
     {"neo-hooke": NeoHooke, "svk": StVenantKirchhoff}
 )
 
 
 def hyperelastic(name: str, linear: Material, unit: float = 1.0) -> Hyperelastic:
-    """Make the material `name` of MATERIALS that is `linear` under small strains.
+    """Return the material `name` of MATERIALS that is `linear` at small strains.
 
-    unit : of stress, Pa; its moduli are multiples of this
+    unit : unit of stress, Pa, by which its moduli are divided
     """
     return MATERIALS[name](linear.E / unit, linear.nu)

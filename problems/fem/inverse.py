@@ -1,20 +1,21 @@
-"""Generalised inverses of the stiffness by sparse Cholesky, and their condensation.
+"""Generalised inverses K⁺ of the stiffness by sparse Cholesky, and their condensation.
 
-A floating body's K is made positive definite by fixing nodes (Brzobohatý, Dostál,
+K of a floating body is regularised by fixing nodes (Brzobohatý, Dostál,
 Kozubek, Kovář, Markopoulos 2011, the paper's reference [8]): with R* the rows of the
 rigid modes at a few nodes (orthonormalised, zero elsewhere) and ρ > 0,
 
     K_ρ = K + ρ R*R*ᵀ    is positive definite, and    K K_ρ⁻¹ K = K,
 
-so K⁺ = K_ρ⁻¹ is a symmetric generalised inverse, one sparse Cholesky factor away. It is
-not the Moore-Penrose inverse; on loads that balance (Rᵀf = 0) the two give solutions
-that differ by a rigid motion only. For supported bodies, K⁺ is K_ff⁻¹ on the free
-components and zero on the prescribed ones.
+so K⁺ = K_ρ⁻¹ is a symmetric generalised inverse that costs one sparse Cholesky factor.
+It is not the Moore-Penrose inverse; for balanced loads (Rᵀf = 0) the two solutions
+differ by a rigid motion only. For supported bodies, K⁺ is K_ff⁻¹ on the free components
+and zero on the prescribed ones.
 
-Constraints touch only the components c of contact sides and supports. Ordered last,
-they leave a trailing block L_cc in the factor, and  (K⁺)_cc = (L_cc L_ccᵀ)⁻¹  gives
-F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  for every load step by one small product. Fixing nodes
-are ordered with them: what couples these far nodes then fills no other column.
+B has entries only in the components c of contact sides and supports. If these are
+eliminated last, the trailing block L_cc of the factor gives (K⁺)_cc = (L_cc L_ccᵀ)⁻¹,
+and  F = BK⁺Bᵀ = B_c (K⁺)_cc B_cᵀ  (eq. (3) of the paper) is one small product in every
+load step. Fixing nodes are eliminated together with c, so that their coupling by
+ρ R*R*ᵀ across the body causes no fill-in elsewhere.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from sksparse.cholmod import Factor, cholesky
 
 from mortarbench.harness import Matrix, Vector
 from mortarbench.problems.fem.dissection import index_arrays
-from mortarbench.problems.fem.elimination import spread_symmetric
+from mortarbench.problems.fem.elimination import scatter_symmetric
 from mortarbench.problems.fem.kernels import congruence
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.multifrontal import Multifrontal, multifrontal
@@ -42,18 +43,18 @@ NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class Interface(NamedTuple):
-    """What constraints can touch, and where the unknowns are."""
+    """Components with entries in constraint rows, and the nodes of all unknowns."""
 
     components: Nodes  #: (c,) ascending
-    points: NDArray[np.float64]  #: (N, dim) of the nodes that K's components belong to
+    points: NDArray[np.float64]  #: (N, dim) positions of the nodes of K
 
 
 class GeneralisedInverse(Protocol):
-    """A symmetric K⁺ (n, n) with K K⁺ K = K on the components it acts on."""
+    """A symmetric K⁺ (n, n) with K K⁺ K = K on the components on which it acts."""
 
     @property
     def seconds(self) -> float:
-        """What factorising took, whichever load step it was for."""
+        """Wall-clock time of the factorisation, s; one factor serves all load steps."""
 
     @property
     def kernel(self) -> NDArray[np.float64]:
@@ -66,52 +67,52 @@ class GeneralisedInverse(Protocol):
         """Return BK⁺Bᵀ (m, m) for sparse rows B (m, n), exactly symmetric."""
 
     def at_constraints(self, b: Vector) -> Vector:
-        """Return K⁺b (n,) where constraints can touch, for b (n,) that acts there."""
+        """Return K⁺b (n,) on the interface components, for b (n,) that acts on them."""
 
 
 @dataclass(frozen=True, eq=False)
-class Factorised:
-    """K⁺ through CHOLMOD's factor; BK⁺Bᵀ by one solve per row, the paper's way."""
+class CholeskyInverse:
+    """K⁺ by CHOLMOD's factor, with one solve per row of B in BK⁺Bᵀ, as in the paper."""
 
     factor: Factor
-    free: Nodes  #: components it acts on; K⁺ is zero on the others
+    free: Nodes  #: components on which K⁺ acts; it is zero on the others
     kernel: NDArray[np.float64]
-    seconds: float  #: to factorise
+    seconds: float  #: time of the factorisation
 
     def __call__(self, b: Vector) -> Vector:
-        """Solve."""
+        """Apply K⁺ by one solve per column."""
         x = np.zeros_like(b)
         x[self.free] = self.factor.solve_A(b[self.free])
         return x
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
-        """Solve for all rows of B in one block."""
-        F = B @ self(B.T.toarray())
+        """Return BK⁺Bᵀ by a block solve for all rows of B."""
+        F = B @ self(B.T.toarray())  # eq. (3)
         return np.asarray((F + F.T) / 2)
 
     def at_constraints(self, b: Vector) -> Vector:
-        """Solve: this is right everywhere."""
+        """Return K⁺b, here on all components."""
         return self(b)
 
 
 @dataclass(frozen=True, eq=False)
-class Condensed:
-    """K⁺ with its block on the components that constraints can touch."""
+class CondensedInverse:
+    """K⁺ by a multifrontal factor, with its block (K⁺)_cc on the interface stored."""
 
     factor: Multifrontal
-    interface: Nodes  #: (c,) components, ascending
-    compliance: NDArray[np.float64]  #: (K⁺)_cc, zero where a component is prescribed
+    interface: Nodes  #: c, components with entries in constraint rows, ascending
+    compliance: NDArray[np.float64]  #: (K⁺)_cc, zero for prescribed components
     kernel: NDArray[np.float64]
-    seconds: float  #: to factorise and to condense
+    seconds: float  #: time of factorisation and condensation
 
     def __call__(self, b: Vector) -> Vector:
-        """Solve with the whole factor."""
+        """Apply K⁺ by a solve with the whole factor."""
         x = np.zeros_like(b)
         x[self.factor.order] = self.factor.solve(b[self.factor.order])
         return x
 
     def congruence(self, B: Matrix) -> NDArray[np.float64]:
-        """Return BK⁺Bᵀ; ValueError where B touches other components."""
+        """Return BK⁺Bᵀ; raise ValueError if B has entries outside the interface."""
         B, number = csr_array(B), np.full(B.shape[1], -1, dtype=np.int32)
         number[self.interface] = np.arange(self.interface.size, dtype=np.int32)
         ptr, idx = index_arrays(B)
@@ -121,7 +122,7 @@ class Condensed:
         return F
 
     def at_constraints(self, b: Vector) -> Vector:
-        """Multiply with (K⁺)_cc; zero elsewhere."""
+        """Return (K⁺)_cc b_c on the interface, zero elsewhere."""
         u = np.zeros(b.size)
         u[self.interface] = self.compliance @ b[self.interface]
         return u
@@ -130,7 +131,7 @@ class Condensed:
 def regular_inverse(
     K: Matrix, free: Nodes, interface: Interface | None = None
 ) -> GeneralisedInverse:
-    """Factorise K_ff, condensed onto the free part of `interface` where it is given.
+    """Factorise K_ff; with `interface`, also compute (K⁺)_cc.
 
     Raises
     ------
@@ -153,15 +154,15 @@ def floating_inverse(
     ----------
     K : (n, n) block diagonal over the bodies
     kernels : per body, an orthonormal basis (n_body, r_body) of its rigid modes
-    fixing : per body, components (within it) that no rigid motion leaves all at rest:
-        of two nodes that are apart in the plane, of three in space, at least
-    interface : to condense onto
+    fixing : per body, the components (numbered within it) of its fixing nodes, on which
+        no rigid mode vanishes: at least two nodes in the plane, three in space
+    interface : components c for (K⁺)_cc; None: one solve per row of B
 
     """
     starred, fixed, start = [], [], 0
     for R, rows in zip(kernels, fixing, strict=True):
         Q = np.zeros_like(R)
-        Q[rows] = np.linalg.qr(R[rows])[0]
+        Q[rows] = np.linalg.qr(R[rows])[0]  # R*, orthonormal
         starred.append(csr_array(Q))
         fixed.append(start + rows)
         start += len(R)
@@ -178,24 +179,24 @@ def supported_inverse(
     rigid: NDArray[np.float64],
     interface: Interface | None = None,
 ) -> GeneralisedInverse:
-    """Factorise K_ff where the supports may leave rigid motions of some body.
+    """Factorise K_ff of bodies whose supports may leave rigid motions.
 
-    As many further components are held as there are such motions, those that a pivoted
-    QR factorisation of the motions finds to fix them best: on loads that balance these,
-    they feel no force.
+    One further component is fixed for each such motion, chosen by a QR factorisation of
+    the motions with pivoting. Balanced loads cause no reactions there.
 
     Parameters
     ----------
-    rigid : (n, r) rigid motions of all bodies, supports or not
-    interface : to condense onto
+    rigid : (n, r) rigid motions of all bodies, ignoring supports
+    interface : components c for (K⁺)_cc; None: one solve per row of B
 
     """
-    held = np.setdiff1d(np.arange(K.shape[0]), free)
-    kernel = rigid @ null_space(rigid[held]) if held.size else rigid
+    fixed = np.setdiff1d(np.arange(K.shape[0]), free)
+    kernel = rigid @ null_space(rigid[fixed]) if fixed.size else rigid
     if not kernel.shape[1]:
         return _inverse(csc_array(K), free, kernel, interface)
-    kernel[held] = 0
+    kernel[fixed] = 0  # exactly: null_space leaves rounding
     kernel = np.linalg.qr(kernel)[0]
+    # pivoting picks components on which the motions are well conditioned
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     return _inverse(csc_array(K), np.setdiff1d(free, pins), kernel, interface)
 
@@ -207,19 +208,20 @@ def _inverse(
     interface: Interface | None,
     fixed: Nodes = NO_NODES,
 ) -> GeneralisedInverse:
-    """Factorise K_ff, the components `fixed` and those of the interface last."""
+    """Factorise K_ff, with the components of the interface and `fixed` last."""
     start = perf_counter()
     if interface is None:
         K_ff = csc_matrix(K[free][:, free])
         factor = cholesky(K_ff, mode="supernodal", ordering_method="nesdis")
-        return Factorised(factor, free, kernel, perf_counter() - start)
-    touched = interface.components
-    last = np.concatenate([touched, fixed])
+        return CholeskyInverse(factor, free, kernel, perf_counter() - start)
+    c = interface.components
+    last = np.concatenate([c, fixed])
     factor = multifrontal(K, free, interface.points, last)
     number = np.full(K.shape[0], -1, dtype=np.int32)
-    number[touched] = np.arange(touched.size, dtype=np.int32)
-    compliance = np.zeros((touched.size, touched.size))
-    for components, U in factor.trailing() if touched.size else ():
+    number[c] = np.arange(c.size, dtype=np.int32)
+    compliance = np.zeros((c.size, c.size))
+    for components, U in factor.trailing() if c.size else ():
+        # (UᵀU)⁻¹ on the components eliminated last; those outside c are skipped
         lower, _ = lapack.dpotri(U.T, lower=1)
-        spread_symmetric(lower.T, number[components], compliance)
-    return Condensed(factor, touched, compliance, kernel, perf_counter() - start)
+        scatter_symmetric(lower.T, number[components], compliance)
+    return CondensedInverse(factor, c, compliance, kernel, perf_counter() - start)

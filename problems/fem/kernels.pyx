@@ -1,19 +1,18 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
-"""Compiled loops of the assembly of cells, and of the congruence with its inverse.
+"""Compiled loops of the assembly, and of congruences BCBᵀ.
 
-Cells couple each node to few others, so the sparsity pattern is found node by node, and
-each cell adds its entries straight into the CSC arrays: no triplets, no sorting. The
-integrals are in `cells.h`, for any element. Compiled when the package is installed;
-`kernels.pyi` has the types.
+Cells couple each node to few others. The sparsity pattern is therefore computed node by
+node, and each cell adds its entries directly to the CSC arrays, without triplets and
+sorting. The integrals, for any element, are in `cells.h`. Types are in `kernels.pyi`.
 """
 
 import numpy as np
 
 
 def node_pattern(const int[:, ::1] cells, int nodes):
-    """Find the nodes that share a cell with each node, ascending, as CSR (ptr, idx).
+    """Return the nodes that share a cell with each node, ascending, as CSR (ptr, idx).
 
-    cells : (E, n) node numbers below `nodes`
+    cells : (E, n) node numbers, below `nodes`
     """
     cdef Py_ssize_t e, a, b, i, j, k, t, first, end = 0, n = cells.shape[1]
     starts = np.zeros(nodes + 1, dtype=np.int32)
@@ -39,7 +38,7 @@ def node_pattern(const int[:, ::1] cells, int nodes):
                 if seen[b] == a:
                     continue
                 seen[b] = a
-                k = end  # insertion sort: a handful of neighbours
+                k = end  # insertion sort: nodes have few neighbours
                 while k > first and idx[k - 1] > b:
                     idx[k] = idx[k - 1]
                     k -= 1
@@ -67,7 +66,10 @@ def dof_pattern(const int[::1] ptr, const int[::1] idx, int dim):
 
 
 def slots(const int[:, ::1] cells, const int[::1] ptr, const int[::1] idx):
-    """Place of node b among the neighbours of node a, for a, b of a cell: (E, n, n)."""
+    """Return the index of node b among the neighbours of a, for a, b of a cell.
+
+    The result is (E, n, n), with a along the second and b along the third axis.
+    """
     cdef Py_ssize_t e, i, j, t, n = cells.shape[1]
     cdef int a, b
     places = np.empty((cells.shape[0], n, n), dtype=np.int32)
@@ -92,7 +94,7 @@ cdef extern from "cells.h" nogil:
         const int *edges
 
     void sum_stiffness(
-        int n, int dim, const element *of, const double *points, Py_ssize_t E,
+        int n, int dim, const element *elem, const double *points, Py_ssize_t E,
         const int *cells, const double *D, const int *material, const int *ptr,
         const int *slot, double *data
     )
@@ -107,7 +109,7 @@ cdef extern from "cells.h" nogil:
 
 
 def add_stiffness(
-    of,
+    elem,
     const double[:, ::1] points,
     const int[:, ::1] cells,
     const double[:, :, ::1] D,
@@ -117,13 +119,13 @@ def add_stiffness(
 ):
     """Sum ∫ BᵀDB over the cells into the values of the dof pattern.
 
-    of: the element; points (N, dim), cells (E, n), D (materials, v, v) in Voigt's
-    notation, material (E,) of each cell.
+    elem : element; points : (N, dim); cells : (E, n); D : (materials, v, v) in Voigt's
+    notation; material : (E,) material of each cell
     """
     cdef int n = cells.shape[1], dim = points.shape[1]
-    cdef const double[:, :, ::1] gradients = of.table
-    cdef const double[::1] weights = of.weights
-    cdef const int[:, :, ::1] edges = of.edges
+    cdef const double[:, :, ::1] gradients = elem.table
+    cdef const double[::1] weights = elem.weights
+    cdef const int[:, :, ::1] edges = elem.edges
     cdef element data
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
     cdef double[::1] sums = values
@@ -146,7 +148,7 @@ def add_tangents(
     const int[::1] ptr,
     const int[:, :, ::1] slot,
 ):
-    """Sum the tangents (E, n·dim, n·dim) of the cells into values of the dof pattern."""
+    """Sum tangents (E, n·dim, n·dim) of cells into the values of the dof pattern."""
     cdef int n = cells.shape[1]
     cdef int dim = tangents.shape[1] // n
     values = np.zeros(dim * dim * ptr[ptr.shape[0] - 1])
@@ -166,9 +168,9 @@ def cell_tangents(
 ):
     """Integrate  K_(ai)(bj) = Σ_q v_q ∂N_a/∂X_m A_imjn ∂N_b/∂X_n  of each cell.
 
-    gradients (E, q, n, dim) of the shape functions at the quadrature points, volumes
-    (E, q) of these, A (E, q, dim, dim, dim, dim) symmetric; returned:
-    (E, n·dim, n·dim), exactly symmetric.
+    gradients : (E, q, n, dim) of the shape functions at the quadrature points;
+    volumes : (E, q) v_q; A : (E, q, dim, dim, dim, dim), symmetric. The result
+    (E, n·dim, n·dim) is exactly symmetric.
     """
     cdef int points = gradients.shape[1], n = gradients.shape[2]
     cdef int dim = gradients.shape[3]
@@ -190,10 +192,10 @@ def congruence(
     const int[::1] number,
     const double[:, ::1] C,
 ):
-    """Multiply BCBᵀ (m, m), exactly symmetric, for sparse rows B (m, n) in CSR.
+    """Return BCBᵀ (m, m), exactly symmetric, for sparse B (m, n) in CSR.
 
-    Column j of B belongs to row number[j] of the symmetric C (c, c); also returned:
-    whether every entry of B has one (number[j] ≥ 0).
+    Column j of B belongs to row number[j] of the symmetric C (c, c). The second value
+    returned is False if B has an entry in a column with number[j] < 0.
     """
     cdef Py_ssize_t i, j, k, t, m = ptr.shape[0] - 1, c = C.shape[0]
     cdef double total

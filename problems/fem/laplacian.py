@@ -9,16 +9,18 @@ from scipy.sparse import csc_array, diags_array, kron
 
 
 def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
-    """Assemble it for linear (one direction) or bilinear elements (two).
+    """Assemble K for linear (one direction) or bilinear elements (two directions).
 
     Nodes are numbered along the last direction first.
 
     Parameters
     ----------
-    cells : along each direction, one or two
-    h : length of a cell, the same in all directions; in two it does not matter
+    cells : number of cells along each of one or two directions
+    h : length of a cell, the same in all directions; K in two directions does not
+        depend on it
 
     """
+    # stiffness of the product grid: K ⊗ M + M ⊗ K
     K, M = zip(*(_along(n, h) for n in cells), strict=True)
     terms = (
         reduce(kron, [K[i] if i == j else M[i] for i in range(len(cells))])
@@ -28,8 +30,9 @@ def grid_stiffness(cells: tuple[int, ...], h: float = 1.0) -> csc_array:
 
 
 def _along(n: int, h: float) -> tuple[csc_array, csc_array]:
-    """Return ∫N_a′N_b′ and ∫N_aN_b of n cells in a row."""
+    """Return ∫N_a′N_b′ and ∫N_aN_b of n linear elements in a row."""
     inside = np.ones(n)
+    # number of cells at each node
     ends = np.r_[1.0, np.full(n - 1, 2.0), 1.0]
     K = diags_array([-inside, ends, -inside], offsets=[-1, 0, 1]) / h
     M = diags_array([inside, 2 * ends, inside], offsets=[-1, 0, 1]) * (h / 6)

@@ -1,14 +1,14 @@
 """Meshes with named boundaries (paper, Section 2 and Figure 1).
 
-The dimension and the number of corners say which element the cells are. In the plane
-they are quadrilaterals or triangles, in any mixture. A triangle is a quadrilateral
-whose last two corners are one: with N₃ + N₄ for that corner, the bilinear map is onto
-the triangle, and N₁, N₂, N₃ + N₄ are its barycentric coordinates,
+Dimension and number of corners determine the element. Plane meshes consist of
+quadrilaterals and triangles in any mixture. A triangle is a degenerate quadrilateral
+whose last two corners coincide: the bilinear map is then onto the triangle, and
+N₁, N₂, N₃ + N₄ are its barycentric coordinates,
 
     Σ N_a x_a = x,   Σ N_a = 1   ⟹   N₁, N₂, N₃ + N₄ are linear in x,
 
-so that the bilinear element *is* the linear triangle (P1); 2×2 Gauss points integrate
-its constant BᵀDB exactly, as the Jacobian determinant is linear.
+so that the bilinear element *is* the linear triangle (P1). 2×2 Gauss points integrate
+its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
 """
 
 from __future__ import annotations
@@ -29,21 +29,25 @@ Nodes = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Nodes and cells; lengths in m.
+    """Nodes, cells and named boundaries; lengths in m.
 
-    A boundary in the plane is the chain of its nodes, ordered so that the body lies on
-    its left: with the unit tangent t the outward normal is (t_y, −t_x).
+    In the plane, a boundary is a chain of nodes with the body on its left: with the
+    unit tangent t, the outward normal is (t_y, −t_x).
+
+    >>> mesh = rectangle((0.0, 0.0), (2.0, 1.0), (2, 1))
+    >>> len(mesh.points), len(mesh.cells), mesh.boundaries["bottom"].tolist()
+    (6, 2, [0, 1, 2])
     """
 
     points: NDArray[np.float64]  #: (N, dim)
-    #: (E, c) nodes of each cell, in the plane counter-clockwise; where kinds are mixed,
-    #: a cell of fewer corners repeats its last node
+    #: (E, c) nodes of each cell, counter-clockwise in the plane; in mixed meshes, cells
+    #: with fewer corners repeat their last node
     cells: Nodes
-    boundaries: Mapping[str, Nodes]
+    boundaries: Mapping[str, Nodes]  #: nodes by name
 
     @property
     def dim(self) -> int:
-        """Number of coordinates of a node, and of components of its displacement."""
+        """Dimension of space: coordinates and displacement components per node."""
         return int(self.points.shape[1])
 
     @property
@@ -53,36 +57,36 @@ class Mesh:
 
     @property
     def element(self) -> Element:
-        """Element that all cells are integrated with."""
+        """Element of all cells; triangles are degenerate quadrilaterals."""
         return ELEMENTS[self.dim, self.cells.shape[1]]
 
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
-        """Cells by their kinds, in the vocabulary of meshio."""
+        """Cells grouped by kind, with the names of meshio."""
         return cell_blocks(self.cells, self.dim)
 
 
 @dataclass(frozen=True, eq=False)
 class StructuredGrid:
-    """Rows and columns of nodes, of which any block can be had without the others.
+    """Structured grid, of which any block can be generated without the rest.
 
-    Node (row j, column i) has the number  j·(columns) + i;  cells are numbered alike.
+    Node (row j, column i) has the number  j·(columns) + i,  and likewise cells.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes
     rows: Vector  #: (ny + 1,) parameter of each row of nodes
-    #: parameters of some columns (k,) and rows (l,) → points (l, k, 2)
+    #: map from parameters of some columns (k,) and rows (l,) to points (l, k, 2)
     place: Callable[[Vector, Vector], NDArray[np.float64]]
-    names: tuple[str, str, str, str]  #: of the sides, anticlockwise from row 0
+    names: tuple[str, str, str, str]  #: names of the sides, anticlockwise from row 0
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Cells along rows and along columns, nx and ny."""
+        """Numbers of cells nx along a row and ny along a column."""
         return self.columns.size - 1, self.rows.size - 1
 
     @property
     def nodes(self) -> int:
-        """How many nodes there are."""
+        """Number of nodes."""
         return self.columns.size * self.rows.size
 
     @property
@@ -99,7 +103,7 @@ class StructuredGrid:
         return np.asarray(np.ascontiguousarray(points.reshape(-1, 2)))
 
     def side(self, name: str) -> NDArray[np.float64]:
-        """Return the points of a side in the order of its chain, (k, 2)."""
+        """Return the points (k, 2) of a side, in the order of its chain."""
         at, all_, last = self.names.index(name), slice(None), slice(-1, None)
         if at in (0, 2):
             points = self.block(all_, last if at else slice(1))
@@ -108,51 +112,52 @@ class StructuredGrid:
         return np.asarray(points if at < 2 else points[::-1])
 
     def position(self, node: Nodes) -> NDArray[np.float64]:
-        """Return the points of some nodes (k, 2), as `block` does."""
+        """Return the points (k, 2) of some nodes, equal to those of `block`."""
         row, column = np.divmod(node, self.columns.size)
-        found = np.empty((node.size, 2))
+        points = np.empty((node.size, 2))
         by_rows = np.unique(row).size <= np.unique(column).size
+        # line by line: `place` evaluates products of columns and rows only
         for line in np.unique(row if by_rows else column):
-            of = np.flatnonzero((row if by_rows else column) == line)
-            places = (
-                (self.columns[column[of]], self.rows[[line]]) if by_rows
-                else (self.columns[[line]], self.rows[row[of]])
+            k = np.flatnonzero((row if by_rows else column) == line)
+            parameters = (
+                (self.columns[column[k]], self.rows[[line]]) if by_rows
+                else (self.columns[[line]], self.rows[row[k]])
             )  # fmt: skip
-            found[of] = self.place(*places).reshape(-1, 2)
-        return found
+            points[k] = self.place(*parameters).reshape(-1, 2)
+        return points
 
     def prefixed(self, prefix: str) -> StructuredGrid:
-        """Put `prefix` before the names of the sides."""
+        """Return the body with `prefix` before the names of its sides."""
         first, second, third, fourth = (prefix + name for name in self.names)
         return replace(self, names=(first, second, third, fourth))
 
     def mesh(self) -> Mesh:
-        """Connect all points."""
+        """Return the whole mesh."""
         cells = cells_of_block(self.columns.size, self.rows.size)
         return Mesh(self.block(slice(None), slice(None)), cells, self.sides)
 
 
 @dataclass(frozen=True, eq=False)
 class HalfDisc:
-    """Rings of cells that end in triangles at the centre of half a disc.
+    """Half disc of rings of cells, with triangles at its centre.
 
-    Of a angles and r radii, node (ring j, angle i) has the number  j·a + i,  and the
-    centre is the last one. Cells are numbered ring by ring, the triangles last.
+    With a angles and r radii, node (ring j, angle i) has the number  j·a + i,  and the
+    centre is the last node. Cells are numbered ring by ring, the triangles last.
     """
 
     centre: tuple[float, float]
-    angles: Vector  #: (a,) increasing, over half a turn; the arc is between the ends
-    radii: Vector  #: (r,) decreasing, all positive: those of the arc and within
-    names: tuple[str, str] = ("arc", "flat")  #: of the sides
+    angles: Vector  #: (a,) increasing, from end to end of the arc, π apart
+    radii: Vector  #: (r,) decreasing and positive, from the radius of the arc inwards
+    names: tuple[str, str] = ("arc", "flat")  #: names of the sides
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Cells along a ring, and rings of cells, triangles being one."""
+        """Numbers of cells along a ring and of rings, including the triangles."""
         return self.angles.size - 1, self.radii.size
 
     @property
     def nodes(self) -> int:
-        """How many nodes there are."""
+        """Number of nodes."""
         return self.angles.size * self.radii.size + 1
 
     @property
@@ -174,11 +179,12 @@ class HalfDisc:
         return np.asarray(np.asarray(self.centre) + radius * self._direction[angle])
 
     def block(self, angles: slice, rings: slice) -> tuple[Nodes, Nodes]:
-        """List the nodes (k,) of some cells, and these cells (E, 4), as `mesh` does.
+        """Return the nodes (k,) of a block of cells, and these cells (E, 4).
 
-        angles, rings : of cells; corners of cells are places in the list of nodes
+        angles, rings : ranges of cells; corners are indices into the nodes returned
         """
         a, r = self.angles.size, self.radii.size
+        # the innermost ring consists of triangles with the centre as common corner
         has_centre = rings.stop == r
         i = np.arange(angles.start, angles.stop + 1)
         j = np.arange(rings.start, rings.stop + (not has_centre))
@@ -192,20 +198,20 @@ class HalfDisc:
         return nodes, cells
 
     def lengths(self) -> tuple[tuple[Vector, Vector], tuple[Vector, Vector]]:
-        """Return the mean sides of cells, along radii and along arcs.
+        """Return the mean lengths of cells along radii and along arcs.
 
-        Each as two factors, one of each ring of cells and one of each angle.
+        Each is a pair of factors, one per ring of cells and one per angle of cells.
         """
         half, r = np.diff(self.angles) / 2, np.append(self.radii, 0.0)
         return (-np.diff(r), np.cos(half)), ((r[1:] + r[:-1]) / 2, 2 * np.sin(half))
 
     def prefixed(self, prefix: str) -> HalfDisc:
-        """Put `prefix` before the names of the sides."""
+        """Return the body with `prefix` before the names of its sides."""
         arc, flat = (prefix + name for name in self.names)
         return replace(self, names=(arc, flat))
 
     def mesh(self) -> Mesh:
-        """Connect all points."""
+        """Return the whole mesh."""
         (a, r), all_ = self.divisions, np.arange(self.nodes)
         return Mesh(
             self.position(all_), self.block(slice(0, a), slice(0, r))[1], self.sides
@@ -213,7 +219,7 @@ class HalfDisc:
 
 
 def cells_of_block(columns: int, rows: int) -> Nodes:
-    """List the cells (E, 4) of so many columns and rows of nodes, row by row."""
+    """Return the cells (E, 4) between columns × rows of nodes, row by row."""
     i = np.arange(rows * columns, dtype=np.int64).reshape(rows, columns)
     corners = i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1]
     return np.stack(corners, axis=-1).reshape(-1, 4)
@@ -252,7 +258,13 @@ def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
 
 def rectangle(corner: tuple[float, float], size: tuple[float, float],
               divisions: tuple[int, int]) -> Mesh:  # fmt: skip
-    """Mesh a rectangle by nx × ny equal cells; boundaries bottom, right, top, left."""
+    """Mesh a rectangle by nx × ny equal cells.
+
+    Boundaries: bottom, right, top, left. Lengths are in m.
+
+    >>> rectangle((0.0, 0.5), (2.0, 0.25), (8, 1)).points[-1].tolist()
+    [2.0, 0.75]
+    """
     return rectangle_grid(corner, size, divisions).mesh()
 
 
@@ -272,17 +284,23 @@ def half_disc(centre: tuple[float, float], angles: Vector, radii: Vector) -> Mes
 
     Parameters
     ----------
-    angles : increasing, over half a turn; the arc lies between the first and the last
-    radii : decreasing, all positive: those of the arc and of the rings of nodes within
+    angles : increasing, from one end of the arc to the other, π apart
+    radii : decreasing and positive, from the radius of the arc inwards
 
     """
     return HalfDisc(centre, angles, radii).mesh()
 
 
 def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
-    """Put bodies into one mesh that shares no node; also return each cell's body.
+    """Join the meshes of bodies, without merging nodes; also return each cell's body.
 
-    Boundaries keep their names where these differ between the bodies.
+    Names of boundaries must differ between the bodies: of equal names, the last body's
+    boundary is kept. `prefixed` makes them differ.
+
+    >>> block = rectangle((0.0, 0.0), (1.0, 1.0), (1, 1))
+    >>> mesh, body = join((prefixed(block, "a_"), prefixed(block, "b_")))
+    >>> mesh.boundaries["b_top"].tolist(), body.tolist()
+    ([7, 6], [0, 1])
     """
     starts = np.cumsum([0] + [len(m.points) for m in meshes])
     boundaries = {
@@ -297,7 +315,7 @@ def join(meshes: tuple[Mesh, ...]) -> tuple[Mesh, Nodes]:
 
 
 def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, Nodes]:
-    """Return the sides of bodies with the numbers that `join` gives their nodes."""
+    """Return the sides of bodies, with nodes numbered as by `join`."""
     starts = np.cumsum([0] + [body.nodes for body in bodies])
     return {
         name: nodes + start
@@ -307,46 +325,54 @@ def joined_sides(bodies: Sequence[StructuredGrid | HalfDisc]) -> Mapping[str, No
 
 
 def prefixed(mesh: Mesh, prefix: str) -> Mesh:
-    """Put `prefix` before the name of each boundary, so that equal shapes can join."""
+    """Return the mesh with `prefix` before the name of each boundary, see `join`."""
     return replace(
         mesh, boundaries={prefix + name: b for name, b in mesh.boundaries.items()}
     )
 
 
-def triangular(cells: Nodes) -> NDArray[np.bool_]:
-    """Say which cells (E, 4) are triangles, (E,)."""
+def is_triangle(cells: Nodes) -> NDArray[np.bool_]:
+    """Return a mask (E,) of the triangles among cells (E, 4)."""
     return np.asarray(cells[:, 2] == cells[:, 3])
 
 
 def boundary_facets(cells: Nodes, dim: int) -> Nodes:
-    """List the facets (k, m) of exactly one cell (E, c), the body on their left.
+    """Return the boundary facets (k, m): those of exactly one cell, body on the left.
 
-    Edges in the plane, ordered by their lower node, then by the other; facets that
-    repeated corners collapse are left out.
+    In the plane facets are edges, sorted by their lower node, then by the other one.
+    Degenerate facets between repeated corners are left out.
     """
     element = ELEMENTS[dim, cells.shape[1]]
     facets = cells[:, element.facets].reshape(-1, element.facets.shape[1])
     nodes = np.sort(facets, axis=1)
     is_facet = (nodes[:, 1:] != nodes[:, :-1]).all(axis=1)
     facets, nodes = facets[is_facet], nodes[is_facet]
-    name, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
-    for k in range(dim):  # so many nodes tell facets apart
-        name = name * count + nodes[:, k]
-    _, first, times = np.unique(name, return_index=True, return_counts=True)
+    key, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
+    # the dim lowest nodes identify a facet
+    for k in range(dim):
+        key = key * count + nodes[:, k]
+    _, first, times = np.unique(key, return_index=True, return_counts=True)
     return np.asarray(facets[first[times == 1]])
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
-    """Return ∫N_j ds (v,) of the linear shape functions on a polyline (v, d)."""
+    """Return ∫N_j ds (v,) of the linear shape functions on a polyline (v, dim), m.
+
+    >>> nodal_lengths(np.array([[0.0, 0.0], [1.0, 0.0], [3.0, 0.0]])).tolist()
+    [0.5, 1.5, 1.0]
+    """
     edge = chain[1:] - chain[:-1]
     half = np.sqrt(np.einsum("ex,ex->e", edge, edge)) / 2
     return np.asarray(np.append(half, 0) + np.append(0, half))
 
 
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
-    """List the displacement components of nodes: dim·i, dim·i + 1, … of node i.
+    """Return the displacement components of nodes: dim·i, dim·i + 1, … for node i.
 
-    axis : 0, 1, …: the components along this axis alone
+    axis : 0, 1, …: only the components along this axis
+
+    >>> dofs_of(np.array([0, 3]), 2).tolist(), dofs_of(np.array([0, 3]), 2, 1).tolist()
+    ([0, 1, 6, 7], [1, 7])
     """
     if axis is not None:
         return np.asarray(dim * nodes + axis)
@@ -354,5 +380,5 @@ def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
 
 
 def as_vectors(u: Vector, dim: int) -> NDArray[np.float64]:
-    """See a dof vector (dim·N,) as one vector per node (N, dim)."""
+    """Return a view of a dof vector (dim·N,) as one vector per node (N, dim)."""
     return u.reshape(-1, dim)

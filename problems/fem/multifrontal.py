@@ -1,8 +1,9 @@
 """Sparse Cholesky factors by the multifrontal method (Duff and Reid 1983; Liu 1992).
 
-Each front eliminates its own unknowns from a small dense matrix, made of their entries
-of K and of what the fronts below it left, and leaves the Schur complement on its border
-to the front above. So the work is that of dense products (Liu, SIAM Review 34, 1992).
+Each front assembles a small dense matrix from the entries of K in its rows and the
+Schur complements of its children, eliminates its unknowns, and passes the Schur
+complement on its border to its parent. Nearly all work is in dense products (Liu, SIAM
+Review 34, 1992).
 """
 
 from __future__ import annotations
@@ -13,7 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Matrix, Vector
-from mortarbench.problems.fem.dissection import Fronts, dissect, index_arrays, spread
+from mortarbench.problems.fem.dissection import (
+    Fronts,
+    dissect,
+    expand_positions,
+    index_arrays,
+)
 from mortarbench.problems.fem.elimination import eliminate, substitute
 from mortarbench.problems.fem.mesh import Nodes
 
@@ -23,12 +29,12 @@ Ints = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class Multifrontal:
-    """K_oo = LLᵀ with L stored by fronts: U = Lᵀ of each, own rows × (own + border)."""
+    """Factor K_oo = LLᵀ, stored by fronts as U = Lᵀ, pivots × (pivots + border)."""
 
-    order: Nodes  #: o, components in the order of elimination
-    fronts: Fronts  #: of these
-    offset: NDArray[np.int64]  #: (F + 1,) where the rows of each front begin in `rows`
-    rows: Floats
+    order: Nodes  #: o, components in elimination order
+    fronts: Fronts  #: of positions in `order`
+    offset: NDArray[np.int64]  #: (F + 1,) start of each front in `rows`
+    rows: Floats  #: entries of U, front by front
 
     def solve(self, b: Vector) -> Vector:
         """Solve K_oo x = b for one right-hand side (o,) or several (o, k)."""
@@ -38,27 +44,28 @@ class Multifrontal:
         return x.T.reshape(b.shape)
 
     def trailing(self) -> list[tuple[Nodes, Floats]]:
-        """List the components ordered last in each connected part, and U on them."""
+        """Return the unknowns eliminated last, per connected part, and U on them."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
-            own = slice(f.start[s], f.start[s + 1])
+            positions = slice(f.start[s], f.start[s + 1])
             rows = self.rows[self.offset[s] : self.offset[s + 1]]
-            size = own.stop - own.start
-            blocks.append((self.order[own], rows.reshape(size, size)))
+            size = positions.stop - positions.start
+            blocks.append((self.order[positions], rows.reshape(size, size)))
         return blocks
 
 
 def multifrontal(
     K: Matrix, free: Nodes, points: NDArray[np.float64], last: Nodes
 ) -> Multifrontal:
-    """Factorise K_ff, ordered by nested dissection with the nodes of `last` at the end.
+    """Factorise K_ff in nested dissection order, with the nodes of `last` at the end.
 
     Parameters
     ----------
     K : (n, n) symmetric, CSC
     free : components f
-    points : (N, 2) of the nodes; node i has the n/N components from i·n/N on
-    last : components whose nodes come last; only they may be coupled across the mesh
+    points : (N, 2) positions of the nodes; node i has the n/N components from i·n/N on
+    last : components whose nodes are eliminated last; K should couple distant nodes
+        only among these
 
     Raises
     ------
@@ -73,12 +80,12 @@ def multifrontal(
     acting = acts.reshape(N, -1)[nodes]
     order = np.arange(n).reshape(N, -1)[nodes][acting]
     ends = np.append(0, np.cumsum(acting.sum(axis=1))).astype(np.int32)
-    fronts = spread(of_nodes, ends)
+    fronts = expand_positions(of_nodes, ends)
 
     position = np.full(n, -1, dtype=np.int32)
     position[order] = np.arange(order.size, dtype=np.int32)
-    own, border = np.diff(fronts.start), np.diff(fronts.first)
-    offset = np.append(0, np.cumsum(own.astype(np.int64) * (own + border)))
+    pivots, border = np.diff(fronts.start), np.diff(fronts.first)
+    offset = np.append(0, np.cumsum(pivots.astype(np.int64) * (pivots + border)))
     rows = np.zeros(offset[-1])
     definite = eliminate(
         *index_arrays(K), K.data, order, position, fronts.start, fronts.first,

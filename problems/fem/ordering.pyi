@@ -9,8 +9,8 @@ def node_graph(
     indptr: Ints, indices: Ints, d: int, nodes: int
 ) -> tuple[Ints, Ints]: ...
 def components(ptr: Ints, idx: Ints) -> Ints: ...
-def dissected(
-    ptr: Ints, idx: Ints, points: Floats, ending: Marks, leaf: int
+def dissect_components(
+    ptr: Ints, idx: Ints, points: Floats, is_last: Marks, leaf: int
 ) -> tuple[Ints, Ints, Ints, Marks]: ...
 def borders(
     ptr: Ints, idx: Ints, order: Ints, start: Ints, children: Ints

@@ -1,6 +1,6 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 # cython: initializedcheck=False
-"""Compiled loops of nested dissection; `problems.fem.dissection` says what it is."""
+"""Compiled loops of nested dissection, see `problems.fem.dissection`."""
 
 from libc.math cimport INFINITY, atan2, cos, fmax, fmin, sin
 from libc.stdint cimport int64_t
@@ -9,9 +9,9 @@ import numpy as np
 
 
 def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
-    """Contract the pattern of a matrix with d components per node, diagonal left out.
+    """Contract a matrix pattern with d components per node to the graph of its nodes.
 
-    Returns the neighbours of each node in turn, as (ptr, idx).
+    Returns the neighbours of each node as (ptr, idx), without the node itself.
     """
     cdef Py_ssize_t a, b, t, end = 0
     pointers = np.zeros(nodes + 1, dtype=np.int32)
@@ -35,54 +35,54 @@ def components(const int[::1] ptr, const int[::1] idx):
     cdef Py_ssize_t seed, t, at, end, nodes = ptr.shape[0] - 1
     cdef int count = 0
     numbers = np.full(nodes, -1, dtype=np.int32)
-    cdef int[::1] number = numbers, reached = np.empty(nodes, dtype=np.int32)
+    cdef int[::1] number = numbers, queue = np.empty(nodes, dtype=np.int32)
     for seed in range(nodes):
         if number[seed] >= 0:
             continue
-        number[seed], reached[0], at, end = count, seed, 0, 1
+        number[seed], queue[0], at, end = count, seed, 0, 1
         while at < end:
-            for t in range(ptr[reached[at]], ptr[reached[at] + 1]):
+            for t in range(ptr[queue[at]], ptr[queue[at] + 1]):
                 if number[idx[t]] < 0:
-                    number[idx[t]], reached[end] = count, idx[t]
+                    number[idx[t]], queue[end] = count, idx[t]
                     end += 1
             at += 1
         count += 1
     return numbers
 
 
-def dissected(
-    const int[::1] ptr, const int[::1] idx, const double[:, :] points, ending, int leaf
+def dissect_components(
+    const int[::1] ptr, const int[::1] idx, const double[:, :] points, is_last, int leaf
 ):
-    """Dissect each connected component; see `dissect` and `Fronts`.
+    """Dissect each connected component, see `dissect` and `Fronts`.
 
     Returns order (N,), start (F + 1,), children (F,) and roots (F,).
     """
-    # each component in turn, its nodes of `ending` after the others, all ascending
-    key = 2 * components(ptr, idx) + ending
+    # component by component, in each the nodes of `is_last` at the end, both ascending
+    key = 2 * components(ptr, idx) + is_last
     chosen = np.argsort(key, kind="stable").astype(np.int32)
     ends = np.append(0, np.bincount(key, minlength=key.max() // 2 * 2 + 2).cumsum())
     cdef int[::1] order = chosen
     cdef const int64_t[::1] end = ends
 
-    # a part of n nodes is cut at most n − 1 times, into two that become fronts
-    cdef Py_ssize_t nodes = points.shape[0], waiting, low, high, middle, separator
+    # a part of n nodes is bisected at most n − 1 times, which bounds the fronts
+    cdef Py_ssize_t nodes = points.shape[0], depth, low, high, middle, separator
     cdef Py_ssize_t c, begin, fronts = 0
     lengths, branches = np.zeros((2, 3 * nodes), dtype=np.int32)
     roots = np.zeros(3 * nodes, dtype=np.bool_)
     cdef int[::1] length = lengths, children = branches
-    cdef int[:, ::1] todo = np.empty((2 * nodes, 2), dtype=np.int32)
-    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # of the last cut of a node
+    cdef int[:, ::1] stack = np.empty((2 * nodes, 2), dtype=np.int32)
+    cdef int[::1] side = np.zeros(nodes, dtype=np.int32)  # in the last bisection
     cdef int[::1] kind = np.empty(nodes, dtype=np.int32), copy = np.empty_like(kind)
     cdef double[:, ::1] along = np.empty((2, nodes))
     cdef int cut = 0
     for c in range(end.shape[0] // 2):
-        # reversed postorder: a separator, all of its second half, all of its first
-        begin, waiting = fronts, 0
+        # in reversed postorder: separator, second half, first half
+        begin, depth = fronts, 0
         if end[2 * c] < end[2 * c + 1]:
-            todo[0, 0], todo[0, 1], waiting = end[2 * c], end[2 * c + 1], 1
-        while waiting:
-            waiting -= 1
-            low, high = todo[waiting, 0], todo[waiting, 1]
+            stack[0, 0], stack[0, 1], depth = end[2 * c], end[2 * c + 1], 1
+        while depth:
+            depth -= 1
+            low, high = stack[depth, 0], stack[depth, 1]
             middle = separator = high
             if high - low > leaf:
                 cut += 2
@@ -94,10 +94,10 @@ def dissected(
                 separator += low
             if middle != low and middle != high:
                 length[fronts], children[fronts] = high - separator, 2
-                todo[waiting, 0], todo[waiting, 1] = low, middle
-                todo[waiting + 1, 0], todo[waiting + 1, 1] = middle, separator
-                waiting += 2
-            else:  # few nodes, or all in one place
+                stack[depth, 0], stack[depth, 1] = low, middle
+                stack[depth + 1, 0], stack[depth + 1, 1] = middle, separator
+                depth += 2
+            else:  # a leaf, or nodes that all have the same coordinate
                 length[fronts], children[fronts] = high - low, 0
             fronts += 1
         lengths[begin:fronts] = lengths[begin:fronts][::-1].copy()
@@ -114,10 +114,10 @@ cdef void bisect(
     int[::1] side, int cut, int[::1] kind, int[::1] copy, double[:, ::1] along,
     Py_ssize_t *middle, Py_ssize_t *separator,
 ) noexcept:
-    """Reorder `part` to first half, second half, separator; tell where these begin.
+    """Reorder `part` to first half, second half, separator; return their offsets.
 
     side becomes `cut` on the first half and cut + 1 on the rest. kind, copy and along
-    (2, N) are overwritten.
+    (2, N) are workspace.
     """
     cdef Py_ssize_t a, t, s, n = part.shape[0]
     cdef double value, least = INFINITY, most = -INFINITY
@@ -126,7 +126,8 @@ cdef void bisect(
     for t in range(n):
         along[1, t] = along[0, t]
         least, most = fmin(least, along[0, t]), fmax(most, along[0, t])
-    # nodes level with the median but for rounding stay together
+    # the tolerance keeps a grid line at the median together, which rounding of the
+    # coordinates would split between both halves
     value = find(&along[1, 0], n, n // 2) - 1e-9 * (most - least)
     for t in range(n):
         side[part[t]] = cut + (along[0, t] >= value)
@@ -201,26 +202,26 @@ def borders(
     const int[::1] start,
     const int[::1] children,
 ):
-    """Find the border of each front: later neighbours of its own and its children's.
+    """Compute the border of each front: later neighbours of it and of its children.
 
     Returns first (F + 1,) and border, see `Fronts`.
     """
-    cdef Py_ssize_t s, t, i, p, child, end = 0, waiting = 0
+    cdef Py_ssize_t s, t, i, p, child, end = 0, depth = 0
     cdef Py_ssize_t nodes = order.shape[0], fronts = children.shape[0]
     firsts = np.zeros(fronts + 1, dtype=np.int32)
     cdef int[::1] first = firsts, stack = np.empty(fronts, dtype=np.int32)
     cdef int[::1] position = np.empty(nodes, dtype=np.int32)
     cdef int[::1] seen = np.full(nodes, -1, dtype=np.int32)
-    found = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
-    cdef int[::1] unsorted = found
+    entries = np.empty(8 * nodes, dtype=np.int32)  # enlarged as needed
+    cdef int[::1] unsorted = entries
     for p in range(nodes):
         position[order[p]] = p
     for s in range(fronts):
         if end + nodes > unsorted.shape[0]:
-            found = unsorted = np.resize(found, 2 * found.size)
+            entries = unsorted = np.resize(entries, 2 * entries.size)
         for i in range(children[s]):
-            waiting -= 1
-            child = stack[waiting]
+            depth -= 1
+            child = stack[depth]
             for t in range(first[child], first[child + 1]):
                 p = unsorted[t]
                 if p >= start[s + 1] and seen[p] != s:
@@ -233,11 +234,11 @@ def borders(
                     seen[p], unsorted[end] = s, p
                     end += 1
         first[s + 1] = end
-        stack[waiting] = s
-        waiting += 1
+        stack[depth] = s
+        depth += 1
 
-    # ascending in each front: by position first, and then back to the fronts
-    cdef int[::1] at = np.append(0, np.bincount(found[:end], minlength=nodes)).cumsum(
+    # two counting sorts, by position and then by front: borders ascend at linear cost
+    cdef int[::1] at = np.append(0, np.bincount(entries[:end], minlength=nodes)).cumsum(
         dtype=np.int32
     )
     cdef int[::1] of_front = np.empty(end, dtype=np.int32), filled = firsts.copy()

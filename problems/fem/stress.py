@@ -1,11 +1,12 @@
-"""Stresses from displacements: at cell centres, Gauss points, recovered at nodes.
+"""Stresses from displacements: at cell centres and Gauss points, recovered at nodes.
 
-Superconvergent patch recovery after Zienkiewicz and Zhu (1992): bilinear quadrilaterals
-have their superconvergent stresses at the cell centres, linear triangles their best
-ones at the centroids; a linear polynomial is fitted to those around each interior node.
-A boundary node takes the mean of the polynomials of the interior nodes that it shares a
-cell with, or (a corner of one triangle) of the boundary nodes that have one. Bodies
-share no nodes, so nothing is averaged across bodies.
+Superconvergent patch recovery after Zienkiewicz and Zhu (1992). Stresses are
+superconvergent at the centres of bilinear quadrilaterals and most accurate at the
+centroids of linear triangles; a linear polynomial is fitted to these around each
+interior node. A boundary node takes the mean of the polynomials of the interior nodes
+with which it shares a cell; if there are none (at the corner of a single triangle),
+that of its boundary neighbours. Bodies share no nodes, so that no average extends over
+several bodies.
 """
 
 from __future__ import annotations
@@ -31,9 +32,9 @@ def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.f
 
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
-    """Return σ = DBu (E, q, v) at the Gauss points, Pa; else as `centre_stress`."""
-    at = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
-    return np.stack(at, axis=1)
+    """Return σ = DBu (E, q, v) at the Gauss points, Pa; see `centre_stress`."""
+    stresses = [_stress_at(point, mesh, D, u) for point in mesh.element.points]
+    return np.stack(stresses, axis=1)
 
 
 def _stress_at(
@@ -58,7 +59,8 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
         weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
     )  # fmt: skip
     offset = (centre[cells] - mesh.points[nodes]) / size
-    basis = np.column_stack([np.ones(len(nodes)), offset])  # 1, x, … about the node
+    # 1, x, … about the node, in units of the extent of the mesh
+    basis = np.column_stack([np.ones(len(nodes)), offset])
     normal, right = np.empty((N, terms, terms)), np.empty((N, terms, k))
     for p, q in combinations_with_replacement(range(terms), 2):
         sums = np.bincount(nodes, basis[:, p] * basis[:, q], N)
@@ -70,28 +72,29 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     interior[boundary_facets(mesh.cells, dim)] = False
     polynomial = np.zeros((N, terms, k))
     polynomial[interior] = np.linalg.solve(normal[interior], right[interior])
-    known = interior
-    for _ in range(2):
-        b, i = _neighbours(mesh, ~known, known)
-        moved = polynomial[i]  # about the node b
+    has_value = interior
+    for _ in range(2):  # from interior nodes, then from boundary nodes
+        b, i = _neighbours(mesh, ~has_value, has_value)
+        moved = polynomial[i]  # expanded about node b
         offset = (mesh.points[b] - mesh.points[i]) / size
         moved[:, 0] += np.einsum("px,pxk->pk", offset, moved[:, 1:])
         np.add.at(polynomial, b, moved)
         count = np.bincount(b, minlength=N)
         polynomial[count > 0] /= count[count > 0, None, None]
-        known = known | (count > 0)
+        has_value = has_value | (count > 0)
+    # the constant term is the value at the node about which it is expanded
     result = polynomial[:, 0]
-    lonely = ~known  # one layer of cells: no interior node nearby
-    result[lonely] = right[lonely, 0] / normal[lonely, 0, 0, None]
+    isolated = ~has_value  # one layer of cells: take the mean of the adjacent cells
+    result[isolated] = right[isolated, 0] / normal[isolated, 0, 0, None]
     return result
 
 
 def von_mises(
     stress: NDArray[np.float64], nu: Vector | float, plane: Plane | None
 ) -> Vector:
-    """Return σ_vM of (…, 3) stresses; plane strain has σ_z = ν(σ_x + σ_y).
+    """Return σ_vM (…) of stresses (…, 3), in Voigt's notation; (…, 6) if plane is None.
 
-    In space (plane is None) stresses are (…, 6), in Voigt's notation.
+    In plane strain, σ_z = ν(σ_x + σ_y).
     """
     if plane is None:
         x, y, z, *shears = np.moveaxis(stress, -1, 0)
@@ -103,7 +106,7 @@ def von_mises(
 
 
 def von_mises_of(stress: NDArray[np.float64]) -> Vector:
-    """Return σ_vM of stresses (…, 4): σ_x, σ_y, τ_xy, σ_z."""
+    """Return σ_vM (…) of stresses (…, 4): σ_x, σ_y, τ_xy, σ_z."""
     x, y, shear, z = np.moveaxis(stress, -1, 0)
     squares = ((x - y) ** 2 + (y - z) ** 2 + (z - x) ** 2) / 2 + 3 * shear**2
     return np.asarray(np.sqrt(squares))
@@ -112,7 +115,7 @@ def von_mises_of(stress: NDArray[np.float64]) -> Vector:
 def _neighbours(
     mesh: Mesh, first: NDArray[np.bool_], second: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pair each node of `first` with those of `second` that share a cell with it."""
+    """Return all pairs of a node of `first` and one of `second` in a common cell."""
     cells = mesh.cells[first[mesh.cells].any(axis=1)]
     corners = cells.shape[1]
     a, b = np.repeat(cells, corners, axis=1).ravel(), np.tile(cells, corners).ravel()

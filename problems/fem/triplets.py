@@ -1,7 +1,7 @@
-"""The stiffness by triplets: the vectorised way of the paper's library [6].
+"""Assembly of the stiffness by triplets, vectorised as in the paper's library [6].
 
-All element matrices at once, then one sort into a sparse matrix. Ours is compared with
-it; see `problems.fem.elasticity.stiffness`.
+All element matrices are computed at once and sorted into a sparse matrix. Benchmarks
+and the paper's experiments compare `problems.fem.elasticity.stiffness` with it.
 """
 
 from __future__ import annotations

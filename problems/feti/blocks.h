@@ -1,7 +1,7 @@
-/* The product of a symmetric block with the columns that all subdomains of a kind have.
+/* The product of a dense block with the columns of all subdomains of a class.
 
-   Compiled twice, for processors with AVX2 and FMA and for all others; which one runs is
-   decided when the module is loaded. */
+   Compiled twice, for processors with AVX2 and FMA and for all others; the loader selects
+   one of them when the module is imported. */
 
 #include <string.h>
 
@@ -19,13 +19,13 @@ typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 #define FOUR(a) (*(four *) (a))
 
 enum {
-    ROWS = 4,   /* of M at a time */
-    WIDTH = 12, /* columns of X at a time: with these rows, sums fill the registers */
-    LINE = 8,   /* numbers in a line of the cache */
-    DEPTH = 256 /* rows of X at a time: so many in that width stay in the nearest cache */
+    ROWS = 4,   /* rows of M per tile */
+    WIDTH = 12, /* columns of X per tile: 12 vectors of sums, 3 of X, 1 of M: 16 registers */
+    LINE = 8,   /* doubles in a cache line */
+    DEPTH = 256 /* rows of X per pass: DEPTH * WIDTH doubles, 24 KiB, stay in the L1 cache */
 };
 
-/* Y += M X of some rows of M, with w ≤ 3 fours of columns; X is packed, w fours a row. */
+/* Y += M X for a few rows of M and w <= 3 vectors of four columns; X is packed by rows. */
 INLINE void
 add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y,
          Py_ssize_t columns, Py_ssize_t some)
@@ -33,7 +33,7 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
     four sum[ROWS][WIDTH / 4] = {0};
     for (Py_ssize_t begin = 0; begin < depth; begin += LINE) {
         Py_ssize_t end = begin + LINE < depth ? begin + LINE : depth;
-        for (int r = 0; r < rows; r++) /* the next rows come from farther caches */
+        for (int r = 0; r < rows; r++) /* prefetch the next rows of M from the outer caches */
             __builtin_prefetch(M + (rows + r) * stride + begin);
         for (Py_ssize_t k = begin; k < end; k++)
             for (int r = 0; r < rows; r++) {
@@ -51,7 +51,7 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
                 Y[r * columns + c] += sum[r][c / 4][c % 4];
 }
 
-/* The same of all n rows, for `some` ≤ 4w columns. */
+/* The same for all n rows and `some` <= 4w columns. */
 INLINE void
 add_strip(in M, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y, Py_ssize_t columns,
           Py_ssize_t some)
@@ -63,7 +63,7 @@ add_strip(in M, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y, Py_ssize_t c
         add_tile(M + i * n, n, X, depth, 1, w, Y + i * columns, columns, some);
 }
 
-/* Y = M X with M (n, n), X and Y (n, columns), all by rows. */
+/* Y = M X with M (n, n), X and Y (n, columns), all stored by rows. */
 TWICE static void
 product(in M, Py_ssize_t n, in X, out Y, Py_ssize_t columns)
 {

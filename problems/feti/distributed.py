@@ -1,15 +1,16 @@
-"""The dual of torn bodies over ranks: who holds what, and what is exchanged.
+"""The dual of decomposed bodies, distributed over ranks of MPI.
 
-A rank holds subdomains and, of every vector of multipliers, the rows that it *owns*. A
-row of B that touches subdomains of several ranks is owned by one of them, in turn; the
-others get its multiplier before they multiply, and send what they add to it:
+A rank holds some subdomains and, of every vector of multipliers, the rows that it
+*owns*. A row of B that touches subdomains of several ranks is owned by one of them,
+round-robin, and is a *ghost* row of the others. These receive its multiplier before
+they multiply, and send back their contributions:
 
     F λ = Σ_ranks B_p K_p⁺ B_pᵀ λ
 
-No rank makes anything of the size of the whole: it has the columns of B, and the rows
-of all vectors, that its subdomains touch. Subdomains go to ranks so that these do
-alike much work and share few rows, by graph partitioning (METIS). Of a kind that
-several ranks have, one forms the explicit blocks, and sends them to the others.
+No rank stores an array of global size, only the columns of B and the rows of vectors
+that its subdomains touch. Graph partitioning (METIS) distributes the subdomains such
+that the work is balanced and few rows are shared. The explicit blocks of a class that
+occurs on several ranks are formed on one of them and sent to the others.
 """
 
 from __future__ import annotations
@@ -38,57 +39,58 @@ from mortarbench.harness.distributed.vectors import (
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.operators import (
-    ROUNDING,
-    SHIFT,
+    CONTACT_SHIFT,
+    COUPLING_ROUNDING,
     DualOperator,
     Group,
+    decouple_contact,
     gram_inverse,
     scaled_columns,
-    touched,
-    uncoupled,
+    touched_components,
 )
-from mortarbench.problems.feti.torn import Condensed, Dense, Subdomains
+from mortarbench.problems.feti.subdomain_classes import Condensed, Dense, Subdomains
 
-#: of what a kind of subdomains takes, what comes after the factor of its stiffness
-AFTER_FACTOR = 0.25
-
-
-class Parts(NamedTuple):
-    """What every rank knows of all."""
-
-    rank: NDArray[np.int64]  #: (S,) of each subdomain
-    reach: csr_array  #: (m, ranks) whether a row touches subdomains of a rank
-    owner: NDArray[np.int64]  #: (m,) rank of each row
+#: share of the work on a class that follows the factorisation of its stiffness matrix;
+#: an estimate that only balances the ranks
+BLOCK_SHARE = 0.25
 
 
-def partition(B: csr_array, domains: Subdomains, ranks: int) -> Parts:
-    """Give subdomains, and rows of B (m, N), to ranks.
+class Partition(NamedTuple):
+    """Partition data replicated on every rank."""
+
+    rank: NDArray[np.int64]  #: (S,) rank of each subdomain
+    reach: csr_array  #: (m, ranks) nonzero where a row touches subdomains of a rank
+    owner: NDArray[np.int64]  #: (m,) rank that owns each row
+
+
+def partition(B: csr_array, domains: Subdomains, ranks: int) -> Partition:
+    """Distribute the subdomains and the rows of B (m, N) over ranks.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks.
+        If there are fewer subdomains than ranks.
 
     """
-    S = domains.kind.size
+    S = domains.class_of.size
     rows = np.repeat(np.arange(B.shape[0]), np.diff(B.indptr))
-    sub = np.searchsorted(domains.start, B.indices, side="right") - 1
+    subdomain = np.searchsorted(domains.start, B.indices, side="right") - 1
     ones = np.ones(rows.size, dtype=np.int32)
-    touches = csr_array((ones, (rows, sub)), shape=(B.shape[0], S))
+    touches = csr_array((ones, (rows, subdomain)), shape=(B.shape[0], S))
     touches.data[:] = 1
     work, size = _work(B, domains), np.diff(domains.start)
-    rank = balanced(csr_array(touches.T @ touches), work, size, ranks)
+    rank = balanced_partition(csr_array(touches.T @ touches), work, size, ranks)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
     reach.data[:] = 1
-    return Parts(rank, reach, owners(np.arange(B.shape[0]), reach))
+    return Partition(rank, reach, assign_owners(np.arange(B.shape[0]), reach))
 
 
-def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
-    """Choose one of the ranks that touch each of some rows (t,), in turn.
+def assign_owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
+    """Return an owner for each of some rows (t,), round-robin among those it touches.
 
-    rows : their numbers
+    rows : global numbers of the rows
     reach : (t, ranks) the ranks that touch them, ascending
     """
     turn = rows % np.diff(reach.indptr)
@@ -96,26 +98,34 @@ def owners(rows: Nodes, reach: csr_array) -> NDArray[np.int64]:
 
 
 def _work(B: csr_array, domains: Subdomains) -> NDArray[np.int64]:
-    """Count what a product does in each subdomain: its dense block."""
-    sizes = np.array([part.size for part in touched(B, domains)])
-    return (sizes**2)[domains.kind]
+    """Return the work of a product in each subdomain (S,): its dense block."""
+    sizes = np.array([part.size for part in touched_components(B, domains)])
+    return (sizes**2)[domains.class_of]
 
 
-EVEN = 1.1  #: largest/mean of what ranks do, or hold, that is good enough
-SEEDS = 12  #: of METIS, that are tried
-SHARES = (0.25, 0.5, 1.0)  #: of size in the weight, beside work
+MAX_IMBALANCE = 1.1  #: acceptable ratio of largest to mean work, or size, of the ranks
+METIS_SEEDS = 12  #: number of seeds to try
+SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
 
 
-def balanced(
+def balanced_partition(
     graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int
 ) -> NDArray[np.int64]:
-    """Partition the graph of subdomains that share rows, by work and size (S,).
+    """Partition subdomains over ranks, balancing both work and size (S,).
 
-    METIS balances one weight: first the work. Where ranks hold uneven parts then, as
-    where few subdomains have most of the work, it weighs both in several ways, and of
-    what leaves the work even the partition with the most even sizes is taken.
+    METIS balances a single weight, and the first one is the work. If the sizes are then
+    out of balance, as on graded half discs, where few subdomains have most of the work,
+    several combinations of both weights are tried. Among those that keep the work
+    balanced, the one with the best balance of sizes is returned.
 
-    graph : (S, S) how many rows they share
+    Parameters
+    ----------
+    graph : (S, S) number of rows shared by two subdomains
+
+    Returns
+    -------
+    rank of each subdomain, (S,)
+
     """
     if work.size < ranks:
         raise InputError(
@@ -134,12 +144,12 @@ def balanced(
 
     rank = _partitioned(graph, work // max(int(work.min()), 1), ranks)
     best = uneven(size, rank)
-    for seed, share in product(range(SEEDS), SHARES):
-        if best <= EVEN:
+    for seed, share in product(range(METIS_SEEDS), SIZE_WEIGHTS):
+        if best <= MAX_IMBALANCE:
             break
         weight = work / work.mean() + share * size / size.mean()
         other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
-        if uneven(work, other) <= EVEN and uneven(size, other) < best:
+        if uneven(work, other) <= MAX_IMBALANCE and uneven(size, other) < best:
             rank, best = other, uneven(size, other)
     return rank
 
@@ -147,16 +157,17 @@ def balanced(
 def _partitioned(
     graph: csr_array, weight: NDArray[np.int64], ranks: int, seed: int | None = None
 ) -> NDArray[np.int64]:
-    """Partition a graph by weights (S,), by METIS."""
-    from pymetis import CSRAdjacency, Options, part_graph  # late: one rank needs none
+    """Partition a graph with weights (S,) of its vertices by METIS."""
+    from pymetis import CSRAdjacency, Options, part_graph  # not needed on one rank
 
-    _, found = part_graph(
+    _, labels = part_graph(
         ranks, CSRAdjacency(graph.indptr, graph.indices), eweights=graph.data,
         vweights=weight, recursive=True,
         options=Options() if seed is None else Options(seed=seed),
     )  # fmt: skip
-    rank = np.array(found, dtype=np.int64)
-    for idle in np.setdiff1d(np.arange(ranks), rank):  # few subdomains: each gets one
+    rank = np.array(labels, dtype=np.int64)
+    # with few subdomains METIS may leave a rank empty
+    for idle in np.setdiff1d(np.arange(ranks), rank):
         largest = np.bincount(rank, minlength=ranks).argmax()
         rank[np.flatnonzero(rank == largest)[-1]] = idle
     return rank
@@ -164,141 +175,151 @@ def _partitioned(
 
 @dataclass(frozen=True, eq=False)
 class Halo:
-    """Rows that a rank touches, those it owns among them, and its neighbours' others.
+    """Rows of B that a rank touches: owned rows and ghosts, which neighbours own.
 
-    Multipliers of rows of a neighbour come in the order of the rows, and what is added
-    to them goes back in it.
+    Messages hold the values of the rows of one neighbour in the order of the rows, in
+    both directions.
     """
 
     ranks: Ranks
-    rows: Nodes  #: (t,) all that its subdomains touch or that it owns, ascending
-    own: Nodes  #: (o,) places of the owned ones in `rows`
-    #: (l,) places in the owned ones of what others need, neighbour by neighbour
-    lent: Nodes
-    #: (t − o,) places in `rows` of what others own, neighbour by neighbour
-    borrowed: Nodes
-    lends: NDArray[np.int64]  #: (ranks,) how many go to each, l in all
-    borrows: NDArray[np.int64]  #: (ranks,) how many come from each
+    rows: Nodes  #: (t,) all rows that its subdomains touch or that it owns, ascending
+    owned: Nodes  #: (o,) places of the owned rows in `rows`
+    #: (l,) places among the owned rows of those that are ghosts elsewhere, by rank
+    exported: Nodes
+    #: (t − o,) places in `rows` of the ghosts, ordered by their owners
+    ghosts: Nodes
+    export_counts: NDArray[np.int64]  #: (ranks,) values sent to each rank, l in all
+    ghost_counts: NDArray[np.int64]  #: (ranks,) values received from each rank
 
     @property
     def is_shared(self) -> NDArray[np.bool_]:
-        """Which of its rows other ranks touch, too."""
+        """Mask (t,) of the rows that other ranks touch as well."""
         shared = np.zeros(self.rows.size, dtype=bool)
-        shared[self.borrowed] = shared[self.own[self.lent]] = True
+        shared[self.ghosts] = shared[self.owned[self.exported]] = True
         return shared
 
-    def borrowing(self, x: Vector) -> Callable[[], Vector]:
-        """Send of the owned rows (o,) what others need; returns theirs (t − o,)."""
+    def start_gather(self, x: Vector) -> Callable[[], Vector]:
+        """Send owned values (o,); return a function that waits for ghosts (t − o,)."""
         with self.ranks.clocked("exchange"):
-            return self.ranks.exchange(x[self.lent], self.lends, self.borrows)
+            return self.ranks.exchange(
+                x[self.exported], self.export_counts, self.ghost_counts
+            )
 
-    def returning(self, y: Vector) -> Callable[[Vector], Vector]:
-        """Send what this rank has for rows of others (t − o,).
+    def start_accumulate(self, y: Vector) -> Callable[[Vector], Vector]:
+        """Send contributions to ghost rows (t − o,) to their owners.
 
-        Returns what adds that of the others to what it has for its own rows (o,).
+        Returns
+        -------
+        function that waits for the contributions of other ranks and adds them to the
+        values of the owned rows (o,), in place
+
         """
         with self.ranks.clocked("exchange"):
-            arrived = self.ranks.exchange(y, self.borrows, self.lends)
+            arrived = self.ranks.exchange(y, self.ghost_counts, self.export_counts)
 
         def added(own: Vector) -> Vector:
             with self.ranks.clocked("exchange"):
-                np.add.at(own, self.lent, arrived())
+                np.add.at(own, self.exported, arrived())
             return own
 
         return added
 
-    def gathered(self, x: Vector) -> Vector:
-        """Complete the owned rows (o,) to all that are touched (t,)."""
-        arrived, found = self.borrowing(x), np.empty(self.rows.size)
-        found[self.own] = x
-        found[self.borrowed] = arrived()
-        return found
+    def gather(self, x: Vector) -> Vector:
+        """Return the values of all touched rows (t,) from those of owned rows (o,)."""
+        arrived, values = self.start_gather(x), np.empty(self.rows.size)
+        values[self.owned] = x
+        values[self.ghosts] = arrived()
+        return values
 
-    def added(self, y: Vector) -> Vector:
-        """Add up what all ranks have for the rows that this one owns (o,)."""
-        return self.returning(y[self.borrowed])(y[self.own])
+    def accumulate(self, y: Vector) -> Vector:
+        """Sum the contributions (t,) of all ranks; return the owned rows (o,)."""
+        return self.start_accumulate(y[self.ghosts])(y[self.owned])
 
 
-def halo(ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]) -> Halo:
-    """Find what this rank exchanges with the others.
+def build_halo(
+    ranks: Ranks, rows: Nodes, reach: csr_array, owner: NDArray[np.int64]
+) -> Halo:
+    """Return the owned and ghost rows of this rank, and its neighbours.
 
     Parameters
     ----------
-    rows : (t,) all that its subdomains touch, ascending
-    reach : (t, ranks) which ranks touch them
-    owner : (t,) rank of each
+    rows : (t,) all rows that its subdomains touch, ascending
+    reach : (t, ranks) nonzero where a rank touches a row
+    owner : (t,) rank that owns each row
 
     """
     me, touched_by = ranks.rank, reach.tocsc()
-    own = np.flatnonzero(owner == me)
-    lent, borrowed = [], []
+    owned = np.flatnonzero(owner == me)
+    exported, ghosts = [], []
     for r in range(ranks.size):
         theirs = touched_by.indices[touched_by.indptr[r] : touched_by.indptr[r + 1]]
         needed = np.sort(theirs[(owner[theirs] == me) & (r != me)])
-        lent.append(np.searchsorted(own, needed))
-        borrowed.append(np.flatnonzero((owner == r) & (r != me)))
+        exported.append(np.searchsorted(owned, needed))
+        ghosts.append(np.flatnonzero((owner == r) & (r != me)))
     return Halo(
-        ranks=ranks, rows=rows, own=own,
-        lent=np.concatenate(lent), borrowed=np.concatenate(borrowed),
-        lends=np.array([*map(len, lent)]), borrows=np.array([*map(len, borrowed)]),
+        ranks=ranks, rows=rows, owned=owned,
+        exported=np.concatenate(exported), ghosts=np.concatenate(ghosts),
+        export_counts=np.array([*map(len, exported)]),
+        ghost_counts=np.array([*map(len, ghosts)]),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class RowsOverRanks:
-    """Rows B of multipliers on what a rank has of them, in products Bᵀx and By.
+    """Local rows of B in products Bᵀx and By with distributed vectors.
 
-    What neighbours exchange is sent first, and waited for when own rows are done.
+    Messages are posted first and completed after the products with owned rows, so that
+    communication and computation overlap.
     """
 
-    at: Halo
-    own: CompressedRows  #: (o, M) of owned rows
+    halo: Halo
+    owned: CompressedRows  #: (o, M) owned rows
     transposed: CompressedRows  #: (M, o)
-    borrowed: CompressedRows  #: (t − o, M) of the neighbours' rows
-    #: (k, t − o) rows of its transpose, without zero ones
-    borrowed_transposed: CompressedRows
-    reached: Nodes  #: (k,) which ones they are
+    ghosts: CompressedRows  #: (t − o, M) ghost rows
+    #: (k, t − o) nonzero rows of their transpose
+    ghosts_transposed: CompressedRows
+    reached: Nodes  #: (k,) places of these rows
 
     @classmethod
     def of(cls, B: csr_array, at: Halo) -> RowsOverRanks:
-        """Split B (t, M) of all rows that a rank touches."""
-        own, borrowed = csr_array(B[at.own]), csr_array(B[at.borrowed])
-        reached = np.unique(borrowed.indices)
+        """Split B (t, M), all rows that a rank touches, into owned and ghost rows."""
+        owned, ghosts = csr_array(B[at.owned]), csr_array(B[at.ghosts])
+        columns = np.unique(ghosts.indices)
         return cls(
-            at, CompressedRows(own), CompressedRows(csr_array(own.T)),
-            CompressedRows(borrowed),
-            CompressedRows(csr_array(borrowed[:, reached].T)), reached,
+            at, CompressedRows(owned), CompressedRows(csr_array(owned.T)),
+            CompressedRows(ghosts),
+            CompressedRows(csr_array(ghosts[:, columns].T)), columns,
         )  # fmt: skip
 
     def transposed_times(self, x: Vector) -> Vector:
-        """Return Bᵀx (M,) of this rank's slice x (o,)."""
-        arrived = self.at.borrowing(x)
-        with self.at.ranks.clocked("products"):
+        """Return Bᵀx (M,) on this rank, from its slice x (o,)."""
+        arrived = self.halo.start_gather(x)
+        with self.halo.ranks.clocked("products"):
             X = self.transposed @ x
-            X[self.reached] += self.borrowed_transposed @ arrived()
+            X[self.reached] += self.ghosts_transposed @ arrived()
         return X
 
     def times(self, X: Vector) -> Vector:
-        """Return this rank's slice (o,) of Σ_ranks B X, with X (M,) of each."""
-        with self.at.ranks.clocked("products"):
-            added = self.at.returning(self.borrowed @ X)
-            return added(self.own @ X)
+        """Return the owned slice (o,) of Σ_ranks B X, with X (M,) on each rank."""
+        with self.halo.ranks.clocked("products"):
+            added = self.halo.start_accumulate(self.ghosts @ X)
+            return added(self.owned @ X)
 
 
 @dataclass(frozen=True, eq=False)
 class RankOperator:
-    """F over ranks: takes and gives this rank's slice of vectors of multipliers."""
+    """F over ranks; acts on the owned slices of vectors of multipliers."""
 
-    local: DualOperator  #: rows that this rank touches, its own subdomains
+    local: DualOperator  #: all touched rows and the local subdomains
     halo: Halo
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows that this rank owns, twice."""
-        return (self.halo.own.size,) * 2
+        """Shape of the owned slice, (o, o)."""
+        return (self.halo.owned.size,) * 2
 
     def __call__(self, x: Dense) -> DistributedVector:
-        """Multiply with F."""
+        """Return Fx."""
         y = self._congruence(self._rows, self.local.inverses, np.asarray(x))
         return distributed(y, self.halo.ranks)
 
@@ -306,8 +327,8 @@ class RankOperator:
         return self(x)
 
     def diagonal(self) -> DistributedVector:
-        """Give the diagonal of F."""
-        return distributed(self.halo.added(self.local.diagonal()), self.halo.ranks)
+        """Return the diagonal of F."""
+        return distributed(self.halo.accumulate(self.local.diagonal()), self.halo.ranks)
 
     @cached_property
     def _rows(self) -> RowsOverRanks:
@@ -318,22 +339,22 @@ class RankOperator:
     ) -> Vector:
         X = rows.transposed_times(x)
         with self.halo.ranks.clocked("products"):
-            Y = self.local.packed.multiplied(blocks, X)
+            Y = self.local.packed.block_products(blocks, X)
         return rows.times(Y)
 
     def onto_rows(self) -> Product:
-        """Make the orthogonal projector onto the range of B:  x ↦ BBᵀ(BBᵀ)⁺x."""
-        of = self.local.packed
-        solve = self._gram_inverse(csr_array(of.B @ of.BT))
+        """Return the orthogonal projector onto the range of B,  x ↦ BBᵀ(BBᵀ)⁺x."""
+        packed = self.local.packed
+        solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Make x ↦ B_D diag(D) B_Dᵀx, as `DualOperator.preconditioner`."""
-        of, ranks = self.local.packed, self.halo.ranks
+        """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
+        packed, ranks = self.local.packed, self.halo.ranks
         blocks, weights = self.local.weighted_blocks(kind, scaling)
-        BW = scaled_columns(of.B, weights)
+        BW = scaled_columns(packed.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
-        solve = self._gram_inverse(csr_array(BW @ of.BT))
+        solve = self._gram_inverse(csr_array(BW @ packed.BT))
 
         def product(x: Dense) -> Dense:
             y = self._congruence(rows, blocks, solve(np.asarray(x)))
@@ -342,25 +363,28 @@ class RankOperator:
         return product
 
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
-        """Make x ↦ (B W Bᵀ)⁻¹x of the sum of all ranks' parts, on owned rows.
+        """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, for the sum of the parts of all ranks.
 
-        Most equations are coupled with no other row, all of them if gluing is
-        orthonormal; all ranks alike solve for those that are. Contact rows are coupled
-        along the contact. They are solved for rank by rank, unless ranks share many.
+        Most equality rows are uncoupled (all of them if gluing is orthonormal) and take
+        a division. The coupled ones are solved for redundantly on all ranks. Contact
+        rows are coupled along the contact: their system is factorised in distributed
+        form, or redundantly if ranks share many of them.
+
+        part : (t, t) contribution of the local subdomains to B W Bᵀ
         """
-        at, equalities = self.halo, self.local.equalities
-        diagonal = at.added(part.diagonal())
-        is_contact = at.rows >= equalities
-        coupled = np.isin(at.rows, _coupled(part, at, diagonal, ~is_contact))
-        contact = touched_rows(at.rows[is_contact], at.ranks)
+        halo, equalities = self.halo, self.local.equalities
+        diagonal = halo.accumulate(part.diagonal())
+        is_contact = halo.rows >= equalities
+        coupled = np.isin(halo.rows, _coupled(part, halo, diagonal, ~is_contact))
+        contact = touched_rows(halo.rows[is_contact], halo.ranks)
         solves = []
         if contact.few_shared:
-            of_contact = csc_array(part[is_contact][:, is_contact])
-            solves.append(_rank_by_rank(of_contact, contact, at, diagonal))
+            gram_contact = csc_array(part[is_contact][:, is_contact])
+            solves.append(_distributed_inverse(gram_contact, contact, halo, diagonal))
         else:
             coupled |= is_contact
-        if at.ranks.extreme(float(coupled.any()), np.max):
-            solves.append(_alike(part, coupled, at, equalities))
+        if halo.ranks.extreme(float(coupled.any()), np.max):
+            solves.append(_replicated_inverse(part, coupled, halo, equalities))
 
         def solve(x: Dense) -> Dense:
             x = np.asarray(x)
@@ -373,254 +397,293 @@ class RankOperator:
 
 
 def _coupled(
-    part: csr_array, at: Halo, diagonal: Vector, some: NDArray[np.bool_]
+    part: csr_array, halo: Halo, diagonal: Vector, selected: NDArray[np.bool_]
 ) -> Nodes:
-    """Find which of some rows (t,) the sum of all parts couples beyond rounding."""
+    """Return the selected rows that the sum of all parts couples beyond rounding."""
     row, column = part.tocoo().coords
-    beside = np.flatnonzero((row != column) & some[row] & some[column])
+    beside = np.flatnonzero((row != column) & selected[row] & selected[column])
     row, column = row[beside], column[beside]
-    size = np.sqrt(at.gathered(diagonal))
+    size = np.sqrt(halo.gather(diagonal))
     share = part.data[beside] / (size[row] * size[column])
-    between = at.is_shared[row] & at.is_shared[column]
-    found = at.rows[row[~between & (np.abs(share) > ROUNDING)]]
+    between = halo.is_shared[row] & halo.is_shared[column]
+    inside = halo.rows[row[~between & (np.abs(share) > COUPLING_ROUNDING)]]
+    # entries between shared rows are complete only once summed over ranks
     between &= share != 0
-    told = [v[between] for v in (at.rows[row], at.rows[column], share)]
+    message = [v[between] for v in (halo.rows[row], halo.rows[column], share)]
     rows, columns, shares = map(
-        np.concatenate, zip(*at.ranks.comm.allgather(told), strict=True)
+        np.concatenate, zip(*halo.ranks.comm.allgather(message), strict=True)
     )
     pairs, place = np.unique(np.stack([rows, columns]), axis=1, return_inverse=True)
     total = np.abs(np.bincount(place.ravel(), shares, pairs.shape[1]))
-    return np.concatenate([found, pairs[0, total > ROUNDING]])
+    return np.concatenate([inside, pairs[0, total > COUPLING_ROUNDING]])
 
 
-def _rank_by_rank(
-    part: csc_array, rows: Touched, at: Halo, diagonal: Vector
+def _distributed_inverse(
+    part: csc_array, rows: Touched, halo: Halo, diagonal: Vector
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Invert the sum of the ranks' parts (k, k) of B W Bᵀ on some rows.
+    """Factorise the sum over ranks of parts (k, k) of B W Bᵀ, in distributed form.
 
-    Returns the places of these among the owned rows (o,), whose sum has this diagonal,
-    and the inverse for what is there.
+    Parameters
+    ----------
+    part, rows : contribution of this rank, and its rows
+    diagonal : (o,) of the sum, at owned rows
+
+    Returns
+    -------
+    places of these rows among the owned ones, and the inverse there
+
     """
-    size = 1 / np.sqrt(at.gathered(diagonal)[np.searchsorted(at.rows, rows.rows)])
+    size = 1 / np.sqrt(halo.gather(diagonal)[np.searchsorted(halo.rows, rows.rows)])
     unit = csc_array(diags_array(size) @ part @ diags_array(size))
-    unit += csc_array(diags_array(SHIFT * unit.diagonal()))
+    unit += csc_array(diags_array(CONTACT_SHIFT * unit.diagonal()))
     factor = local_factor(unit, rows).completed()
-    _, mine, owned = np.intersect1d(rows.rows, at.rows[at.own], return_indices=True)
+    _, places, owned = np.intersect1d(
+        rows.rows, halo.rows[halo.owned], return_indices=True
+    )
 
     def inverse(x: Dense) -> Dense:
         t = np.zeros(rows.rows.size)
-        t[mine] = size[mine] * x
-        return np.asarray(factor(t))[mine] * size[mine]
+        t[places] = size[places] * x
+        return np.asarray(factor(t))[places] * size[places]
 
     return owned, inverse
 
 
-def _alike(
-    part: csr_array, some: NDArray[np.bool_], at: Halo, equalities: int
+def _replicated_inverse(
+    part: csr_array, selected: NDArray[np.bool_], halo: Halo, equalities: int
 ) -> tuple[Nodes, Callable[[Dense], Dense]]:
-    """Do as `_rank_by_rank`, the same on all ranks.
+    """Invert the sum over ranks of B W Bᵀ on selected rows, redundantly on all ranks.
 
-    some : (t,) which of the touched rows
+    selected : (t,) mask of the touched rows
+
+    Returns
+    -------
+    places of these rows among the owned ones, and the inverse there
+
     """
-    ranks, entries = at.ranks, part.tocoo()
-    known = np.unique(np.concatenate(ranks.comm.allgather(at.rows[some])))
-    told = at.rows[entries.row], at.rows[entries.col], entries.data
-    of_known = np.isin(told[0], known) & np.isin(told[1], known)
+    ranks, entries = halo.ranks, part.tocoo()
+    all_rows = np.unique(np.concatenate(ranks.comm.allgather(halo.rows[selected])))
+    message = halo.rows[entries.row], halo.rows[entries.col], entries.data
+    of_known = np.isin(message[0], all_rows) & np.isin(message[1], all_rows)
     row, column, data = map(
         np.concatenate,
-        zip(*ranks.comm.allgather([t[of_known] for t in told]), strict=True),
+        zip(*ranks.comm.allgather([t[of_known] for t in message]), strict=True),
     )
-    places = np.searchsorted(known, row), np.searchsorted(known, column)
-    gram = csr_array((data, places), shape=(known.size,) * 2)
-    first = int(np.searchsorted(known, equalities))
-    solve = gram_inverse(uncoupled(gram, first), first)
-    _, place, owned = np.intersect1d(known, at.rows[at.own], return_indices=True)
+    places = np.searchsorted(all_rows, row), np.searchsorted(all_rows, column)
+    gram = csr_array((data, places), shape=(all_rows.size,) * 2)
+    first = int(np.searchsorted(all_rows, equalities))
+    solve = gram_inverse(decouple_contact(gram, first), first)
+    _, place, owned = np.intersect1d(
+        all_rows, halo.rows[halo.owned], return_indices=True
+    )
 
     def inverse(x: Dense) -> Dense:
-        whole = np.zeros(known.size)
+        whole = np.zeros(all_rows.size)
         whole[place] = x
         return np.asarray(solve(ranks.total(whole))[place])
 
     return owned, inverse
 
 
-class Forming(NamedTuple):
-    """Who forms the blocks of one kind."""
+class Assignment(NamedTuple):
+    """Ranks that factorise and condense a class of congruent subdomains."""
 
-    work: int  #: in some unit
-    have: list[int]  #: ranks that have the kind
-    factor: int  #: rank that factorises its stiffness
-    blocks: int  #: rank that forms the blocks with that factor, and sends them
+    work: int  #: in any unit, the same for all classes
+    ranks: list[int]  #: those with subdomains of the class
+    factor_rank: int  #: factorises the stiffness matrix
+    block_rank: int  #: forms the blocks with that factor and sends them to the others
 
 
-def forming(work: Sequence[Mapping[str, int]]) -> dict[str, Forming]:
-    """Share out what forms the blocks of each kind, once.
+def assign_factorisations(work: Sequence[Mapping[str, int]]) -> dict[str, Assignment]:
+    """Assign the factorisation and the blocks of each class to one rank each.
 
-    Largest first, each goes to the rank that has the least to do so far (Graham 1969).
-    Ranks that have more than others then give away what comes after the factor.
+    In order of decreasing work, each class goes to the rank with the smallest load so
+    far (longest processing time first, Graham 1969). Then ranks with higher loads hand
+    the formation of blocks, which follows the factorisation, to others.
 
-    work : of each rank, what each of its kinds takes, by its name
+    work : for each rank, the work on its classes by name
     """
     have: dict[str, list[int]] = {}
     for rank, one in enumerate(work):
         for name in one:
             have.setdefault(name, []).append(rank)
     size = {name: work[ranks[0]][name] for name, ranks in have.items()}
-    loads, found = [0.0] * len(work), dict[str, Forming]()
+    loads, tasks = [0.0] * len(work), dict[str, Assignment]()
     for name in sorted(have, key=lambda name: (-size[name], name)):
         rank = min(have[name], key=loads.__getitem__)
         loads[rank] += size[name]
-        found[name] = Forming(size[name], have[name], rank, rank)
-    for name, task in found.items():
-        rank, part = min(task.have, key=loads.__getitem__), AFTER_FACTOR * task.work
-        if loads[rank] + 2 * part <= loads[task.factor]:
+        tasks[name] = Assignment(size[name], have[name], rank, rank)
+    for name, task in tasks.items():
+        rank, part = min(task.ranks, key=loads.__getitem__), BLOCK_SHARE * task.work
+        # after the move both loads are at most the larger one before, less `part`
+        if loads[rank] + 2 * part <= loads[task.factor_rank]:
             loads[rank] += part
-            loads[task.factor] -= part
-            found[name] = task._replace(blocks=rank)
-    return found
+            loads[task.factor_rank] -= part
+            tasks[name] = task._replace(block_rank=rank)
+    return tasks
 
 
-def meanwhile(tasks: Mapping[str, Forming], rank: int) -> int:
-    """Count the blocks that a rank forms until factors are given away.
+def blocks_before_exchange(tasks: Mapping[str, Assignment], rank: int) -> int:
+    """Return how many blocks a rank forms before factors are exchanged.
 
-    Of those that it forms with factors of its own; all of them if none are given away.
+    These are blocks with factors of its own, formed while slower ranks still factorise.
+    All of them come first if no factors are exchanged.
     """
     factors: dict[int, float] = {}
     for task in tasks.values():
-        if len(task.have) > 1:
-            made = (1 - AFTER_FACTOR) * task.work
-            factors[task.factor] = factors.get(task.factor, 0.0) + made
-    giving = [factors[t.factor] for t in tasks.values() if t.factor != t.blocks]
-    left = max(giving, default=np.inf) - factors.get(rank, 0.0)
-    own = [t for t in tasks.values() if t.factor == t.blocks == rank]
-    takes = [t.work * (AFTER_FACTOR if len(t.have) > 1 else 1.0) for t in own]
-    return int(np.count_nonzero(np.cumsum(takes) - np.array(takes) / 2 < left))
+        if len(task.ranks) > 1:
+            factorisation = (1 - BLOCK_SHARE) * task.work
+            factors[task.factor_rank] = (
+                factors.get(task.factor_rank, 0.0) + factorisation
+            )
+    factors_given = [
+        factors[t.factor_rank] for t in tasks.values() if t.factor_rank != t.block_rank
+    ]
+    time = max(factors_given, default=np.inf) - factors.get(rank, 0.0)
+    blocks = [t for t in tasks.values() if t.factor_rank == t.block_rank == rank]
+    durations = [t.work * (BLOCK_SHARE if len(t.ranks) > 1 else 1.0) for t in blocks]
+    return int(np.count_nonzero(np.cumsum(durations) - np.array(durations) / 2 < time))
 
 
-def condensed_by_ranks(
+def condense_over_ranks(
     groups: Sequence[Group], ranks: Ranks
 ) -> Iterator[tuple[int, Condensed]]:
-    """Form the blocks of equal groups on one of the ranks that have them.
+    """Yield the blocks of all groups; equal groups are condensed on one rank only.
 
-    Factors that are given away are sent when those who give them have made all that
-    several ranks need. Who has made its own before has formed some blocks meanwhile.
-    What one rank alone has is formed whole in its turn, and not kept.
+    First each rank computes the factors assigned to it of classes that several ranks
+    have, then forms some blocks while slower ranks factorise. Then factors are
+    exchanged, remaining blocks formed, and blocks exchanged. Blocks of a class on this
+    rank alone are yielded as soon as they are formed, and not stored.
     """
     me, names = ranks.rank, [_name(group) for group in groups]
-    ours = dict(zip(names, groups, strict=True))
-    border = {name: g.kind.border(g.touched).size for name, g in ours.items()}
-    work = {name: ours[name].kind.K.nnz * h for name, h in border.items()}
-    tasks = forming(ranks.comm.allgather(work))
-    given = [n for n, t in tasks.items() if t.factor == me != t.blocks]
-    taken = [n for n, t in tasks.items() if t.factor != me == t.blocks]
-    kept = [n for n, t in tasks.items() if t.factor == me == t.blocks]
-    alone = {n for n in kept if len(tasks[n].have) == 1}
-    place = {name: i for i, name in enumerate(names)}
+    groups_by_name = dict(zip(names, groups, strict=True))
+    border = {
+        name: g.template.border(g.touched).size for name, g in groups_by_name.items()
+    }
+    work = {name: groups_by_name[name].template.K.nnz * h for name, h in border.items()}
+    tasks = assign_factorisations(ranks.comm.allgather(work))
+    sent = [n for n, t in tasks.items() if t.factor_rank == me != t.block_rank]
+    received = [n for n, t in tasks.items() if t.factor_rank != me == t.block_rank]
+    local = [n for n, t in tasks.items() if t.factor_rank == me == t.block_rank]
+    exclusive = {n for n in local if len(tasks[n].ranks) == 1}
+    position = {name: i for i, name in enumerate(names)}
     factors = {
-        n: ours[n].kind.border_factor(ours[n].touched)
-        for n in given + kept if n not in alone
+        n: groups_by_name[n].template.border_factor(groups_by_name[n].touched)
+        for n in sent + local if n not in exclusive
     }  # fmt: skip
-    found = dict[str, Dense]()  # (2, b, b) of what several ranks have
+    blocks = dict[str, Dense]()  # (2, b, b) of classes on several ranks
 
     def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
         for n in some:
-            kind, touched = ours[n].kind, ours[n].touched
-            if n in alone:
-                yield place[n], kind.condensed(touched)
+            kind, touched = groups_by_name[n].template, groups_by_name[n].touched
+            if n in exclusive:
+                yield position[n], kind.condense(touched)
             else:
-                found[n] = np.stack(kind.blocks(touched, factors.pop(n)))
+                blocks[n] = np.stack(kind.blocks(touched, factors.pop(n)))
 
-    before = meanwhile(tasks, me)
-    yield from formed(kept[:before])
-    came = _exchanged(
+    before = blocks_before_exchange(tasks, me)
+    yield from formed(local[:before])
+    arrays = _exchange_blocks(
         ranks,
-        [(tasks[n].blocks, np.ascontiguousarray(factors.pop(n).T)) for n in given],
-        [(tasks[n].factor, (border[n], border[n])) for n in taken],
+        [(tasks[n].block_rank, np.ascontiguousarray(factors.pop(n).T)) for n in sent],
+        [(tasks[n].factor_rank, (border[n], border[n])) for n in received],
     )
-    factors |= {n: L.T for n, L in zip(taken, came, strict=True)}
-    yield from formed(kept[before:] + taken)
-    others = [n for n, t in tasks.items() if n in ours and t.blocks != me]
-    to = [(r, n) for n in tasks if n in found for r in tasks[n].have if r != me]
-    came = _exchanged(
+    factors |= {n: L.T for n, L in zip(received, arrays, strict=True)}
+    yield from formed(local[before:] + received)
+    foreign = [
+        n for n, t in tasks.items() if n in groups_by_name and t.block_rank != me
+    ]
+    destinations = [
+        (r, n) for n in tasks if n in blocks for r in tasks[n].ranks if r != me
+    ]
+    arrays = _exchange_blocks(
         ranks,
-        [(r, found[n]) for r, n in to],
-        [(tasks[n].blocks, (2, *2 * (ours[n].touched.size,))) for n in others],
+        [(r, blocks[n]) for r, n in destinations],
+        [
+            (tasks[n].block_rank, (2, *2 * (groups_by_name[n].touched.size,)))
+            for n in foreign
+        ],
     )
-    found |= dict(zip(others, came, strict=True))
-    del came
-    yield from ((place[n], Condensed(*found.pop(n))) for n in list(found))
+    blocks |= dict(zip(foreign, arrays, strict=True))
+    del arrays  # so that each full block is released as the caller packs it
+    yield from ((position[n], Condensed(*blocks.pop(n))) for n in list(blocks))
 
 
-def _exchanged(
+def _exchange_blocks(
     ranks: Ranks,
     out: Sequence[tuple[int, Dense]],
     coming: Sequence[tuple[int, tuple[int, ...]]],
 ) -> list[Dense]:
-    """Send arrays to ranks, and take arrays of known shapes from ranks."""
-    found = [np.empty(shape) for _, shape in coming]
-    posted = [
+    """Send arrays to ranks, and receive arrays of given shapes from ranks."""
+    arrays = [np.empty(shape) for _, shape in coming]
+    requests = [
         ranks.comm.Irecv(array, source=rank)
-        for array, (rank, _) in zip(found, coming, strict=True)
+        for array, (rank, _) in zip(arrays, coming, strict=True)
     ]
-    posted += [ranks.comm.Isend(array, dest=rank) for rank, array in out]
+    requests += [ranks.comm.Isend(array, dest=rank) for rank, array in out]
     with ranks.clocked("waiting"):
-        for request in posted:
+        for request in requests:
             request.Wait()
-    return found
+    return arrays
 
 
 def _name(group: Group) -> str:
-    """Name what the blocks of a group depend on."""
-    return f"{group.kind.name} {hex_digest((group.touched.tobytes(),), 32)}"
+    """Return a name for everything that the blocks of a group depend on."""
+    return f"{group.template.name} {hex_digest((group.touched.tobytes(),), 32)}"
 
 
-def shared(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
-    """Take this rank's share of a dual of torn bodies.
+def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
+    """Return the share of this rank in a dual of decomposed bodies.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     B, domains = operator.B, operator.domains
-    parts = partition(B, domains, ranks.size)
-    touched_here = np.flatnonzero(parts.reach[:, [ranks.rank]].toarray())
-    reach = csr_array(parts.reach[touched_here])
-    at = halo(ranks, touched_here, reach, parts.owner[touched_here])
-    mine = np.flatnonzero(parts.rank == ranks.rank)
-    kinds, kind = np.unique(domains.kind[mine], return_inverse=True)
+    partitioned = partition(B, domains, ranks.size)
+    touched = np.flatnonzero(partitioned.reach[:, [ranks.rank]].toarray())
+    reach = csr_array(partitioned.reach[touched])
+    halo = build_halo(ranks, touched, reach, partitioned.owner[touched])
+    subdomains = np.flatnonzero(partitioned.rank == ranks.rank)
+    classes, class_of = np.unique(domains.class_of[subdomains], return_inverse=True)
     columns = np.concatenate(
-        [np.arange(domains.start[s], domains.start[s + 1]) for s in mine]
+        [np.arange(domains.start[s], domains.start[s + 1]) for s in subdomains]
     )
     local = DualOperator(
-        csr_array(B[at.rows][:, columns]),
-        Subdomains(tuple(domains.kinds[k].without_factor(str(k)) for k in kinds), kind),
-        operator.explicit[kinds],
+        csr_array(B[halo.rows][:, columns]),
+        Subdomains(
+            tuple(domains.classes[k].without_factor(str(k)) for k in classes), class_of
+        ),
+        operator.explicit[classes],
         operator.equalities,
-        partial(condensed_by_ranks, ranks=ranks),
+        partial(condense_over_ranks, ranks=ranks),
     )
-    own = at.rows[at.own]
-    q, lb, ub = (distributed(v[own], ranks) for v in (qp.q, qp.lb, qp.ub))
-    part = QP(
-        P=RankOperator(local, at),
-        q=q, lb=lb, ub=ub, G=no_rows(own.size), h=np.zeros(0),
-        A=DistributedColumns(csr_array(qp.A[:, own]), ranks), b=np.array(qp.b),
+    owned = halo.rows[halo.owned]
+    q, lb, ub = (distributed(v[owned], ranks) for v in (qp.q, qp.lb, qp.ub))
+    qp_local = QP(
+        P=RankOperator(local, halo),
+        q=q, lb=lb, ub=ub, G=no_rows(owned.size), h=np.zeros(0),
+        A=DistributedColumns(csr_array(qp.A[:, owned]), ranks), b=np.array(qp.b),
     )  # fmt: skip
 
-    return Share(part, gathered_on_one(at, qp.q.size))
+    return Share(qp_local, gather_on_rank_0(halo, qp.q.size))
 
 
-def gathered_on_one(at: Halo, count: int) -> Callable[[Solution], Solution | None]:
-    """Make what gathers a solution of so many multipliers on rank 0."""
+def gather_on_rank_0(halo: Halo, count: int) -> Callable[[Solution], Solution | None]:
+    """Return a function that gathers a solution of `count` multipliers on rank 0.
+
+    It returns None on all other ranks.
+    """
 
     def whole(s: Solution) -> Solution | None:
-        told = at.rows[at.own], np.asarray(s.x), np.asarray(s.z_box)
-        found = at.ranks.comm.gather(told)
-        if found is None:
+        message = halo.rows[halo.owned], np.asarray(s.x), np.asarray(s.z_box)
+        messages = halo.ranks.comm.gather(message)
+        if messages is None:
             return None
         x, z_box = np.empty(count), np.empty(count)
-        for rows, x_part, z_part in found:
+        for rows, x_part, z_part in messages:
             x[rows], z_box[rows] = x_part, z_part
         return replace(s, x=x, z_box=z_box)
 

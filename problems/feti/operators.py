@@ -1,30 +1,33 @@
 """The dual operator of Total FETI, F = B K⁺Bᵀ, and its preconditioners.
 
-Only components that rows touch matter: with B_b the columns of B there and all of them
-packed group by group, a product is sparse, dense, sparse:
+Only the components b with entries in B matter. With B_b the columns of B there, packed
+group by group, a product consists of a sparse, a dense and a sparse one:
 
     F λ = B_b diag((K⁺)_bb) B_bᵀ λ
 
-A group is subdomains that share a dense block; what they gather are the columns of one
-matrix, so that a group is one product of two dense matrices. Of the block of a single
-subdomain one triangle is kept, since reading it takes the time. Blocks (K⁺)_bb and S_bb
-are formed where they fit (*explicit*; it pays after about ten products); beyond, a
-product solves with the factors of its kind.
+A group is the set of subdomains that share a dense block. Their components form the
+columns of one matrix, so that each group takes one product of two dense matrices. For a
+single subdomain only one triangle of the block is stored, because the product is bound
+by memory bandwidth. The blocks (K⁺)_bb and S_bb are formed (*explicit*) as far as they
+fit into memory, which pays after about ten products; for all other classes a product
+solves with their factors.
 
-Preconditioners approximate F⁻¹ (Farhat and Roux 1991; Rixen and Farhat 1999):
+Preconditioners approximate F⁻¹ (Farhat and Roux 1991, lumped; Farhat, Mandel and Roux
+1994, Dirichlet; Rixen and Farhat 1999, scaling):
 
     B_D diag(D) B_Dᵀ,    B_D = (B W Bᵀ)⁻¹B W
 
 with D = K_bb (lumped) or S_bb (Dirichlet), where S = K_gg − K_gi K_ii⁻¹K_ig is
 condensed onto the whole boundary g of a subdomain, and the weights W = 1 (multiplicity)
-or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular; of the
-equations it is block diagonal, a block for each node, and inverted as Moore and Penrose
-do, so that nothing is added to λ that Bᵀ does not feel.
+or the reciprocal moduli (stiffness). Redundant rows make B W Bᵀ singular. Its part for
+the equality rows is block diagonal, with one block per node, and is inverted in the
+sense of Moore and Penrose, so that λ stays free of components in ker Bᵀ.
 
-Of B W Bᵀ, what couples contact rows with the equations is left out. There is some only
-where contact touches supports; there it would weigh the equations for contact that most
-faces do not have: κ in the final face of beam-ring/Nr=8/Nh=5/steps=1/feti=8 is 58 with
-it, and 3.7 without, as it is if B holds the rows of that face alone.
+Entries of B W Bᵀ that couple contact rows with equality rows are dropped. They exist
+only where contact touches supports. There they would weight the equality rows for
+contact rows that are inactive in most faces: κ in the final face of
+beam-ring/Nr=8/Nh=5/steps=1/feti=8 is 58 with them and 3.7 without, the same value as if
+B contained only the rows of that face.
 """
 
 from __future__ import annotations
@@ -45,47 +48,58 @@ from mortarbench.harness import Vector
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import multiply
-from mortarbench.problems.feti.torn import Condensed, Dense, Kind, Subdomains
+from mortarbench.problems.feti.subdomain_classes import (
+    Condensed,
+    Dense,
+    SubdomainClass,
+    Subdomains,
+)
 
-EXPLICIT_MIB = 2048  #: that all explicit blocks of an operator may take
-COLUMNS = 256  #: of a block that is not formed, multiplied out at a time
-#: of the diagonal of B W Bᵀ, added where contact rows might depend on one another
-SHIFT = 1e-8
-SINGULAR = 1e-10  #: of the largest eigenvalue of a block of B W Bᵀ: taken for zero
-ROUNDING = 1e-12  #: of an entry of B W Bᵀ, relative to its diagonal
+MAX_EXPLICIT_MIB = 2048  #: memory for all explicit blocks of an operator
+STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
+#: multiple of the diagonal of B W Bᵀ that is added to its contact part, which is
+#: singular where contact rows are linearly dependent
+CONTACT_SHIFT = 1e-8
+#: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
+EIGENVALUE_CUTOFF = 1e-10
+#: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding
+COUPLING_ROUNDING = 1e-12
 
 
 class Group(NamedTuple):
-    """The subdomains of one kind, with what rows touch of any of them."""
+    """The subdomains of one class and the components of them that B touches."""
 
-    kind: Kind
-    explicit: bool  #: whether (K⁺)_bb is formed
+    template: SubdomainClass
+    explicit: bool  #: True if (K⁺)_bb is formed
     members: NDArray[np.int64]  #: (S_g,) subdomains
-    touched: Nodes  #: b (n_g,) components within each, ascending
+    touched: Nodes  #: b (n_g,) components within a subdomain, ascending
 
 
-def condensed(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
-    """Form (K⁺)_bb and S_bb of each group, when it is asked for, with its place."""
-    return ((i, g.kind.condensed(g.touched)) for i, g in enumerate(groups))
+def condense_groups(groups: Sequence[Group]) -> Iterable[tuple[int, Condensed]]:
+    """Yield the position of each group with its blocks (K⁺)_bb and S_bb."""
+    return (
+        (i, group.template.condense(group.touched)) for i, group in enumerate(groups)
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Packed:
-    """The touched components of all subdomains, numbered group by group.
+    """Rows B on the components that they touch, numbered group by group.
 
-    Within a group by component, then by subdomain: what a group gathers is (n_g, S_g).
+    Within a group components come before subdomains, so that the packed vector of a
+    group is a matrix (n_g, S_g) stored by rows.
     """
 
     groups: tuple[Group, ...]
-    B: csr_array  #: (m, M) columns of B, packed
-    BT: csr_array  #: (M, m) its transpose by rows
+    B: csr_array  #: (m, M) packed columns of B
+    BT: csr_array  #: (M, m) the transpose, stored by rows
 
     def congruence(self, blocks: Sequence[Any], x: Dense) -> Dense:
-        """Multiply  B_b diag(blocks) B_bᵀ  with x (m,) or (m, k)."""
-        return np.asarray(self.B @ self.multiplied(blocks, self.BT @ x))
+        """Multiply x (m,) or (m, k) by  B_b diag(blocks) B_bᵀ."""
+        return np.asarray(self.B @ self.block_products(blocks, self.BT @ x))
 
-    def multiplied(self, blocks: Sequence[Any], X: Dense) -> Dense:
-        """Multiply each subdomain's part of X (M,) or (M, k) with its group's block."""
+    def block_products(self, blocks: Sequence[Any], X: Dense) -> Dense:
+        """Multiply the part of X (M,) or (M, k) of each group by its block."""
         Y, end = np.empty_like(X), 0
         for block, group in zip(blocks, self.groups, strict=True):
             n = group.touched.size
@@ -100,8 +114,8 @@ class Packed:
     def diagonal(self, blocks: Sequence[Any]) -> Vector:
         """Return the diagonal of  B_b diag(blocks) B_bᵀ.
 
-        Row r has the sum of B_ri M_ij B_rj over pairs of its entries that are in one
-        subdomain, with the block M of that.
+        Entry r is the sum of B_ri M_ij B_rj over all pairs of entries of row r in the
+        same subdomain, where M is the block of that subdomain.
         """
         B, members = self.B, [group.members.size for group in self.groups]
         sizes = [g.touched.size * g.members.size for g in self.groups]
@@ -109,6 +123,7 @@ class Packed:
         within = B.indices - (np.cumsum(sizes) - sizes)[group]
         component, subdomain = np.divmod(within, np.array(members)[group])
 
+        # all pairs of entries in the same row, then those within one subdomain
         entries = np.diff(B.indptr)
         row = np.repeat(np.arange(entries.size), entries)
         left = np.repeat(np.arange(B.nnz), entries[row])
@@ -127,60 +142,67 @@ class Packed:
         return total
 
 
-def packed(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
-    """Pack the columns of B (m, N)."""
+def pack(B: csr_array, domains: Subdomains, explicit: NDArray[np.bool_]) -> Packed:
+    """Pack the nonzero columns of B (m, N) by classes; flags `explicit` (classes,)."""
     groups, number, end = [], np.full(B.shape[1], -1, dtype=np.int64), 0
-    parts = touched(B, domains)
-    for k, (kind, members) in enumerate(
-        zip(domains.kinds, domains.members, strict=True)
+    parts = touched_components(B, domains)
+    for k, (template, members) in enumerate(
+        zip(domains.classes, domains.members, strict=True)
     ):
-        groups.append(Group(kind, bool(explicit[k]), members, parts[k]))
-        places = domains.start[members] + parts[k][:, None]
-        number[places.ravel()] = np.arange(end, end + places.size)
-        end += places.size
+        groups.append(Group(template, bool(explicit[k]), members, parts[k]))
+        unknowns = domains.start[members] + parts[k][:, None]
+        number[unknowns.ravel()] = np.arange(end, end + unknowns.size)
+        end += unknowns.size
     indices = number[B.indices].astype(B.indices.dtype)
     B_b = csr_array((B.data, indices, B.indptr), shape=(B.shape[0], end))
     return Packed(tuple(groups), B_b, csr_array(B_b.T))
 
 
-def touched(B: csr_array, domains: Subdomains) -> list[Nodes]:
-    """List the components that rows touch of any subdomain of each kind, ascending."""
+def touched_components(B: csr_array, domains: Subdomains) -> list[Nodes]:
+    """Return, for each class, the components that B touches in any subdomain of it."""
     columns = np.zeros(B.shape[1], dtype=bool)
     columns[B.indices] = True
-    found = np.flatnonzero(columns)
-    sub = np.searchsorted(domains.start, found, side="right") - 1
+    unknowns = np.flatnonzero(columns)
+    subdomain = np.searchsorted(domains.start, unknowns, side="right") - 1
     largest = int(np.diff(domains.start).max())
-    kind, at = np.divmod(
-        np.unique(domains.kind[sub] * largest + found - domains.start[sub]), largest
+    class_of, component = np.divmod(
+        np.unique(
+            domains.class_of[subdomain] * largest + unknowns - domains.start[subdomain]
+        ),
+        largest,
     )
-    ends = np.cumsum(np.bincount(kind, minlength=len(domains.kinds)))
-    return np.split(at, ends[:-1])
+    ends = np.cumsum(np.bincount(class_of, minlength=len(domains.classes)))
+    return np.split(component, ends[:-1])
 
 
 @dataclass(frozen=True, eq=False)
 class DualOperator:
-    """F of torn bodies; x ↦ Fx takes (m,) and (m, k)."""
+    """The operator F of decomposed bodies; x ↦ Fx takes (m,) and (m, k)."""
 
     B: csr_array  #: (m, N)
     domains: Subdomains
     explicit: NDArray[np.bool_]  #: (kinds,) whose blocks are formed
-    equalities: int  #: rows that are equations, the first ones; the others are contact
-    #: forms (K⁺)_bb and S_bb of explicit groups, in any order, with their places
-    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = condensed
+    equalities: int  #: number of equality rows, which come first; contact rows follow
+    #: yields (K⁺)_bb and S_bb of explicit groups with their positions, in any order
+    condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
+        condense_groups
+    )
 
     def __call__(self, x: Dense) -> Dense:
-        """Multiply with F."""
+        """Return Fx."""
         return self.packed.congruence(self.inverses, x)
 
     def diagonal(self) -> Vector:
-        """Give the diagonal of F."""
+        """Return the diagonal of F, (m,)."""
         return self._diagonal
 
     def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Make x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
+        """Return the function x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
 
-        kind : lumped or dirichlet
-        scaling : multiplicity or stiffness
+        Parameters
+        ----------
+        kind : "lumped" or "dirichlet"
+        scaling : "multiplicity" or "stiffness"
 
         Raises
         ------
@@ -190,21 +212,21 @@ class DualOperator:
         """
         blocks, weights = self.weighted_blocks(kind, scaling)
         BW = scaled_columns(self.packed.B, weights)
-        gram = uncoupled(csr_array(BW @ self.packed.BT), self.equalities)
+        gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
         WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
 
         def product(x: Dense) -> Dense:
-            return solve(BW @ self.packed.multiplied(blocks, WB @ solve(x)))
+            return solve(BW @ self.packed.block_products(blocks, WB @ solve(x)))
 
         return product
 
     def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
-        """Return D of each group, and the weights W of all that rows touch.
+        """Return the blocks D of the groups, and weights W (M,) of packed components.
 
         Raises
         ------
         ValueError
-            As of `preconditioner`.
+            For names unknown to `preconditioner`.
 
         """
         for name, value, known in (
@@ -215,11 +237,12 @@ class DualOperator:
                 raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
         groups = self.packed.groups
         blocks = (
-            [g.kind.block(g.touched) for g in groups] if kind == "lumped"
+            [g.template.block(g.touched) for g in groups] if kind == "lumped"
             else [schur for _, schur in self._blocks]
         )  # fmt: skip
         softness = [
-            np.repeat(1 / g.kind.stiffness[g.touched], g.members.size) for g in groups
+            np.repeat(1 / g.template.stiffness[g.touched], g.members.size)
+            for g in groups
         ]
         weights = np.concatenate(softness)
         if scaling == "multiplicity":
@@ -228,12 +251,12 @@ class DualOperator:
 
     @cached_property
     def packed(self) -> Packed:
-        """Its rows on what they touch."""
-        return packed(self.B, self.domains, self.explicit)
+        """The rows B on the components that they touch."""
+        return pack(self.B, self.domains, self.explicit)
 
     @property
     def inverses(self) -> list[Any]:
-        """(K⁺)_bb of each group: a matrix, or what multiplies with it."""
+        """(K⁺)_bb of each group: a dense matrix, or an object with `@`."""
         return [inverse for inverse, _ in self._blocks]
 
     @cached_property
@@ -242,13 +265,13 @@ class DualOperator:
 
     @cached_property
     def _blocks(self) -> list[tuple[Any, Any]]:
-        """(K⁺)_bb and S_bb of each group: matrices, or what multiplies with them."""
+        """(K⁺)_bb and S_bb of each group: dense matrices, or objects with `@`."""
         groups = self.packed.groups
-        found = {i: _implicit(g) for i, g in enumerate(groups) if not g.explicit}
-        places = [i for i, g in enumerate(groups) if g.explicit]
-        for at, blocks in self.condense([groups[i] for i in places]):
-            found[places[at]] = _explicit(groups[places[at]], blocks)
-        return [found[i] for i in range(len(groups))]
+        blocks_of = {i: _implicit(g) for i, g in enumerate(groups) if not g.explicit}
+        explicit = [i for i, g in enumerate(groups) if g.explicit]
+        for at, condensed in self.condense([groups[i] for i in explicit]):
+            blocks_of[explicit[at]] = _explicit(groups[explicit[at]], condensed)
+        return [blocks_of[i] for i in range(len(groups))]
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
@@ -258,7 +281,7 @@ def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
 
 
 def _implicit(group: Group) -> tuple[Any, Any]:
-    kind, b = group.kind, group.touched
+    kind, b = group.template, group.touched
     g = np.union1d(kind.boundary, b)
     at = np.searchsorted(g, b)
     return _Part(kind.K.shape[0], b, kind.inverse), _Part(
@@ -267,7 +290,7 @@ def _implicit(group: Group) -> tuple[Any, Any]:
 
 
 class _Triangle(NamedTuple):
-    """A symmetric matrix by its upper triangle, column by column."""
+    """A symmetric matrix, stored as its upper triangle column by column."""
 
     n: int
     entries: Vector
@@ -281,7 +304,7 @@ class _Triangle(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """M_bb of a matrix M (n, n) that columns can be multiplied with."""
+    """The block M_bb of a matrix M (n, n) that is available only as a product."""
 
     n: int
     b: Nodes
@@ -294,31 +317,32 @@ class _Part(NamedTuple):
 
 
 def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
-    """Read entries of a block; one that only multiplies is multiplied out in parts."""
+    """Return the entries (i, j) of a block; an implicit one is evaluated in strips."""
     if isinstance(block, _Triangle):
         i, j = np.minimum(i, j), np.maximum(i, j)
         return np.asarray(block.entries[j * (j + 1) // 2 + i])
     if not isinstance(block, _Part):
         return np.asarray(block[i, j])
-    found, n = np.empty(i.size), block.b.size
-    for first in range(0, n, COLUMNS):
-        part = (first <= j) & (j < first + COLUMNS)
-        unit = np.eye(n, min(COLUMNS, n - first), -first)
-        found[part] = (block @ unit)[i[part], j[part] - first]
-    return found
+    values, n = np.empty(i.size), block.b.size
+    for first in range(0, n, STRIP_COLUMNS):
+        part = (first <= j) & (j < first + STRIP_COLUMNS)
+        unit = np.eye(n, min(STRIP_COLUMNS, n - first), -first)
+        values[part] = (block @ unit)[i[part], j[part] - first]
+    return values
 
 
 def scaled_columns(B: csr_array, weights: Vector) -> csr_array:
-    """Multiply the columns of B (m, M) with weights (M,)."""
+    """Return B (m, M) with its columns multiplied by weights (M,)."""
     return csr_array((B.data * weights[B.indices], B.indices, B.indptr), shape=B.shape)
 
 
-def uncoupled(gram: csr_array, equalities: int) -> csr_array:
-    """Leave out of B W Bᵀ what couples contact rows with equations, and rounding."""
+def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
+    """Drop from B W Bᵀ the coupling of contact with equality rows, and rounding."""
     diagonal = gram.diagonal()
     rows, columns = gram.tocoo().coords
     size = np.sqrt(diagonal[rows] * diagonal[columns])
-    kept = (np.abs(gram.data) > ROUNDING * size) & (
+    # rounding would join the small blocks that `block_pseudoinverse` looks for
+    kept = (np.abs(gram.data) > COUPLING_ROUNDING * size) & (
         (rows < equalities) == (columns < equalities)
     )
     parts = (gram.data[kept], (rows[kept], columns[kept]))
@@ -326,13 +350,15 @@ def uncoupled(gram: csr_array, equalities: int) -> csr_array:
 
 
 def gram_inverse(gram: csr_array, equalities: int) -> Product:
-    """Make x ↦ (B W Bᵀ)⁺x of what `uncoupled` leaves."""
+    """Return the function x ↦ (B W Bᵀ)⁺x for a result of `decouple_contact`."""
     m = gram.shape[0]
-    inverse = inverted_blocks(csr_array(gram[:equalities, :equalities]))
+    inverse = block_pseudoinverse(csr_array(gram[:equalities, :equalities]))
     if equalities == m:
         return lambda x: np.asarray(inverse @ x)
     contact = csc_matrix(gram[equalities:, equalities:])
-    factor = cholesky(csc_matrix(contact + diags_array(SHIFT * contact.diagonal())))
+    factor = cholesky(
+        csc_matrix(contact + diags_array(CONTACT_SHIFT * contact.diagonal()))
+    )
 
     def solve(x: Dense) -> Dense:
         y = np.empty_like(x)
@@ -343,8 +369,8 @@ def gram_inverse(gram: csr_array, equalities: int) -> Product:
     return solve
 
 
-def inverted_blocks(M: csr_array) -> csr_array:
-    """Return M⁺ of a symmetric M with many small blocks, in whatever order of rows."""
+def block_pseudoinverse(M: csr_array) -> csr_array:
+    """Return M⁺ of a symmetric M with many small blocks, under any order of rows."""
     if not M.nnz:
         return M
     _, block = connected_components(M, directed=False)
@@ -353,31 +379,39 @@ def inverted_blocks(M: csr_array) -> csr_array:
     within = np.empty_like(order)
     within[order] = np.arange(order.size) - (np.cumsum(size) - size)[block[order]]
     rows, columns = M.tocoo().coords
-    data, places = [], []
+    data, coordinates = [], []
     for n in np.unique(size):
-        mine = size == n
-        number = np.cumsum(mine) - 1
-        dense = np.zeros((mine.sum(), n, n))
-        of = mine[block[rows]]
-        at = number[block[rows[of]]], within[rows[of]], within[columns[of]]
-        dense[at] = M.data[of]
-        members = order[mine[block[order]]].reshape(-1, n)
-        data.append(np.linalg.pinv(dense, rcond=SINGULAR, hermitian=True).ravel())
-        places.append([np.repeat(members, n), np.tile(members, n).ravel()])
-    entries = np.concatenate(data), tuple(np.concatenate(places, axis=1))
+        same = size == n
+        number = np.cumsum(same) - 1
+        dense = np.zeros((same.sum(), n, n))
+        inside = same[block[rows]]
+        place = (
+            number[block[rows[inside]]],
+            within[rows[inside]],
+            within[columns[inside]],
+        )
+        dense[place] = M.data[inside]
+        members = order[same[block[order]]].reshape(-1, n)
+        data.append(
+            np.linalg.pinv(dense, rcond=EIGENVALUE_CUTOFF, hermitian=True).ravel()
+        )
+        coordinates.append([np.repeat(members, n), np.tile(members, n).ravel()])
+    entries = np.concatenate(data), tuple(np.concatenate(coordinates, axis=1))
     return csr_array(entries, shape=M.shape)
 
 
-def explicit_kinds(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
-    """Choose the kinds whose blocks are formed: the smallest, as many as fit."""
-    sizes = np.array([part.size for part in touched(B, domains)])
+def explicit_classes(B: csr_array, domains: Subdomains) -> NDArray[np.bool_]:
+    """Flag the classes with explicit blocks: the smallest, as many as fit."""
+    sizes = np.array([part.size for part in touched_components(B, domains)])
     order = np.argsort(sizes, kind="stable")
-    found = np.zeros(sizes.size, dtype=bool)
-    found[order] = np.cumsum(block_bytes(sizes, domains)[order]) <= EXPLICIT_MIB * 2**20
-    return found
+    fits = np.zeros(sizes.size, dtype=bool)
+    fits[order] = (
+        np.cumsum(block_bytes(sizes, domains)[order]) <= MAX_EXPLICIT_MIB * 2**20
+    )
+    return fits
 
 
 def block_bytes(sizes: NDArray[np.int64], domains: Subdomains) -> NDArray[np.int64]:
-    """Return what both blocks of each kind take, formed on so many components."""
+    """Return the bytes that both blocks of each class take on b (sizes,) components."""
     alone = np.array([members.size == 1 for members in domains.members])
     return np.where(alone, 8 * sizes * (sizes + 1), 16 * sizes**2)

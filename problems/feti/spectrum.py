@@ -1,18 +1,18 @@
 """Extreme eigenvalues of F on the null space of its equations, with error bounds.
 
-With P the orthogonal projector onto ker G ∩ range B, the condition numbers are those of
+With P the orthogonal projector onto ker G ∩ range B, these are the spectra of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
 
-the latter with a preconditioner M ≈ F⁻¹; both on the range of P. Both are self-adjoint
-there, so that one Lanczos process serves both (Parlett 1998, Chapter 13). Each vector
-is orthogonalised against the last two, as the recurrence says, then against all, so
-that nothing is found twice; and it is projected anew, as what rounding leaves of a
-kernel grows from step to step.
+the latter with a preconditioner M ≈ F⁻¹, both on the range of P. Both operators are
+self-adjoint there, and one Lanczos process serves both (Parlett 1998, Chapter 13). Each
+vector is orthogonalised against the last two, as in the recurrence, then against all
+previous ones, which excludes spurious copies of eigenvalues. It is projected again in
+every step, because components in the kernel that stem from rounding grow.
 
-Of a Ritz value θ with residual r an eigenvalue is no farther than ‖r‖, and ‖r‖ is what
-the last row of the tridiagonal matrix says.
+The interval of radius ‖r‖ around a Ritz value θ with residual r contains an eigenvalue,
+and ‖r‖ follows from the last components of the eigenvectors of the tridiagonal matrix.
 """
 
 from __future__ import annotations
@@ -22,30 +22,29 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csc_matrix, csr_array
+from scipy.sparse import csc_matrix
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Vector
 from mortarbench.harness.distributed.vectors import DistributedColumns
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.distributed import RankOperator
-from mortarbench.problems.feti.operators import inverted_blocks, uncoupled
-from mortarbench.problems.feti.stored import dual_operator, made
-from mortarbench.problems.feti.torn import Torn
 
 Product = Callable[[Vector], Vector]
 
-EXHAUSTED = 1e-10  #: length of a new vector, of the largest Ritz value: none is left
-CHECKED = 5  #: steps from one look at the Ritz values to the next
-_CHUNK = 64  #: vectors that memory is taken for at once
+#: a new vector below this share of the largest Ritz value ends the Lanczos process: the
+#: Krylov space is invariant up to rounding
+BREAKDOWN = 1e-10
+CHECK_INTERVAL = 5  #: steps between evaluations of the Ritz values
+_CHUNK = 64  #: vectors per allocation
 
 
 class Spectrum(NamedTuple):
-    """The extreme eigenvalues of an operator, without zeros."""
+    """The extreme eigenvalues of an operator on the range of P."""
 
     smallest: float
     largest: float
-    smallest_error: float  #: an eigenvalue is within this of `smallest`
+    smallest_error: float  #: bound of the distance from `smallest` to an eigenvalue
     largest_error: float
     steps: int  #: products with F
 
@@ -56,48 +55,23 @@ class Spectrum(NamedTuple):
 
     @property
     def condition_error(self) -> float:
-        """By how much κ may be wrong, to first order in the errors."""
+        """Bound of the error of κ, to first order in the errors of both eigenvalues."""
         relative = self.smallest_error / self.smallest
         return self.condition * (relative + self.largest_error / self.largest)
 
     def within(self, tol: float) -> bool:
-        """Say whether both errors are at most `tol`, relative."""
+        """Return True if both relative errors are at most `tol`."""
         return (
             self.smallest_error <= tol * self.smallest
             and self.largest_error <= tol * self.largest
         )
 
 
-def projector(G: csr_array, B: csr_array) -> Product:
-    """Make the orthogonal projector onto ker G ∩ range B.
-
-    Rows of B that depend on one another, those of redundant gluing, meet at a
-    crosspoint; BBᵀ has a small block there.
-
-    Parameters
-    ----------
-    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
-    B : (m, N)
-
-    """
-    gram = uncoupled(csr_array(B @ B.T), B.shape[0])
-    within = csr_array(gram @ inverted_blocks(gram))
-    if not G.shape[0]:
-        return lambda x: np.asarray(within @ x)
-    factor, GT = cholesky(csc_matrix(G @ G.T)), csr_array(G.T)
-
-    def project(x: Vector) -> Vector:
-        y = within @ x
-        return np.asarray(y - GT @ factor(G @ y))
-
-    return project
-
-
 def spectrum(
     F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5,
     *, rows: Nodes | None = None, total: Product = np.asarray,
 ) -> Spectrum:  # fmt: skip
-    """Find the extreme eigenvalues of PFP, or of PMPF, on the range of P.
+    """Compute the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
     Parameters
     ----------
@@ -105,11 +79,11 @@ def spectrum(
     P : orthogonal projector of vectors (n,)
     M : preconditioner, symmetric positive semidefinite
     tol : error bound of both eigenvalues, relative
-    rows : components that this rank has, of n; all of them unless given
-    total : adds numbers (k,) over all ranks, which get the same
+    rows : components on this rank; None for all n of them
+    total : sums numbers (k,) over all ranks; returns the same sum on each of them
 
     """
-    own = np.arange(n) if rows is None else rows
+    local = np.arange(n) if rows is None else rows
 
     def dot(x: Vector, y: Vector) -> float:
         return float(total(np.atleast_1d(x @ y))[0])
@@ -117,15 +91,15 @@ def spectrum(
     #: x ↦ Wx of the inner product, and Wx ↦ (operator) x
     metric: Product = (lambda x: P(F(x))) if M is not None else (lambda x: x)
     image: Product = (lambda y: P(M(y))) if M is not None else (lambda y: P(F(y)))
-    v = P(np.sin(1.0 + own**2))
-    V = np.empty((_CHUNK, own.size))
+    v = P(np.sin(1.0 + local**2))  # any start with a part of every eigenvector
+    V = np.empty((_CHUNK, local.size))
     WV = V if M is None else np.empty_like(V)
     alpha, beta = list[float](), list[float]()
     Wv = metric(v)
     length = float(np.sqrt(dot(v, Wv)))
     for k in range(n):
         if k == len(V):
-            more = np.empty((_CHUNK, own.size))
+            more = np.empty((_CHUNK, local.size))
             V = np.concatenate([V, more])
             WV = V if M is None else np.concatenate([WV, more])
         V[k], WV[k] = v / length, Wv / length
@@ -135,34 +109,13 @@ def spectrum(
         v = P(v - total(WV[: k + 1] @ v) @ V[: k + 1])
         Wv = metric(v)
         length = float(np.sqrt(max(dot(v, Wv), 0.0)))
-        over = length <= EXHAUSTED * max(alpha)
-        if over or k % CHECKED == CHECKED - 1 or k == n - 1:
-            found = ritz_bounds(np.array(alpha), np.array(beta), length)
-            if over or found.within(tol):
+        over = length <= BREAKDOWN * max(alpha)
+        if over or k % CHECK_INTERVAL == CHECK_INTERVAL - 1 or k == n - 1:
+            result = ritz_bounds(np.array(alpha), np.array(beta), length)
+            if over or result.within(tol):
                 break
         beta.append(length)
-    return found
-
-
-def spectra_of_equations(
-    torn: Torn,
-    preconditioners: Sequence[tuple[str, str] | None] = (None,),
-    tol: float = 1e-5,
-) -> list[Spectrum]:
-    """Find the spectra for the rows of supports and gluing, as if no contact was there.
-
-    Parameters
-    ----------
-    torn : its supports hold every body
-    preconditioners : kind and scaling of each, see `problems.feti.operators`, or none
-    tol : as of `spectrum`
-
-    """
-    B_E, m = torn.B[: torn.equalities], torn.equalities
-    F = made(dual_operator(B_E, torn.domains, m).arrays)
-    P = projector(csr_array((B_E @ torn.domains.kernel).T), B_E)
-    inverses = [p and F.preconditioner(*p) for p in preconditioners]
-    return [spectrum(F, P, m, M, tol) for M in inverses]
+    return result
 
 
 def spectra_over_ranks(
@@ -171,24 +124,21 @@ def spectra_over_ranks(
     preconditioners: Sequence[tuple[str, str] | None] = (None,),
     tol: float = 1e-5,
 ) -> list[Spectrum]:
-    """Find what `spectra_of_equations` does, of a dual that ranks have made.
+    """Compute the spectra of F for the rows of supports and gluing.
 
-    Called by all ranks, which get the same.
+    Called by all ranks, which get the same; one process counts as one rank.
 
     Parameters
     ----------
-    F, G : of the dual of bodies that nothing touches
+    F, G : of the dual of a problem without contact, whose supports hold every body
+    preconditioners : kind and scaling of each, see `problems.feti.operators`; None
+        stands for PFP itself
+    tol : error bound of both eigenvalues, relative
 
     """
-    at, ranks = F.halo, F.halo.ranks
-    m, within = ranks.total(np.array([float(at.own.size)]))[0], F.onto_rows()
-    coarse = cholesky(csc_matrix(G.gram())) if G.shape[0] else None
-
-    def project(x: Vector) -> Vector:
-        y = within(x)
-        if coarse is not None:
-            y -= np.asarray(G.T @ coarse(G @ y))
-        return y
+    halo, ranks = F.halo, F.halo.ranks
+    m = ranks.total(np.array([float(halo.owned.size)]))[0]
+    project = projector(F, G)
 
     def plain(A: Product) -> Product:
         return lambda x: np.asarray(A(x))
@@ -197,10 +147,31 @@ def spectra_over_ranks(
     return [
         spectrum(
             plain(F), project, int(m), M, tol,
-            rows=at.rows[at.own], total=ranks.total,
+            rows=halo.rows[halo.owned], total=ranks.total,
         )
         for M in inverses
     ]  # fmt: skip
+
+
+def projector(F: RankOperator, G: DistributedColumns) -> Product:
+    """Return the orthogonal projector onto ker G ∩ range B; called by all ranks.
+
+    Parameters
+    ----------
+    F : operator with the rows B, which may depend on one another (redundant gluing)
+    G : RᵀBᵀ (r, m) of full rank, so that its rows are in range B; r may be 0
+
+    """
+    within = F.onto_rows()
+    if not G.shape[0]:
+        return within
+    factor = cholesky(csc_matrix(G.gram()))
+
+    def project(x: Vector) -> Vector:
+        y = within(x)
+        return np.asarray(y - np.asarray(G.T @ factor(G @ y)))
+
+    return project
 
 
 def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:

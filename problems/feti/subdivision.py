@@ -1,10 +1,9 @@
-"""Bodies in subdomains as somebody knows them who holds a few of these.
+"""Subdivision of bodies into subdomains, replicated on every rank.
 
-What tearing and gluing number (`problems.feti.tearing`, `problems.feti.gluing`) can be
-counted once it is known which subdomains have a node. In blocks of structured grids
-that follows from tables as long as their sides (`problems.feti.structured.Layout`). For
-anything else, the nodes that several subdomains have are listed with these (`Listed`):
-a list as long as the interfaces are.
+Global numbers of torn nodes and of gluing rows follow from the subdomains that contain
+each node. For blocks of structured grids, tables as long as the sides of the grids are
+enough (`problems.feti.structured.Layout`). Otherwise the nodes that several subdomains
+share are listed (`ListedSubdivision`), and the list is as long as the interfaces.
 """
 
 from __future__ import annotations
@@ -20,35 +19,35 @@ from scipy.sparse import coo_array, csr_array, triu
 
 from mortarbench.harness.digest import hex_digest
 from mortarbench.problems.fem.mesh import HalfDisc, Mesh, Nodes
-from mortarbench.problems.feti.tearing import Block, labelled
+from mortarbench.problems.feti.tearing import Block, label_blocks
 
 Integers = NDArray[np.integer[Any]]
 Points = NDArray[np.float64]
 
 
-class TornNodes(NamedTuple):
-    """The nodes of some subdomains, one after another, within each ascending."""
+class SubdomainNodes(NamedTuple):
+    """Nodes of some subdomains, one subdomain after another, ascending within each."""
 
     subdomain: Integers  #: (M,) place in the list of subdomains
-    number: Nodes  #: (M,) of the whole
-    times: Integers  #: (M,) copies of it in all subdomains
-    copy: Integers  #: (M,) which of these it is, from 0 on
-    start: NDArray[np.int64]  #: (subdomains + 1,) first of each, and M
+    number: Nodes  #: (M,) global numbers
+    multiplicity: Integers  #: (M,) number of copies in all subdomains
+    copy: Integers  #: (M,) number of this copy, from 0
+    start: NDArray[np.int64]  #: (subdomains + 1,) first node of each, and M
 
 
 class Subdivision(Protocol):
-    """S subdomains of one or more bodies; nodes are given by their numbers (k,).
+    """S subdomains of one or more bodies; arguments `node` are global numbers (k,).
 
-    Copies of a node are numbered as the subdomains that have them.
+    Copies of a node are numbered in the order of their subdomains.
     """
 
     @property
     def count(self) -> int:
-        """How many subdomains there are, S."""
+        """Number of subdomains, S."""
 
     @property
     def nodes(self) -> int:
-        """How many nodes all bodies have."""
+        """Number of nodes of all bodies."""
 
     @property
     def body(self) -> Integers:
@@ -56,67 +55,67 @@ class Subdivision(Protocol):
 
     @property
     def sizes(self) -> NDArray[np.int64]:
-        """Count the nodes of each subdomain, (S,)."""
+        """Number of nodes of each subdomain, (S,)."""
 
-    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
-        """List the nodes of some subdomains."""
+    def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
+        """Return the nodes of some subdomains."""
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
-        """Return what is the same of subdomains whose cells are numbered alike."""
+        """Return keys that are equal for subdomains with equally numbered cells."""
 
     def points(self, subdomains: Nodes) -> Sequence[Points]:
         """Return the points (n, 2) of the nodes of some subdomains."""
 
     def cells(self, subdomain: int) -> Nodes:
-        """List the cells (E, 4) of one; corners are places in its list of nodes."""
+        """Return the cells (E, 4) of a subdomain, as places in its list of nodes."""
 
     @property
     def label(self) -> NDArray[np.int64]:
         """Subdomain of each cell of the whole mesh, (E,)."""
 
-    def times(self, node: Nodes) -> NDArray[np.int64]:
-        """Count the copies (k,)."""
+    def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
+        """Return the number of copies of each node, (k,)."""
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
-        """Find the subdomain (k,) that has a copy of each node.
+        """Return the subdomain (k,) of one copy of each node.
 
-        copy : (k,) which one, from 0 on
+        copy : (k,) number of the copy, from 0
         """
 
     def position(self, node: Nodes) -> Points:
         """Return the points of some nodes, (k, 2)."""
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Count, of each, those before it that have as many copies."""
+        """Return, for each node, the number of nodes before it with as many copies."""
 
     @property
-    def having(self) -> Mapping[int, int]:
-        """How many nodes have several copies, by the number of these."""
+    def nodes_by_multiplicity(self) -> Mapping[int, int]:
+        """Number of nodes with m copies, for each m > 1."""
 
-    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """List pairs of subdomains, and how many nodes these share: all (k,)."""
+    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+        """Return pairs of subdomains with their numbers of shared nodes, all (k,)."""
 
     def glued(self) -> NDArray[np.int64]:
-        """Count the nodes of each subdomain that have several copies, (S,)."""
+        """Return the number of nodes with several copies in each subdomain, (S,)."""
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Listed:
-    """Subdomains whose common nodes are listed; see `Subdivision`.
+class ListedSubdivision:
+    """Subdivision with a list of the nodes that subdomains share; see `Subdivision`.
 
-    Only of what is listed can copies, holders and points be asked for.
+    Copies, holders and points are available for listed nodes only.
     """
 
     nodes: int
     body: Integers  #: (S,)
     sizes: NDArray[np.int64]  #: (S,) nodes of each subdomain
-    node: Nodes  #: (k,) listed ones, ascending
+    node: Nodes  #: (k,) listed nodes, ascending
     start: NDArray[np.int64]  #: (k + 1,) first holder of each, and l
-    held_by: Nodes  #: (l,) subdomains that have it, ascending for each
-    #: nodes (n,) of a subdomain, ascending, and its cells (E, 4) as places in these
+    holders: Nodes  #: (l,) subdomains of each node, ascending
+    #: returns the nodes (n,) of a subdomain, ascending, and its cells (E, 4) in them
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
-    labelling: Callable[[], NDArray[np.int64]]  #: makes `label`
+    labelling: Callable[[], NDArray[np.int64]]  #: computes `label`
 
     @property
     def label(self) -> NDArray[np.int64]:
@@ -125,11 +124,11 @@ class Listed:
 
     @property
     def count(self) -> int:
-        """How many subdomains there are, S."""
+        """Number of subdomains, S."""
         return self.body.size
 
-    def torn_nodes(self, subdomains: Nodes) -> TornNodes:
-        """List the nodes of some subdomains."""
+    def subdomain_nodes(self, subdomains: Nodes) -> SubdomainNodes:
+        """Return the nodes of some subdomains."""
         parts = [self.part(int(s))[0] for s in subdomains]
         sizes = np.array([part.size for part in parts])
         number = np.concatenate(parts)
@@ -137,20 +136,20 @@ class Listed:
         subdomain = np.repeat(np.arange(sizes.size, dtype=np.int32), sizes)
         copy = np.zeros(number.size, dtype=np.int32)
         listed = np.flatnonzero(self.node[place] == number)
-        # holders are ascending for each listed node, so pairs are in order
+        # holders ascend for each listed node, so that the pairs are sorted
         pairs = np.repeat(np.arange(self.node.size), np.diff(self.start))
-        found = np.searchsorted(
-            pairs * self.count + self.held_by,
+        position = np.searchsorted(
+            pairs * self.count + self.holders,
             place[listed] * self.count + subdomains[subdomain[listed]],
         )
-        copy[listed] = found - self.start[place[listed]]
-        return TornNodes(
-            subdomain, number, self.times(number).astype(np.int32), copy,
+        copy[listed] = position - self.start[place[listed]]
+        return SubdomainNodes(
+            subdomain, number, self.multiplicity(number).astype(np.int32), copy,
             np.concatenate([[0], np.cumsum(sizes)]),
         )  # fmt: skip
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
-        """Return a digest of the cells of each."""
+        """Return a digest of the cells of each subdomain."""
         cells = (np.ascontiguousarray(self.cells(int(s))) for s in subdomains)
         return [hex_digest((c.tobytes(),), 32) for c in cells]
 
@@ -159,79 +158,81 @@ class Listed:
         return [self.position(self.part(int(s))[0]) for s in subdomains]
 
     def cells(self, subdomain: int) -> Nodes:
-        """List the cells (E, 4) of one; corners are places in its list of nodes."""
+        """Return the cells (E, 4) of a subdomain, as places in its list of nodes."""
         return self.part(subdomain)[1]
 
     def _place(self, node: Nodes) -> Nodes:
-        """Find listed nodes."""
+        """Return the places of listed nodes."""
         return np.searchsorted(self.node, node)
 
-    def times(self, node: Nodes) -> NDArray[np.int64]:
-        """Count the copies (k,); one of what is not listed."""
+    def multiplicity(self, node: Nodes) -> NDArray[np.int64]:
+        """Return the number of copies of each node, (k,); 1 for unlisted nodes."""
         place = np.minimum(self._place(node), self.node.size - 1)
         return np.where(self.node[place] == node, np.diff(self.start)[place], 1)
 
     def holder(self, node: Nodes, copy: Integers | int = 0) -> Nodes:
-        """Find the subdomain (k,) that has a copy of each listed node."""
-        return np.asarray(self.held_by[self.start[self._place(node)] + copy])
+        """Return the subdomain (k,) of one copy of each listed node."""
+        return np.asarray(self.holders[self.start[self._place(node)] + copy])
 
     def before(self, node: Nodes) -> NDArray[np.int64]:
-        """Count, of each listed node, those before it that have as many copies."""
+        """Return the number of nodes before each listed one with as many copies."""
         return np.asarray(self._before[self._place(node)])
 
     @cached_property
     def _before(self) -> NDArray[np.int64]:
-        times = np.diff(self.start)
-        found = np.empty_like(times)
-        for m in np.unique(times):
-            of = np.flatnonzero(times == m)
-            found[of] = np.arange(of.size)
-        return found
+        multiplicity = np.diff(self.start)
+        before = np.empty_like(multiplicity)
+        for m in np.unique(multiplicity):
+            nodes = np.flatnonzero(multiplicity == m)
+            before[nodes] = np.arange(nodes.size)
+        return before
 
     @cached_property
-    def having(self) -> Mapping[int, int]:
-        """How many nodes have several copies, by the number of these."""
-        times, count = np.unique(np.diff(self.start), return_counts=True)
-        return {int(m): int(n) for m, n in zip(times, count, strict=True) if m > 1}
+    def nodes_by_multiplicity(self) -> Mapping[int, int]:
+        """Number of nodes with m copies, for each m > 1."""
+        multiplicity, count = np.unique(np.diff(self.start), return_counts=True)
+        return {
+            int(m): int(n) for m, n in zip(multiplicity, count, strict=True) if m > 1
+        }
 
-    def sharing(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
-        """List pairs of subdomains, and how many nodes these share: all (k,)."""
+    def shared_node_counts(self) -> tuple[Nodes, Nodes, NDArray[np.int64]]:
+        """Return pairs of subdomains with their numbers of shared nodes, all (k,)."""
         shape = (self.node.size, self.count)
-        ones = np.ones(self.held_by.size, dtype=np.int64)
-        has = csr_array((ones, self.held_by, self.start), shape=shape)
+        ones = np.ones(self.holders.size, dtype=np.int64)
+        has = csr_array((ones, self.holders, self.start), shape=shape)
         pairs = coo_array(triu(has.T @ has, k=1))
         return pairs.row, pairs.col, pairs.data
 
     def glued(self) -> NDArray[np.int64]:
-        """Count the nodes of each subdomain that have several copies, (S,)."""
-        times = np.diff(self.start)
-        several = np.repeat(times > 1, times)
-        return np.bincount(self.held_by[several], minlength=self.count)
+        """Return the number of nodes with several copies in each subdomain, (S,)."""
+        multiplicity = np.diff(self.start)
+        several = np.repeat(multiplicity > 1, multiplicity)
+        return np.bincount(self.holders[several], minlength=self.count)
 
 
-def listed_by_holders(
+def sort_holders(
     number: Nodes, subdomain: Nodes, subdomains: int
 ) -> tuple[Nodes, NDArray[np.int64], Nodes]:
-    """Sort pairs of a node and a subdomain that has it, each there once or more.
+    """Sort pairs of a node and a subdomain that contains it; repeated pairs count once.
 
     number, subdomain : (e,)
 
     Returns
     -------
-    `node`, `start` and `held_by` of `Listed`
+    `node`, `start` and `holders` of `ListedSubdivision`
 
     """
-    node, held_by = np.divmod(np.unique(number * subdomains + subdomain), subdomains)
+    node, holders = np.divmod(np.unique(number * subdomains + subdomain), subdomains)
     first = np.flatnonzero(np.diff(node, prepend=-1))
-    return node[first], np.append(first, node.size), held_by
+    return node[first], np.append(first, node.size), holders
 
 
 def half_discs_in_blocks(
     discs: Sequence[HalfDisc], blocks: Sequence[Sequence[Block]]
-) -> Listed:
-    """Know half discs by the perimeters of the blocks that their cells form.
+) -> ListedSubdivision:
+    """Return the subdivision of half discs into blocks; block perimeters are listed.
 
-    blocks : rings and angles of cells, of each disc, in the order of the subdomains
+    blocks : for each disc, the rings and angles of cells, in the order of subdomains
     """
     first = np.cumsum([0, *(disc.nodes for disc in discs)])
     body = np.repeat(np.arange(len(discs)), [len(own) for own in blocks])
@@ -246,41 +247,39 @@ def half_discs_in_blocks(
         return begin + nodes, cells
 
     def position(node: Nodes) -> Points:
-        of = np.searchsorted(first, node, side="right") - 1
-        found = np.empty((node.size, 2))
-        for b in np.unique(of).tolist():
-            found[of == b] = discs[b].position(node[of == b] - first[b])
-        return found
+        disc_of = np.searchsorted(first, node, side="right") - 1
+        points = np.empty((node.size, 2))
+        for b in np.unique(disc_of).tolist():
+            points[disc_of == b] = discs[b].position(node[disc_of == b] - first[b])
+        return points
 
     subdomain = np.repeat(np.arange(len(every)), [nodes.size for nodes in around])
-    node, start, held_by = listed_by_holders(
-        np.concatenate(around), subdomain, len(every)
-    )
-    return Listed(
+    node, start, holders = sort_holders(np.concatenate(around), subdomain, len(every))
+    return ListedSubdivision(
         nodes=int(first[-1]), body=body,
         sizes=np.array([_nodes(disc, *block) for disc, _, *block in every]),
-        node=node, start=start, held_by=held_by,
+        node=node, start=start, holders=holders,
         part=part, position=position, labelling=lambda: _labels(blocks),
     )  # fmt: skip
 
 
 def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
-    """Label the cells of discs, one disc after another."""
+    """Return the block of each cell, one disc after another."""
     first = np.cumsum([0, *map(len, blocks)])
     return np.concatenate(
-        [labelled(own) + begin for own, begin in zip(blocks, first, strict=False)]
+        [label_blocks(own) + begin for own, begin in zip(blocks, first, strict=False)]
     )
 
 
 def _nodes(disc: HalfDisc, rings: slice, angles: slice) -> int:
-    """Count the nodes of a block of cells; the centre, if it is there, is one."""
+    """Return the number of nodes of a block of cells; the centre counts as one."""
     has_centre = rings.stop == disc.radii.size
     lines = rings.stop - rings.start + (not has_centre)
     return int((angles.stop - angles.start + 1) * lines + has_centre)
 
 
 def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
-    """List the nodes on the sides of a block of cells, some of them twice."""
+    """Return the nodes on the sides of a block of cells, some of them twice."""
     a, r = disc.angles.size, disc.radii.size
     has_centre = rings.stop == r
     i = np.arange(angles.start, angles.stop + 1)
@@ -290,15 +289,15 @@ def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
     return np.concatenate([a * rings.start + i, inner, *ends])
 
 
-def mesh_in_parts(
+def mesh_in_subdomains(
     mesh: Mesh, label: NDArray[np.int64], body: NDArray[np.int64], named: Nodes
-) -> Listed:
-    """Know a mesh of any kind by the labels of its cells; it is kept as a whole.
+) -> ListedSubdivision:
+    """Return the subdivision of any mesh by labels of its cells; the mesh is stored.
 
     Parameters
     ----------
     label, body : (E,) subdomain and body of each cell
-    named : nodes that are listed though only one subdomain has them
+    named : nodes to list although only one subdomain has them
 
     """
     points, cells, N = mesh.points, mesh.cells, len(mesh.points)
@@ -310,16 +309,16 @@ def mesh_in_parts(
     kept = np.bincount(number, minlength=N) > 1
     kept[named] = True
     several = kept[number]
-    node, start, held_by = listed_by_holders(number[several], subdomain[several], S)
+    node, start, holders = sort_holders(number[several], subdomain[several], S)
 
     def part(s: int) -> tuple[Nodes, Nodes]:
-        own = cells[by_label[ends[s] : ends[s + 1]]]
-        nodes, corner = np.unique(own, return_inverse=True)
-        return nodes, corner.reshape(own.shape)
+        own_cells = cells[by_label[ends[s] : ends[s + 1]]]
+        nodes, corner = np.unique(own_cells, return_inverse=True)
+        return nodes, corner.reshape(own_cells.shape)
 
-    return Listed(
+    return ListedSubdivision(
         nodes=N, body=body[by_label[ends[:-1]]],
         sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
-        held_by=held_by, part=part, position=points.__getitem__,
+        holders=holders, part=part, position=points.__getitem__,
         labelling=lambda: label,
     )  # fmt: skip

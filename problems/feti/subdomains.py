@@ -1,26 +1,28 @@
-"""Bodies in subdomains, of which a process has some: what it makes without the whole.
+"""The local subdomains of one rank, and their rows of B.
 
-Each rank builds its own subdomains only: their meshes, stiffness, loads and the rows of
-B that touch them. A single process has all of them. What is numbered in the whole
-follows from what all ranks know of the subdivision (`problems.feti.subdivision`):
-tables as long as the sides of structured grids, or a list of the nodes of interfaces.
-Beyond that, a rank has a few numbers for each subdomain of the whole, as a coarse
-problem has.
+Each rank builds only its local subdomains: their meshes, stiffness matrices, loads and
+the rows of B that touch them. A single process has all subdomains. Global numbers
+follow from the subdivision (`problems.feti.subdivision`), which is replicated on all
+ranks: tables as long as the sides of structured grids, or a list of the nodes on
+interfaces. Beyond that, a rank stores a few numbers for each subdomain of the whole, as
+does a coarse problem.
 
-Rows of B, in turn, are those of supports, of gluing and of contact. Supports are rows
-of every copy of a node. Of a free component, m copies are glued by one of
+The rows of B are those of supports, of gluing and of contact, in this order (Total
+FETI, Dostál, Horák and Kučera 2006). Supports are rows for every copy of a node. The m
+copies of a free component are glued by one of
 
 * ``orthonormal``: m − 1 orthonormal rows that are orthogonal to (1, …, 1),
-* ``chain``: m − 1 rows  v_p − v_q = 0  of copies that follow one another,
+* ``chain``: m − 1 rows  v_p − v_q = 0  of consecutive copies,
 * ``redundant``: all m(m − 1)/2 rows  v_p − v_q = 0.
 
-Contact rows act on the average of the copies, which is the same for all of them once
-they are glued; so a contact row is there once, wherever subdomains meet, and orthogonal
-to all gluing.
+Contact rows act on the average of the copies, which equals each of them once they are
+glued. So a contact row exists once, even at a node of several subdomains, and it is
+orthogonal to the gluing rows.
 
-Rows of a body are scaled by √E of that body, contact rows by that of the softest body
-they touch, after they are normalised: then F does not depend on E where each body is
-homogeneous. A factor of E may follow the shape of cells (`problems.feti.structured`).
+Rows of supports and gluing are scaled by √E of their body. Contact rows are normalised,
+then scaled by √E of the softest body they touch. So F does not depend on E if each body
+is homogeneous. E may be multiplied by a factor for the shape of the cells
+(`problems.feti.structured`).
 """
 
 from __future__ import annotations
@@ -38,17 +40,27 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, coo_array, csr_array
 
 from mortarbench.harness import Vector
-from mortarbench.harness.distributed.vectors import Ranks, alone
+from mortarbench.harness.distributed.vectors import Ranks, single_process
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.distributed import balanced
+from mortarbench.problems.feti.distributed import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
     Points,
     Subdivision,
-    TornNodes,
+    SubdomainNodes,
 )
-from mortarbench.problems.feti.tearing import ALIKE, Part, classify, images, spread_of
-from mortarbench.problems.feti.torn import Kind, Subdomains, Torn
+from mortarbench.problems.feti.subdomain_classes import (
+    DecomposedBodies,
+    SubdomainClass,
+    Subdomains,
+)
+from mortarbench.problems.feti.tearing import (
+    CONGRUENCE_TOL,
+    SubdomainMesh,
+    classify,
+    congruent,
+    spread_of,
+)
 
 Weights = Callable[[int], NDArray[np.float64]]
 
@@ -66,122 +78,125 @@ def _redundant(m: int) -> NDArray[np.float64]:
     return np.asarray(np.eye(m)[p] - np.eye(m)[q])
 
 
-#: the weights (rows, m) of m copies of a component
+#: names of gluings → weights (rows, m) of the m copies of a component
 GLUE: Mapping[str, Weights] = MappingProxyType(
     {"orthonormal": _orthonormal, "chain": _chain, "redundant": _redundant}
 )
 
 
 class Contact(NamedTuple):
-    """Rows of contact, then of friction, of the whole; every rank has them."""
+    """Global rows of contact, then of friction; replicated on every rank."""
 
-    rows: csr_array  #: (m_I, n) columns are components of the whole
+    rows: csr_array  #: (m_I, n) in components of the undivided bodies
     c: Vector  #: (m_I,)
-    bound: Vector  #: (k,) of the last rows, those of friction with a given bound
+    bound: Vector  #: (k,) friction bounds of the last rows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ProblemInParts:
-    """A contact problem on bodies in subdomains, without dimensions, nothing made."""
+class DecomposedProblem:
+    """A contact problem on decomposed bodies, nondimensional, before assembly."""
 
-    layout: Subdivision  #: of the bodies into subdomains, S in all
-    components: int  #: of a node: 2 of displacements, 1 of heights
-    material: Integers  #: (S,) of each subdomain
-    kind: Callable[[Part], Kind]  #: assembles a floating subdomain
-    E: Vector  #: (bodies,) stiffness that rows are scaled by
+    layout: Subdivision  #: the S subdomains
+    components: int  #: per node: those of a displacement, or 1 for a height
+    material: Integers  #: (S,) material of each subdomain
+    assemble_class: Callable[
+        [SubdomainMesh], SubdomainClass
+    ]  #: from a floating subdomain
+    E: Vector  #: (bodies,) moduli for the scaling of rows
     names: tuple[str, ...]  #: of the bodies
-    #: makes of some subdomains the factor of E in rows that hold their torn nodes, as
-    #: `problems.feti.structured.Layout.shaping`; None for 1
+    #: returns, for some subdomains, the factor of E in rows at their torn nodes, see
+    #: `problems.feti.structured.Layout.shaping`; None stands for the factor 1
     shaping: Callable[[Nodes], Callable[[Nodes, Nodes, bool], Vector]] | None = None
-    load: Callable[[Nodes], Vector]  #: components of the whole (k,) → forces (k,)
-    held: Nodes  #: components of the whole that are zero, in the order of their rows
-    #: whether these are eliminated, as in FETI-1, and have no rows: such subdomains do
-    #: not float. Axes of subdomains are those of the whole there
+    load: Callable[[Nodes], Vector]  #: global components (k,) → forces (k,)
+    fixed: Nodes  #: global components that are zero, in row order
+    #: True if these are eliminated as in FETI-1 (Farhat and Roux 1991) instead of being
+    #: rows of B. Their subdomains do not float and keep the global axes
     eliminated: bool = False
     contact: Contact
-    glue: str  #: how copies are glued, one of `GLUE`
+    glue: str  #: name of the gluing, one of `GLUE`
 
     @cached_property
     def contact_scale(self) -> Vector:
-        """√(E/‖B_i‖²) of contact rows (m,), E of the softest body they touch."""
+        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches."""
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
             return np.zeros(0)
         node = rows.indices // self.components
         E = self.E[of.body[of.holder(node)]]
-        norm2 = np.add.reduceat(rows.data**2 / of.times(node), rows.indptr[:-1])
+        # an entry b at a node of m copies becomes m entries b/m of B: m(b/m)² = b²/m
+        norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
         return np.asarray(np.sqrt(softest / norm2))
 
 
 class Entries(NamedTuple):
-    """Entries of B in own columns, and who else has entries in the same rows."""
+    """Entries of B in local columns, and the ranks that touch the same rows."""
 
-    row: NDArray[np.int64]  #: (e,) of the whole
-    column: NDArray[np.int64]  #: (e,) own torn unknowns
+    row: NDArray[np.int64]  #: (e,) global rows
+    column: NDArray[np.int64]  #: (e,) local torn unknowns
     value: Vector  #: (e,)
-    reached: NDArray[np.int64]  #: (k, 2) pairs: a row of B, and a rank that touches it
+    reached: NDArray[np.int64]  #: (k, 2) pairs of a row and a rank that touches it
 
 
 @dataclass(frozen=True, eq=False)
-class OwnSubdomains:
-    """What one rank holds of torn bodies."""
+class LocalSubdomains:
+    """The subdomains of one rank; most properties are computed on first use."""
 
-    problem: ProblemInParts
+    problem: DecomposedProblem
     ranks: Ranks
-    rank: NDArray[np.int64]  #: (S,) of each subdomain
+    rank: NDArray[np.int64]  #: (S,) rank of each subdomain
 
     @cached_property
     def number(self) -> NDArray[np.int64]:
-        """Its subdomains among all, (S_p,)."""
+        """Global numbers of the local subdomains, (S_p,)."""
         return np.flatnonzero(self.rank == self.ranks.rank)
 
     @cached_property
-    def nodes(self) -> TornNodes:
-        """Its torn nodes, (M_p,)."""
-        return self.problem.layout.torn_nodes(self.number)
+    def nodes(self) -> SubdomainNodes:
+        """Torn nodes of the local subdomains, (M_p,)."""
+        return self.problem.layout.subdomain_nodes(self.number)
 
-    def torn(self, subdomain: Nodes, node: Nodes) -> Nodes:
-        """Find own torn nodes (k,) by their subdomains and their nodes, (k,) both."""
+    def local_nodes(self, subdomain: Nodes, node: Nodes) -> Nodes:
+        """Return the local torn nodes (k,) of given subdomains and global nodes."""
         nodes, N = self.nodes, self.problem.layout.nodes
-        known = nodes.subdomain * np.int64(N) + nodes.number
+        keys = nodes.subdomain * np.int64(N) + nodes.number
         return np.searchsorted(
-            known, np.searchsorted(self.number, subdomain) * np.int64(N) + node
+            keys, np.searchsorted(self.number, subdomain) * np.int64(N) + node
         )
 
     @property
     def component(self) -> Nodes:
-        """Component of the whole that each torn unknown is a copy of, (N_p,)."""
-        return self._component[self.kept]
+        """Global component of which each torn unknown is a copy, (N_p,)."""
+        return self._component[self.free]
 
     @property
     def _component(self) -> Nodes:
-        """Of those that are eliminated, too."""
+        """The same, including eliminated components."""
         return self._of_nodes(self.nodes.number)
 
     @cached_property
     def _distinct(self) -> tuple[Nodes, Nodes]:
-        """Own nodes of the whole, and the place of each torn node among them."""
+        """Global nodes on this rank, and the place of each torn node among them."""
         return np.unique(self.nodes.number, return_inverse=True)
 
     @property
     def components(self) -> Nodes:
-        """Components of the whole that it has, ascending, (n_p,)."""
+        """Global components on this rank, ascending, (n_p,)."""
         return self._of_nodes(self._distinct[0])
 
     @property
     def place(self) -> Nodes:
         """Place of each torn unknown among `components`, (N_p,)."""
-        return self._of_nodes(self._distinct[1])[self.kept]
+        return self._of_nodes(self._distinct[1])[self.free]
 
     def _of_nodes(self, node: Nodes) -> Nodes:
-        """Return the components of some nodes, in turn."""
+        """Return the components of some nodes, node by node."""
         d = self.problem.components
         return np.asarray((d * node[:, None] + np.arange(d)).ravel())
 
     @cached_property
     def spread(self) -> csr_array:
-        """T (N_p, n_p): a block Qᵀ for each torn node, into the axes of subdomains."""
+        """T (N_p, n_p): a block Qᵀ per torn node, into the axes of its subdomain."""
         d, place = self.problem.components, self._distinct[1]
         M, n = place.size, d * self._distinct[0].size
         if d == 1:
@@ -191,223 +206,244 @@ class OwnSubdomains:
             blocks = np.ascontiguousarray(turn), place, np.arange(M + 1)
             T = csr_array(bsr_array(blocks, shape=(d * M, n)))
             T.eliminate_zeros()
-        return csr_array(T[self.kept]) if self.problem.eliminated else T
+        return csr_array(T[self.free]) if self.problem.eliminated else T
 
     @property
-    def times(self) -> NDArray[np.int64]:
-        """How many copies it has on all ranks together, (N_p,)."""
-        times = np.repeat(self.nodes.times, self.problem.components)
-        return np.asarray(times[self.kept])
+    def multiplicity(self) -> NDArray[np.int64]:
+        """Number of copies of each torn unknown on all ranks together, (N_p,)."""
+        multiplicity = np.repeat(self.nodes.multiplicity, self.problem.components)
+        return np.asarray(multiplicity[self.free])
 
     @cached_property
-    def kept(self) -> slice | Nodes:
-        """Choose the torn unknowns among all components of all torn nodes."""
+    def free(self) -> slice | Nodes:
+        """Places of the torn unknowns among all components of all torn nodes."""
         if not self.problem.eliminated:
             return slice(None)
-        return np.flatnonzero(~np.isin(self._component, self.problem.held))
+        return np.flatnonzero(~np.isin(self._component, self.problem.fixed))
 
     @cached_property
     def _classified(self) -> tuple[Subdomains, NDArray[np.float64]]:
-        """Sort subdomains into kinds, which have the same frame on all ranks."""
+        """Local subdomains by class, with one frame on all ranks, and rotations."""
         problem, of = self.problem, self.problem.layout
         material = problem.material[self.number].tolist()
         keys = list(zip(of.keys(self.number), material, strict=True))
         points = of.points(self.number)
-        first, kind, rotation = classify(keys, points)
-        leader = self._leaders(
+        first, class_of, rotation = classify(keys, points)
+        representative = self._representatives(
             [(int(self.number[s]), keys[s], points[s]) for s in first]
         )
-        kinds = []
+        classes = []
         for k, s in enumerate(first):
-            number, at = leader[int(self.number[s])]
+            number, origin = representative[int(self.number[s])]
             if number != self.number[s]:
-                mine = np.flatnonzero(kind == k)
-                turn = images(np.stack([at, *(points[s] for s in mine.tolist())]))[1]
-                rotation[mine] = turn[1:]
+                members = np.flatnonzero(class_of == k)
+                rotations = congruent(
+                    np.stack([origin, *(points[s] for s in members.tolist())])
+                )[1]
+                rotation[members] = rotations[1:]
             cells = of.cells(int(self.number[s]))
-            kinds.append(
-                problem.kind(Part(at, cells, np.full(len(cells), material[s])))
+            classes.append(
+                problem.assemble_class(
+                    SubdomainMesh(origin, cells, np.full(len(cells), material[s]))
+                )
             )
-        return Subdomains(tuple(kinds), kind), rotation
+        return Subdomains(tuple(classes), class_of), rotation
 
     @property
-    def floating(self) -> OwnSubdomains:
-        """Hold the same with supports that are rows: all its subdomains float."""
+    def floating(self) -> LocalSubdomains:
+        """The same problem with supports as rows of B: all subdomains float."""
         if not self.problem.eliminated:
             return self
-        return self.posed(replace(self.problem, eliminated=False))
+        return self.with_problem(replace(self.problem, eliminated=False))
 
     @cached_property
     def domains(self) -> Subdomains:
-        """Its subdomains on their own."""
-        found = self._classified[0]
+        """The local subdomains, without eliminated components."""
+        domains = self._classified[0]
         if self.problem.eliminated:
-            free = np.zeros(int(found.start[-1]), dtype=bool)
-            free[self.kept] = True
-            found = found.without(free)
-        return found
+            free = np.zeros(int(domains.start[-1]), dtype=bool)
+            free[self.free] = True
+            domains = domains.restrict(free)
+        return domains
 
-    def _leaders(
+    def _representatives(
         self, own: list[tuple[int, Hashable, Points]]
     ) -> dict[int, tuple[int, Points]]:
-        """Find the first subdomain of each kind on all ranks, with its points.
+        """Return the first subdomain of each class on all ranks, with its points.
 
-        own : number, key and points of the first subdomains of own kinds, by whose
-            numbers the leaders are told
+        Ranks exchange the points of one subdomain of each class that, by its key and
+        its spread, may also occur elsewhere.
+
+        own : number, key and points of the first local subdomain of each class
+
+        Returns
+        -------
+        number of such a subdomain → number and points of the first one on all ranks
+
         """
         comm = self.ranks.comm
-        told = comm.allgather([(n, key, spread_of(at)) for n, key, at in own])
+        spreads = comm.allgather([(n, key, spread_of(at)) for n, key, at in own])
         elsewhere: dict[Hashable, list[float]] = {}
-        for rank, theirs in enumerate(told):
+        for rank, theirs in enumerate(spreads):
             for _, key, spread in theirs if rank != self.ranks.rank else ():
                 elsewhere.setdefault(key, []).append(spread)
 
         def may_be_elsewhere(key: Hashable, at: Points) -> bool:
             spread = np.array(elsewhere.get(key, []))
-            off = 3 * ALIKE * np.sqrt(at.size)  # a little more than `classify` allows
+            off = 3 * CONGRUENCE_TOL * np.sqrt(at.size)  # `classify` allows 2
             return bool((np.abs(spread - spread_of(at)) <= off * spread).any())
 
-        asked = [one for one in own if may_be_elsewhere(*one[1:])]
-        known = sorted(chain.from_iterable(comm.allgather(asked)), key=itemgetter(0))
-        found = {number: (number, at) for number, _, at in own}
-        if known:
+        candidates = [one for one in own if may_be_elsewhere(*one[1:])]
+        shared = sorted(
+            chain.from_iterable(comm.allgather(candidates)), key=itemgetter(0)
+        )
+        representatives = {number: (number, at) for number, _, at in own}
+        if shared:
             first, group, _ = classify(
-                [key for _, key, _ in known], [at for *_, at in known]
+                [key for _, key, _ in shared], [at for *_, at in shared]
             )
-            for (number, *_), k in zip(known, group, strict=True):
-                of, _, at = known[first[k]]
-                found[number] = of, at
-        return found
+            for (number, *_), k in zip(shared, group, strict=True):
+                of, _, at = shared[first[k]]
+                representatives[number] = of, at
+        return representatives
 
     @property
     def rotation(self) -> NDArray[np.float64]:
-        """(S_p, 2, 2) turns each from the axes of its kind to those of the whole."""
+        """Rotations (S_p, dim, dim) from the axes of each class to the global axes."""
         return self._classified[1]
 
     @cached_property
     def motions(self) -> NDArray[np.int64]:
-        """First rigid motion of each subdomain of the whole, and how many: (S + 1,)."""
-        modes = np.array([kind.R.shape[1] for kind in self.domains.kinds])
-        found = np.zeros(self.rank.size, dtype=np.int64)
-        own = self.number, modes[self.domains.kind]
-        for number, count in self.ranks.comm.allgather(own):
-            found[number] = count
-        return np.concatenate([[0], np.cumsum(found)])
+        """First rigid motion of each of all S subdomains, and the total: (S + 1,)."""
+        modes = np.array([kind.R.shape[1] for kind in self.domains.classes])
+        counts = np.zeros(self.rank.size, dtype=np.int64)
+        local = self.number, modes[self.domains.class_of]
+        for number, count in self.ranks.comm.allgather(local):
+            counts[number] = count
+        return np.concatenate([[0], np.cumsum(counts)])
 
     @property
-    def own_motions(self) -> NDArray[np.int64]:
-        """Number its rigid motions among those of all subdomains."""
+    def local_motions(self) -> NDArray[np.int64]:
+        """Global numbers of the rigid motions of the local subdomains."""
         first, end = self.motions[self.number], self.motions[self.number + 1]
         return np.concatenate([np.arange(*m) for m in zip(first, end, strict=True)])
 
     @property
-    def coarse(self) -> int:
-        """How many rigid motions all subdomains have together."""
+    def coarse_size(self) -> int:
+        """Number of rigid motions of all subdomains (coarse problem)."""
         return int(self.motions[-1])
 
     @cached_property
     def f(self) -> Vector:
-        """Its part of the load, (N_p,) in the axes of subdomains."""
+        """Local part of the load, (N_p,) in subdomain axes, split among copies."""
         d = self.problem.components
-        times = np.repeat(self.nodes.times, d)
-        found = self.problem.load(self._component) / times
+        multiplicity = np.repeat(self.nodes.multiplicity, d)
+        load = self.problem.load(self._component) / multiplicity
         if d > 1:
-            loaded = np.flatnonzero(found.reshape(-1, d).any(axis=1))
-            turn = self.rotation[self.nodes.subdomain[loaded]]
-            shared = found.reshape(-1, d)
-            shared[loaded] = np.einsum("mkq,mk->mq", turn, shared[loaded])
-        return np.asarray(found[self.kept])
+            loaded = np.flatnonzero(load.reshape(-1, d).any(axis=1))
+            rotation = self.rotation[self.nodes.subdomain[loaded]]
+            shared = load.reshape(-1, d)
+            shared[loaded] = np.einsum("mkq,mk->mq", rotation, shared[loaded])
+        return np.asarray(load[self.free])
 
     def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return Rᵀ of single forces (k, r), in the columns of the rigid motions.
+        """Return the resultants (k, r) of single forces along all r rigid motions.
 
         unknown, value : torn unknowns and the forces there, (k,)
         """
         domains = self.domains
         of = np.searchsorted(domains.start, unknown, side="right") - 1
-        R = np.concatenate([kind.R.ravel() for kind in domains.kinds])
-        first = np.cumsum([0, *(kind.R.size for kind in domains.kinds)])
+        R = np.concatenate([kind.R.ravel() for kind in domains.classes])
+        first = np.cumsum([0, *(kind.R.size for kind in domains.classes)])
         modes = np.diff(self.motions)[self.number[of]]
-        at = first[domains.kind[of]] + modes * (unknown - domains.start[of])
+        at = first[domains.class_of[of]] + modes * (unknown - domains.start[of])
         ends = np.concatenate([[0], np.cumsum(modes)])
         along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
         entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
         column = np.repeat(self.motions[self.number[of]], modes) + along
-        return csr_array((entries, column, ends), shape=(unknown.size, self.coarse))
+        return csr_array(
+            (entries, column, ends), shape=(unknown.size, self.coarse_size)
+        )
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
         shaping = self.problem.shaping
         return None if shaping is None else shaping(self.number)
 
-    def stiffness(self, node: Nodes, *, held: bool) -> Vector:
-        """Return what rows of supports, or gluing, at torn nodes (k,) are scaled by."""
+    def row_stiffness(self, node: Nodes, *, supports: bool) -> Vector:
+        """Return the stiffness by whose root rows at torn nodes (k,) are scaled.
+
+        supports : True for rows of supports, False for rows of gluing
+        """
         body = self.problem.layout.body[self.number]
         E = self.problem.E[body[self.nodes.subdomain[node]]]
         if self._shape is None:
             return E
-        return np.asarray(E * self._shape(node, self.nodes.number[node], held))
+        return np.asarray(E * self._shape(node, self.nodes.number[node], supports))
 
     @cached_property
     def rows(self) -> _Rows:
-        """Its rows of B."""
-        return _rows(self)
+        """The rows of B that touch local subdomains."""
+        return _local_rows(self)
 
     @cached_property
-    def torn_bodies(self) -> Torn:
-        """Collect what its subdomains are; rows and components are those it has."""
+    def decomposed(self) -> DecomposedBodies:
+        """The local subdomains with their rows of B and their components."""
         domains, rows = self.domains, self.rows
-        return Torn(
-            kinds=domains.kinds, kind=domains.kind, spread=self.spread, B=rows.B,
-            c=rows.c, scale=self.problem.contact_scale, f=self.f,
-            equalities=rows.equalities,
+        return DecomposedBodies(
+            classes=domains.classes, class_of=domains.class_of,
+            spread=self.spread, B=rows.B, c=rows.c,
+            scale=self.problem.contact_scale, f=self.f, equalities=rows.equalities,
         )  # fmt: skip
 
-    def bounded(self, bound: Vector) -> OwnSubdomains:
-        """Hold the same with another bound (k,) of friction."""
+    def with_bound(self, bound: Vector) -> LocalSubdomains:
+        """Return a copy with another friction bound (k,); cached results are kept."""
         contact = self.problem.contact._replace(bound=bound)
-        found = replace(self, problem=replace(self.problem, contact=contact))
-        # nothing that is remembered here depends on the bound
-        vars(found).update({**vars(self), "problem": found.problem})
-        return found
+        copy = replace(self, problem=replace(self.problem, contact=contact))
+        # no cached property depends on the bound
+        vars(copy).update({**vars(self), "problem": copy.problem})
+        return copy
 
-    def posed(self, problem: ProblemInParts) -> OwnSubdomains:
-        """Hold the same bodies with other loads, contact or supports that are rows."""
-        found = replace(self, problem=problem)
+    def with_problem(self, problem: DecomposedProblem) -> LocalSubdomains:
+        """Return the same bodies with another load, contact or supports as rows.
+
+        The classes of subdomains, the expensive part, are kept.
+        """
+        copy = replace(self, problem=problem)
         same = ("number", "nodes", "_classified", "_distinct")
-        vars(found).update({k: v for k, v in vars(self).items() if k in same})
-        return found
+        vars(copy).update({k: v for k, v in vars(self).items() if k in same})
+        return copy
 
 
 class _Rows(NamedTuple):
     """The rows of B that touch subdomains of this rank."""
 
-    number: Nodes  #: (t,) ascending
+    number: Nodes  #: (t,) global numbers, ascending
     B: csr_array  #: (t, N_p)
-    reach: csr_array  #: (t, ranks) which ranks touch them
+    reach: csr_array  #: (t, ranks) nonzero where a rank touches a row
     c: Vector  #: (t,)
-    equalities: int  #: of all rows of the whole
-    total: int  #: rows of the whole
+    equalities: int  #: number of equality rows on all ranks
+    total: int  #: number of rows on all ranks
 
 
-def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
-    """Give subdomains to ranks (S,), so that these do and hold alike much.
+def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
+    """Return a rank for each subdomain (S,), balancing work and memory.
 
     Raises
     ------
     InputError
-        Where there are fewer subdomains than ranks.
+        If there are fewer subdomains than ranks.
 
     """
     of, d = problem.layout, problem.components
     S = of.count
     if ranks == 1:
         return np.zeros(S, dtype=np.int64)
-    one, other, nodes = of.sharing()
+    one, other, nodes = of.shared_node_counts()
     graph = coo_array((d * nodes, (one, other)), shape=(S, S))
     touched = of.glued()
-    node = np.unique(np.concatenate([problem.held, problem.contact.rows.indices]) // d)
-    single = of.times(node) == 1
+    node = np.unique(np.concatenate([problem.fixed, problem.contact.rows.indices]) // d)
+    single = of.multiplicity(node) == 1
     touched = touched + np.bincount(of.holder(node[single]), minlength=S)
     entries = problem.contact.rows.tocoo()
     touches = csr_array(
@@ -419,22 +455,24 @@ def subdomains_of(problem: ProblemInParts, ranks: int) -> NDArray[np.int64]:
     )
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    return balanced(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
+    return balanced_partition(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
 
 
-def _rows(own: OwnSubdomains) -> _Rows:
-    """Fill the rows of B, in the order of supports, gluing and contact."""
-    problem, ranks = own.problem, own.ranks
-    parts = [_glued(own), _contact(own)]
+def _local_rows(local: LocalSubdomains) -> _Rows:
+    """Assemble the local rows of B, in the order of supports, gluing and contact."""
+    problem, ranks = local.problem, local.ranks
+    entries = [_gluing_rows(local), _contact_rows(local)]
     if not problem.eliminated:
-        parts.insert(0, _supports(own))
-    row, column, value = (np.concatenate(p) for p in list(zip(*parts, strict=True))[:3])
+        entries.insert(0, _support_rows(local))
+    row, column, value = (
+        np.concatenate(p) for p in list(zip(*entries, strict=True))[:3]
+    )
     number, place = np.unique(row, return_inverse=True)
-    unknowns = problem.components * own.nodes.number.size
+    unknowns = problem.components * local.nodes.number.size
     B = csr_array((value, (place, column)), shape=(number.size, unknowns))
     if problem.eliminated:
-        B = csr_array(B[:, own.kept])
-    pairs = np.concatenate([part.reached for part in parts])
+        B = csr_array(B[:, local.free])
+    pairs = np.concatenate([part.reached for part in entries])
     pairs = pairs[np.isin(pairs[:, 0], number)]
     reach = csr_array(
         (
@@ -446,131 +484,136 @@ def _rows(own: OwnSubdomains) -> _Rows:
     reach.sort_indices()
     reach.data[:] = 1
     contact, scale = problem.contact, problem.contact_scale
-    E = _equalities(problem)
+    E = _equality_count(problem)
     touching = number >= E
     c = np.zeros(number.size)
     c[touching] = (scale * contact.c)[number[touching] - E]
     return _Rows(number, B, reach, c, E, E + scale.size)
 
 
-def _supports(own: OwnSubdomains) -> Entries:
-    """One row for each copy of a component that is held, the last copy first."""
-    problem, d = own.problem, own.problem.components
-    node, k = np.divmod(problem.held, d)
-    times = problem.layout.times(node)
-    copies = _own_copies(own, node)
-    of = copies.node[copies.mine]
-    row = np.cumsum(times)[of] - 1 - copies.copy[copies.mine]
-    value = np.sqrt(own.stiffness(copies.torn, held=True))
-    reached = np.stack([row, np.full(row.size, own.ranks.rank)], axis=1)
-    return Entries(*_turned(own, row, copies.torn, k[of], value), reached)
+def _support_rows(local: LocalSubdomains) -> Entries:
+    """Return a row for each copy of a fixed component, the last copy first."""
+    problem, d = local.problem, local.problem.components
+    node, k = np.divmod(problem.fixed, d)
+    multiplicity = problem.layout.multiplicity(node)
+    copies = _local_copies(local, node)
+    of = copies.node[copies.local]
+    row = np.cumsum(multiplicity)[of] - 1 - copies.copy[copies.local]
+    value = np.sqrt(local.row_stiffness(copies.local_node, supports=True))
+    reached = np.stack([row, np.full(row.size, local.ranks.rank)], axis=1)
+    return Entries(*_rotated(local, row, copies.local_node, k[of], value), reached)
 
 
 class _Copies(NamedTuple):
-    """The copies of some nodes on all ranks, node by node."""
+    """Copies of some nodes on all ranks, node by node."""
 
     node: NDArray[np.int64]  #: (k,) place in the list of nodes
-    copy: NDArray[np.int64]  #: (k,) which one it is, from 0 on
-    rank: NDArray[np.int64]  #: (k,) that holds it
-    mine: NDArray[np.int64]  #: (l,) places of those that this rank holds
-    torn: NDArray[np.int64]  #: (l,) which of the own torn nodes they are
+    copy: NDArray[np.int64]  #: (k,) number of the copy, from 0
+    rank: NDArray[np.int64]  #: (k,) rank of the copy
+    local: NDArray[np.int64]  #: (l,) places of those on this rank
+    local_node: NDArray[np.int64]  #: (l,) their places among the local torn nodes
 
 
-def _own_copies(own: OwnSubdomains, node: Nodes) -> _Copies:
-    """Find the copies of some nodes (k,), and which of them this rank holds."""
-    of = own.problem.layout
-    times = of.times(node)
-    place = np.repeat(np.arange(times.size), times)
-    copy = np.arange(place.size) - np.repeat(np.cumsum(times) - times, times)
+def _local_copies(local: LocalSubdomains, node: Nodes) -> _Copies:
+    """Return the copies of some nodes on all ranks, and those on this one."""
+    of = local.problem.layout
+    multiplicity = of.multiplicity(node)
+    place = np.repeat(np.arange(multiplicity.size), multiplicity)
+    copy = np.arange(place.size) - np.repeat(
+        np.cumsum(multiplicity) - multiplicity, multiplicity
+    )
     subdomain = of.holder(node[place], copy)
-    rank = own.rank[subdomain]
-    mine = np.flatnonzero(rank == own.ranks.rank)
-    torn = own.torn(subdomain[mine], node[place[mine]])
+    rank = local.rank[subdomain]
+    mine = np.flatnonzero(rank == local.ranks.rank)
+    torn = local.local_nodes(subdomain[mine], node[place[mine]])
     return _Copies(place, copy, rank, mine, torn)
 
 
-def _glued(own: OwnSubdomains) -> Entries:
-    """Rows of nodes with few copies first, and among these node by node."""
-    problem, nodes, of = own.problem, own.nodes, own.problem.layout
+def _gluing_rows(local: LocalSubdomains) -> Entries:
+    """Return the gluing rows, ordered by multiplicity, then by node and component."""
+    problem, nodes, of = local.problem, local.nodes, local.problem.layout
     d = problem.components
-    held = np.sort(problem.held)
-    held_times = of.times(held // d)
-    base = 0 if problem.eliminated else int(held_times.sum())
+    fixed = np.sort(problem.fixed)
+    fixed_multiplicity = of.multiplicity(fixed // d)
+    base = 0 if problem.eliminated else int(fixed_multiplicity.sum())
     none = np.zeros(0, dtype=np.int64)
-    found = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
-    for m, nodes_with in sorted(of.having.items()):
+    parts = [Entries(none, none, np.zeros(0), none.reshape(0, 2))]
+    for m, nodes_with in sorted(of.nodes_by_multiplicity.items()):
         W = GLUE[problem.glue](m)
-        held_m = held[held_times == m]
-        several = np.flatnonzero(nodes.times == m)
+        fixed_m = fixed[fixed_multiplicity == m]
+        several = np.flatnonzero(nodes.multiplicity == m)
         number = nodes.number[several]
         before = of.before(number)
-        ranks = np.stack([own.rank[of.holder(number, p)] for p in range(m)], axis=1)
+        ranks = np.stack([local.rank[of.holder(number, p)] for p in range(m)], axis=1)
         for k in range(d):
             component = d * number + k
-            free = ~np.isin(component, held_m)
-            first = d * before + k - np.searchsorted(held_m, component)
+            free = ~np.isin(component, fixed_m)
+            first = d * before + k - np.searchsorted(fixed_m, component)
             for r, weights in enumerate(W):
-                mine = np.flatnonzero(free & (weights[nodes.copy[several]] != 0))
-                row = base + first[mine] * len(W) + r
-                node = several[mine]
+                rows = np.flatnonzero(free & (weights[nodes.copy[several]] != 0))
+                row = base + first[rows] * len(W) + r
+                node = several[rows]
                 value = weights[nodes.copy[node]]
-                entries = _turned(
-                    own, row, node, np.full(node.size, k),
-                    np.sqrt(own.stiffness(node, held=False)) * value,
+                entries = _rotated(
+                    local, row, node, np.full(node.size, k),
+                    np.sqrt(local.row_stiffness(node, supports=False)) * value,
                 )  # fmt: skip
-                there = ranks[mine][:, weights != 0]
+                ranks_there = ranks[rows][:, weights != 0]
                 reached = np.stack(
-                    [np.repeat(row, there.shape[1]), there.ravel()], axis=1
+                    [np.repeat(row, ranks_there.shape[1]), ranks_there.ravel()], axis=1
                 )
-                found.append(Entries(*entries, reached))
-        base += len(W) * (d * nodes_with - held_m.size)
-    return Entries(*(np.concatenate(p) for p in zip(*found, strict=True)))
+                parts.append(Entries(*entries, reached))
+        base += len(W) * (d * nodes_with - fixed_m.size)
+    return Entries(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
 
-def _contact(own: OwnSubdomains) -> Entries:
-    """Rows of contact and friction, which act on the average of copies."""
-    problem, d = own.problem, own.problem.components
+def _contact_rows(local: LocalSubdomains) -> Entries:
+    """Return the rows of contact and friction, which act on averages of copies."""
+    problem, d = local.problem, local.problem.components
     entries = problem.contact.rows.tocoo()
     node, k = np.divmod(entries.col.astype(np.int64), d)
-    copies = _own_copies(own, node)
-    row = _equalities(problem) + entries.row.astype(np.int64)
+    copies = _local_copies(local, node)
+    row = _equality_count(problem) + entries.row.astype(np.int64)
     reached = np.stack([row[copies.node], copies.rank], axis=1)
-    times = problem.layout.times(node)
-    share = problem.contact_scale[entries.row] * entries.data / times
-    of = copies.node[copies.mine]
-    return Entries(*_turned(own, row[of], copies.torn, k[of], share[of]), reached)
+    multiplicity = problem.layout.multiplicity(node)
+    share = problem.contact_scale[entries.row] * entries.data / multiplicity
+    of = copies.node[copies.local]
+    return Entries(
+        *_rotated(local, row[of], copies.local_node, k[of], share[of]), reached
+    )
 
 
-def _turned(
-    own: OwnSubdomains,
+def _rotated(
+    local: LocalSubdomains,
     row: NDArray[np.int64],
     node: NDArray[np.int64],
     k: NDArray[np.int64],
     value: Vector,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Vector]:
-    """Give entries (e,) in the axes of subdomains, of components k of nodes (j,)."""
-    d = own.problem.components
+    """Return entries in subdomain axes, from values at components k of nodes (j,)."""
+    d = local.problem.components
     if d == 1:
         return row, node, value
-    turn = own.rotation[own.nodes.subdomain[node], k]  # row k of Q: u_k = Σ Q_kq v_q
-    kept = turn != 0
+    # row k of Q, as u_k = Σ Q_kq v_q
+    rotation = local.rotation[local.nodes.subdomain[node], k]
+    nonzero = rotation != 0
     column = d * node[:, None] + np.arange(d)
-    rows = np.broadcast_to(row[:, None], kept.shape)
-    return rows[kept], column[kept], (turn * value[:, None])[kept]
+    rows = np.broadcast_to(row[:, None], nonzero.shape)
+    return rows[nonzero], column[nonzero], (rotation * value[:, None])[nonzero]
 
 
-def _equalities(problem: ProblemInParts) -> int:
-    """Count the rows of supports and gluing."""
+def _equality_count(problem: DecomposedProblem) -> int:
+    """Return the number of rows of supports and gluing on all ranks."""
     of, d = problem.layout, problem.components
-    times = of.times(problem.held // d)
+    multiplicity = of.multiplicity(problem.fixed // d)
     glued = sum(
-        len(GLUE[problem.glue](m)) * (d * count - int((times == m).sum()))
-        for m, count in of.having.items()
+        len(GLUE[problem.glue](m)) * (d * count - int((multiplicity == m).sum()))
+        for m, count in of.nodes_by_multiplicity.items()
     )
-    return glued if problem.eliminated else int(times.sum()) + glued
+    return glued if problem.eliminated else int(multiplicity.sum()) + glued
 
 
-def on_one_process(problem: ProblemInParts) -> OwnSubdomains:
-    """Hold all subdomains on a single process."""
+def on_one_process(problem: DecomposedProblem) -> LocalSubdomains:
+    """Return all subdomains on this process, as if it was the only rank."""
     every = np.zeros(problem.layout.count, dtype=np.int64)
-    return OwnSubdomains(problem, alone(), every)
+    return LocalSubdomains(problem, single_process(), every)

@@ -1,4 +1,4 @@
-"""Torn bodies as certificates see them: local stiffness, its kernel and its inverse."""
+"""Local problems of subdomains for certificates: stiffness, kernel and inverse."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from scipy.sparse import bsr_array, csr_array
 
 from mortarbench.harness import Vector
 from mortarbench.harness.verify.products import projected_products
-from mortarbench.problems.feti.torn import Kind, Torn
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
 
 
 @dataclass(frozen=True, eq=False)
 class LocalProblems:
-    """The local problems of torn bodies; see `harness.mechanics.Substructures`.
+    """Local problems of decomposed bodies; see `harness.mechanics.Substructures`.
 
-    Factors are made when they are needed.
+    Factors are computed on first use.
     """
 
-    torn: Torn
-    components: int = 2  #: of a node; torn unknowns are numbered node by node
+    torn: DecomposedBodies
+    components: int = 2  #: per node; torn unknowns are numbered node by node
 
     @property
     def spread(self) -> csr_array:
-        """T (N, n)."""
+        """T (N, n) from global components to torn unknowns."""
         return self.torn.spread
 
     @property
     def kernel(self) -> csr_array:
-        """R (N, r)."""
+        """R (N, r), a basis of the rigid motions of all subdomains."""
         return self.torn.domains.kernel
 
     @cached_property
     def weight(self) -> Vector:
         """Sum of the diagonal entries of K at each torn node, (N,)."""
-        d, found = self.components, np.empty(self.spread.shape[0])
-        for kind, place in self._kinds():
-            trace = kind.K.diagonal().reshape(-1, d).sum(axis=1)
-            found[place] = np.repeat(trace, d)[:, None]
-        return found
+        d, weight = self.components, np.empty(self.spread.shape[0])
+        for template, place in self._classes():
+            trace = template.K.diagonal().reshape(-1, d).sum(axis=1)
+            weight[place] = np.repeat(trace, d)[:, None]
+        return weight
 
     def diagonal(self, at: NDArray[np.int64]) -> Vector:
         """Return the diagonal of  TᵀK_T T  at components `at` (k,)."""
@@ -51,10 +51,10 @@ class LocalProblems:
         number = np.full(self.spread.shape[0] // d, -1)
         number[nodes] = np.arange(nodes.size)
         blocks = np.empty((nodes.size, d, d))
-        for kind, place in self._kinds():
-            own = number[place[::d] // d]
-            node, subdomain = np.nonzero(own >= 0)
-            blocks[own[node, subdomain]] = _nodal(kind, d)[node]
+        for template, place in self._classes():
+            places = number[place[::d] // d]
+            node, subdomain = np.nonzero(places >= 0)
+            blocks[places[node, subdomain]] = _nodal(template, d)[node]
         rows = (d * nodes[:, None] + np.arange(d)).ravel()
         T = csr_array(self.spread[rows][:, at])
         ends = np.arange(nodes.size + 1)
@@ -62,45 +62,47 @@ class LocalProblems:
         return np.asarray(T.multiply(K @ T).sum(axis=0))
 
     def product(self, v: NDArray[Any]) -> NDArray[Any]:
-        """Apply PKP in the precision of v."""
-        found, domains = np.zeros_like(v), self.torn.domains
-        for kind, members in zip(domains.kinds, domains.members, strict=True):
-            K, R = kind.K, np.ascontiguousarray(kind.R)
+        """Apply PKP to v (N,) in the precision of v; P removes rigid motions."""
+        image, domains = np.zeros_like(v), self.torn.domains
+        for template, members in zip(domains.classes, domains.members, strict=True):
+            K, R = template.K, np.ascontiguousarray(template.R)
             projected_products(
-                K.data, K.indices, K.indptr, R, domains.start[members], v, found
+                K.data, K.indices, K.indptr, R, domains.start[members], v, image
             )
-        return found
+        return image
 
     def squared_product(self, v: Vector) -> Vector:
         """Apply K∘K, the squares of the entries of K, to v (N,)."""
-        found = np.empty_like(v)
-        for kind, place in self._kinds():
-            K = kind.K.copy()
+        image = np.empty_like(v)
+        for template, place in self._classes():
+            K = template.K.copy()
             K.data = K.data**2
-            found[place] = K @ v[place]
-        return found
+            image[place] = K @ v[place]
+        return image
 
     def solve(self, b: Vector) -> Vector:
-        """Apply PK⁺P with one factor per kind; all subdomains of a kind at once."""
-        found, domains = np.zeros_like(b), self.torn.domains
+        """Apply PK⁺P to b (N,), all subdomains of a class with one factor at once."""
+        solution, domains = np.zeros_like(b), self.torn.domains
         acting = np.logical_or.reduceat(b != 0, domains.start[:-1])
-        for (kind, place), members in zip(self._kinds(), domains.members, strict=True):
-            place = place[:, acting[members]]  # 0 of the others is 0
-            own, R = b[place], kind.R
-            own -= R @ (R.T @ own)
-            image = kind.inverse(own)
+        for (template, place), members in zip(
+            self._classes(), domains.members, strict=True
+        ):
+            place = place[:, acting[members]]  # the image of 0 is 0 elsewhere
+            columns, R = b[place], template.R
+            columns -= R @ (R.T @ columns)
+            image = template.inverse(columns)
             image -= R @ (R.T @ image)
-            found[place] = image
-        return found
+            solution[place] = image
+        return solution
 
-    def _kinds(self) -> zip[tuple[Kind, NDArray[np.int64]]]:
-        """Give each kind with the torn unknowns (n_k, S_k) of its subdomains."""
-        return zip(self.torn.kinds, self.torn.domains.places(), strict=True)
+    def _classes(self) -> zip[tuple[SubdomainClass, NDArray[np.int64]]]:
+        """Return each class with the torn unknowns (n_k, S_k) of its subdomains."""
+        return zip(self.torn.classes, self.torn.domains.places(), strict=True)
 
 
-def _nodal(kind: Kind, d: int) -> NDArray[np.float64]:
-    """Return the blocks of K of each node, (n_k/d, d, d)."""
-    blocks = np.empty((kind.K.shape[0] // d, d, d))
+def _nodal(template: SubdomainClass, d: int) -> NDArray[np.float64]:
+    """Return the diagonal blocks of K, one per node, (n_k/d, d, d)."""
+    blocks = np.empty((template.K.shape[0] // d, d, d))
     for i, j in np.ndindex(d, d):
-        blocks[:, i, j] = kind.K.diagonal(j - i)[min(i, j) :: d]
+        blocks[:, i, j] = template.K.diagonal(j - i)[min(i, j) :: d]
     return blocks

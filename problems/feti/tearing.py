@@ -1,12 +1,12 @@
-"""A mesh cut into subdomains that share no node.
+"""Partition of meshes into subdomains, and their classes up to rigid motions.
 
-Which cells form a subdomain is a label of each cell: blocks of a structured mesh, or
-whatever a library of graph partitioning says. Cells of one subdomain keep their nodes;
-a node on the boundary of several subdomains gets a copy in each.
+A label of each cell names its subdomain: a block of a structured mesh, or a part found
+by graph partitioning. A node on the boundary of several subdomains has a copy in each
+of them (tearing).
 
-Subdomains that are images of one another by a rigid motion are of one kind. They are
-found by their cells (numbered alike), their materials and their points; the rotation of
-each is the best one in the sense of least squares (Kabsch 1976).
+Subdomains that are images of one another under a rigid motion form a class. They have
+equally numbered cells, equal materials and congruent points; the rotation of each is
+the best one in the sense of least squares (Kabsch 1976, Acta Cryst. A32).
 """
 
 from __future__ import annotations
@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
 
-ALIKE = 1e-11  #: distance of the points of equal subdomains, of their diameter
+#: largest distance between points of congruent subdomains, relative to their radius
+CONGRUENCE_TOL = 1e-11
 
 
-class Part(NamedTuple):
-    """One subdomain on its own, with nodes 0 … n_k − 1."""
+class SubdomainMesh(NamedTuple):
+    """Mesh of one subdomain, with nodes 0 … n_k − 1."""
 
     points: NDArray[np.float64]  #: (n_k, dim)
     cells: Nodes  #: (E_k, corners)
@@ -34,14 +35,14 @@ class Part(NamedTuple):
 def blocks(
     divisions: tuple[int, ...], most: int | tuple[int, ...]
 ) -> NDArray[np.int64]:
-    """Label the cells of a structured mesh by blocks of at most `most` cells a side.
+    """Label the cells of a structured mesh by blocks of at most `most` cells per side.
 
-    The blocks along a direction are as equal as whole numbers allow.
+    The numbers of cells of the blocks along a direction differ by at most one.
 
     Parameters
     ----------
-    divisions : cells along each direction, the one that is numbered fastest first
-    most : H/h; of each direction, where these differ
+    divisions : cells along each direction, in the order of numbering, fastest first
+    most : H/h, for all directions or for each
 
     Returns
     -------
@@ -64,43 +65,44 @@ Sides = tuple[tuple[Vector, Vector], tuple[Vector, Vector]]
 
 
 def compact_blocks(sides: Sides, most: int) -> list[Block]:
-    """Cut a graded structured mesh into blocks of cells about as long as wide.
+    """Cut a graded structured mesh into blocks of cells with aspect ratios near one.
 
-    A block of more than most² cells is cut across where it is longer, at half of its
-    length, and nearer to its beginning where two lines are as near to that but for
-    rounding. Blocks as long as `blocks` are in cells would be as long and thin as
-    these, and bending of long subdomains is what conditions their dual worst.
+    A block of more than most² cells is cut across its longer side, at the line nearest
+    to its middle; if two lines are equally near up to rounding, at the first one.
+    Blocks of equal numbers of cells, as from `blocks`, would have the aspect ratio of
+    the cells, and the bending modes of long subdomains dominate the condition number
+    of the dual.
 
     Parameters
     ----------
-    sides : of the cells, of ny rows and nx columns
-    most : H/h of a square
+    sides : of the cells in ny rows and nx columns
+    most : H/h of a square block
 
     """
     (deep, deep_of), (wide_of, wide) = sides
-    found, left = list[Block](), [(slice(0, deep.size), slice(0, wide.size))]
-    while left:
-        rows, columns = left.pop()
+    finished, pending = list[Block](), [(slice(0, deep.size), slice(0, wide.size))]
+    while pending:
+        rows, columns = pending.pop()
         lengths = (
             deep[rows] * deep_of[columns].mean(), wide[columns] * wide_of[rows].mean(),
         )  # fmt: skip
         size = [0.0 if part.size == 1 else part.sum() for part in lengths]
         if lengths[0].size * lengths[1].size <= most**2 or not any(size):
-            found.append((rows, columns))
+            finished.append((rows, columns))
             continue
-        k = int(size[1] > size[0] * (1 + ALIKE))
+        k = int(size[1] > size[0] * (1 + CONGRUENCE_TOL))
         ends = np.cumsum(lengths[k])
         off = np.abs(ends[:-1] - ends[-1] / 2)
-        nearest = int(np.argmax(off <= off.min() + ALIKE * ends[-1]))
+        nearest = int(np.argmax(off <= off.min() + CONGRUENCE_TOL * ends[-1]))
         cut = (rows, columns)[k]
         at = cut.start + nearest + 1
         for part in (slice(at, cut.stop), slice(cut.start, at)):
-            left.append((part, columns) if k == 0 else (rows, part))
-    return found
+            pending.append((part, columns) if k == 0 else (rows, part))
+    return finished
 
 
-def labelled(found: Sequence[Block]) -> NDArray[np.int64]:
-    """Label cells, row by row, by the blocks that cover them."""
+def label_blocks(found: Sequence[Block]) -> NDArray[np.int64]:
+    """Return the block of each cell, row by row."""
     shape = [max(block[k].stop for block in found) for k in (0, 1)]
     label = np.empty(shape, dtype=np.int64)
     for b, block in enumerate(found):
@@ -111,62 +113,67 @@ def labelled(found: Sequence[Block]) -> NDArray[np.int64]:
 def classify(
     keys: Iterable[Hashable], points: Sequence[NDArray[np.float64]]
 ) -> tuple[list[int], NDArray[np.int64], NDArray[np.float64]]:
-    """Find which of S subdomains are images of one another by a rigid motion.
+    """Sort S subdomains into classes of images under rigid motions.
 
     Parameters
     ----------
-    keys : what is the same of all subdomains of one kind: cells and materials
-    points : (n_s, dim) of each; of those with one key equally many
+    keys : cells and materials of each subdomain, equal within a class
+    points : (n_s, dim) of each; subdomains with equal keys have equally many
 
     Returns
     -------
-    first subdomain of each kind, kind (S,) of each subdomain, and rotations
-    (S, dim, dim) of it against the first one
+    first subdomain of each class, class (S,) of each subdomain, and its rotation
+    (S, dim, dim) relative to the first one
 
     """
     alike: dict[Hashable, list[int]] = {}
     for s, key in enumerate(keys):
         alike.setdefault(key, []).append(s)
     S, dim = len(points), points[0].shape[1]
-    first, kind = list[int](), np.empty(S, dtype=np.int64)
+    first, class_of = list[int](), np.empty(S, dtype=np.int64)
     rotation = np.empty((S, dim, dim))
     for group in alike.values():
-        left = np.array(group)
+        remaining = np.array(group)
         spread = np.array([spread_of(points[s]) for s in group])
-        # of images, ‖x − x̄‖ differs by no more than their points do
-        off = 2 * ALIKE * np.sqrt(points[group[0]].size)
-        while left.size:
+        # norms ‖x − x̄‖ of images differ by at most √size times the distance of points:
+        # a necessary condition that saves most comparisons
+        off = 2 * CONGRUENCE_TOL * np.sqrt(points[group[0]].size)
+        while remaining.size:
             near = np.flatnonzero(np.abs(spread - spread[0]) <= off * spread[0])
-            same, turn = images(np.stack([points[s] for s in left[near]]))
-            found = left[near[same]]
-            kind[found], rotation[found] = len(first), turn[same]
-            first.append(int(left[0]))
-            others = np.delete(np.arange(left.size), near[same])
-            left, spread = left[others], spread[others]
-    return first, kind, rotation
+            is_image, rotations = congruent(
+                np.stack([points[s] for s in remaining[near]])
+            )
+            members = remaining[near[is_image]]
+            class_of[members], rotation[members] = len(first), rotations[is_image]
+            first.append(int(remaining[0]))
+            others = np.delete(np.arange(remaining.size), near[is_image])
+            remaining, spread = remaining[others], spread[others]
+    return first, class_of, rotation
 
 
 def spread_of(points: NDArray[np.float64]) -> float:
-    """Return ‖x − x̄‖, which is the same of images."""
+    """Return ‖x − x̄‖, which is invariant under rigid motions."""
     return float(np.linalg.norm(points - points.mean(axis=0)))
 
 
-def images(
+def congruent(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Say which of equally many points (g, n, dim) are images of the first, and how.
+    """Find images of the first of g sets of points (g, n, dim), and their rotations.
 
     Returns
     -------
-    (g,) whether, and (g, dim, dim) the rotations: x − x̄ = Q (x₁ − x̄₁)
+    (g,) True for images, and rotations Q (g, dim, dim) with x − x̄ = Q (x₁ − x̄₁)
 
     """
     x = points - points.mean(axis=1, keepdims=True)
-    near = ALIKE * np.linalg.norm(x[0], axis=1).max()
+    near = CONGRUENCE_TOL * np.linalg.norm(x[0], axis=1).max()
     U, _, Vt = np.linalg.svd(np.einsum("gni,nj->gij", x, x[0]))
-    U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]  # no reflections
+    U[:, :, -1] *= np.linalg.det(U @ Vt)[:, None]  # det Q = 1 excludes reflections
     Q = U @ Vt
-    moved = np.abs(x - x[0]).max(axis=(1, 2)) <= near  # without turning
-    Q[moved] = np.eye(x.shape[2])
-    turned = np.abs(x - np.einsum("gij,nj->gni", Q, x[0])).max(axis=(1, 2)) <= near
-    return turned, Q
+    translated = (
+        np.abs(x - x[0]).max(axis=(1, 2)) <= near
+    )  # translations only: Q = I without rounding, so that B stays sparse
+    Q[translated] = np.eye(x.shape[2])
+    is_image = np.abs(x - np.einsum("gij,nj->gni", Q, x[0])).max(axis=(1, 2)) <= near
+    return is_image, Q

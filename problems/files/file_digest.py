@@ -1,6 +1,6 @@
-"""What a case rests on when it comes from files: their format and content, by digest.
+"""Formats of QP files, and digests of their content.
 
-Text and .mat files may be compressed by gzip; npz and Parquet are compressed as it is.
+Text and .mat files may be compressed by gzip; npz and Parquet are compressed already.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ FORMATS = (".npz", ".parquet", *COMPRESSIBLE)  #: suffixes of QP files
 
 
 def format_of(path: Path) -> str:
-    """Name the format of a QP file by its suffix, without a .gz that it has besides.
+    """Return the suffix that names the format of a QP file, without a final .gz.
 
     Raises
     ------
     InputError
-        For a suffix that names none.
+        For an unknown suffix.
 
     """
     suffix = path.suffix.lower()
@@ -36,7 +36,7 @@ def format_of(path: Path) -> str:
 
 
 def check_digest(path: Value, asked: Value, found: str) -> None:
-    """Raise InputError unless the content is what the case was named for."""
+    """Raise InputError unless the content has the digest in the name of the case."""
     if asked != found:
         raise InputError(
             f"{path}: its content has the digest {found}, not {asked}; "

@@ -1,23 +1,23 @@
 """QPS: the MPS format of linear programs with a section for the quadratic term.
 
-Fields are separated by white space (so names hold none), which also reads files in
-fixed columns. Sections as in Maros and Mészáros (1999), "A repository of convex
-quadratic programming problems", Optim. Methods Softw. 11/12:
+Fields are separated by white space, so that names cannot contain any; files in fixed
+columns are read as well. Sections follow Maros and Mészáros (1999), "A repository of
+convex quadratic programming problems", Optim. Methods Softw. 11/12:
 
 * N rows after the first are ignored; the objective's RHS is minus its constant.
 * RANGES R turns  ≤ b  into [b − |R|, b],  ≥ b  into [b, b + |R|],  = b  into
   [b, b + R] or, for R < 0, [b + R, b].
-* BOUNDS default to [0, ∞); a negative UP on its own frees the lower side, as the
-  commercial readers have it.
+* BOUNDS default to [0, ∞); a negative UP alone removes the lower bound, as in
+  commercial readers.
 * QUADOBJ and QSECTION hold one triangle of P, QMATRIX both; the objective is
   ½xᵀPx + qᵀx, so diagonal entries are as in P, not halved.
 
-Undefined names and numbers that are none are refused, with their line: HiGHS' reader
-(1.15) ignores the one and takes the other for 0.
+Undefined names and malformed numbers raise an error with their line. (The reader of
+HiGHS 1.15 ignores the former and reads the latter as 0.)
 
-What is written here is read here as the same QP, to the last digit of every number. Of
-a P that is symmetric up to rounding only, that is its symmetric part: the objective has
-no other, and HiGHS refuses a QMATRIX whose triangles differ in the last digit.
+A QP that is written and read again is the same to the last digit of every number. If P
+is symmetric only up to rounding, its symmetric part is written: the objective depends
+on nothing else, and HiGHS rejects a QMATRIX whose triangles differ in the last digit.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.errors import shortened, unknown
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.files.qpfile import explicit_matrices
-from mortarbench.problems.files.two_sided import INFINITE, TwoSidedQP
+from mortarbench.problems.files.two_sided import MIN_INFINITE, TwoSidedQP
 
 _NUMBER = re.compile(
     r"[+-]?(\d+(\.\d*)?|\.\d+)([ED][+-]?\d+)?|[+-]?INF(INITY)?",
@@ -45,8 +45,8 @@ _NUMBER = re.compile(
 
 
 @dataclass(eq=False)
-class _Model:
-    """What has been read so far; rows and columns by name."""
+class _QPSModel:
+    """Content of the sections read so far; rows and columns by name."""
 
     rows: dict[str, str] = field(default_factory=dict)  #: name → N, L, G or E
     columns: dict[str, int] = field(default_factory=dict)
@@ -57,22 +57,22 @@ class _Model:
     upper: dict[str, float] = field(default_factory=dict)
     triangle: dict[tuple[str, str], float] = field(default_factory=dict)
     whole: dict[tuple[str, str], float] = field(default_factory=dict)
-    sign: float = 1.0  #: −1 where the objective is maximised
+    sign: float = 1.0  #: −1 if the objective is maximised
     objective: str = ""  #: the first N row
 
 
 def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
-    """Read a QPS text; also return the sign, −1 where it maximises.
+    """Parse a QPS text; return the problem and the sign of its objective.
 
-    A maximised objective comes back negated, constant included.
+    The sign is −1 for a maximisation, whose objective is negated with its constant.
 
     Raises
     ------
     InputError
-        With the number of the line where there is one.
+        If the text is malformed; the message names the line if possible.
 
     """
-    model, section, ended = _Model(), "", False
+    model, section, ended = _QPSModel(), "", False
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split()
         if not words or line.startswith("*"):
@@ -88,7 +88,7 @@ def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
         if ended := section == "ENDATA":
             break
     if not ended:
-        raise InputError("no ENDATA; the file is cut off, or no QPS")
+        raise InputError("no ENDATA; the file is truncated or not QPS")
     if not model.objective:
         raise InputError("no row of type N; expected the objective among ROWS")
     if math.isinf(model.rhs.get(model.objective, 0.0)):
@@ -97,24 +97,24 @@ def parse_qps(text: str) -> tuple[TwoSidedQP, float]:
 
 
 def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
-    """Write `qp` as a QPS text; an operator P is multiplied out.
+    """Write `qp` as a QPS text; an operator P is assembled.
 
-    The format has no place for more: `meta`, plain data, becomes comments.
+    The format has no metadata: `meta`, plain data, is written as comments.
 
     Raises
     ------
     InputError
-        When a side or a bound is as large as what the format takes for infinite, or
-        the file cannot be written.
+        If a finite right-hand side or bound counts as infinite in the format, or the
+        file cannot be written.
 
     """
     for name in ("b", "h", "lb", "ub"):
         values = getattr(qp, name)
-        large = np.isfinite(values) & (np.abs(values) >= INFINITE)
+        large = np.isfinite(values) & (np.abs(values) >= MIN_INFINITE)
         if large.any():
             raise InputError(
-                f"{path}: {name} holds {values[large.argmax()]:g}, and QPS takes what "
-                f"is {INFINITE:g} or more for infinite; expected .npz or .mat"
+                f"{path}: {name} holds {values[large.argmax()]:g}, but QPS treats "
+                f"{MIN_INFINITE:g} or more as infinite; expected .npz or .mat"
             )
     try:
         with replacing(path) as file:
@@ -125,7 +125,7 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
 
 
 def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
-    """Write the sections; rows e1 … are Ax = b, i1 … are Gx ≤ h, columns x1 …."""
+    """Yield the lines; rows e1 … are Ax = b, i1 … are Gx ≤ h, columns x1 …."""
     rows = [f"e{i + 1}" for i in range(qp.b.size)]
     rows += [f"i{i + 1}" for i in range(qp.h.size)]
     for key, value in meta.items():
@@ -163,7 +163,7 @@ def _column_lines(A: csc_array, q: Vector, rows: list[str]) -> Iterator[str]:
 
 
 def _bound_kinds(low: float, high: float) -> Iterator[tuple[str, str]]:
-    """Say which lines make [0, ∞), the default, [low, high]."""
+    """Yield the types and values of BOUNDS that change [0, ∞) to [low, high]."""
     if low == high:
         yield "FX", _digits(low)
         return
@@ -176,11 +176,11 @@ def _bound_kinds(low: float, high: float) -> Iterator[tuple[str, str]]:
 
 
 def _digits(value: float) -> str:
-    """Write the fewest digits that are read as the same number."""
+    """Return the shortest text that is read as the same number."""
     return repr(float(value))
 
 
-def _header(model: _Model, section: str, words: list[str]) -> None:
+def _header(model: _QPSModel, section: str, words: list[str]) -> None:
     known = (*_SECTIONS, "NAME", "ENDATA")
     if section not in known:
         raise unknown("section", words[0], known)
@@ -192,20 +192,20 @@ def _header(model: _Model, section: str, words: list[str]) -> None:
         _sense(model, words[1:])
 
 
-def _data(model: _Model, section: str, words: list[str]) -> None:
+def _data(model: _QPSModel, section: str, words: list[str]) -> None:
     if section not in _SECTIONS:
         raise InputError(f"{words[0]!r} is outside of every section; expected ROWS")
     _SECTIONS[section](model, words)
 
 
-def _sense(model: _Model, words: list[str]) -> None:
+def _sense(model: _QPSModel, words: list[str]) -> None:
     senses = {"MIN": 1.0, "MINIMIZE": 1.0, "MAX": -1.0, "MAXIMIZE": -1.0}
     if words[0].upper() not in senses:
         raise unknown("objective sense", words[0], senses)
     model.sign = senses[words[0].upper()]
 
 
-def _row(model: _Model, words: list[str]) -> None:
+def _row(model: _QPSModel, words: list[str]) -> None:
     _expect(len(words) == 2, "a type and a name")
     kind, name = words[0].upper(), words[1]
     if kind not in ("N", "L", "G", "E"):
@@ -216,7 +216,7 @@ def _row(model: _Model, words: list[str]) -> None:
         model.objective = name
 
 
-def _column(model: _Model, words: list[str]) -> None:
+def _column(model: _QPSModel, words: list[str]) -> None:
     if len(words) > 1 and words[1].strip("'") == "MARKER":
         raise InputError("integer variables; expected continuous ones")
     _expect(len(words) in (3, 5), "a column and one or two pairs of row and number")
@@ -227,10 +227,10 @@ def _column(model: _Model, words: list[str]) -> None:
         model.entries[row, name] = value
 
 
-def _sides(target: str) -> Callable[[_Model, list[str]], None]:
-    """Read RHS or RANGES, whose name of the set may be left out."""
+def _sides(target: str) -> Callable[[_QPSModel, list[str]], None]:
+    """Return a reader of RHS or RANGES, whose set name is optional."""
 
-    def read(model: _Model, words: list[str]) -> None:
+    def read(model: _QPSModel, words: list[str]) -> None:
         _expect(2 <= len(words) <= 5, "one or two pairs of row and number")
         values: dict[str, float] = getattr(model, target)
         for row, value in _pairs(model, words[len(words) % 2 :], _number):
@@ -240,7 +240,7 @@ def _sides(target: str) -> Callable[[_Model, list[str]], None]:
     return read
 
 
-def _bound(model: _Model, words: list[str]) -> None:
+def _bound(model: _QPSModel, words: list[str]) -> None:
     kind, *rest = words
     kind = kind.upper()
     if kind in ("BV", "LI", "UI", "SC", "SI"):
@@ -249,7 +249,7 @@ def _bound(model: _Model, words: list[str]) -> None:
         raise unknown("bound type", words[0], ("LO", "UP", "FX", "FR", "MI", "PL"))
     if kind in ("FR", "MI", "PL"):
         _expect(1 <= len(rest) <= 3, "a column")
-        # [set] column [number that means nothing]
+        # [set] column [ignored number]
         name, value = rest[min(len(rest) - 1, 1)], math.inf
         if len(rest) == 2 and rest[1] not in model.columns:
             name = rest[0]
@@ -265,8 +265,8 @@ def _bound(model: _Model, words: list[str]) -> None:
         model.lower[name] = -math.inf
 
 
-def _quadratic(target: str) -> Callable[[_Model, list[str]], None]:
-    def read(model: _Model, words: list[str]) -> None:
+def _quadratic(target: str) -> Callable[[_QPSModel, list[str]], None]:
+    def read(model: _QPSModel, words: list[str]) -> None:
         _expect(len(words) in (3, 5), "a column and one or two of column and number")
         values: dict[tuple[str, str], float] = getattr(model, target)
         i = words[0]
@@ -280,7 +280,7 @@ def _quadratic(target: str) -> Callable[[_Model, list[str]], None]:
     return read
 
 
-_SECTIONS: dict[str, Callable[[_Model, list[str]], None]] = {
+_SECTIONS: dict[str, Callable[[_QPSModel, list[str]], None]] = {
     "OBJSENSE": _sense, "ROWS": _row, "COLUMNS": _column,
     "RHS": _sides("rhs"), "RANGES": _sides("ranges"), "BOUNDS": _bound,
     "QUADOBJ": _quadratic("triangle"), "QSECTION": _quadratic("triangle"),
@@ -288,7 +288,7 @@ _SECTIONS: dict[str, Callable[[_Model, list[str]], None]] = {
 }  # fmt: skip
 
 
-def _two_sided(model: _Model) -> TwoSidedQP:
+def _two_sided(model: _QPSModel) -> TwoSidedQP:
     names, n = list(model.columns), len(model.columns)
     rows = {
         row: i for i, row in enumerate(k for k, v in model.rows.items() if v != "N")
@@ -313,8 +313,8 @@ def _two_sided(model: _Model) -> TwoSidedQP:
     )  # fmt: skip
 
 
-def _limits(model: _Model, row: str) -> tuple[float, float]:
-    """Find l and u of a row from its type, right-hand side and range."""
+def _limits(model: _QPSModel, row: str) -> tuple[float, float]:
+    """Return l and u of a row from its type, right-hand side and range."""
     b, R = model.rhs.get(row, 0.0), model.ranges.get(row)
     match model.rows[row]:
         case "E":
@@ -332,7 +332,7 @@ def _sparse(entries: list[tuple[int, int, float]], shape: tuple[int, int]) -> co
 
 
 def _pairs(
-    model: _Model, words: list[str], read: Callable[[str], float]
+    model: _QPSModel, words: list[str], read: Callable[[str], float]
 ) -> list[tuple[str, float]]:
     for row in words[::2]:
         if row not in model.rows:
@@ -340,15 +340,15 @@ def _pairs(
     return [(r, read(v)) for r, v in zip(words[::2], words[1::2], strict=True)]
 
 
-def _known_column(model: _Model, name: str) -> None:
+def _known_column(model: _QPSModel, name: str) -> None:
     if name not in model.columns:
         raise InputError(f"column {name!r} is not among COLUMNS")
 
 
 def _number(text: str) -> float:
-    """Read a number as Fortran writes it, or ±inf, which is an absent limit."""
+    """Read a number in Fortran notation, or ±inf for an absent limit."""
     if not _NUMBER.fullmatch(text):
-        raise InputError(f"{text!r} is no number")
+        raise InputError(f"{text!r} is not a number")
     if text[-1] not in "0123456789.":
         return float(text)
     value = float(text.upper().replace("D", "E"))
@@ -358,9 +358,9 @@ def _number(text: str) -> float:
 
 
 def _finite(text: str) -> float:
-    """Read the coefficient of a matrix or of the objective."""
+    """Read a finite coefficient of a matrix or of the objective."""
     if math.isinf(value := _number(text)):
-        raise InputError(f"{text!r} is no finite number")
+        raise InputError(f"{text!r} is not a finite number")
     return value
 
 

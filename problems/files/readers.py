@@ -25,16 +25,16 @@ from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 #: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
 Loaded = tuple[QP, float, float]
 
-_COPIES = 16  #: of a QPS text in memory: names and numbers as Python objects
+_COPIES = 16  #: memory of a parsed QPS text relative to the file, as Python objects
 
 
 def read(path: Path) -> Loaded:
-    """Read a QP in the format that the suffix of its path names; .gz may follow it.
+    """Read a QP in the format given by the suffix of its path; .gz may follow it.
 
     Raises
     ------
     InputError
-        When the file is damaged, or holds no convex QP.
+        If the file is damaged or its QP is not convex.
     KeyError
         For another suffix.
 
@@ -52,13 +52,13 @@ def _npz(path: Path) -> Loaded:
 
 
 def _mat(path: Path) -> Loaded:
-    """Read our own .mat file, known by its bounds, or one of Maros-Mészáros."""
+    """Read a .mat file: our own, recognised by G or h, or one of Maros-Mészáros."""
     arrays = read_mat(path)
     with located(str(path)):
         if {"G", "h"} & arrays.keys():
             return _with_units(*to_qp(arrays))
-        given = maros_meszaros(arrays)
-        return one_sided(given), 1.0, given.r
+        two_sided = maros_meszaros(arrays)
+        return one_sided(two_sided), 1.0, two_sided.r
 
 
 def _parquet(path: Path) -> Loaded:
@@ -74,8 +74,8 @@ def _qps(path: Path) -> Loaded:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not UTF-8; expected a QPS text") from None
     with located(str(path)):
-        given, sign = parse_qps(text)
-        return one_sided(given), sign, sign * given.r
+        two_sided, sign = parse_qps(text)
+        return one_sided(two_sided), sign, sign * two_sided.r
 
 
 _READERS: dict[str, Callable[[Path], Loaded]] = {
@@ -85,18 +85,18 @@ _READERS: dict[str, Callable[[Path], Loaded]] = {
 
 
 def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
-    """Take  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  out of the variables of a .mat file.
+    """Return the problem  ½xᵀPx + qᵀx + r,  l ≤ Ax ≤ u  of the arrays of a .mat file.
 
-    P and q may be called Q and c, r be missing. As distributed, the last n rows of A
-    are the identity: the bounds of the variables, and they become bounds here.
+    P and q may be called Q and c, and r may be missing. In the distributed files the
+    last n rows of A are the identity; they become bounds of the variables.
 
     Raises
     ------
     InputError
-        When a variable is missing or its shape does not fit the others.
+        If a variable is missing or its shape does not fit the others.
 
     """
-    read = partial(_called, arrays)
+    read = partial(_first_named, arrays)
     P, q = read(matrix, "P", "Q"), read(vector, "q", "c")
     A, l, u = read(matrix, "A"), read(vector, "l"), read(vector, "u")
     r = float(vector(arrays, "r").sum()) if "r" in arrays else 0.0
@@ -109,7 +109,7 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
             raise InputError(f"{name} has shape {got}, expected {right}")
     for name, size in (("n", n), ("m", m)):
         if name in arrays and vector(arrays, name).tolist() != [size]:
-            raise InputError(f"{name} is not {size}, as the other variables have it")
+            raise InputError(f"{name} is not {size}, the size of the other variables")
     bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
     rows = m - n if bounded else m
     return TwoSidedQP(
@@ -119,8 +119,10 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     )  # fmt: skip
 
 
-def _called(arrays: Mapping[str, Any], read: Callable[..., Any], *names: str) -> Any:
-    """Read the variable under the first of its names that is there."""
+def _first_named(
+    arrays: Mapping[str, Any], read: Callable[..., Any], *names: str
+) -> Any:
+    """Read the variable under the first of its names that is present."""
     return read(arrays, next((name for name in names if name in arrays), names[0]))
 
 
@@ -129,5 +131,5 @@ def _with_units(qp: QP, meta: Mapping[str, Any]) -> Loaded:
     if not all(
         is_number(v) and abs(v) <= sys.float_info.max for v in (scale, constant)
     ):
-        raise InputError("meta: scale and constant are no finite numbers")
+        raise InputError("meta: scale or constant is not a finite number")
     return qp, float(scale), float(constant)

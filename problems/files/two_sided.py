@@ -1,4 +1,4 @@
-"""QPs with two-sided rows, as test sets distribute them, turned into ours."""
+"""QPs with two-sided rows, as in test sets, and their conversion to `QP`."""
 
 from __future__ import annotations
 
@@ -11,54 +11,57 @@ from scipy.sparse import csc_array, csr_array, vstack
 from mortarbench.harness import QP, InputError, Vector
 from mortarbench.harness.qp import check_symmetric
 
-INFINITE = 1e20  #: bounds of at least this size mean that there is none
+MIN_INFINITE = 1e20  #: bounds of at least this size count as infinite
 
 
 class TwoSidedQP(NamedTuple):
-    """Minimise ½xᵀPx + qᵀx + r subject to l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
+    """The problem  min ½xᵀPx + qᵀx + r  subject to  l ≤ Ax ≤ u, lb ≤ x ≤ ub."""
 
-    P: Any  #: (n, n) sparse, whole
+    P: Any  #: (n, n) sparse, both triangles
     q: Vector  #: (n,)
     r: float
     A: Any  #: (m, n) sparse
-    l: Vector  #: (m,) ≤ −1e20: none
-    u: Vector  #: (m,) ≥ 1e20: none
-    lb: Vector  #: (n,) as l
-    ub: Vector  #: (n,) as u
+    l: Vector  #: (m,) values ≤ −1e20 are absent
+    u: Vector  #: (m,) values ≥ 1e20 are absent
+    lb: Vector  #: (n,) like l
+    ub: Vector  #: (n,) like u
 
 
-def one_sided(given: TwoSidedQP) -> QP:
-    """Split the rows: those with l = u are equalities, others up to two inequalities.
+def one_sided(qp: TwoSidedQP) -> QP:
+    """Return the QP with rows l = u as equalities and all others as inequalities.
 
-    First all upper sides  Ax ≤ u, then all lower ones  −Ax ≤ −l; free rows vanish.
+    All upper sides  Ax ≤ u  come first, then all lower sides  −Ax ≤ −l; free rows are
+    dropped.
 
     Raises
     ------
     InputError
-        When P is not symmetric, or sides cross.
+        If P is not symmetric, or limits cross.
 
     """
-    P, A = csc_array(given.P, dtype=float), csr_array(given.A, dtype=float)
+    P, A = csc_array(qp.P, dtype=float), csr_array(qp.A, dtype=float)
     try:
         check_symmetric(P)
     except ValueError as e:
         raise InputError(str(e)) from None
-    l, u = _limits("row", given.l, given.u)
-    lb, ub = _limits("variable", given.lb, given.ub)
+    l, u = _limits("row", qp.l, qp.u)
+    lb, ub = _limits("variable", qp.lb, qp.ub)
     equal = l == u
     upper, lower = np.isfinite(u) & ~equal, np.isfinite(l) & ~equal
     return QP(
-        P=P, q=given.q, A=A[equal], b=u[equal],
+        P=P, q=qp.q, A=A[equal], b=u[equal],
         G=csr_array(vstack([A[upper], -A[lower]])), h=np.append(u[upper], -l[lower]),
         lb=lb, ub=ub,
     )  # fmt: skip
 
 
 def _limits(what: str, low: Vector, high: Vector) -> tuple[Vector, Vector]:
-    """Make absent sides infinite; refuse those that cross or leave nothing."""
-    low = np.where(low <= -INFINITE, -np.inf, low)
-    high = np.where(high >= INFINITE, np.inf, high)
-    bad: NDArray[np.bool_] = ~(low <= high) | (low >= INFINITE) | (high <= -INFINITE)
+    """Replace absent limits by ±inf; raise InputError if limits admit no value."""
+    low = np.where(low <= -MIN_INFINITE, -np.inf, low)
+    high = np.where(high >= MIN_INFINITE, np.inf, high)
+    bad: NDArray[np.bool_] = (
+        ~(low <= high) | (low >= MIN_INFINITE) | (high <= -MIN_INFINITE)
+    )
     if bad.any():
         i = int(bad.argmax())
         raise InputError(

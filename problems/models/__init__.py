@@ -1,1 +1,1 @@
-"""What the families build: meshes, materials, loads and exact solutions."""
+"""Models of the families: meshes, materials, loads and exact solutions."""

@@ -1,13 +1,14 @@
 """The paper's benchmark: an elastic beam pressed onto a half ring (Section 2).
 
-A beam of 2 m × 0.25 m, its lower left corner at height 0.5 m, is clamped on the left
-and pulled down by F₀ = 10⁸ N/m at its upper right corner; a half ring with radii 0.3 m
-and 0.49 m around (1 m, 0), clamped at both feet, holds it up. The initial gap is 1 cm.
+A beam of 2 m × 0.25 m (Figure 1 of the paper), with its lower left corner at height
+0.5 m, is clamped on the left and pulled down by F₀ = 10⁸ N/m at its upper right corner.
+It is supported by a half ring with radii 0.3 m and 0.49 m around (1 m, 0), clamped at
+both feet. The initial gap is 1 cm.
 
-Errata of the paper that bite here: its 313 nodes for Nr = 4, Nh = 3 belong to a ring
-with Nh radial layers (``radial=3``), text and Table 1 to 2·Nh (424 nodes); m_E counts
-prescribed displacement components, 2(Nr + 1) + 4(radial + 1); plane strain and a force
-per unit thickness are not stated but implied.
+Errata of the paper that matter here: its 313 nodes for Nr = 4, Nh = 3 imply a ring with
+Nh radial layers (``radial=3``), but its text and Table 1 imply 2·Nh (424 nodes). m_E is
+the number of prescribed displacement components, 2(Nr + 1) + 4(radial + 1), not of
+nodes. Plane strain and a force per unit thickness are implied, not stated.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     StructuredGrids,
-    by_keys,
-    remembered,
+    cached_problem,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
@@ -41,26 +42,26 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 
-LENGTH = 2.0  #: l, m
-LOAD = 1e8  #: F₀, N/m
+LENGTH = 2.0  #: l, length of the beam, m
+LOAD = 1e8  #: F₀ = 0.1 GN per m of thickness
 NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """State the benchmark; its load grows in `steps`."""
+    """Return the benchmark, loaded in `steps` equal load steps."""
     p: Any = params
-    of = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"])
-    tip = _tip(of.shape.sides)
+    elastic = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"])
+    tip = _tip(elastic.shape.sides)
     return ContactProblem(
-        bodies=of, linearise=by_keys(p),
+        bodies=elastic, linearise=keyed_linearisation(p),
         stages=load_steps(
-            p["steps"], p["relin"], of.forces, of.fixed, (law_of(p),),
+            p["steps"], p["relin"], elastic.forces, elastic.fixed, (law_of(p),),
             quasi_static=p["loading"] == "quasi-static",
         ),
-        results=lambda found: {"tip": (found.at(tip) * LENGTH).tolist()},
+        results=lambda answer: {"tip": (answer.at(tip) * LENGTH).tolist()},
     )  # fmt: skip
 
 
@@ -82,14 +83,16 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 @lru_cache(maxsize=4)
 def bodies(Nr: int, Nh: int, radial: int, plane: Plane) -> ElasticBodies:
-    """Put a beam (8Nr × Nr cells) above a ring (12Nh × radial)."""
+    """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells."""
     shape = StructuredGrids(_grids(Nr, Nh, radial))
     sides = shape.sides
+    # m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
     clamped = [dofs_of(sides[b], 2) for b in ("left", "left_foot", "right_foot")]
     return ElasticBodies(
         shape=shape, names=NAMES, materials=(BEAM, RING), plane=plane, length=LENGTH,
         force=LOAD, fixed=np.concatenate(clamped),
         forces=Forces(_tip(sides)[1:], np.array([-1.0])),
+        # as in the paper: the ring is the slave, the beam the master
         pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
     )  # fmt: skip
 

@@ -1,22 +1,22 @@
-"""A cantilever under an end load at finite strain, beside the elastica.
+"""A cantilever under an end load at finite strain, compared with the elastica.
 
 A beam of length L and thickness t = L/slenderness, clamped at its left end, carries the
-dead load P per width at its right end, spread evenly over the end face. A slender one
+dead load P per width at its right end, spread evenly over the end face. If slender, it
 is an inextensible elastica with the bending stiffness of plane strain,
 
     EI θ″ = −P cos θ,    EI = E t³ / (12(1 − ν²)),    θ(0) = θ′(L) = 0,
 
 whose solution by elliptic integrals (Bisshopp and Drucker 1945, Quarterly of Applied
-Mathematics 3, 272-275) depends on the key `load`, PL²/EI, alone. What slenderness
-leaves is of order (t/L)²: of small loads shear adds 3/(5(1 − ν)) (t/L)² to the
+Mathematics 3, 272-275) depends on the key `load`, PL²/EI, alone. The error of this
+model is of order (t/L)²: under small loads, shear adds 3/(5(1 − ν)) (t/L)² to the
 deflection, 0.2 % for L/t = 20 and ν = 0.3.
 
-Bilinear cells h_x × h_y do not bend: in linear elasticity the beam is stiffer by
+Bilinear cells h_x × h_y cannot bend: in linear elasticity the beam is too stiff by
 
     (1 − ν)/2 (h_x/t)²  (parasitic shear)  +  ν²/(1 − 2ν) (h_y/t)²  (constant ε_y)
 
-than it should be, 0.55 % and 0.35 % for square cells, ν = 0.3 and t = 8h. So cells are
-half as long as thick where `nx` does not say otherwise. With mean dilatation
+which is 0.55 % and 0.35 % for square cells, ν = 0.3 and t = 8h. The default `nx`
+therefore makes cells half as long as thick. With mean dilatation
 (`problems.fem.finite_strain`) the second term is −ν(h_y/t)².
 """
 
@@ -44,20 +44,20 @@ from mortarbench.problems.fem.mesh import (
 )
 
 LENGTH = 1.0  #: L, m
-E = 10e6  #: Pa, that of rubber
+E = 10e6  #: modulus of rubber, Pa
 
 
 class Elastica(NamedTuple):
-    """The end of the elastica."""
+    """Displacement of the loaded end of the elastica."""
 
-    deflection: float  #: w/L, along the load
-    shortening: float  #: u/L, towards the clamp
+    deflection: float  #: w/L in the direction of the load
+    shortening: float  #: u/L towards the clamp
 
 
 def elastica(load: float) -> Elastica:
-    """Solve for a cantilever under the end load PL²/EI.
+    """Return the elastica of a cantilever under the end load PL²/EI.
 
-    With the end's slope θ₀, k² = ½(1 + sin θ₀) and sin φ = 1/(k√2):
+    With the slope θ₀ of the end, k² = ½(1 + sin θ₀) and sin φ = 1/(k√2):
 
         √load = K(k) − F(φ, k),    w/L = 1 − 2(E(k) − E(φ, k))/√load,
         1 − u/L = √(2 sin θ₀/load).
@@ -67,11 +67,12 @@ def elastica(load: float) -> Elastica:
         m = (1 + np.sin(slope)) / 2
         return m, float(np.arcsin(1 / np.sqrt(2 * m)))
 
-    def missing(slope: float) -> float:
+    def residual(slope: float) -> float:
         m, phi = modulus(slope)
         return float(ellipk(m) - ellipkinc(phi, m) - np.sqrt(load))
 
-    slope = brentq(missing, 0.0, np.pi / 2 * (1 - 1e-15), xtol=1e-15)
+    # θ₀ → π/2 only for infinite loads, where K(k) is infinite
+    slope = brentq(residual, 0.0, np.pi / 2 * (1 - 1e-15), xtol=1e-15)
     m, phi = modulus(slope)
     return Elastica(
         1 - 2 * float(ellipe(m) - ellipeinc(phi, m)) / float(np.sqrt(load)),
@@ -80,7 +81,7 @@ def elastica(load: float) -> Elastica:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of one Newton iteration of one load step in one form."""
+    """Return the QP of one Newton iteration of a load step in one form."""
     p: Any = params
     path = _path(
         p["slenderness"], p["load"], (p["nx"], p["ny"]), p["nu"], p["material"],
@@ -89,8 +90,9 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     exact = elastica(p["load"] * p["step"] / p["steps"])
 
     def results(at: Iteration, s: Solution) -> dict[str, Any]:
-        """Report the end: the mean displacement of its face, m, and the elastica's."""
+        """Compare the mean displacement of the end face, m, with the elastica."""
         end = at.tangent.mesh.boundaries["right"]
+        # mean over the face by ∫N_j
         share = nodal_lengths(at.tangent.mesh.points[end])
         u = share @ as_vectors(s.x, 2)[end] / share.sum() * LENGTH
         return {
@@ -105,8 +107,9 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def beam(slenderness: float, load: float, cells: tuple[int, int], nu: float) -> Bodies:
-    """Mesh the beam by nx × ny cells, clamped on the left, with its full load."""
+    """Assemble the beam of nx × ny cells, clamped on the left, under its full load."""
     t = LENGTH / slenderness
+    # P = load·EI/L² with EI = E t³/(12(1 − ν²))
     P = load * E * t**3 / (12 * (1 - nu**2)) / LENGTH**2
     mesh = rectangle((0.0, -t / 2), (LENGTH, t), cells)
     end = mesh.boundaries["right"]

@@ -1,4 +1,4 @@
-"""A contact problem described by a TOML file next to a mesh from gmsh.
+"""Reader of contact problems described by a TOML file next to a mesh from gmsh.
 
 ::
 
@@ -34,15 +34,15 @@
     mu = 0.3
 
 
-Whatever the length unit is, everything in this file is in SI units, and so are results:
-E and tractions in Pa, forces in N/m, units.length in m.
+Whatever the length unit of the mesh is, this file and all results are in SI units: E
+and tractions in Pa, forces in N/m, units.length in m.
 
-What stands between mesh and units may be left out for the values above; bodies that
-contact alone holds have no form dual-bounds and, with linear kinematics, ``steps = 1``.
-So may units, for the larger side of the box around the mesh and the sum of |load| over
-nodes. Without a law of its own a pair has that of the keys friction, bound and mu,
-which the file may set at its top: none by default. There, ``loading = "static"`` makes
-the slip that of the whole load.
+The keys between mesh and units are optional, with the values above as defaults. Bodies
+that contact alone supports have no form dual-bounds and need, with linear kinematics,
+``steps = 1``. The default of units.length is the longer side of the bounding box of the
+mesh, that of units.force the sum of |load| over the nodes. A pair without a law of its
+own has the law of the top-level keys friction, bound and mu, by default none. The
+top-level key ``loading = "static"`` measures slip from the undeformed state.
 """
 
 from __future__ import annotations
@@ -61,21 +61,21 @@ from mortarbench.harness.files.reading import read_toml
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     UnassembledBodies,
-    supports,
+    support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import NamedMesh, halved, read_msh
+from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh, refine
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
+    LAW_PARAMETERS,
     LAWS,
+    MAX_STEPS,
     METHODS,
-    MOST_STEPS,
-    NEEDED,
     PLANES,
     SETTINGS,
-    fits,
+    check_memory,
     physical,
 )
 
@@ -83,12 +83,13 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y")
-#: names of units of length, m
+#: units of length by name, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
     "in": 0.0254, "ft": 0.3048,
 }  # fmt: skip
-SOFT = 1e6  #: moduli below that of rubber, Pa, that may be meant in MPa
+#: smaller moduli, in Pa, are softer than rubber; a remark asks whether MPa was meant
+MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
     "mesh",
     "length_unit",
@@ -102,12 +103,12 @@ _KEYS = (
 
 
 def read_description(path: Path) -> dict[str, Any]:
-    """Read the TOML file and check its keys, settings and the path of its mesh.
+    """Read the TOML file, and check its keys and settings.
 
     Raises
     ------
     InputError
-        With the file and the key.
+        When a key or value is wrong. The message names the file and the key.
 
     """
     table = read_toml(path)
@@ -122,40 +123,41 @@ def read_description(path: Path) -> dict[str, Any]:
             raise unknown("length_unit", unit, LENGTH_UNITS)
         for key in ("steps", "relin"):
             default = SETTINGS[key].default
-            checked.at_least_one(key, table.get(key, default), MOST_STEPS)
-        chosen = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
-        _check_choices(table, chosen)
+            checked.at_least_one(key, table.get(key, default), MAX_STEPS)
+        choices = (*METHODS, *PLANES, "kinematics", "material", *CONTACT_STIFFNESS)
+        _check_choices(table, choices)
         for entry in checked.filled_list("contacts", table["contacts"]):
             checked.table("contacts", entry)
-        _friction(table)
+        _check_friction_values(table)
     return table
 
 
-def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
-    """Read what the TOML file describes.
+def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
+    """Read the bodies of a TOML file and its mesh.
 
-    halvings : times that every edge of the mesh is halved, on straight edges
+    halvings : number of uniform refinements of the mesh, with straight edges
 
     Raises
     ------
     InputError
-        With the file and the entry, the name or value that is wrong, what is right.
+        When an entry is wrong. The message names the file, the entry, the wrong name or
+        value, and what would be right.
 
     """
     table = read_description(path)
     named = read_msh(path.parent / table["mesh"])
-    fits(str(path), 2 * len(named.cells) * 4**halvings)  # before it is halved
+    check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before refining
     for _ in range(halvings):
-        named = halved(named)
+        named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
         materials = _materials(table["bodies"], named)
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
-        _check_felt(table["loads"], loads, np.concatenate(fixed))
+        _check_loads_act(table["loads"], loads, np.concatenate(fixed))
         pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
-        _described_once(table["contacts"])
+        _check_unique(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
         length, force = _units(table.get("units", {}), named, load)
     body = np.repeat(
@@ -166,22 +168,22 @@ def described_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBo
         mesh=mesh, body=body, names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces), plane=plane,
         length=length, force=force, f=load.ravel() / force,
-        B_D=supports(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
+        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
     )  # fmt: skip
 
 
 def remarks(path: Path) -> tuple[str, ...]:
-    """Say what of a description that can be read may be meant otherwise.
+    """Return remarks on valid entries that may be mistakes.
 
-    Moduli that may be in another unit, and contacts in two passes: each side is the
-    slave of the other one, and the force is shared among the rows of both.
+    They concern moduli that may be in another unit, and contacts in two passes: of two
+    sides, each is the slave of the other, and the rows of both share the force.
     """
     table = read_description(path)
     soft = (
         f"{path}: bodies[{i}]: E = {E:g} Pa is softer than rubber; E is in Pa whatever "
         f"length_unit is: if {E:g} MPa is meant, write {1e6 * E:g}"
         for i, E in enumerate(body["E"] for body in table["bodies"])
-        if E < SOFT
+        if E < MIN_PLAUSIBLE_E
     )
     sides = _sides(table["contacts"])
     two_passes = (
@@ -197,35 +199,35 @@ def remarks(path: Path) -> tuple[str, ...]:
 def _each(
     table: Mapping[str, Any], key: str, read: Callable[[dict[str, Any]], Any]
 ) -> list[Any]:
-    """Read every entry of a list of tables; what is wrong is said with its number."""
-    found = []
+    """Read every entry of a list of tables; errors name the number of the entry."""
+    values = []
     for i, entry in enumerate(checked.filled_list(key, table[key])):
         with located(f"{key}[{i}]"):
-            found.append(read(checked.table("entry", entry)))
-    return found
+            values.append(read(checked.table("entry", entry)))
+    return values
 
 
 def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
-    found: dict[str, Material] = {}
+    materials: dict[str, Material] = {}
 
     def read(entry: dict[str, Any]) -> None:
         _keys(entry, ("name", "E", "nu"))
         name = _one_of(named.surfaces, "physical surface", entry, "name")
-        if name in found:
+        if name in materials:
             raise InputError(f"body {name!r} is described twice; expected once")
         E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
         if not checked.is_number(nu) or not -1 < nu < 0.5:
             raise InputError(f"nu = {shown(nu)}; expected a number between -1 and 0.5")
-        found[name] = Material(E=E, nu=float(nu))
+        materials[name] = Material(E=E, nu=float(nu))
 
     _each({"bodies": entries}, "bodies", read)
-    if missing := [name for name in named.surfaces if name not in found]:
+    if missing := [name for name in named.surfaces if name not in materials]:
         raise InputError(f"bodies: physical surface {missing[0]!r} has no entry")
-    return found
+    return materials
 
 
 def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
-    """Return the displacement components that a support fixes."""
+    """Return the displacement components fixed by a support."""
     checked.only_keys(entry, (*_PLACES, "fix"))
     nodes, _ = _place(entry, named, ("fix",))
     fix = checked.filled_list("fix", entry["fix"])
@@ -251,7 +253,7 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
         lengths = np.linalg.norm(np.diff(named.points[edges], axis=1)[:, 0], axis=1)
         np.add.at(weights, edges, lengths[:, None] / 2)
     elif kinds == ["traction"]:
-        raise InputError("a point takes a force, no traction")
+        raise InputError("traction acts on a point; expected a boundary, or force")
     else:
         weights[nodes] = 1.0
     if kinds == ["force"]:
@@ -259,39 +261,39 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     return np.outer(weights, vector)
 
 
-def _check_felt(
+def _check_loads_act(
     entries: Sequence[Mapping[str, Any]],
     loads: Sequence[NDArray[np.float64]],
     fixed: Nodes,
 ) -> None:
-    """Refuse a load with a component that acts on prescribed displacements alone."""
+    """Raise InputError for loads that act on prescribed displacements only."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
-        lost = []
+        without_effect = []
         for axis, name in enumerate(_AXES):
             at = np.flatnonzero(load[:, axis])
             if at.size and np.isin(dofs_of(at, len(_AXES), axis), fixed).all():
-                lost.append(name)
-        if lost:
+                without_effect.append(name)
+        if without_effect:
             where = entry.get("boundary", entry.get("point"))
             raise InputError(
-                f"loads[{i}] acts on {where!r} in {' and '.join(lost)}, which fix "
-                "holds there: it has no effect; load another side, or hold other "
-                "components"
+                f"loads[{i}] acts on {where!r} in {' and '.join(without_effect)}, "
+                "which fix holds there: it has no effect; load another side, or hold "
+                "other components"
             )
 
 
 def _check_choices(entry: Mapping[str, Any], keys: Iterable[str]) -> None:
-    """Refuse values that the keys of cases do not have either."""
+    """Raise InputError for values that the corresponding keys of cases do not allow."""
     for key in keys:
-        known = SETTINGS[key].values
-        if key in entry and checked.text(key, entry[key]) not in known:
-            raise unknown(f"value of {key}", entry[key], map(str, known))
+        allowed = SETTINGS[key].values
+        if key in entry and checked.text(key, entry[key]) not in allowed:
+            raise unknown(f"value of {key}", entry[key], map(str, allowed))
 
 
-def _friction(entry: Mapping[str, Any]) -> None:
-    """Check the values of what an entry says of friction."""
+def _check_friction_values(entry: Mapping[str, Any]) -> None:
+    """Check the values of an entry's keys of friction."""
     _check_choices(entry, ("friction", "loading"))
-    for key, what in NEEDED.items():
+    for key, what in LAW_PARAMETERS.items():
         if key in entry and physical(key, entry[key]) < 0:
             raise InputError(f"{key} = {shown(entry[key])}; expected {what}")
 
@@ -299,12 +301,13 @@ def _friction(entry: Mapping[str, Any]) -> None:
 def pair_laws(
     contacts: Sequence[Mapping[str, Any]], params: Mapping[str, Any]
 ) -> tuple[FrictionLaw, ...]:
-    """Find the law of each pair: what its entry says, else what the keys say.
+    """Return the law of each pair: that of its entry, or of the case's keys.
 
     Raises
     ------
     InputError
-        When a law lacks what it needs, or an entry says what its law does not use.
+        When a parameter of a law is missing, or an entry has one that its law does not
+        use.
 
     """
     return tuple(
@@ -313,22 +316,24 @@ def pair_laws(
 
 
 def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
-    _friction(entry)
+    _check_friction_values(entry)
     law = entry.get("friction", params["friction"])
     needed = LAWS[law]
-    for key in NEEDED:
+    for key in LAW_PARAMETERS:
         if key in entry and key != needed:
             raise InputError(f"{key} is not used by friction {law!r}; expected none")
-    given = {"friction": law, "bound": 0.0, "mu": 0.0}
+    keys = {"friction": law, "bound": 0.0, "mu": 0.0}
     if needed:
-        given[needed] = entry.get(needed, params[needed])
-        if given[needed] < 0:
-            raise InputError(f"friction {law!r} needs {needed}, {NEEDED[needed]}")
-    return law_of(given)
+        keys[needed] = entry.get(needed, params[needed])
+        if keys[needed] < 0:
+            raise InputError(
+                f"friction {law!r} needs {needed}, {LAW_PARAMETERS[needed]}"
+            )
+    return law_of(keys)
 
 
 def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    checked.only_keys(entry, ("slave", "master", "friction", *NEEDED))
+    checked.only_keys(entry, ("slave", "master", "friction", *LAW_PARAMETERS))
     _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
     for side in _SIDES:
@@ -340,11 +345,12 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
 
 
 def _sides(entries: list[dict[str, str]]) -> list[tuple[str, str]]:
-    """Return the names of slave and master of every contact."""
+    """Return the names of slave and master of each contact."""
     return [(entry["slave"], entry["master"]) for entry in entries]
 
 
-def _described_once(entries: list[dict[str, str]]) -> None:
+def _check_unique(entries: list[dict[str, str]]) -> None:
+    """Raise InputError for a pair of sides that is listed twice."""
     sides = _sides(entries)
     for i, (slave, master) in enumerate(sides):
         if (first := sides.index((slave, master))) < i:
@@ -355,15 +361,15 @@ def _described_once(entries: list[dict[str, str]]) -> None:
 
 
 def _chain(where: str, edges: Nodes) -> Nodes:
-    """Order the edges (k, 2) to one open chain of nodes (k + 1,)."""
+    """Return the nodes (k + 1,) of the edges (k, 2), ordered as one open chain."""
     following = dict(edges.tolist())
     starts = np.setdiff1d(edges[:, 0], edges[:, 1])
     chain = starts[:1].tolist()
     while chain and chain[-1] in following:
         chain.append(following.pop(chain[-1]))
     if len(chain) != len(edges) + 1:
-        got = "is in pieces or branches" if starts.size else "closes on itself"
-        raise InputError(f"{where} {got}; expected one open chain of edges")
+        fault = "is in pieces or branches" if starts.size else "closes on itself"
+        raise InputError(f"{where} {fault}; expected one open chain of edges")
     return np.array(chain, dtype=np.int64)
 
 
@@ -375,7 +381,7 @@ def _units(
         checked.only_keys(units, ("length", "force"))
         total = float(np.linalg.norm(load, axis=1).sum())
         if total == 0:
-            raise InputError("the loads sum up to nothing; expected a load")
+            raise InputError("all loads are zero; expected a load")
         extent = float(np.ptp(named.points, axis=0).max())
         return (
             physical("length", checked.positive("length", units.get("length", extent))),
@@ -386,7 +392,7 @@ def _units(
 def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
-    """Find the nodes, and the edges if there are any, that an entry is about."""
+    """Return the nodes of an entry's boundary or point, and the boundary's edges."""
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, a physical name")
@@ -400,16 +406,16 @@ def _place(
 
 
 def _one_of(
-    known: Mapping[str, Any], what: str, entry: Mapping[str, Any], key: str
+    names: Mapping[str, Any], what: str, entry: Mapping[str, Any], key: str
 ) -> str:
     name = checked.text(key, entry[key])
-    if name not in known:
-        raise unknown(what, name, known, where=key)
+    if name not in names:
+        raise unknown(what, name, names, where=key)
     return name
 
 
 def _keys(entry: Mapping[str, Any], keys: tuple[str, ...]) -> None:
-    """Expect exactly these keys."""
+    """Raise InputError unless the entry has exactly these keys."""
     checked.only_keys(entry, keys)
     for key in keys:
         if key not in entry:

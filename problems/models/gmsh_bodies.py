@@ -1,11 +1,12 @@
-"""A user's own bodies: ``bodies:PATH.toml/key=value/…/FORM``.
+"""Bodies of a user, ``bodies:PATH.toml/key=value/…/FORM``.
 
-The TOML file is described in `problems.models.description`.
+`problems.models.description` documents the TOML file.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,71 +16,87 @@ from scipy.sparse import vstack
 
 from mortarbench.harness import Case, InputError, Reference, Value
 from mortarbench.harness.checked import located
-from mortarbench.problems.contact.balance import check_balance
+from mortarbench.problems.contact.balance import check_balance, is_determined
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.contact.stepping import load_steps
+from mortarbench.problems.contact.stepping import load_steps, with_normal_forces
 from mortarbench.problems.duality.newton import NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
-    by_keys,
-    remembered,
-    stated,
+    cached_problem,
+    elastic_bodies_of,
+    keyed_linearisation,
 )
 from mortarbench.problems.models.description import (
-    described_bodies,
     pair_laws,
+    read_bodies,
     read_description,
 )
 
-STRAIGHT = 1e-6  #: angle between edges of a straight side, which coordinates round
-ARC = np.pi / 4  #: between chords of an arc, at most; larger angles are drawn corners
+#: largest angle between edges of a straight side, from rounded coordinates
+MAX_STRAIGHT_ANGLE = 1e-6
+#: largest angle between the chords of an arc; larger ones are corners of the geometry
+MAX_ARC_ANGLE = np.pi / 4
 
 
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """State the bodies; their load grows in `steps`.
+    """Return the problem of the bodies, loaded in `steps` equal load steps.
 
     Raises
     ------
     InputError
-        Where nothing balances the load of some body, or bodies that contact alone holds
-        are asked for after the first linearisation.
+        When the load of some body is not balanced, or bodies that neither supports nor
+        friction keep in place have more than one load step or linearisation.
 
     """
     p: Any = params
-    found = _problem(params)
-    if not found.bodies.is_held and not p["step"] == p["relin"] == 1:
+    contact_problem = _problem(params)
+    elastic = contact_problem.bodies
+    if p["step"] == p["relin"] == 1 or elastic.is_supported:
+        return contact_problem
+    whole = elastic.whole
+    rows = keyed_linearisation(p)(whole, laws_of(p))(np.zeros(whole.mesh.dofs))
+    # without friction the displacement along the contact is not unique, nor is the next
+    # linearisation
+    if not is_determined(whole, vstack([rows.B, rows.T])):
         raise InputError(
-            f"{p['path']}: the supports leave a rigid motion of some body, which load "
-            "steps and re-linearisations do not allow; expected steps=1 and relin=1"
+            f"{p['path']}: supports and friction leave a rigid motion of some body, "
+            "which load steps and re-linearisations do not allow; expected steps=1 "
+            "and relin=1"
         )
-    return found
+    return contact_problem
 
 
-@remembered
+@cached_problem
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
-    of, laws = bodies(p["path"], p["sha256"], p["plane"], p["halvings"]), laws_of(p)
-    is_single = p["steps"] == p["relin"] == 1 or not of.is_held
-    if not of.is_held:
-        rows = by_keys(p)(of.whole, laws)(np.zeros(of.whole.mesh.dofs))
-        with located(p["path"]):  # friction may hold either way
-            check_balance(of.whole, vstack([rows.B, rows.T, -rows.T]))
+    elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
+    laws = laws_of(p)
+    stages = load_steps(
+        p["steps"], p["relin"], elastic.forces, elastic.fixed, laws,
+        quasi_static=p["loading"] == "quasi-static",
+    )  # fmt: skip
+    whole_load = float(np.abs(elastic.forces.value).sum())
+    if not elastic.is_supported:
+        whole = elastic.whole
+        rows = keyed_linearisation(p)(whole, laws)(np.zeros(whole.mesh.dofs))
+        with located(p["path"]):  # friction can act in both directions
+            check_balance(whole, vstack([rows.B, rows.T, -rows.T]))
+        stages = tuple(
+            replace(stage, begin=with_normal_forces(stage.begin, whole_load))
+            for stage in stages
+        )
     return ContactProblem(
-        bodies=of, linearise=by_keys(p),
-        stages=load_steps(
-            p["steps"], p["relin"], of.forces, of.fixed, laws,
-            quasi_static=p["loading"] == "quasi-static",
-        ),
-        # friction may have to hold bodies
-        pressed=float(np.abs(of.forces.value).sum()) if is_single else 0.0,
+        bodies=elastic, linearise=keyed_linearisation(p), stages=stages,
+        # first bound of Coulomb's law: large enough to support bodies by friction
+        initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
     )  # fmt: skip
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of one Newton iteration of one load step at finite strain."""
+    """Return the QP of one Newton iteration of a load step at finite strain."""
     p: Any = params
     source = (p["path"], p["sha256"], p["plane"], p["halvings"])
     with located(source[0]):
@@ -96,26 +113,26 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
-    """Find the law of each pair, see `pair_laws`."""
+    """Return the law of friction of each pair, see `pair_laws`."""
     return pair_laws(read_description(Path(str(params["path"])))["contacts"], params)
 
 
 @lru_cache(maxsize=4)
 def bodies(path: str, sha256: str, plane: Any, halvings: int) -> ElasticBodies:
-    """State the bodies of a description; the digest tells contents apart."""
+    """Return the bodies of a description; the digest is part of the cache's key."""
     del sha256
-    return stated(described_bodies(Path(path), plane, halvings))
+    return elastic_bodies_of(read_bodies(Path(path), plane, halvings))
 
 
 def has_arcs(params: Mapping[str, Value]) -> bool:
-    """Return True if a side that may touch has edges that meet at less than ARC."""
+    """Return True if a contact side is curved: edges meet below MAX_ARC_ANGLE."""
     p: Any = params
-    of = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
-    for side in (chain for pair in of.pairs for chain in pair):
-        edges = np.diff(of.shape.mesh.points[side], axis=0)
+    elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
+    for side in (chain for pair in elastic.pairs for chain in pair):
+        edges = np.diff(elastic.shape.mesh.points[side], axis=0)
         angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
-        turns = np.abs(np.diff(angles))
-        if ((turns > STRAIGHT) & (turns < ARC)).any():
+        bends = np.abs(np.diff(angles))
+        if ((bends > MAX_STRAIGHT_ANGLE) & (bends < MAX_ARC_ANGLE)).any():
             return True
     return False
 

@@ -1,13 +1,13 @@
 """GRECO's plate with Coulomb friction on a rigid plane (Code_Aster's SSNV128).
 
-A square of 40 mm, in plane strain, lies on y = 0 with μ = 1. It is pressed down on its
-top, pushed towards +x on its left side, and held on its right one:
+A square of 40 mm in plane strain lies on y = 0 with μ = 1. Pressures act on its top and
+left sides, and its right side is supported in x:
 
     σ_y = −5e7 Pa at y = 40 mm,  σ_x = −15e7 Pa at x = 0,  u_x = 0 at x = 40 mm
 
-and u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end lifts off,
+with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end lifts off,
 the middle slips and the right end sticks. Published are the tangential displacements of
-five points of the contact side, ±5 %, and the normal force at 38.75 mm on 32 cells a
+five points of the contact side, ±5 %, and the normal force at 38.75 mm for 32 cells per
 side (GRECO working group on friction; collected in Code_Aster's document V6.04.128).
 """
 
@@ -21,29 +21,29 @@ import numpy as np
 from mortarbench.harness import QP, Friction, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.rigid_plane import above_plane
+from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     StructuredGrids,
-    remembered,
+    cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle_grid
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
-TOP, LEFT = 5e7, 15e7  #: pressures, Pa
+TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
 FORCE = TOP * SIDE  #: F₀, N/m
-PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: m
+PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
 PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
-FORCE_AT = 38.75e-3  #: m
+FORCE_AT = 38.75e-3  #: x of the published normal force, m
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """State the plate with n × n cells."""
+    """Return the plate with n × n cells."""
     p: Any = params
     grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (p["n"], p["n"]))
     sides = grid.sides
@@ -66,23 +66,23 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
-        linearise=lambda bodies, _: lambda u: above_plane(
+        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
             bodies.mesh, bodies.pairs[0].slave, tangential=True
         ),
-        results=lambda found: {
-            **along_the_side(*found.sides), "tresca_problems": found.problems,
+        results=lambda answer: {
+            **published_quantities(*answer.sides), "tresca_problems": answer.problems,
         },
     )  # fmt: skip
 
 
-def along_the_side(
+def published_quantities(
     bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
 ) -> dict[str, Any]:
-    """Report what was published; between nodes, by linear interpolation.
+    """Return the published quantities, interpolated linearly between nodes.
 
-    displacement: u_x at `PLACES`, m. published_error: the largest relative distance
-    from the published ones. normal_force: of the node at 38.75 mm, tangential_sum: of
-    all nodes, N/m.
+    displacement: u_x at `PLACES`, m. published_error: the largest relative deviation
+    from the published values. normal_force: nodal force at 38.75 mm, N/m.
+    tangential_sum: magnitude of the sum over all nodes, N/m.
     """
     nodes = bodies.pairs[0].slave
     x, u = bodies.mesh.points[nodes, 0], s.x[dofs_of(nodes, 2, 0)] * bodies.length

@@ -1,23 +1,24 @@
-"""Two half planes in contact by the logarithmic kernel: no mesh, a dense F of any size.
+"""Contact of two half planes by the logarithmic kernel: no mesh, a dense F.
 
 Forces per thickness on the surfaces of two half planes displace them, relative to each
 other, by (Johnson 1985, "Contact mechanics", Sections 2.2 and 2.3, 2/(πE*) of both)
 
     u(x) = −2/(πE*) ∫ ln(|x − s|/a) p(s) ds + a constant
 
-along the normal by pressures, along the tangent by shear tractions; between bodies of
-one material neither causes the other. With a traction λ_j/h on each of n equal elements
-and u at their midpoints, u = Fλ with F_ij of |i − j| alone. F is positive definite over
-a length of less than 4a. The constant, free as the force is given, is the multiplier of
-the one equation Σλ = force: the form ``dual`` of bodies with one rigid motion.
+along the normal for pressures, along the tangent for shear tractions; between bodies of
+the same material the two are decoupled. With a traction λ_j/h on each of n equal
+elements and u at their midpoints, u = Fλ, where F_ij depends on |i − j| only. F is
+positive definite on intervals shorter than 4a. As the total force is prescribed, the
+constant is free: it is the multiplier of the single equation Σλ = force. This is the
+form ``dual`` of bodies with one rigid motion.
 
 * law=hertz: min ½λᵀFλ + gᵀλ over λ ≥ 0, Σλ = P, with the gap g = x²/2R; |x| ≤ 3a/2
 * law=cattaneo: min ½λᵀFλ − (Fλ*)ᵀλ over |λ_i| ≤ μ∫p over element i, Σλ = Q, with the
-  exact p and, when unloading, the exact tractions λ* before, else 0; |x| ≤ a
+  exact p and, in unloading, the exact tractions λ* at the peak, otherwise 0; |x| ≤ a
 
-Forces are in units of F₀ = P (tangential ones μP), displacements in l = 2F₀/(πE*), so
-that F is a matrix of logarithms and Hertz's gap (x/a)². Exact energies are those of
-sums of semicircles: with lengths in a and s_c = 2/(πc)√(1 − x²/c²),
+Forces are in units of F₀ = P (tangential ones of μP), displacements of l = 2F₀/(πE*).
+Then F is a matrix of logarithms, and Hertz's gap is (x/a)². Exact tractions are sums of
+semicircles, whose energies follow from, with lengths in a and s_c = 2/(πc)√(1 − x²/c²),
 
     −∫ ln|x − t| s_c(t) dt = ln(2/c) + ½ − x²/c²,  |x| ≤ c,      ∫x²s_c = c²/4
 """
@@ -43,42 +44,42 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
-from mortarbench.problems.models.hertz import CURVE, MATERIAL, RADIUS, UNIT_LOAD
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
+from mortarbench.problems.models.hertz import CURVE_POINTS, MATERIAL, RADIUS, UNIT_LOAD
 from mortarbench.problems.models.line_contact import LineContact, TangentialContact
 
 MU = 0.3
-LOAD = 10 * UNIT_LOAD  #: P, N/m
+LOAD = 10 * UNIT_LOAD  #: normal force P, N/m
 SIDE = "half plane on half plane"
-REACH = 1.5  #: half width of what may touch, in a, of law=hertz
+MESH_HALF_WIDTH = 1.5  #: half width of the potential contact of law=hertz, in a
 
-#: two cylinders of the radius and the material of the families of Hertz
+#: exact solution for two cylinders with the radius and material of the Hertz families
 EXACT = LineContact(LOAD, RADIUS / 2, MATERIAL.E / (2 * (1 - MATERIAL.nu**2)))
 
 
-def half_planes(params: Mapping[str, Value]) -> Case:
-    """Emit the QP, a dual."""
+def half_plane_case(params: Mapping[str, Value]) -> Case:
+    """Return the QP of complete keys, in its only form, dual."""
     p: Any = params
     if p["law"] == "hertz":
-        return _pressed(p["n"])
-    return _sheared(p["n"], TangentialContact(EXACT, MU, p["Q"], p["peak"]))
+        return _hertz_case(p["n"])
+    return _cattaneo_case(p["n"], TangentialContact(EXACT, MU, p["Q"], p["peak"]))
 
 
 @dataclass(frozen=True, eq=False)
 class Elements:
-    """Equal elements of [−width, width]; lengths in a."""
+    """Division of [−width, width] into n equal elements; lengths in a."""
 
     n: int
     width: float
 
     @property
     def h(self) -> float:
-        """Length of one."""
+        """Length of an element."""
         return 2 * self.width / self.n
 
     @property
     def ends(self) -> Vector:
-        """Ends (n + 1,) of all, ascending."""
+        """End points (n + 1,) of the elements, ascending."""
         return np.linspace(-self.width, self.width, self.n + 1)
 
     @property
@@ -88,35 +89,36 @@ class Elements:
 
     @property
     def F(self) -> Matrix:
-        """Displacement of the midpoints by a unit force on each element, (n, n).
+        """Displacements (n, n) of the midpoints by unit forces on the elements.
 
-        −1/h ∫ ln|x_i − s| ds over element j, by the antiderivative t ln|t| − t.
+        F_ij = −1/h ∫ ln|x_i − s| ds over element j; an antiderivative is t ln|t| − t.
         """
         t = self.h * (np.arange(self.n + 1) - 0.5)
         antiderivative = t * np.log(np.abs(t)) - t
         return toeplitz(-np.diff(antiderivative) / self.h)
 
 
-def _pressed(n: int) -> Case:
-    elements = Elements(n, REACH)
+def _hertz_case(n: int) -> Case:
+    elements = Elements(n, MESH_HALF_WIDTH)
     qp = _dual(elements.F, elements.middle**2, 1.0, np.zeros(n), np.full(n, np.inf))
     x, width = EXACT.a * elements.middle, EXACT.a * elements.h
     approach = displacement(((1.0, 1.0),))
     exact_energy = self_energy(((1.0, 1.0),)) - approach
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Hertz; errors are relative, that of p at the midpoints.
+        """Compare with Hertz; errors are relative, that of p in l² of the midpoints.
 
-        energy: elastic − P·approach, of an approach that is zero where u is.
+        energy: elastic energy − P·approach, with zero approach where u = 0.
         """
         force = s.x * EXACT.P
         p, hertz = force / width, EXACT.pressure(x)
+        # ∫px² = Pa²/4, with the moment of a constant pressure on each element
         half_width = np.sqrt(4 * force @ (x**2 + width**2 / 12) / EXACT.P)
         energy = 0.5 * s.x @ (qp.P @ s.x) + s.y[0]
         return {
             "elements": n,
             "contact_rows": n,
-            "active": int((s.x > ACTIVE * s.x.max(initial=0.0)).sum()),
+            "active": int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum()),
             "energy": float(energy) * _energy_unit(EXACT.P),
             "energy_error": float(energy / exact_energy - 1),
             "multiplier_sum": float(force.sum()),
@@ -129,8 +131,8 @@ def _pressed(n: int) -> Case:
             "half_width_error": float(half_width / EXACT.a - 1),
         }
 
-    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
-    exact = np.column_stack([curve, EXACT.pressure(curve), np.zeros(CURVE)])
+    curve = EXACT.a * np.linspace(-MESH_HALF_WIDTH, MESH_HALF_WIDTH, CURVE_POINTS)
+    exact = np.column_stack([curve, EXACT.pressure(curve), np.zeros(CURVE_POINTS)])
 
     def fields(s: Solution) -> Fields:
         p = s.x * EXACT.P / width
@@ -143,34 +145,34 @@ def _pressed(n: int) -> Case:
     return _case(qp, EXACT.P, quantities, fields)
 
 
-def _sheared(n: int, exact: TangentialContact) -> Case:
+def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
     elements = Elements(n, 1.0)
     F0, ends = exact.mu * EXACT.P, EXACT.a * elements.ends
     bound = np.diff(EXACT.force(ends)) / EXACT.P
     unloads = exact.Q != exact.peak
-    before = np.diff(exact.before.force(ends)) / F0 if unloads else np.zeros(n)
+    at_peak = np.diff(exact.before.force(ends)) / F0 if unloads else np.zeros(n)
     F = elements.F
-    qp = _dual(F, -F @ before, exact.Q, -bound, bound)
+    qp = _dual(F, -F @ at_peak, exact.Q, -bound, bound)
     x, width = EXACT.a * elements.middle, EXACT.a * elements.h
-    moved = displacement(exact.semicircles)
-    moved_before = displacement(exact.before.semicircles) if unloads else 0.0
-    exact_energy = self_energy(exact.semicircles) - exact.Q * moved
+    exact_displacement = displacement(exact.semicircles)
+    displacement_at_peak = displacement(exact.before.semicircles) if unloads else 0.0
+    exact_energy = self_energy(exact.semicircles) - exact.Q * exact_displacement
 
     def quantities(s: Solution) -> dict[str, Any]:
-        """Compare with Cattaneo and Mindlin; errors are relative, of q at midpoints.
+        """Compare with Cattaneo and Mindlin; errors are relative, that of q in l².
 
-        energy: elastic − Q·displacement; dissipation: of this loading or unloading,
-        Σg|slip|; both J/m. stick_half_width: of a traction with this ∫x²q.
-        shear_centre: mean of what is next to x = 0.
+        energy: elastic energy − Q·displacement, J/m. dissipation: Σg|slip| of this
+        loading or unloading, J/m. stick_half_width: that of an exact traction with the
+        same ∫x²q. shear_centre: mean of the elements next to x = 0.
         """
         force = s.x * F0
         q, mindlin = force / width, exact.traction(x)
         moment = float(force @ (x**2 + width**2 / 12))
         c = exact.stick_half_width(moment, EXACT.P * EXACT.a**2 / 4)
-        next_to = slice((n - 1) // 2, n // 2 + 1)
-        centre, at_centre = (float(v[next_to].mean()) for v in (q, mindlin))
+        central = slice((n - 1) // 2, n // 2 + 1)  # one element, or two for even n
+        centre, at_centre = (float(v[central].mean()) for v in (q, mindlin))
         slips = slipping(s)
-        energy = 0.5 * s.x @ (F @ s.x) - exact.Q * (moved_before - s.y[0])
+        energy = 0.5 * s.x @ (F @ s.x) - exact.Q * (displacement_at_peak - s.y[0])
         return {
             "elements": n,
             "contact_rows": n,
@@ -190,9 +192,9 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
         }
 
     def slipping(s: Solution) -> NDArray[np.bool_]:
-        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE))
+        return np.asarray(np.abs(s.x) >= bound * (1 - ACTIVE_THRESHOLD))
 
-    curve = EXACT.a * np.linspace(-REACH, REACH, CURVE)
+    curve = EXACT.a * np.linspace(-MESH_HALF_WIDTH, MESH_HALF_WIDTH, CURVE_POINTS)
     tractions = np.column_stack([curve, EXACT.pressure(curve), -exact.traction(curve)])
 
     def fields(s: Solution) -> Fields:
@@ -207,26 +209,26 @@ def _sheared(n: int, exact: TangentialContact) -> Case:
 
 
 def displacement(semicircles: Sequence[tuple[float, float]]) -> float:
-    """Return the constant that u, in l, is where all tractions Σ w·s_c of (w, c) act.
+    """Return the constant part of u, in l, under the tractions Σ w·s_c of pairs (w, c).
 
-    It is the displacement where bodies stick: parabolas add up to zero there, or to
-    Hertz's gap.
+    It is the displacement where bodies stick: there the parabolas −x²/c² of all
+    semicircles add up to zero, or to Hertz's gap.
     """
     return float(sum(w * (np.log(2 / c) + 0.5) for w, c in semicircles))
 
 
 def self_energy(semicircles: Sequence[tuple[float, float]]) -> float:
-    """Return ½∫q Fq, in F₀l, of tractions Σ w·s_c of parts (w, c)."""
+    """Return ½∫q Fq, in F₀l, of tractions q = Σ w·s_c of pairs (w, c)."""
     total = 0.0
     for v, b in semicircles:
         for w, c in semicircles:
-            least, most = sorted((b, c))
-            total += v * w * (np.log(2 / most) + 0.5 - (least / most) ** 2 / 4)
+            narrow, wide = sorted((b, c))
+            total += v * w * (np.log(2 / wide) + 0.5 - (narrow / wide) ** 2 / 4)
     return float(0.5 * total)
 
 
 def _dual(F: Matrix, gap: Vector, force: float, lower: Vector, upper: Vector) -> QP:
-    """Emit  min ½λᵀFλ + gᵀλ,  Σλ = force,  lower ≤ λ ≤ upper."""
+    """Return the QP  min ½λᵀFλ + gᵀλ,  Σλ = force,  lower ≤ λ ≤ upper."""
     n = gap.size
     return QP(
         P=F, q=gap, A=np.ones((1, n)), b=np.array([force]),
@@ -252,9 +254,9 @@ def _case(
 
 
 def _surface(x: Vector, side: ContactSide) -> Fields:
-    """Give tractions at the midpoints x (n,), m; half planes have no outlines.
+    """Return tractions at the midpoints x (n,), m; half planes have no mesh to draw.
 
-    They are those on the upper surface, which Q pushes along +x.
+    They act on the upper surface, which Q pushes along +x.
     """
     n = x.size
     return Fields(
@@ -265,7 +267,7 @@ def _surface(x: Vector, side: ContactSide) -> Fields:
 
 
 def _length_unit(force: float) -> float:
-    """Return l, m."""
+    """Return l = 2F₀/(πE*), m."""
     return 2 * force / (np.pi * EXACT.E_star)
 
 
@@ -274,4 +276,5 @@ def _energy_unit(force: float) -> float:
 
 
 def _distance(got: Vector, exact: Vector) -> float:
+    """Return the relative l² distance."""
     return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

@@ -1,20 +1,20 @@
 """Exact line contact: Hertz's pressure, and Cattaneo and Mindlin's shear traction.
 
-Two elastic bodies whose profiles are parabolas of relative curvature 1/R,
-1/R = 1/R₁ + 1/R₂, and 1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ), touch under the force
-P per thickness over |x| ≤ a with (Johnson 1985, "Contact mechanics", Section 4.2)
+Two elastic bodies with parabolic profiles of relative curvature 1/R = 1/R₁ + 1/R₂, and
+1/E* = Σ(1 − νᵢ²)/Eᵢ (plane stress: Σ1/Eᵢ), are in contact over |x| ≤ a under the force
+P per thickness, with (Johnson 1985, "Contact mechanics", Section 4.2)
 
     p(x) = p₀√(1 − x²/a²),   a = √(4PR/(πE*)),   p₀ = 2P/(πa),   ∫px² dx = Pa²/4
 
-Where both are of one material, p causes no tangential displacement between them and a
-shear traction no normal one. A tangential force Q < μP that is applied afterwards lets
-a ≥ |x| ≥ c slip while |x| < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2), with
+If both are of the same material, p causes no relative tangential displacement, and a
+shear traction no relative normal one. Under a tangential force Q < μP applied after P,
+c ≤ |x| ≤ a slips while |x| < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2), with
 
     q(x) = μp₀√(1 − x²/a²) − μp₀(c/a)√(1 − x²/c²),    c/a = √(1 − Q/μP)
 
-where a root of something negative counts as zero. Back from Q* to Q, |Q| ≤ Q*, slip of
-the other direction comes in from the edge and q is q* − 2q′, with q′ the traction of
-half the difference: c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
+where square roots of negative numbers count as zero. When Q decreases from Q* to Q,
+|Q| ≤ Q*, reverse slip spreads from the edge, and q = q* − 2q′ with the traction q′ of
+half the difference, c′/a = √(1 − (Q* − Q)/2μP) (Mindlin and Deresiewicz 1953).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class LineContact:
         return self.p0 * _root(x / self.a)
 
     def force(self, x: Vector) -> Vector:
-        """Return the force on all that is left of x, N/m: ∫p from −a to x."""
+        """Return ∫p from −a to x, N/m."""
         return self.P * _share(x / self.a)
 
 
@@ -59,30 +59,30 @@ class TangentialContact:
 
     normal: LineContact
     mu: float
-    Q: float  #: tangential force as a part of μP, −peak … peak
-    peak: float  #: the largest that came before, as a part of μP; Q if there was none
+    Q: float  #: tangential force over μP, −peak … peak
+    peak: float  #: largest tangential force so far over μP; Q if never unloaded
 
     @property
     def before(self) -> TangentialContact:
-        """The state at the peak."""
+        """State at the peak, before unloading."""
         return TangentialContact(self.normal, self.mu, self.peak, self.peak)
 
     @property
     def semicircles(self) -> tuple[tuple[float, float], ...]:
-        """Forces w in μP and half widths c in a with q = μP Σ w·2/(πc)√(1 − x²/c²).
+        """Pairs (w, c), in units of μP and a, with q = μP Σ w·2/(πc)√(1 − x²/c²).
 
-        Those of the loading, and after them those of the unloading.
+        The pairs of the loading come before those of the unloading.
         """
-        stuck = 1 - self.peak  # (c/a)²
+        stuck = 1 - self.peak  # (c/a)² = 1 − Q*/μP, and the force of its semicircle
         loading = ((1.0, 1.0), (-stuck, np.sqrt(stuck)))
         if self.Q == self.peak:
             return loading
-        stuck = 1 - (self.peak - self.Q) / 2
+        stuck = 1 - (self.peak - self.Q) / 2  # (c′/a)²
         return (*loading, (-2.0, 1.0), (2 * stuck, np.sqrt(stuck)))
 
     @property
     def c(self) -> float:
-        """Half width of the part that sticks, m: c, or c′ when unloading."""
+        """Half width of the stick zone, m: c, or c′ after unloading."""
         return float(self.normal.a * self.semicircles[-1][1])
 
     def traction(self, x: Vector) -> Vector:
@@ -98,12 +98,13 @@ class TangentialContact:
     def stick_half_width(self, shear: float, pressure: float) -> float:
         """Return c, m, of a traction with the moments ∫x²q dx and ∫x²p dx, N·m.
 
-        While loading  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  When unloading,
-        the traction before is taken for exact. Where no c gives the moment, the nearest
-        is returned.
+        In loading,  ∫x²q = μPa²/4 (1 − (c/a)⁴)  and  ∫x²p = Pa²/4.  In unloading, the
+        traction of the loading is taken to be exact. A moment that no c yields gives
+        the nearest c.
         """
-        *known, (w, c) = self.semicircles
-        rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in known)
+        # a semicircle of force w and half width c has the moment ∫x² = wc²/4
+        *others, (w, c) = self.semicircles
+        rest = shear / (self.mu * pressure) - sum(v * d**2 for v, d in others)
         return float(self.normal.a * np.clip(rest * c**2 / w, 0, 1) ** 0.25)
 
 
@@ -113,6 +114,6 @@ def _root(s: Vector) -> Vector:
 
 
 def _share(s: Vector) -> Vector:
-    """Return (2/π)∫√(1 − t²) dt from −1 to s: 0 … 1."""
+    """Return (2/π)∫√(1 − t²) dt from −1 to s, between 0 and 1."""
     s = np.clip(s, -1, 1)
     return np.asarray(0.5 + (s * np.sqrt(1 - s**2) + np.arcsin(s)) / np.pi)

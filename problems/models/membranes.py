@@ -1,16 +1,17 @@
-"""Two membranes that press on each other along an edge: a model problem of Total FETI.
+"""Two membranes in contact along an edge: a model problem of Total FETI.
 
-Dostál and Horák 2004, "Scalable FETI with optimal dual penalty for a variational
-inequality"; PERMON's developers measure with it. Under unit tension,
+The problem is that of Dostál and Horák 2004, "Scalable FETI with optimal dual penalty
+for a variational inequality" (ref. [20] of the paper), which PERMON's developers use in
+benchmarks. Under unit tension,
 
     min Σ_b ∫ ½|∇u_b|² − f_b u_b,    u_1 = 0 on x = 0,   u_1 ≤ u_2 on x = 1
 
 on Ω_1 = (0, 1)² and Ω_2 = (1, 2) × (0, 1). The load pulls down: f_1 = −3 where y > ¾,
-f_2 = −1 where y < ¼, zero elsewhere. Nothing but the first membrane holds the second,
-which can move as a whole; so the forces between them add up to its load, ¼.
+f_2 = −1 where y < ¼, and both are zero elsewhere. Only the first membrane supports the
+second, which floats, so that the sum of the contact forces is its load, ¼.
 
-Bilinear elements. Each membrane is cut into S × S squares of n × n cells, which are all
-of one kind.
+Elements are bilinear. Each membrane is decomposed into S × S congruent squares of n × n
+cells.
 """
 
 from __future__ import annotations
@@ -26,11 +27,11 @@ from scipy.sparse import block_diag, csc_array, csr_array, eye_array
 
 from mortarbench.harness import QP, Case, Grid, Mechanics, Solution, Value, Vector
 from mortarbench.problems.contact.sides import active
-from mortarbench.problems.duality.dualisation import posed
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
+from mortarbench.problems.duality.dualisation import primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
 )
 from mortarbench.problems.fem.fixing import fixing_nodes
 from mortarbench.problems.fem.inverse import GeneralisedInverse, supported_inverse
@@ -43,38 +44,38 @@ from mortarbench.problems.fem.mesh import (
     joined_sides,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    ProblemInParts,
+    DecomposedProblem,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import Part
-from mortarbench.problems.feti.torn import Kind
+from mortarbench.problems.feti.tearing import SubdomainMesh
 
 NAMES = ("left", "right")
-LOADED = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and the heights it acts at
+LOADS = ((-3.0, (0.75, 1.0)), (-1.0, (0.0, 0.25)))  #: f and its interval of y
 
 
 def membranes(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP in one form."""
+    """Return the QP in one form."""
     p: Any = params
     pair = Membranes(p["S"], p["n"])
     matrices: Mapping[str, Any] = {}
     decomposition: Mapping[str, Any] = {}
-    seconds, in_parts = None, None
+    seconds, certify_by_subdomains = None, None
     if form == "primal":
-        new = posed(pair.qp)
+        new = primal_form(pair.qp)
     else:
         start = perf_counter()
         own = on_one_process(pair.in_subdomains(p["glue"]))
-        pieces, in_parts = own.torn_bodies, certified_by(own, pair.qp.P)
-        new = torn_dual(pieces, pair.qp)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
+        new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
-        matrices = torn_matrices(pieces, new.qp)
-        decomposition = torn_quantities(pieces, new.qp)
+        matrices = feti_matrices(pieces, new.qp)
+        decomposition = decomposition_quantities(pieces, new.qp)
     dofs = pair.qp.q.size
     return Case(
         qp=new.qp,
@@ -85,24 +86,24 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=pair.qp, back=new.recover, factorise=pair.factorise,
+            primal=pair.qp, to_primal=new.recover, factorise=pair.factorise,
             mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
-            in_parts=in_parts,
+            certify_by_subdomains=certify_by_subdomains,
         ),
     )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Membranes:
-    """Both membranes on uniform grids, node by node, the left one first."""
+    """Two membranes on uniform grids, with the nodes of the left one first."""
 
-    S: int  #: subdomains along a side of a membrane, 1/H
-    n: int  #: cells along a side of a subdomain, H/h
+    S: int  #: number of subdomains along a side of a membrane, 1/H
+    n: int  #: number of cells along a side of a subdomain, H/h
 
     @property
     def side(self) -> int:
-        """Cells along a side of a membrane."""
+        """Number of cells along a side of a membrane."""
         return self.S * self.n
 
     @cached_property
@@ -111,7 +112,7 @@ class Membranes:
 
     @property
     def grids(self) -> tuple[StructuredGrid, ...]:
-        """The squares, side by side."""
+        """Grids of both squares, side by side."""
         return tuple(
             rectangle_grid((x, 0.0), (1.0, 1.0), (self.side,) * 2).prefixed(f"{name} ")
             for x, name in zip((0.0, 1.0), NAMES, strict=True)
@@ -119,7 +120,7 @@ class Membranes:
 
     @property
     def mesh(self) -> Mesh:
-        """Both squares; the sides that touch are not joined."""
+        """Mesh of both squares; nodes on the common edge are duplicated."""
         return self._joined[0]
 
     @property
@@ -129,63 +130,63 @@ class Membranes:
 
     @cached_property
     def qp(self) -> QP:
-        """The primal problem: unknowns are the heights of the nodes."""
+        """Primal problem; unknowns are the heights u of the nodes."""
         nodes, sides = len(self.mesh.points), self.mesh.boundaries
         K = grid_stiffness((self.side, self.side))
         one = csr_array(eye_array(nodes, format="csr"))
-        held, G = one[np.sort(sides["left left"])], _touching(sides, nodes)
+        A, G = one[np.sort(sides["left left"])], _contact_rows(sides, nodes)
         return QP(
             P=csc_array(block_diag([K, K], format="csc")),
             q=-self.load(np.arange(nodes)),
-            A=held, b=np.zeros(held.shape[0]), G=G, h=np.zeros(G.shape[0]),
+            A=A, b=np.zeros(A.shape[0]), G=G, h=np.zeros(G.shape[0]),
             lb=np.full(nodes, -np.inf), ub=np.full(nodes, np.inf),
         )  # fmt: skip
 
     def load(self, node: Nodes) -> Vector:
-        """Return the forces on some nodes (k,)."""
+        """Return the nodal forces on some nodes (k,)."""
         body, within = np.divmod(node, (self.side + 1) ** 2)
         row, column = np.divmod(within, self.side + 1)
-        f = np.array([value for value, _ in LOADED])
-        heights = np.stack([shares(self.side, *y) for _, y in LOADED])
-        along = shares(self.side, 0.0, 1.0)
+        f = np.array([value for value, _ in LOADS])
+        heights = np.stack([hat_integrals(self.side, *y) for _, y in LOADS])
+        along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def in_subdomains(self, rows: str) -> ProblemInParts:
-        """Describe the dual, glued by `rows`, one of `GLUE`."""
+    def in_subdomains(self, rows: str) -> DecomposedProblem:
+        """Return the decomposed problem, with gluing rows `rows`, one of `GLUE`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
-        G = _touching(sides, layout.nodes)
-        return ProblemInParts(
+        G = _contact_rows(sides, layout.nodes)
+        return DecomposedProblem(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
-            kind=membrane_kind, E=np.ones(2), names=NAMES, load=self.load, glue=rows,
-            held=np.sort(sides["left left"]),
+            assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
+            glue=rows, fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 
     @property
     def rigid(self) -> Any:
-        """Motions of each membrane as a whole, (nodes, 2), orthonormal."""
+        """Orthonormal translations of each membrane, (nodes, 2)."""
         half = self.qp.q.size // 2
         return np.kron(np.eye(2), np.full((half, 1), half**-0.5))
 
     def factorise(self) -> GeneralisedInverse:
-        """Factorise K without the prescribed components; the right one is free."""
+        """Factorise K without the prescribed components; the right membrane floats."""
         free = np.setdiff1d(np.arange(self.qp.q.size), self.qp.A.indices)
         return supported_inverse(self.qp.P, free, self.rigid)
 
     def quantities(self, s: Solution) -> dict[str, Any]:
-        """Report counts, energy, force on the right membrane and its lowest height.
+        """Return counts, energy, contact force and lowest height of a primal solution.
 
-        Of a solution of the primal problem; energy and force are per tension.
+        Energy and force are divided by the tension.
         """
-        return self._reported(s.z, self.qp.objective(s.x), float(s.x.min()))
+        return self._quantities(s.z, self.qp.objective(s.x), float(s.x.min()))
 
-    def results(self, found: OwnSolution) -> dict[str, Any]:
-        """Report what ranks have found, as `quantities`; called by all of them."""
-        lowest = found.bodies.ranks.extreme(float(found.u.min()), np.min)
-        return self._reported(found.z, found.energy, lowest)
+    def results(self, answer: LocalSolution) -> dict[str, Any]:
+        """Return the results of `quantities` from all ranks; collective."""
+        lowest = answer.bodies.ranks.extreme(float(answer.u.min()), np.min)
+        return self._quantities(answer.z, answer.energy, lowest)
 
-    def _reported(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
+    def _quantities(self, z: Vector, energy: float, lowest: float) -> dict[str, Any]:
         nodes = 2 * (self.side + 1) ** 2
         return {
             "nodes": nodes,
@@ -200,32 +201,33 @@ class Membranes:
         }
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the dual, of which ranks can emit their shares."""
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
+    """Return the decomposed problem of complete keys."""
     p: Any = params
     return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
-    """Report what ranks have found, as `Membranes.quantities`."""
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
+    """Return the function that evaluates `Membranes.quantities` on ranks."""
     del dual
     p: Any = params
     return Membranes(p["S"], p["n"]).results
 
 
-def membrane_kind(part: Part, h: float = 1.0) -> Kind:
-    """Assemble one floating block of a grid, under unit tension.
+def membrane_class(part: SubdomainMesh, h: float = 1.0) -> SubdomainClass:
+    """Assemble a floating subdomain of a grid under unit tension.
 
-    Its kernel are the constants. Its nodes are numbered as those of `grid_stiffness`.
+    The constants are its kernel. Its nodes are numbered as by `grid_stiffness`.
 
     h : length of a cell
     """
-    places = [np.unique(x.round(9)) for x in (part.points / h).T]
-    cells = tuple(x.size - 1 for x in places)
+    # rounded: coordinates of one grid line differ in their last digits
+    lines = [np.unique(x.round(9)) for x in (part.points / h).T]
+    cells = tuple(x.size - 1 for x in lines)
     nodes = len(part.points)
-    at = np.indices([x.size for x in places]).reshape(len(cells), -1)
+    at = np.indices([x.size for x in lines]).reshape(len(cells), -1)
     last = np.array(cells)[:, None]
-    return Kind(
+    return SubdomainClass(
         K=grid_stiffness(cells, h),
         R=np.full((nodes, 1), nodes**-0.5),
         fixing=fixing_nodes(part.points),
@@ -234,16 +236,18 @@ def membrane_kind(part: Part, h: float = 1.0) -> Kind:
     )
 
 
-def _touching(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
-    """Return the rows  u_1 − u_2  of nodes that face each other, (m, nodes)."""
+def _contact_rows(sides: Mapping[str, Nodes], nodes: int) -> csr_array:
+    """Return the rows  u_1 − u_2 ≤ 0  of opposite nodes, (m, nodes)."""
+    # both sides ascending by node, hence by y: the grids match
     pairs = np.stack([np.sort(sides[s]) for s in ("left right", "right left")], axis=1)
     ends = 2 * np.arange(len(pairs) + 1)
     data = np.tile([1.0, -1.0], len(pairs))
     return csr_array((data, pairs.ravel(), ends), shape=(len(pairs), nodes))
 
 
-def shares(n: int, lower: float, upper: float) -> Vector:
+def hat_integrals(n: int, lower: float, upper: float) -> Vector:
     """Return ∫N_j over lower < y < upper of the n + 1 hat functions on (0, 1)."""
     begin, end = (np.clip(y * n - np.arange(n), 0, 1) for y in (lower, upper))
+    # of each cell, ∫ of its rising and of its falling hat function
     rising = (end**2 - begin**2) / 2
     return np.asarray((np.append(end - begin - rising, 0) + np.append(0, rising)) / n)

@@ -1,28 +1,28 @@
-"""A string or membrane over an obstacle: exact solutions in closed form.
+"""A string or membrane over an obstacle, with exact solutions in closed form.
 
-*Flat.* Under unit tension, pulled down by the load q = 2 over Ω = (−3/2, 3/2)^dim and
-held at the boundary at the height of the solution, it minimises ∫ ½|∇u|² + q u over
-u ≥ 0. With r the distance from the origin, contact is where r ≤ 1, and beyond
+*Flat.* Under unit tension and the downward load q = 2 over Ω = (−3/2, 3/2)^dim, with
+the exact solution as Dirichlet data, u minimises ∫ ½|∇u|² + q u over u ≥ 0. With the
+distance r from the origin, the contact region is r ≤ 1, and for r ≥ 1
 
     string (dim = 1):    u = (r − 1)²               u″ = 2
     membrane (dim = 2):  u = r²/2 − ln r − ½        Δu = u″ + u′/r = 2
 
-both with u = u′ = 0 at r = 1; the obstacle pushes back with the pressure q inside, in
-all 2q and πq. (The membrane is a standard test of the obstacle problem, for instance in
-Bartels and Carstensen 2004.)
+both with u = u′ = 0 at r = 1. In the contact region the pressure of the obstacle is q;
+its total force is 2q and πq. (The membrane is a standard test of obstacle problems, for
+instance in Bartels and Carstensen 2004.)
 
 *Hemisphere.* Over Ω = (−2, 2)², without load, a membrane lies on the unit ball,
-ψ = √(1 − r²) for r ≤ 0.9 and its tangent beyond (tutorial 9 of PETSc's SNES; Bueler,
-"PETSc for partial differential equations", 2021, Chapter 12). Contact is where r ≤ a,
+ψ = √(1 − r²) for r ≤ 0.9, continued by its tangent for r > 0.9 (tutorial 9 of PETSc's
+SNES; Bueler, "PETSc for partial differential equations", 2021, Chapter 12). The contact
+region is r ≤ a,
 
     a²(ln 2 − ln a) = 1 − a²,    u = A ln(2/r) for r ≥ a,   A = a²/√(1 − a²)
 
-so that u and u′ are those of ψ at r = a, and u = 0 at r = 2. The ball pushes with 2πA.
+so that u and u′ equal those of ψ at r = a, and u = 0 at r = 2. The force of the ball is
+2πA.
 
-Linear or bilinear elements on a uniform grid: the nodal error and that of the energy
-are of second order.
-
-Lengths are in m, forces per tension.
+Elements are linear or bilinear on a uniform grid; errors at nodes and of the energy are
+of second order. Lengths are in m, forces are divided by the tension.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ from mortarbench.harness import (
     Vector,
     no_rows,
 )
-from mortarbench.problems.contact.sides import ACTIVE
+from mortarbench.problems.contact.sides import ACTIVE_THRESHOLD
 from mortarbench.problems.duality.dualisation import Transformed, dual_bounds, dualise
-from mortarbench.problems.duality.torn_dual import torn_dual, torn_quantities
+from mortarbench.problems.duality.feti_dual import decomposition_quantities, feti_dual
 from mortarbench.problems.fem.inverse import (
     GeneralisedInverse,
     regular_inverse,
@@ -59,42 +59,42 @@ from mortarbench.problems.fem.inverse import (
 )
 from mortarbench.problems.fem.laplacian import grid_stiffness
 from mortarbench.problems.fem.mesh import Mesh, Nodes, StructuredGrid
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import mesh_in_parts
+from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    ProblemInParts,
+    DecomposedProblem,
     on_one_process,
 )
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.models.membranes import membrane_kind
+from mortarbench.problems.models.membranes import membrane_class
 
 HALF = {"flat": 1.5, "hemisphere": 2.0}  #: half the width of Ω, m
 LOAD = {"flat": 2.0, "hemisphere": 0.0}  #: q, 1/m
-TANGENT = 0.9  #: r at which the hemisphere gives way to its tangent, m
-LIFT_OFF = 0.697965148223374  #: a, m
-SLOPE = LIFT_OFF**2 / np.sqrt(1 - LIFT_OFF**2)  #: A, m
+TANGENT_RADIUS = 0.9  #: r beyond which ψ continues by its tangent, m
+CONTACT_RADIUS = 0.697965148223374  #: a, root of a²(ln 2 − ln a) = 1 − a², m
+SLOPE = CONTACT_RADIUS**2 / np.sqrt(1 - CONTACT_RADIUS**2)  #: A, m
 
 
-def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP in one form."""
+def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
+    """Return the QP in one form."""
     p: Any = params
     if p["feti"] and form != "dual":
         raise InputError(
             f"feti with form {form} is not built; expected form dual, or no feti"
         )
     problem = obstacle_problem(p["dim"], p["n"], p["shape"])
-    rows, start, in_parts = problem.qp, perf_counter(), None
+    rows, start, certify_by_subdomains = problem.qp, perf_counter(), None
     decomposition: Mapping[str, Any] = {}
     if form == "primal":
-        new = with_bounds(rows)
+        new = bound_form(rows)
     elif p["feti"]:
         own = on_one_process(in_subdomains(params))
-        pieces, in_parts = own.torn_bodies, certified_by(own, rows.P)
-        new = torn_dual(pieces, rows)
-        decomposition = torn_quantities(pieces, new.qp)
+        pieces, certify_by_subdomains = own.decomposed, certifier(own, rows.P)
+        new = feti_dual(pieces, rows)
+        decomposition = decomposition_quantities(pieces, new.qp)
     elif form == "dual":
         new = dualise(rows, problem.floating())
     else:
@@ -111,9 +111,9 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
         constant=new.constant + datum,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=rows, back=new.recover, factorise=problem.factorise,
+            primal=rows, to_primal=new.recover, factorise=problem.factorise,
             mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
-            in_parts=in_parts,
+            certify_by_subdomains=certify_by_subdomains,
             constant=datum, grid=Grid(
                 problem.x, cells(p["dim"], p["n"]),
                 np.zeros(problem.cells, dtype=np.int64), problem.lift,
@@ -122,72 +122,72 @@ def over_obstacle(form: str, params: Mapping[str, Value]) -> Case:
     )  # fmt: skip
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the dual on a grid in blocks; every node within has a row of contact."""
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
+    """Return the decomposed problem; every interior node has a contact row."""
     p: Any = params
     if p["dim"] == 1:
         return _string_in_subdomains(p["n"], p["feti"], p["glue"])
     n, shape, all_ = p["n"], p["shape"], slice(None)
     grid = _grid(n, shape)
     layout = Layout.of((grid,), p["feti"])
-    held = np.unique(np.concatenate([*grid.sides.values()]))
-    free = np.setdiff1d(np.arange(grid.nodes), held)
+    boundary = np.unique(np.concatenate([*grid.sides.values()]))
+    free = np.setdiff1d(np.arange(grid.nodes), boundary)
     psi = obstacle_height(grid.block(all_, all_)[free], shape)
     ends = np.arange(free.size + 1)
     rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_kind, h=2 * HALF[shape] / n), E=np.ones(1),
-        names=("membrane",), load=partial(_load, grid, shape), held=held,
+        assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
+        names=("membrane",), load=partial(_load, grid, shape), fixed=boundary,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
     )  # fmt: skip
 
 
-def _string_in_subdomains(n: int, most: int, glue: str) -> ProblemInParts:
-    """Describe the dual of a string; its mesh is listed as a whole."""
+def _string_in_subdomains(n: int, most: int, glue: str) -> DecomposedProblem:
+    """Return the decomposed problem of a string, from its whole mesh."""
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_parts(mesh, blocks((n,), most), body, np.arange(n + 1))
+    layout = mesh_in_subdomains(mesh, blocks((n,), most), body, np.arange(n + 1))
     qp = problem.qp
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        kind=partial(membrane_kind, h=2 * HALF["flat"] / n), E=np.ones(1),
-        names=("string",), load=lambda node: -qp.q[node], held=qp.A.indices,
+        assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
+        names=("string",), load=lambda node: -qp.q[node], fixed=qp.A.indices,
         contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
     )  # fmt: skip
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
-    """Report what ranks have found, as `obstacle_quantities`."""
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
+    """Return the function that evaluates `obstacle_quantities` on ranks."""
     del dual
     p: Any = params
-    return partial(_found_by_ranks, _grid(p["n"], p["shape"]), p["shape"])
+    return partial(_rank_quantities, _grid(p["n"], p["shape"]), p["shape"])
 
 
-def _found_by_ranks(
-    grid: StructuredGrid, shape: str, found: OwnSolution
+def _rank_quantities(
+    grid: StructuredGrid, shape: str, answer: LocalSolution
 ) -> Mapping[str, Any]:
-    """Report what ranks have found, as `obstacle_quantities`; called by all of them.
+    """Return `obstacle_quantities` from the solutions of all ranks; collective.
 
-    The energy of the lift is that of `Problem.energy` for v = 0: qᵀw − ½wᵀKw.
+    The energy of the lift w is that of `Problem.energy` at v = 0, qᵀw − ½wᵀKw.
     """
-    held = np.unique(np.concatenate([*grid.sides.values()]))
+    boundary = np.unique(np.concatenate([*grid.sides.values()]))
     n = grid.divisions[0]
-    w, q = exact_height(grid.position(held), shape), -_load(grid, shape, held)
-    load = LOAD[shape] * _shares(n, 2 * HALF[shape] / n, held)
-    node = found.bodies.components
-    x, here = grid.position(node), np.isin(node, held)
-    u = np.where(here, exact_height(x, shape), found.u)
+    w, q = exact_height(grid.position(boundary), shape), -_load(grid, shape, boundary)
+    load = LOAD[shape] * _hat_integrals(n, 2 * HALF[shape] / n, boundary)
+    node = answer.bodies.components
+    x, at_boundary = grid.position(node), np.isin(node, boundary)
+    u = np.where(at_boundary, exact_height(x, shape), answer.u)
     error = float(np.abs(u - exact_height(x, shape)).max())
-    return _reported(
-        shape, (2, grid.nodes, n**2, held.size), found.z,
-        found.energy + float(w @ (q + load) / 2),
-        found.bodies.ranks.extreme(error, np.max),
+    return _quantities(
+        shape, (2, grid.nodes, n**2, boundary.size), answer.z,
+        answer.energy + float(w @ (q + load) / 2),
+        answer.bodies.ranks.extreme(error, np.max),
     )  # fmt: skip
 
 
 def _grid(n: int, shape: str) -> StructuredGrid:
-    """Divide Ω ⊂ ℝ²; its nodes are numbered as `nodes`, along y first."""
+    """Return the grid of Ω ⊂ ℝ², with nodes numbered as in `nodes`, along y first."""
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     return StructuredGrid(
         columns=x, rows=x,
@@ -199,8 +199,8 @@ def _grid(n: int, shape: str) -> StructuredGrid:
 def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
     """Return −q − Kw of `Problem` at some nodes (k,).
 
-    K of a square is the sum of Kronecker products of the stiffness and the mass of
-    lines of linear elements; only next to the boundary, w is felt.
+    K of a square is K₁ ⊗ M₁ + M₁ ⊗ K₁ with stiffness K₁ and mass M₁ of a line of linear
+    elements. Kw is zero except at nodes on the boundary and next to it.
     """
     n = grid.divisions[0]
     h, (i, j) = 2 * HALF[shape] / n, np.divmod(node, n + 1)
@@ -210,41 +210,40 @@ def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
         stiff, mass = (-one, one) if step else (_cells_at(k, n), 2 * _cells_at(k, n))
         return stiff / h, mass * (h / 6)
 
-    f = -LOAD[shape] * _shares(n, h, node)
+    f = -LOAD[shape] * _hat_integrals(n, h, node)
     for a, b in np.ndindex(3, 3):
         beside = np.stack([i + a - 1, j + b - 1])
         at_boundary = ((beside == 0) | (beside == n)).any(axis=0)
-        of = np.flatnonzero(at_boundary & ((beside >= 0) & (beside <= n)).all(axis=0))
-        (K_i, M_i), (K_j, M_j) = along(i[of], a - 1), along(j[of], b - 1)
-        w = exact_height(grid.position(beside[0, of] * (n + 1) + beside[1, of]), shape)
-        f[of] -= (K_i * M_j + M_i * K_j) * w
+        k = np.flatnonzero(at_boundary & ((beside >= 0) & (beside <= n)).all(axis=0))
+        (K_i, M_i), (K_j, M_j) = along(i[k], a - 1), along(j[k], b - 1)
+        w = exact_height(grid.position(beside[0, k] * (n + 1) + beside[1, k]), shape)
+        f[k] -= (K_i * M_j + M_i * K_j) * w
     return np.asarray(f)
 
 
 def _cells_at(line: Nodes, n: int) -> Vector:
-    """Count the cells beside some of n + 1 points on a line, (k,)."""
+    """Return the number of cells (k,) adjacent to some of n + 1 points on a line."""
     return np.where((line == 0) | (line == n), 1.0, 2.0)
 
 
-def _shares(n: int, h: float, node: Nodes) -> Vector:
-    """Return ∫N of some nodes (k,) of a square of n × n cells."""
+def _hat_integrals(n: int, h: float, node: Nodes) -> Vector:
+    """Return ∫N_j of some nodes (k,) of a square of n × n cells."""
     i, j = np.divmod(node, n + 1)
     return np.asarray((h / 2) ** 2 * _cells_at(i, n) * _cells_at(j, n))
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The obstacle problem of v = u − w, with w = u at the boundary and 0 elsewhere.
+    """Obstacle problem of v = u − w, with w = u at boundary nodes and 0 at the others.
 
     ::
 
         min ½vᵀKv + (q + Kw)ᵀv,   v = 0 at the boundary,   −v ≤ −ψ at the other nodes
     """
 
-    shape: str  #: flat, ψ = 0, or hemisphere
-
+    shape: str  #: "flat" (ψ = 0) or "hemisphere"
     x: Vector  #: (N, dim) nodes, m
-    cells: int
+    cells: int  #: number of cells
     lift: Vector  #: w (N,), m
     qp: QP
 
@@ -253,19 +252,19 @@ class Problem:
         return regular_inverse(self.qp.P, self.qp.G.indices)
 
     def floating(self) -> GeneralisedInverse:
-        """Factorise K with its kernel, the constants."""
+        """Factorise K with the constants as kernel, for duals with Dirichlet rows."""
         N = self.qp.q.size
         return supported_inverse(self.qp.P, np.arange(N), np.full((N, 1), N**-0.5))
 
     def energy(self, v: Vector) -> float:
-        """Return ∫ ½|∇u|² + q u, per tension."""
+        """Return ∫ ½|∇u|² + q u of u = v + w, over the tension."""
         w, qp = self.lift, self.qp
         constant = qp.q @ w - 0.5 * w @ (qp.P @ w)
         return qp.objective(v) + float(constant)
 
 
 def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
-    """Assemble the problem on a uniform grid of n cells per side."""
+    """Assemble the problem on a uniform grid with n cells per side."""
     h = 2 * HALF[shape] / n
     ends = np.array([1.0] + [2.0] * (n - 1) + [1.0])
     K = grid_stiffness((n,) * dim, h)
@@ -273,6 +272,7 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     if dim == 2:
         share = np.outer(share, share).ravel()
     x = nodes(dim, n, shape)
+    # half a cell of tolerance against rounding of the coordinates
     at_boundary = np.abs(x).max(axis=1) > HALF[shape] - h / 2
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
@@ -285,8 +285,8 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     return Problem(shape, x, n**dim, w, qp)
 
 
-def with_bounds(rows: QP) -> Transformed:
-    """Take out the prescribed components, and write −v ≤ −ψ as bounds v ≥ ψ."""
+def bound_form(rows: QP) -> Transformed:
+    """Eliminate the prescribed components, and write −v ≤ −ψ as bounds v ≥ ψ."""
     free = rows.G.indices
     n, m = rows.q.size, free.size
     K = csc_array(rows.P)
@@ -314,7 +314,7 @@ def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
 
 
 def cells(dim: int, n: int) -> NDArray[np.int64]:
-    """Return the corners of each cell in turn, (n, 2) or (n², 4)."""
+    """Return the corners of the cells, (n, 2) or (n², 4)."""
     i = np.arange(n)
     if dim == 1:
         return np.stack([i, i + 1], axis=-1)
@@ -327,16 +327,16 @@ def obstacle_height(x: Vector, shape: str) -> Vector:
     if shape == "flat":
         return np.zeros(len(x))
     r = np.linalg.norm(x, axis=1)
-    ball = np.sqrt(1 - np.minimum(r, TANGENT) ** 2)
-    return np.asarray(ball - TANGENT / ball * np.maximum(r - TANGENT, 0))
+    ball = np.sqrt(1 - np.minimum(r, TANGENT_RADIUS) ** 2)
+    return np.asarray(ball - TANGENT_RADIUS / ball * np.maximum(r - TANGENT_RADIUS, 0))
 
 
 def exact_height(x: Vector, shape: str = "flat") -> Vector:
     """Return the exact u at positions (N, dim), m."""
     if shape == "hemisphere":
         r = np.linalg.norm(x, axis=1)
-        beyond = SLOPE * np.log(2 / np.maximum(r, LIFT_OFF))
-        return np.where(r <= LIFT_OFF, obstacle_height(x, shape), beyond)
+        beyond = SLOPE * np.log(2 / np.maximum(r, CONTACT_RADIUS))
+        return np.where(r <= CONTACT_RADIUS, obstacle_height(x, shape), beyond)
     r = np.maximum(np.linalg.norm(x, axis=1), 1.0)
     if x.shape[1] == 1:
         return np.asarray((r - 1) ** 2)
@@ -346,55 +346,57 @@ def exact_height(x: Vector, shape: str = "flat") -> Vector:
 def exact_energy(dim: int, shape: str = "flat") -> float:
     """Return ∫ ½|∇u|² + q u of the exact solution: ⅓ for the string.
 
-    For the membrane the integral over r is elementary; with ρ the distance of the
-    boundary in the direction φ,
+    For the membrane, integrate over r in closed form, and over φ numerically. With the
+    distance ρ of the boundary in the direction φ,
 
         8 ∫_0^{π/4} [⅜(ρ⁴ − 1) − ½(ρ² − 1) + (½ − ρ²) ln ρ] dφ,    ρ = HALF/cos φ
 
-    and with the hemisphere π∫_0^a r³/(1 − r²) dr + 8 ∫_0^{π/4} ½A² ln(ρ/a) dφ.
+    For the hemisphere: π∫_0^a r³/(1 − r²) dr + 8 ∫_0^{π/4} ½A² ln(ρ/a) dφ.
     """
     if dim == 1:
         return 1 / 3
-    at, weights = leggauss(20)  # enough for all digits of what is so smooth
+    at, weights = leggauss(20)  # exact to rounding for these smooth integrands
     rho = HALF[shape] / np.cos(np.pi / 8 * (1 + at))
     if shape == "hemisphere":
-        ball = -np.pi / 2 * (LIFT_OFF**2 + np.log(1 - LIFT_OFF**2))
-        return float(ball + np.pi * weights @ (SLOPE**2 / 2 * np.log(rho / LIFT_OFF)))
+        ball = -np.pi / 2 * (CONTACT_RADIUS**2 + np.log(1 - CONTACT_RADIUS**2))
+        return float(
+            ball + np.pi * weights @ (SLOPE**2 / 2 * np.log(rho / CONTACT_RADIUS))
+        )
     along_ray = 3 / 8 * (rho**4 - 1) - (rho**2 - 1) / 2 + (0.5 - rho**2) * np.log(rho)
     return float(np.pi * weights @ along_ray)
 
 
 def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
-    """Report counts, energy and force of the obstacle, with their errors.
+    """Return counts, energy and force of the obstacle, with their errors.
 
-    energy and obstacle_force, Σλ: per tension. energy_error and force_error: relative.
-    max_error: largest error of u at a node, m.
+    energy and obstacle_force, Σλ, are divided by the tension. energy_error and
+    force_error are relative. max_error: largest error of u at a node, m.
     """
     N, dim = problem.x.shape
     error = problem.lift + s.x - exact_height(problem.x, problem.shape)
-    return _reported(
+    return _quantities(
         problem.shape, (dim, N, problem.cells, problem.qp.b.size), s.z,
         problem.energy(s.x), float(np.abs(error).max()),
     )  # fmt: skip
 
 
-def _reported(
+def _quantities(
     shape: str, sizes: tuple[int, int, int, int], z: Vector, energy: float, error: float
 ) -> dict[str, Any]:
-    """Put together what `obstacle_quantities` tells.
+    """Return the dictionary of `obstacle_quantities`.
 
-    sizes : dimensions, nodes, cells, and nodes at the boundary
+    sizes : dimension, and numbers of nodes, cells and boundary nodes
     """
-    (dim, N, elements, held), force = sizes, float(z.sum())
+    (dim, N, elements, boundary), force = sizes, float(z.sum())
     flat = LOAD["flat"] * (2.0 if dim == 1 else np.pi)
     exact_force = flat if shape == "flat" else 2 * np.pi * SLOPE
     return {
         "nodes": N,
         "elements": elements,
         "dofs": N,
-        "equality_rows": held,
+        "equality_rows": boundary,
         "contact_rows": z.size,
-        "active": int((z > ACTIVE * z.max(initial=0.0)).sum()),
+        "active": int((z > ACTIVE_THRESHOLD * z.max(initial=0.0)).sum()),
         "energy": energy,
         "energy_error": energy / exact_energy(dim, shape) - 1,
         "obstacle_force": force,

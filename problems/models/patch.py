@@ -1,23 +1,24 @@
-"""The contact patch test: a uniform pressure must pass through a non-matching joint.
+"""Contact patch test: transfer of a uniform pressure across a non-matching interface.
 
-Two blocks of 1 m × ½ m lie on each other without a gap, with or without friction, each
-on rollers at its left side, the lower one on rollers at its bottom; the pressure p acts
-on the top. The exact solution is linear in each block, so bilinear elements contain it:
+Two blocks of 1 m × ½ m are stacked without a gap, with or without friction. Both are on
+rollers at their left sides, the lower one also at its bottom; the pressure p acts on
+the top. The exact solution is linear in each block, so that bilinear elements contain
+it:
 
     σ_y = −p,  σ_x = τ_xy = 0      (plane strain: ε_y = −(1 − ν²)p/E, ε_x = ν(1 + ν)p/E)
 
 A contact discretisation that reproduces it transfers constant pressures exactly (Taylor
-and Papadopoulos 1991). Mortar methods do, node-to-segment contact in one pass does not:
-its error in σ_y is of order one and does not vanish with the mesh size. Friction makes
-no difference while the blocks are of one material. Contact alone holds the upper block
-up, so that ``dual-bounds`` does not exist.
+and Papadopoulos 1991). Mortar methods pass; one-pass node-to-segment contact fails: its
+error in σ_y is of order one and does not vanish with the mesh size. Friction changes
+nothing if the blocks are of the same material. Contact alone supports the upper block,
+so that the form ``dual-bounds`` does not exist.
 
 At finite strain (kinematics=finite) the pressure is a dead load, a nominal stress, and
 the exact solution is homogeneous: with the stretches λ₁ along x and λ₂ along y
 
     F = diag(λ₁, λ₂),   P₁₁(λ₁, λ₂) = 0,   P₂₂(λ₁, λ₂) = −p,   σ_y = P₂₂/λ₁
 
-while the blocks are of one material. `stretch` is λ₂ in place of p.
+if the blocks are of the same material. The key `stretch` prescribes λ₂ instead of p.
 """
 
 from __future__ import annotations
@@ -45,11 +46,11 @@ from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
+    ContactSolution,
     ElasticBodies,
-    Found,
     StructuredGrids,
-    by_keys,
-    remembered,
+    cached_problem,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.finite_strain import cauchy_stress, strain_energy
@@ -63,40 +64,40 @@ from mortarbench.problems.fem.mesh import (
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import gauss_stress
-from mortarbench.problems.ranges import SHORTEST
+from mortarbench.problems.ranges import MIN_STRETCH
 
-LENGTH, HEIGHT = 1.0, 0.5  #: of each block, m
+LENGTH, HEIGHT = 1.0, 0.5  #: size of each block, m
 NAMES = ("lower", "upper")
 PRESSURE = 1e6  #: p, Pa
-E_UPPER, NU = 10e6, 0.3  #: Pa
+E_UPPER, NU = 10e6, 0.3  #: modulus of the upper block, Pa, and ν of both
 
 
-@remembered
+@cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """State the linear problem of the blocks."""
+    """Return the linear problem of the blocks."""
     p: Any = params
-    of = bodies(p)
-    D = elasticity_matrices(of.materials, of.plane)
+    elastic = bodies(p)
+    D = elasticity_matrices(elastic.materials, elastic.plane)
 
-    def error(found: Found) -> dict[str, Any]:
-        """Find the largest |σ_y + p|/p over all Gauss points."""
+    def error(answer: ContactSolution) -> dict[str, Any]:
+        """Return the largest |σ_y + p|/p over all Gauss points."""
         largest = 0.0
-        for part in found.meshes():
+        for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)
-            off = np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE
-            largest = max(largest, float(off))
-        return {"stress_error": found.largest(largest)}
+            deviation = np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE
+            largest = max(largest, float(deviation))
+        return {"stress_error": answer.largest(largest)}
 
     return ContactProblem(
-        bodies=of, linearise=by_keys(p), results=error,
-        stages=load_steps(1, 1, of.forces, of.fixed, (law_of(p),)),
-        # friction may have to hold the blocks
-        pressed=float(np.abs(of.forces.value).sum()),
+        bodies=elastic, linearise=keyed_linearisation(p), results=error,
+        stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
+        # first bound of Coulomb's law: large enough to support blocks by friction
+        initial_force=float(np.abs(elastic.forces.value).sum()),
     )  # fmt: skip
 
 
 class Homogeneous(NamedTuple):
-    """Uniform compression of a free block between frictionless plates."""
+    """State of a block in uniform compression between frictionless plates."""
 
     lateral: float  #: stretch λ₁ along x
     stretch: float  #: λ₂ along y
@@ -107,29 +108,30 @@ class Homogeneous(NamedTuple):
 
 
 def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
-    """Solve P₁₁ = 0 for the lateral stretch under a stretch of the height."""
+    """Return the state with stretch λ₂, by solving P₁₁ = 0 for λ₁."""
 
-    def at(lateral: float) -> NDArray[np.float64]:
+    def F(lateral: float) -> NDArray[np.float64]:
         return np.diag([lateral, stretch])
 
     lateral = float(brentq(
-        lambda lateral: material.stress(at(lateral))[0, 0], 0.5, 3.0, xtol=1e-15
+        lambda lateral: material.stress(F(lateral))[0, 0], 0.5, 3.0, xtol=1e-15
     ))  # fmt: skip
-    P, A = material.stress(at(lateral)), material.tangent(at(lateral))
+    P, A = material.stress(F(lateral)), material.tangent(F(lateral))
     return Homogeneous(
         lateral, stretch, float(P[1, 1]), float(P[1, 1] / lateral),
-        float(material.energy(at(lateral))),
+        float(material.energy(F(lateral))),
+        # dP₁₁ = 0 determines dλ₁, which is eliminated from dP₂₂
         float(A[1, 1, 1, 1] - A[0, 0, 1, 1] ** 2 / A[0, 0, 0, 0]),
     )  # fmt: skip
 
 
-def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
-    """Find the state with a given stretch, which a growing load must come to.
+def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
+    """Return the state with a prescribed stretch.
 
     Raises
     ------
     InputError
-        When the material softens before.
+        When a growing load cannot reach it, since the material softens before.
 
     """
     softest = _softest(material)
@@ -142,9 +144,9 @@ def pressed_to(material: Hyperelastic, stretch: float) -> Homogeneous:
     return homogeneous(material, stretch)
 
 
-def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
-    """Find the state under a nominal pressure, Pa."""
-    least = max(_softest(material), SHORTEST)
+def state_under_pressure(material: Hyperelastic, pressure: float) -> Homogeneous:
+    """Return the state under a nominal pressure, Pa."""
+    least = max(_softest(material), MIN_STRETCH)
     stretch = float(brentq(
         lambda stretch: homogeneous(material, stretch).nominal + pressure, least, 1.0,
         xtol=1e-15,
@@ -153,25 +155,27 @@ def pressed_by(material: Hyperelastic, pressure: float) -> Homogeneous:
 
 
 def _softest(material: Hyperelastic) -> float:
-    """Return the stretch at which the pressure is largest; 0 where there is none."""
-    if homogeneous(material, SHORTEST).stiffness > 0:
+    """Return the stretch of the largest pressure; 0 if the material never softens."""
+    if homogeneous(material, MIN_STRETCH).stiffness > 0:
         return 0.0
     return float(
-        brentq(lambda stretch: homogeneous(material, stretch).stiffness, SHORTEST, 1.0)
+        brentq(
+            lambda stretch: homogeneous(material, stretch).stiffness, MIN_STRETCH, 1.0
+        )
     )
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Emit the QP of one Newton iteration at finite strain."""
+    """Return the QP of one Newton iteration at finite strain."""
     p: Any = params
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     exact = _uniform(params)
 
     def results(at: Iteration, s: Solution) -> dict[str, Any]:
-        found = _measured(path, at, s)
+        values = _mean_state(path, at, s)
         if p["ratio"] == 1:
-            found |= _compared(path, s, exact)
-        return found
+            values |= _errors(path, s, exact)
+        return values
 
     return newton_case(path, form, 1, p["newton"], results)
 
@@ -188,18 +192,18 @@ def _newton_path(
 
 
 def _uniform(params: Mapping[str, Any]) -> Homogeneous:
-    """Find the uniform state of the upper block that its load belongs to."""
+    """Return the uniform state of the upper block under its load."""
     material = hyperelastic(params["material"], Material(E_UPPER, NU))
     if params["stretch"] == 1:
-        return pressed_by(material, PRESSURE)
-    return pressed_to(material, float(params["stretch"]))
+        return state_under_pressure(material, PRESSURE)
+    return state_at_stretch(material, float(params["stretch"]))
 
 
-def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
-    """Report mean stretches of the blocks, [λ₁, λ₂], and what is between them.
+def _mean_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
+    """Return mean stretches [λ₁, λ₂], stresses and the strain energy of the blocks.
 
-    nominal_stress: the contact force over the undeformed length, Pa. cauchy_stress:
-    mean of σ_y over the cells, Pa. strain_energy: ∫W, J/m.
+    nominal_stress: contact force over the undeformed length, Pa. cauchy_stress: mean of
+    σ_y over the cells, Pa. strain_energy: ∫W, J/m.
     """
     bodies, u = path.bodies, as_vectors(s.x * path.bodies.length, 2)
     sides = bodies.mesh.boundaries
@@ -217,8 +221,8 @@ def _measured(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:
     }
 
 
-def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]:
-    """Report the largest errors: of σ_y over the cells, relative; of x at nodes, m."""
+def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]:
+    """Return the largest errors: relative, of σ_y in cells, and of x at nodes, m."""
     bodies = path.bodies
     stress = cauchy_stress(path.cells, s.x)[:, 1] * (bodies.force / bodies.length)
     u = as_vectors(s.x * bodies.length, 2)
@@ -230,7 +234,7 @@ def _compared(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, An
 
 
 def bodies(params: Mapping[str, Value]) -> ElasticBodies:
-    """Put the blocks on each other, with `lower` and `upper` elements along x."""
+    """Return the stacked blocks, with `lower` and `upper` cells along x."""
     p: Any = params
     shape = StructuredGrids(_grids(params))
     sides, force = shape.sides, PRESSURE * LENGTH
@@ -266,4 +270,5 @@ def _grids(params: Mapping[str, Any]) -> tuple[StructuredGrid, StructuredGrid]:
 
 
 def _divisions(n: int) -> tuple[int, int]:
+    """Return the numbers of cells along x and y; cells are about square."""
     return n, -(-n // 2)

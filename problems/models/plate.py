@@ -1,16 +1,17 @@
-"""An elastic plate in square subdomains: a linear problem to measure FETI on.
+"""An elastic plate in rectangular subdomains: a linear problem to study FETI.
 
-A plate of `width` × `height` is held at its left edge and pulled down by 1 MN per m of
-thickness. It consists of Sx × Sy subdomains of n × ny cells, of steel, with `jump`
-times its modulus in some of them: every other one (``checkerboard``) or those at the
-held edge (``column``). Nothing touches it, so that the dual has equations only, and its
-condition numbers say how well the method scales, without load, stopping test or units.
+A plate of `width` × `height` is clamped at its left edge and pulled down by 1 MN per m
+of thickness. It consists of Sx × Sy subdomains of n × ny cells of steel. In some of
+them, the modulus is larger by the factor `jump`: in every other one (``checkerboard``)
+or in those at the clamped edge (``column``). There is no contact, so that the dual has
+equations only. Its condition numbers measure the scalability of the method
+independently of load, stopping test and units.
 
 The load acts at the upper right corner (``point``), as a constant traction on the right
 edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
-Supports are rows of B as everywhere (Total FETI), or ``eliminated``: then subdomains at
-the held edge do not float, as in FETI-1 (Farhat and Roux 1991).
+Supports are rows of B as in all families (Total FETI), or ``eliminated``: subdomains at
+the clamped edge then do not float, as in FETI-1 (Farhat and Roux 1991).
 """
 
 from __future__ import annotations
@@ -36,12 +37,12 @@ from mortarbench.harness import (
     no_rows,
 )
 from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.divided import elastic_kind, looked_up
-from mortarbench.problems.duality.dualisation import Transformed, posed
-from mortarbench.problems.duality.torn_dual import (
-    torn_dual,
-    torn_matrices,
-    torn_quantities,
+from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
+from mortarbench.problems.duality.dualisation import Transformed, primal_form
+from mortarbench.problems.duality.feti_dual import (
+    decomposition_quantities,
+    feti_dual,
+    feti_matrices,
 )
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -59,26 +60,26 @@ from mortarbench.problems.fem.mesh import (
     nodal_lengths,
     rectangle_grid,
 )
-from mortarbench.problems.feti.emission import OwnDual
-from mortarbench.problems.feti.own_bodies import OwnSolution, Results, certified_by
+from mortarbench.problems.feti.distributed_dual import LocalDual
+from mortarbench.problems.feti.local_bodies import LocalSolution, Results, certifier
 from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
 )
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
-    OwnSubdomains,
-    ProblemInParts,
+    DecomposedProblem,
+    LocalSubdomains,
     on_one_process,
 )
 from mortarbench.problems.feti.tearing import blocks
-from mortarbench.problems.feti.torn import Torn
 
-LENGTH = 1.0  #: l, m
-LOAD = 1e6  #: F₀, N/m
+LENGTH = 1.0  #: l, unit of length, m
+LOAD = 1e6  #: F₀, the load, N/m
 STEEL = Material(E=210e9, nu=0.3)
-#: preconditioner and scaling, by the names under which their spectra are reported
+#: preconditioner and scaling by the name of the spectrum; None: no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
     "none": None,
     "lumped": ("lumped", "multiplicity"),
@@ -88,10 +89,10 @@ PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
 
 
 def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
-    """Emit the QP in one form."""
+    """Return the QP in one form."""
     plate = model(tuple(params.items()))
     mesh = plate.mesh
-    new = plate.dual if form == "dual" else posed(plate.primal)
+    new = plate.dual if form == "dual" else primal_form(plate.primal)
 
     def results(s: Solution) -> Mapping[str, Any]:
         counts = quantities(plate, new.recover(s))
@@ -107,17 +108,17 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
-        matrices=torn_matrices(plate.torn, new.qp) if form == "dual" else {},
+        matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
-            primal=plate.primal, back=new.recover, factorise=plate.factorise,
+            primal=plate.primal, to_primal=new.recover, factorise=plate.factorise,
             mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
             rigid=rigid_modes(mesh.points), names=("plate",),
             scale=LOAD * LENGTH, grid=Grid(
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
-            in_parts=(
-                certified_by(plate.own, plate.primal.P) if form == "dual" else None
+            certify_by_subdomains=(
+                certifier(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),
     )  # fmt: skip
@@ -125,63 +126,63 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Plate:
-    """The plate of one set of keys; K, f and moduli have no dimension, by l and F₀."""
+    """Plate of one set of keys; K, f and moduli are non-dimensional, by l and F₀."""
 
     size: tuple[float, float]  #: width and height, m
     mesh: Mesh
-    subdomain: NDArray[np.int64]  #: (E,) of each cell
-    material: NDArray[np.int64]  #: (E,) of each cell, a place in `moduli`
-    moduli: Vector  #: of the materials; the first is that of steel
+    subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
+    material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
+    moduli: Vector  #: (k,) moduli of the materials, that of steel first
     D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials
     primal: QP
-    parts: ProblemInParts
+    parts: DecomposedProblem
 
     @cached_property
-    def own(self) -> OwnSubdomains:
-        """The plate in its subdomains, all of them."""
+    def own(self) -> LocalSubdomains:
+        """All subdomains of the plate, on this process."""
         return on_one_process(self.parts)
 
     @property
-    def torn(self) -> Torn:
-        """The same with what was made of them."""
-        return self.own.torn_bodies
+    def torn(self) -> DecomposedBodies:
+        """Assembled subdomains of the plate."""
+        return self.own.decomposed
 
     @cached_property
     def dual(self) -> Transformed:
-        """The dual of the torn plate."""
-        return torn_dual(self.torn, self.primal)
+        """Dual of the decomposed plate."""
+        return feti_dual(self.torn, self.primal)
 
     @cached_property
     def spectra(self) -> Mapping[str, Spectrum]:
-        """Spectra of F on its equations, alone and with preconditioners."""
-        return _spectra(self.moduli, OwnDual(self.own))
+        """Spectra of F on the kernel of its equations, by preconditioner."""
+        return _spectra(self.moduli, LocalDual(self.own))
 
     @property
-    def held(self) -> NDArray[np.int64]:
-        """Components at the held edge."""
+    def clamped(self) -> NDArray[np.int64]:
+        """Displacement components at the clamped edge."""
         return dofs_of(self.mesh.boundaries["left"], 2)
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
-        free = np.setdiff1d(np.arange(self.mesh.dofs), self.held)
+        free = np.setdiff1d(np.arange(self.mesh.dofs), self.clamped)
         return regular_inverse(self.primal.P, free)
 
 
-def _spectra(moduli: Vector, dual: OwnDual) -> Mapping[str, Spectrum]:
-    """Find the spectra by the names of `PRECONDITIONERS`; called by all ranks."""
+def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
+    """Compute the spectra by the names of `PRECONDITIONERS`; collective over ranks."""
     qp = dual.share().qp
     names = dict(PRECONDITIONERS)
-    uniform = moduli[0] == moduli[1]  # so that both scalings are one
+    uniform = moduli[0] == moduli[1]  # then both scalings are the same
     if uniform:
         del names["dirichlet_stiffness"]
-    found = spectra_over_ranks(qp.P, qp.A, list(names.values()))
-    spectra = dict(zip(names, found, strict=True))
+    per_name = spectra_over_ranks(qp.P, qp.A, list(names.values()))
+    spectra = dict(zip(names, per_name, strict=True))
     return spectra | ({"dirichlet_stiffness": spectra["dirichlet"]} if uniform else {})
 
 
 @lru_cache(maxsize=4)
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
-    """Mesh and assemble the plate of complete keys; it is one body."""
+    """Mesh and assemble the plate of complete keys as one body."""
     p: Any = dict(params)
     grid, side = _grid(p), _side(p)
     mesh = grid.mesh()
@@ -190,10 +191,10 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     moduli, D = _stiffness(p)
     n = mesh.dofs
     one = csr_array(eye_array(n, format="csr"))
-    held = dofs_of(mesh.boundaries["left"], 2)
+    clamped = dofs_of(mesh.boundaries["left"], 2)
     primal = QP(
         P=stiffness(mesh, D, material), q=-load(grid, p["load"]),
-        A=one[held], b=np.zeros(held.size), G=no_rows(n), h=np.zeros(0),
+        A=one[clamped], b=np.zeros(clamped.size), G=no_rows(n), h=np.zeros(0),
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
     return Plate(
@@ -202,44 +203,45 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     )  # fmt: skip
 
 
-def in_subdomains(params: Mapping[str, Value]) -> ProblemInParts:
-    """Describe the dual of the plate."""
+def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
+    """Return the decomposed problem of complete keys."""
     p: Any = params
     grid, (moduli, D) = _grid(p), _stiffness(p)
     layout = Layout.of((grid,), _side(p))
     column, row = (x.astype(np.int64) for x in layout.block[1:])
+    # no contact rows, but the interface of problems with contact
     none = np.zeros(0)
-    return ProblemInParts(
+    return DecomposedProblem(
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
         material=_material(p, column, row),
-        kind=partial(elastic_kind, D=D, E=moduli),
-        load=looked_up(Forces(*_pull(grid, p["load"]))),
-        held=dofs_of(grid.sides["left"], 2),
+        assemble_class=partial(elastic_class, D=D, E=moduli),
+        load=force_lookup(Forces(*_pull(grid, p["load"]))),
+        fixed=dofs_of(grid.sides["left"], 2),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(2 * grid.nodes), none, none),
     )  # fmt: skip
 
 
-def results(params: Mapping[str, Value], dual: OwnDual) -> Results:
-    """Report what ranks have found, as `quantities`."""
-    return partial(_found_by_ranks, _grid(params), _stiffness(params)[0], dual)
+def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
+    """Return the function that evaluates `quantities` on ranks."""
+    return partial(_rank_quantities, _grid(params), _stiffness(params)[0], dual)
 
 
-def _found_by_ranks(
-    grid: StructuredGrid, moduli: Vector, dual: OwnDual, found: OwnSolution
+def _rank_quantities(
+    grid: StructuredGrid, moduli: Vector, dual: LocalDual, answer: LocalSolution
 ) -> dict[str, Any]:
-    """Report what ranks have found; called by all of them."""
-    own = found.subdomains
+    """Return `quantities` and condition numbers from all ranks; collective."""
+    own = answer.subdomains
     tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]), 2)
-    known = {
+    values = {
         "nodes": grid.nodes,
         "elements": int(np.prod(grid.divisions)),
         "dofs": 2 * grid.nodes,
-        "equality_rows": own.problem.held.size,
-        "energy": found.energy * LOAD * LENGTH,
-        "tip": (found.at(tip) * LENGTH).tolist(),
+        "equality_rows": own.problem.fixed.size,
+        "energy": answer.energy * LOAD * LENGTH,
+        "tip": (answer.at(tip) * LENGTH).tolist(),
     }
-    return known | conditions(_spectra(moduli, dual))
+    return values | conditions(_spectra(moduli, dual))
 
 
 def _size(p: Mapping[str, Any]) -> tuple[float, float]:
@@ -247,7 +249,7 @@ def _size(p: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _side(p: Mapping[str, Any]) -> tuple[int, int]:
-    """Return the cells along the sides of a subdomain."""
+    """Return the numbers of cells along the sides of a subdomain."""
     return p["n"], p["ny"] or p["n"]
 
 
@@ -259,7 +261,7 @@ def _grid(p: Mapping[str, Any]) -> StructuredGrid:
 def _material(
     p: Mapping[str, Any], column: NDArray[np.int64], row: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Choose the material by columns and rows of subdomains."""
+    """Return the materials of subdomains by their columns and rows."""
     patterns: dict[str, NDArray[np.int64]] = {
         "uniform": np.zeros_like(column),
         "checkerboard": (column + row) % 2,
@@ -269,14 +271,14 @@ def _material(
 
 
 def _stiffness(p: Mapping[str, Any]) -> tuple[Vector, NDArray[np.float64]]:
-    """Return moduli (2,) and elasticity matrices (2, 3, 3), without dimension."""
+    """Return non-dimensional moduli (2,) and elasticity matrices (2, 3, 3)."""
     moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
     materials = [Material(E, STEEL.nu) for E in moduli]
     return moduli, np.stack([elasticity_matrix(m, p["plane"]) for m in materials])
 
 
 def load(grid: StructuredGrid, kind: str) -> Vector:
-    """Return nodal forces (2N,) that pull down with F₀ in all, without dimension."""
+    """Return the non-dimensional nodal forces (2N,) of the load F₀."""
     component, force = _pull(grid, kind)
     f = np.zeros(2 * grid.nodes)
     f[component] = force
@@ -284,7 +286,7 @@ def load(grid: StructuredGrid, kind: str) -> Vector:
 
 
 def _pull(grid: StructuredGrid, kind: str) -> tuple[Nodes, Vector]:
-    """Return the components that are pulled, and the forces there."""
+    """Return the loaded components and their forces."""
     right = grid.sides["right"]
     share = {
         "point": (right == np.intersect1d(right, grid.sides["top"])).astype(float),
@@ -295,7 +297,7 @@ def _pull(grid: StructuredGrid, kind: str) -> tuple[Nodes, Vector]:
 
 
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
-    """Report counts, energy, J/m, and the tip [u_x, u_y], m: the upper right corner."""
+    """Return counts, energy, J/m, and the tip [u_x, u_y] (upper right corner), m."""
     mesh = plate.mesh
     tip = dofs_of(np.intersect1d(mesh.boundaries["top"], mesh.boundaries["right"]), 2)
     return {
@@ -309,23 +311,24 @@ def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
 
 
 def dual_quantities(plate: Plate) -> dict[str, Any]:
-    """Report how the plate is torn, ‖PFP‖, and condition numbers with error bounds.
+    """Return the decomposition, ‖PFP‖, and condition numbers with error bounds.
 
-    norm_PFP: that for E = 1, as all rows are scaled by √E. kappa: κ(PFP).
-    kappa_lumped, kappa_dirichlet, kappa_dirichlet_stiffness: with these
-    preconditioners, by multiplicity but for the last. Each has an `…_error`.
+    norm_PFP: ‖PFP‖ for E = 1, as all rows are scaled by √E. kappa: κ(PFP).
+    kappa_lumped, kappa_dirichlet: with these preconditioners, scaled by multiplicity.
+    kappa_dirichlet_stiffness: scaled by stiffness. Each has an `…_error`.
     """
-    torn = torn_quantities(plate.torn, plate.dual.qp)
-    return conditions(plate.spectra) | torn
+    return conditions(plate.spectra) | decomposition_quantities(
+        plate.torn, plate.dual.qp
+    )
 
 
 def conditions(spectra: Mapping[str, Spectrum]) -> dict[str, Any]:
-    """Report ‖PFP‖ and condition numbers, see `dual_quantities`."""
-    found: dict[str, Any] = {
+    """Return ‖PFP‖ and condition numbers, see `dual_quantities`."""
+    values: dict[str, Any] = {
         "norm_PFP": spectra["none"].largest,
         "norm_PFP_error": spectra["none"].largest_error,
     }
-    for name, of in spectra.items():
+    for name, spectrum in spectra.items():
         key = "kappa" if name == "none" else f"kappa_{name}"
-        found |= {key: of.condition, f"{key}_error": of.condition_error}
-    return found
+        values |= {key: spectrum.condition, f"{key}_error": spectrum.condition_error}
+    return values

@@ -1,4 +1,4 @@
-"""Variational inequalities with bounds alone, from collections of test problems.
+"""Variational inequalities with bounds as only constraints, from test collections.
 
 Each is min ½vᵀPv + qᵀv, l ≤ v ≤ u with a sparse P; unknowns and energies have no units.
 
@@ -21,9 +21,9 @@ HALF_WIDTH = 10.0  #: b of the journal bearing's rectangle (0, 2π) × (0, 2b)
 
 
 def string(n: int) -> Case:
-    """Hang a string of n points on [0, 1] over the obstacle ½ sin(4πx − π/6) − 2.
+    """Return the problem of a string over the obstacle ½ sin(4πx − π/6) − 2, n points.
 
-    The first and the last are held at 0, each by an equation of its own.
+    The string spans [0, 1]. Decoupled rows of P fix its end points at 0.
     """
     h = 1 / (n - 1)
     inside = np.r_[0.0, np.ones(n - 2), 0.0]
@@ -34,7 +34,7 @@ def string(n: int) -> Case:
 
 
 def journal_bearing(n: int, eccentricity: float) -> Case:
-    """Find the pressure v ≥ 0 of the film in a journal bearing, n² inner nodes.
+    """Return the problem of the pressure v ≥ 0 in a journal bearing, n² inner nodes.
 
     v minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b), v = 0 at the
     boundary. Node i + n·j is at the i-th ξ and the j-th height.
@@ -53,13 +53,14 @@ def journal_bearing(n: int, eccentricity: float) -> Case:
 
 
 def torsion(n: int, twist: float) -> Case:
-    """Find the stress function of a twisted elastic-plastic bar, n² inner nodes.
+    """Return the problem of the stress function v of a twisted bar, n² inner nodes.
 
-    It minimises ∫ ½|∇v|² − c v over the unit square, v = 0 at the boundary, within the
-    distance from the boundary on both sides; c is the twist per length. Plastic is
-    where it reaches that.
+    v minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 at the boundary and |v|
+    bounded by the distance from the boundary; c is the twist per length. The bar is
+    plastic where |v| is at its bound.
     """
     h = 1 / (n + 1)
+    # distance from the ends of an interval; of a square, the smaller of two
     near = h * np.minimum(np.arange(1, n + 1), np.arange(n, 0, -1))
     distance = np.minimum.outer(near, near).ravel()
     T, one = _second_difference(n), eye_array(n)

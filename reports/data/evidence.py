@@ -306,7 +306,7 @@ def _in_like_environments(directory: Path, records: list[Record]) -> list[Record
         known.setdefault(of[digest], found)
     return [
         r if of[r.environment] == r.environment
-        else r.but(environment=of[r.environment])
+        else r.replace(environment=of[r.environment])
         for r in records
     ]  # fmt: skip
 
@@ -318,7 +318,7 @@ def _one_name_each(records: list[Record]) -> list[Record]:
         if r.family == FROM_FILE and r.qp is not None:
             first.setdefault(r.qp, r)
     return [
-        r.but(case=same.case, params=same.params)
+        r.replace(case=same.case, params=same.params)
         if r.family == FROM_FILE and (same := first.get(r.qp or "")) else r
         for r in records
     ]  # fmt: skip
@@ -366,7 +366,7 @@ def _apart(record: Record, factor: float, marks: Mapping[str, str]) -> Record:
     mode = "" if record.mode == "cold" else f" ({record.mode})"
     if after := mode + marks.get(record.environment, ""):
         changes["solver"] = record.solver + after
-    return record.but(**changes) if changes else record
+    return record.replace(**changes) if changes else record
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:

@@ -73,7 +73,7 @@ def compare_ways(evidence: Evidence) -> Ways:
     charged = replace(
         evidence,
         records=arrange(
-            r.but(
+            r.replace(
                 case=name,
                 solver=Way(r.solver, r.form).label,
                 total_seconds=None

@@ -55,7 +55,9 @@ def _as_journalled(record: Record) -> Record:
     mode = f" ({record.mode})"
     named_apart = record.mode != "cold" and record.solver.endswith(mode)
     return (
-        record.but(solver=record.solver.removesuffix(mode)) if named_apart else record
+        record.replace(solver=record.solver.removesuffix(mode))
+        if named_apart
+        else record
     )
 
 

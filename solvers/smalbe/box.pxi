@@ -1,5 +1,5 @@
-# The set that x stays in, and all that MPRGP asks about it. The loop knows no bounds: a
-# further set (discs of friction) adds its part to each operation of this section.
+# The feasible set and every operation on it that MPRGP uses. The loop itself contains no
+# bounds, so that another set (discs of friction) only has to extend these operations.
 
 
 cdef struct Line:
@@ -10,19 +10,18 @@ cdef struct Line:
 
 
 cdef struct Parts:
-    double phi_square  # ‖φ‖² of the free gradient φ, g off the boundary
-    double beta_square  # ‖β‖² of the chopped gradient β, what leads inside on it
-    double reduced_square  # φ̃ᵀφ, φ̃ the φ that no step of length 1/τ takes beyond it
+    double phi_square  # ‖φ‖², φ the free gradient: g off the boundary
+    double beta_square  # ‖β‖², β the chopped gradient: the inward part of g on it
+    double reduced_square  # φ̃ᵀφ, φ̃ = φ reduced so that x − φ̃/τ stays feasible
     double phi_Hp  # φᵀHp after a step along p
 
 
 @cython.final
 cdef class Box:
-    """l ≤ x ≤ u, of vectors that several processes may share.
+    """The box l ≤ x ≤ u for vectors that may be distributed over processes.
 
-    Every operation is one pass over its vectors, together with the sums that the step
-    needs of them, over all processes: a CG step would otherwise read each vector several
-    times.
+    Each operation passes over its vectors once and accumulates all sums that the step
+    needs: separate operations would read each vector several times per CG step.
     """
 
     cdef Py_ssize_t n
@@ -33,14 +32,14 @@ cdef class Box:
 
     @staticmethod
     cdef Box of(const double *lower, const double *upper, Py_ssize_t n, Reduction over):
-        cdef Box made = Box.__new__(Box)
+        cdef Box new = Box.__new__(Box)
         cdef Py_ssize_t i
-        made.n, made.over, made.lower, made.upper = n, over, lower, upper
+        new.n, new.over, new.lower, new.upper = n, over, lower, upper
         for i in range(n):
             if upper[i] < INFINITY:
-                made.upper_if_any = upper
+                new.upper_if_any = upper
                 break
-        return made
+        return new
 
     cdef bint has_bound(self, Py_ssize_t i) noexcept:
         return self.lower[i] > -INFINITY or self.upper[i] < INFINITY
@@ -55,7 +54,7 @@ cdef class Box:
 
     cdef int lengths(self, const double *x, const double *g, const double *p,
                      const double *Hp, Line *line) except -1:
-        """Find how far to go along x − αp."""
+        """Compute the step lengths along x − αp."""
         if self.over.ranks is None:
             lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
             return 0
@@ -69,20 +68,19 @@ cdef class Box:
         self, const sparse *F, double s, const double *x, const double *g, double *p,
         double *Hp, Line *line
     ) noexcept:
-        """Hp ← s F p, and its `lengths`, in one go through memory."""
+        """Hp ← s F p, and the `lengths` along p, in one pass over memory."""
         sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
     cdef void next_product_and_lengths(
         self, const sparse *F, double s, double gamma, const double *x, const double *g,
         double *p, double *Hp, Line *line
     ) noexcept:
-        """p ← φ − γp, Hp ← s F p, and its `lengths`, in one go through memory."""
-        sparse_turn(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
+        """p ← φ − γp, Hp ← s F p, and the `lengths` along p, in one pass over memory."""
+        sparse_update_direction(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
     cdef int split(self, const double *x, const double *g, double tau, double *phi,
                    double *free, Parts *parts) except -1:
-        """Split g by the face on which x lies: φ and `free`, 1 off the boundary, else 0.
-        """
+        """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""
         split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 3)
 
@@ -91,17 +89,17 @@ cdef class Box:
                      Parts *parts) except -1:
         """x ← x − αp, g ← g − αHp, and `split`.
 
-        What comes nearer to the boundary than rounding can tell is on it: a step as far
-        as it is feasible must not stop short of the face.
+        Components within rounding of their bound are set to it: otherwise a step of
+        the largest feasible length could stop just short of the face.
 
-        phi, free : NULL where they are not stored
+        phi, free : NULL if they are not stored
         """
         advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
                 self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """β, what of g leads inside on the boundary."""
+        """beta ← β, the part of g on the boundary that points into the box."""
         cdef Py_ssize_t i
         for i in range(self.n):
             beta[i] = 0.0
@@ -121,44 +119,44 @@ cdef class Box:
                        double *piece) noexcept:
         """s ← argmin gᵀs + τ/2‖s‖², x + s in the set.
 
-        piece : −1 and 1 at the lower and the upper bound, 0 between; may be NULL
+        piece : −1 at the lower bound, 1 at the upper, 0 between; may be NULL
         """
-        tilted(x, g, tau, self.lower, self.upper, s, piece, self.n)
+        model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
 
     cdef void minimise_part(
         self, Py_ssize_t first, Py_ssize_t size, const double *x, const double *g_part,
         double tau, double *s, double *piece
     ) noexcept:
-        """Do so for some neighbouring components; g_part and piece are theirs alone."""
-        tilted(x + first, g_part, tau, self.lower + first, self.upper + first, s + first,
+        """Apply `minimise` to a range of components; g_part and piece are of that size."""
+        model_minimiser(x + first, g_part, tau, self.lower + first, self.upper + first, s + first,
                piece, size)
 
-    cdef void leave(self, double alpha, double beta, bint release, double *x, double *g,
+    cdef void leave_box(self, double alpha, double beta, bint release, double *x, double *g,
                     const double *p, const double *Hp, double *x0, double *g0,
                     double *free, Box face, double *z, double *z_g) noexcept:
-        """Go to the boundary, x ← x − αp; what was there is in x₀, g₀ and `free`.
+        """Step to the boundary, x ← x − αp; save the state before in x₀, g₀ and `free`.
 
-        face : becomes the set of the step that follows, which keeps what is on the
-            boundary there, unless it may `release` it
-        z : x − βp from the new x, outside of the set, and its gradient
+        face : receives the set of the next step; it fixes the components that are on
+            the boundary, unless `release`
+        z, z_g : receive x − βp from the new x, outside of the set, and its gradient
         """
-        leave(alpha, beta, release, x, g, p, Hp, self.lower, self.upper, x0, g0, free,
+        leave_box(alpha, beta, release, x, g, p, Hp, self.lower, self.upper, x0, g0, free,
               <double *> face.lower, <double *> face.upper, z, z_g, self.n)
 
     cdef double minimise_near(
         self, const double *z, const double *z_g, double tau, const double *x,
         const double *g, double *s
     ) except? -1:
-        """Find s from x to where `minimise` leads from z; returns gᵀs."""
-        return self.over.total(tilted_within(
+        """s ← z + argmin of `minimise` at z, minus x; returns gᵀs."""
+        return self.over.total(model_minimiser_within(
             z, z_g, tau, x, g, self.lower, self.upper, s, self.n
         ))
 
     cdef double within(self, const double *z, const double *x, const double *g,
                        bint release, double *s) except? -1:
-        """s ← z + s − x, on the boundary where that is nearer than rounding; gᵀs.
+        """s ← z + s − x, rounded to the boundary where within rounding; returns gᵀs.
 
-        Zero where the set leaves no choice, unless that is a `release`.
+        s is zero on components that the set fixes, unless `release`.
         """
         return self.over.total(within(
             z, x, g, self.lower, self.upper, release, s, self.n
@@ -167,7 +165,10 @@ cdef class Box:
     cdef double inward_energy(self, const double *x, const double *g,
                               const double *diagonal, double norm,
                               double noise) except? -1:
-        """Sum (norm gᵢ)²/Dᵢ over components where g leads inside by more than noise."""
+        """Return Σ (norm gᵢ)²/Dᵢ over components whose descent direction is feasible.
+
+        noise : components with a smaller gradient are left out
+        """
         return self.over.total(inward_energy(
             x, g, self.lower, self.upper, diagonal, norm, noise, self.n
         ))

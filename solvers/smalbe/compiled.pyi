@@ -6,11 +6,12 @@ from numpy.typing import NDArray
 from mortarbench.harness import QP, Matrix, Solution, Vector
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.solvers.smalbe import rows as orthonormal_rows
+from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.projected import Iterate, Projected
 
 Array = NDArray[np.float64]
-Kept = NDArray[np.int32]
+Indices = NDArray[np.int32]
 
 class Reduction:
     def __init__(
@@ -26,7 +27,7 @@ class Product:
     def __call__(self, v: Vector) -> Vector: ...
 
 class Rows:
-    given: orthonormal_rows.Rows
+    source: orthonormal_rows.Rows
     def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
     def met(self, nu: Vector, tol: float, least: float) -> bool: ...
 
@@ -61,7 +62,8 @@ class SMALBE:
         problem: Projected,
         options: Options,
         preconditioned: bool,
-        M: Callable[[Vector], Vector] | None = None,
+        M: Operator | None = None,
+        step_rule: StepRule | None = None,
     ) -> None: ...
     def begin(self, x: Vector, mu: Vector, rho: float) -> tuple[Vector, Vector]: ...
     def precondition(
@@ -93,7 +95,8 @@ def residual_bound(
 def orthonormal(
     G: Array, e: Vector
 ) -> tuple[
-    tuple[Array, Array, Array, float, float, Vector, bool], tuple[Array, Kept, Vector]
+    tuple[Array, Array, Array, float, float, Vector, bool],
+    tuple[Array, Indices, Vector],
 ]: ...
 def lanczos(
     F: Product, C: Rows, start: Vector, steps: int
@@ -106,4 +109,4 @@ def homogenised(
     ub: Vector,
     norm: float,
 ) -> tuple[Vector, tuple[Vector, Vector]]: ...
-def multipliers(m: int, R: Array, kept: Kept, size: Vector, a: Vector) -> Vector: ...
+def multipliers(m: int, R: Array, kept: Indices, size: Vector, a: Vector) -> Vector: ...

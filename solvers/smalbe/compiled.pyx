@@ -1,31 +1,31 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 # cython: initializedcheck=False
-"""SMALBE: preparation, MPRGP, outer loop and the way back, compiled.
+"""SMALBE, compiled: preparation, MPRGP, outer loop and recovery of the solution.
 
-One loop for all: it is written in a few operations, which work on the numbers of one
-process without Python, or ask Python for what several processes, an operator, a factor
-or a preconditioner of its own do.
+One loop serves all problems. It is written in a few operations. On one process with an
+explicit P they run without Python; sums over ranks, products with operators, sparse
+factors and preconditioners call back into Python.
 
 * operations.pxi: sums over processes, products with F, orthonormal rows
-* box.pxi: the set: steps to its boundary, projections, the parts of a gradient
+* box.pxi: the feasible set: steps to its boundary, projections, parts of the gradient
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free part of a sparse P
 * judge.pxi: KKT residuals of the problem as given, from the gradient
 * mprgp.pxi: the inner loop
 * release.pxi: its proportioning by such a factor
-* outer.pxi: the outer loop and the way back
-* residuals.pxi: a bound of the KKT residuals of the problem as given
+* outer.pxi: the outer loop and the recovery of x and its multipliers
+* residuals.pxi: an upper bound of the KKT residuals of the QP
 
-The textbook version in tests/support/textbook says the same in NumPy, and is what tests
-compare with: the same counts, and the same points up to rounding.
+tests/support/textbook has the same algorithm in NumPy. Tests compare both: the same
+counts, and the same points up to rounding.
 
-P is dense (then one triangle is read), sparse, or an operator, which is asked by Python.
-A sparse P whose entries lie on few diagonals, as differences and finite elements on a
-grid have them, is multiplied with by these: neighbouring rows at once, and half the
-entries, for P is symmetric. A CG step goes through memory twice then: the direction, its
-product and the lengths; the step and the new gradient, whose free part is not stored. Its
-loops over vectors are in `vectors.h`.
+P is dense (one triangle is read), sparse, or an operator called through Python. A sparse
+P with few nonzero diagonals, such as a difference or finite element matrix on a grid, is
+stored by diagonals: products process neighbouring rows at once, and read half of the
+entries because P is symmetric. A CG step then passes over memory twice: once for the
+direction, its product and the step lengths, once for the step and the new gradient, whose
+free part is not stored. The loops over vectors are in `vectors.h`.
 """
 
 cimport cython
@@ -34,7 +34,7 @@ from cpython.buffer cimport (
 )
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
-from libc.stdlib cimport calloc, free as give_back, realloc
+from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
@@ -46,6 +46,8 @@ from mortarbench.harness.verify cimport scales
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+from mortarbench.solvers.smalbe.extension import Step
+
 cdef extern from "vectors.h" nogil:
     ctypedef struct sparse:
         Py_ssize_t n, count
@@ -54,22 +56,22 @@ cdef extern from "vectors.h" nogil:
         const Py_ssize_t *offset
         const double *data
         const double *diagonals
-    int MOST_DIAGONALS
+    int MAX_DIAGONALS
     Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
                               signed char *slot)
     void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
     void sparse_product(const sparse *F, double s, const double *v, double *y)
     void sparse_lengths(const sparse *F, double s, const double *x, const double *g,
                         double *p, double *Hp, const double *lower,
-                        const double *upper, double *told)
-    void sparse_turn(const sparse *F, double s, double gamma, const double *x,
+                        const double *upper, double *result)
+    void sparse_update_direction(const sparse *F, double s, double gamma, const double *x,
                      const double *g, double *p, double *Hp, const double *lower,
-                     const double *upper, double *told)
-    double turn_freely(const double *g, const double *free, double gamma, double *p,
+                     const double *upper, double *result)
+    double update_free_direction(const double *g, const double *free, double gamma, double *p,
                        Py_ssize_t n)
-    void sparse_turn_freely(const sparse *F, double s, const double *g,
+    void sparse_update_free_direction(const sparse *F, double s, const double *g,
                             const double *free, double gamma, double *p, double *Hp,
-                            double *told)
+                            double *result)
     double dot(const double *a, const double *b, Py_ssize_t n)
     void add(double s, const double *a, double *b, Py_ssize_t n)
     void scale(double s, double *a, Py_ssize_t n)
@@ -86,34 +88,34 @@ cdef extern from "vectors.h" nogil:
     double first_bound(const double *x, const double *p, const double *lower,
                        const double *upper, Py_ssize_t n)
     void lengths(const double *x, const double *g, const double *p, const double *Hp,
-                 const double *lower, const double *upper, Py_ssize_t n, double *told)
-    void leave(double alpha, double beta, bint release, double *x, double *g,
+                 const double *lower, const double *upper, Py_ssize_t n, double *result)
+    void leave_box(double alpha, double beta, bint release, double *x, double *g,
                const double *p, const double *Hp, const double *lower,
                const double *upper, double *x0, double *g0, double *free,
                double *box_lower, double *box_upper, double *z, double *z_g,
                Py_ssize_t n)
     void split(const double *x, const double *g, const double *lower,
                const double *upper, double tau, double *phi, double *free,
-               Py_ssize_t n, double *told)
+               Py_ssize_t n, double *result)
     void advance(double alpha, double *x, double *g, const double *p, const double *Hp,
                  const double *lower, const double *upper, double tau, double *phi,
-                 double *free, Py_ssize_t n, double *told)
+                 double *free, Py_ssize_t n, double *result)
     double within(const double *x, const double *origin, const double *g,
                   const double *lower, const double *upper, bint release, double *s,
                   Py_ssize_t n)
-    double tilted_within(const double *x, const double *x_g, double tau,
+    double model_minimiser_within(const double *x, const double *x_g, double tau,
                          const double *origin, const double *g, const double *lower,
                          const double *upper, double *s, Py_ssize_t n)
     void rest_of_step(const double *x, const double *g, const double *s,
                       const double *Hs, const double *z_g, double *z, Py_ssize_t n,
-                      double *told)
+                      double *result)
     void projected(const double *x, const double *g, double tau, const double *lower,
                    const double *upper, double *y, Py_ssize_t n)
-    bint turn_round(double *s, Py_ssize_t n)
-    double turn(const double *z, double gamma, double *p, Py_ssize_t n)
+    bint negate(double *s, Py_ssize_t n)
+    double update_direction(const double *z, double gamma, double *p, Py_ssize_t n)
     void advance_freely(double alpha, double *x, double *g, const double *p,
                         const double *Hp, const double *free, Py_ssize_t n,
-                        double *told)
+                        double *result)
     void symmetric_product(const double *F, double s, const double *v, double *y,
                            Py_ssize_t n)
     void transposed(const double *U, double *columns, Py_ssize_t k, Py_ssize_t n,
@@ -127,13 +129,13 @@ cdef extern from "vectors.h" nogil:
                 Py_ssize_t k, Py_ssize_t stride)
     int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t stride)
     void solve(const double *R, const double *inverse, double *y, Py_ssize_t stride)
-    Py_ssize_t changed(const double *piece, double *held, Py_ssize_t n, int *where)
-    void tilted(const double *x, const double *g, double tau, const double *lower,
+    Py_ssize_t changed(const double *piece, double *active, Py_ssize_t n, int *where)
+    void model_minimiser(const double *x, const double *g, double tau, const double *lower,
                 const double *upper, double *s, double *piece, Py_ssize_t n)
     void restored(const double *nu, const double *shift, const double *lower,
                   const double *upper, const double *lb, const double *ub, double *x,
                   double *free, Py_ssize_t n)
-    void held_by(const double *nu, const double *lower, const double *upper,
+    void bound_multipliers(const double *nu, const double *lower, const double *upper,
                  const double *g, double *z, Py_ssize_t n)
     void masked(const double *free, const double *a, double *t, Py_ssize_t n)
     double terms_of_energy(const double *q, const double *diagonal, const double *x,

@@ -27,14 +27,15 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
 from mortarbench.solvers.common.conversion import dense, needs_dense, positive
 from mortarbench.solvers.smalbe.compiled import Reduction, residual_bound
-from mortarbench.solvers.smalbe.driver import CLAIM, PATIENCE
+from mortarbench.solvers.smalbe.driver import CLAIM_FACTOR, MAX_IDLE_TIGHTENINGS
 from mortarbench.solvers.smalbe.faces import Faces
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.rows import FREE_RANK, DenseRows, orthonormal_rows
 
-LARGEST = 2000  #: unknowns; docs/smalbe.md says where `smalbe` is the faster one
-RHO = 1e3  #: ρ/‖P‖ at first, Frobenius norm
-MOST_RHO = 1e9  #: where ‖Cν‖ falls slowly, ρ grows to this
+#: limit of unknowns: a face costs O(n³), and `smalbe` is faster long before
+MAX_UNKNOWNS = 2000
+INITIAL_RHO = 1e3  #: initial ρ/‖P‖, Frobenius norm
+MAX_RHO = 1e9  #: limit of ρ/‖P‖, which grows if ‖Cν‖ falls slowly
 DELTA = 1e-10  #: δ
 
 
@@ -42,11 +43,11 @@ DELTA = 1e-10  #: δ
 class Direct:
     """In-house SMALBE for small problems: face problems by updated Cholesky factors.
 
-    Ends where the KKT residuals on the QP as given are within `tol`, or get no smaller
-    and are within 5·tol, which is what is claimed.
+    Ends when the KKT residuals of the QP are within `tol`, or no longer decrease.
+    Success is claimed if they are within 5·tol.
     """
 
-    max_solves: int = 10_000  #: with factors of faces, in total
+    max_solves: int = 10_000  #: limit of solves with factors of faces, in total
 
     about: ClassVar[About] = About(
         title="SMALBE, direct (ours)", licence="BSD-3-Clause",
@@ -55,8 +56,8 @@ class Direct:
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
-            f"declines more than {LARGEST} unknowns; with a sparse P `smalbe` is the "
-            "faster one from about 300 on",
+            f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P `smalbe` is "
+            "the faster one from about 300 on",
         ),
     )  # fmt: skip
 
@@ -66,8 +67,8 @@ class Direct:
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
             return "takes bounds and equality rows, no inequality rows"
-        if qp.q.size > LARGEST:
-            return f"is for small problems; takes at most {LARGEST} unknowns"
+        if qp.q.size > MAX_UNKNOWNS:
+            return f"is for small problems; takes at most {MAX_UNKNOWNS} unknowns"
         return needs_dense(qp, 3)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -79,7 +80,7 @@ class Direct:
             return partial(Solution.without_point, qp, Status.INFEASIBLE, message)
         bounds = (qp.lb, qp.ub)
         try:
-            faces = Faces(P, qp.q, rows.C, rows.x_tilde, bounds, RHO, DELTA)
+            faces = Faces(P, qp.q, rows.C, rows.x_tilde, bounds, INITIAL_RHO, DELTA)
         except ArithmeticError:
             return partial(_not_convex, qp)
         return partial(_solved, _Task(qp, rows, faces), tol, self.max_solves)
@@ -89,7 +90,7 @@ class _Point(NamedTuple):
     x: Vector
     y: Vector
     z_box: Vector
-    residual: float  #: at least the worst on the QP as given
+    residual: float  #: upper bound of the worst KKT residual
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,10 +100,10 @@ class _Task:
     faces: Faces
 
     def point(self, *, fitted: bool) -> _Point:
-        """Return the present x with its multipliers.
+        """Return the current x with its multipliers.
 
-        fitted : have a leave least of the gradient on the free components, where its
-            own rounding, ρ times that of Cν, may be seen
+        fitted : whether to fit a to the gradient on the free components, by least
+            squares; the rounding of a is ρ times that of Cν, and may be too large
         """
         qp, faces, a = self.qp, self.faces, self.faces.a
         x, Px, z_box = faces.at(a)
@@ -110,21 +111,21 @@ class _Task:
             a = self._fitted(a, x, Px + qp.q)
             x, Px, z_box = faces.at(a)
         y = self.rows.multipliers(a)
-        s, alone = self.solution(x, y, z_box), Reduction()
-        worst = residual_bound(qp, s, Px, faces.diagonal, self.rows.G, alone)
-        if worst == np.inf:  # it tells nothing
+        s, serial = self.solution(x, y, z_box), Reduction()
+        worst = residual_bound(qp, s, Px, faces.diagonal, self.rows.G, serial)
+        if worst == np.inf:  # no bound is known
             worst = kkt_residuals(qp, s).worst
         return _Point(x, y, z_box, worst)
 
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
-        """Claim a point, before it has been checked."""
+        """Return a point as a claim of success; the caller checks it."""
         return Solution(
             status=Status.SOLVED, x=x, y=y, z=np.zeros(0), z_box=z_box,
             message="converged",
         )  # fmt: skip
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
-        """Have Cᵀa leave least of the gradient g on the free components."""
+        """Return the a with the least ‖(g + Cᵀa)_F‖ on the free components F."""
         C, free = self.rows.C, (self.qp.lb < x) & (x < self.qp.ub)
         missing = g[free] + C.T[free] @ a
         change, _, rank, _ = np.linalg.lstsq(C.T[free], missing, rcond=FREE_RANK)
@@ -134,13 +135,13 @@ class _Task:
 
 
 def _solved(task: _Task, tol: float, most: int) -> Solution:
-    """Run the outer loop until the residuals are within `tol`, or get no smaller."""
+    """Run the outer loop until the residuals are within `tol` or stop decreasing."""
     qp, rows, faces = task.qp, task.rows, task.faces
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     best: _Point | None = None
     error, outer, waited, settled = np.inf, 0, 0, True
-    most_rho = MOST_RHO / RHO * faces.rho
-    while settled and waited < PATIENCE:
+    most_rho = MAX_RHO / INITIAL_RHO * faces.rho
+    while settled and waited < MAX_IDLE_TIGHTENINGS:
         outer += 1
         try:
             settled = faces.minimise(most)
@@ -164,7 +165,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Raise ρ a hundredfold where rounding allows; return the most that it does."""
+    """Raise ρ a hundredfold if rounding allows; returns the new limit of ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)
@@ -177,15 +178,15 @@ def _penalised(faces: Faces, most: float) -> float:
 def _claimed(
     task: _Task, point: _Point | None, tol: float, otherwise: str, outer: int
 ) -> Solution:
-    """Claim a point that is within 5·tol, by its residuals where a bound is not."""
+    """Claim success if the bound of the residuals, or these, are within 5·tol."""
     faces, checked = task.faces, False
     if point is None:
         return Solution.without_point(task.qp, Status.ITERATION_LIMIT, otherwise)
     s = task.solution(point.x, point.y, point.z_box)
     status, message = s.status, s.message
-    if not point.residual <= CLAIM * tol:
+    if not point.residual <= CLAIM_FACTOR * tol:
         checked = True
-        if not kkt_residuals(task.qp, s).worst <= CLAIM * tol:
+        if not kkt_residuals(task.qp, s).worst <= CLAIM_FACTOR * tol:
             status, message = Status.ITERATION_LIMIT, otherwise
     counts = {
         "P_products": faces.products + checked, "outer": outer,

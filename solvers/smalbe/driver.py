@@ -1,4 +1,4 @@
-"""One run of SMALBE on a QP: transformed, solved, brought back, and checked there."""
+"""One run of SMALBE on a QP: transformation, solution, recovery and check."""
 
 from __future__ import annotations
 
@@ -15,13 +15,15 @@ from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
+from mortarbench.solvers.smalbe.extension import checked
 from mortarbench.solvers.smalbe.infeasibility import infeasible
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import (
-    chosen,
-    offered,
+    Preconditioner,
+    preconditioned_operator,
+    resolved_preconditioner,
     scalable,
-    structural,
+    structural_preconditioner,
 )
 from mortarbench.solvers.smalbe.projected import (
     Iterate,
@@ -39,39 +41,43 @@ from mortarbench.solvers.smalbe.spectrum import random_start
 STEPS = {
     "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
 }  # fmt: skip
-CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+#: "solved" is claimed if the KKT residuals are within this factor of the tolerance
+CLAIM_FACTOR = 5.0
 #: Factors of the tolerance, less than a residual demands, for one that exceeds it. The
 #: first is enough on four in five of the bodies where it does: the residual falls with
 #: ‖g^P‖, though not in proportion.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
-LEAST_LANCZOS = 5  #: steps, however few unknowns there are
-RHO = 1e4  #: penalty where none is given
-#: where P offers a preconditioner: the face preconditioner knows what ρ does there, and
-#: fewer outer iterations interrupt CG
-TORN_RHO = 1e6
-PATIENCE = 3  #: tightenings in a row that need not halve the residuals
-WITHOUT_P = ("model", "none")  #: preconditioners that an eliminated problem can have
+MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
+#: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
+#: with 1e4 two or three outer iterations suffice
+RHO = 1e4
+#: default penalty if P offers a preconditioner. Each multiplier step restarts CG on the
+#: thousands of rows of decomposed bodies, so that fewer outer iterations pay there
+PRECONDITIONED_RHO = 1e6
+MAX_IDLE_TIGHTENINGS = 3  #: tightenings in a row that may fail to halve the residuals
+#: preconditioners that need no data of the eliminated variables
+ELIMINATION_PRECONDITIONERS = ("model", "none")
 
 
 class Carry(NamedTuple):
-    """What one problem of a sequence leaves for the next."""
+    """Data that one problem of a sequence passes on to the next."""
 
     x: Vector  #: (n,)
-    side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper one, else 0
+    side: NDArray[np.int8]  #: (n,) −1 at the lower bound, 1 at the upper bound, else 0
     force: Vector  #: Cᵀa (n,) with the multipliers a of Cx = Cx̃
     spectrum: Spectrum
     block: FreeBlock | None
 
 
 Solve = Callable[[], tuple[Solution, Callable[[], Carry | None]]]
-#: letter of a step, x and g after it
+#: observer of a step: its letter, x and g after it
 Note = Callable[[str, Vector, Vector], None]
 
 
 class _Task(NamedTuple):
     qp: QP
-    inner: QP  #: without the variables that were eliminated
+    inner: QP  #: `qp` without the eliminated variables
     eliminated: Eliminated | None
     scaled: Scaled | None
     problem: Projected
@@ -85,18 +91,22 @@ class _Task(NamedTuple):
 def prepared(
     qp: QP, tol: float, options: Options, carry: Carry | None, *, eliminate: bool
 ) -> Solve:
-    """Eliminate the free variables where asked and possible; project; look at F."""
-    rho = options.rho or (TORN_RHO if offered(qp) else RHO)
+    """Prepare a run: eliminate free variables, project the QP, estimate its spectrum.
+
+    eliminate : whether to eliminate the free variables, if that is possible
+    """
+    rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
     eliminated = None
-    kind = chosen(qp, options.preconditioner)
-    chosen_freely = kind == "incomplete" and options.preconditioner == "auto"
-    if eliminate and (kind in WITHOUT_P or chosen_freely):
+    kind = resolved_preconditioner(qp, options.preconditioner)
+    automatic = options.preconditioner == "auto"
+    # the functions of a subclass expect the variables of the QP as given
+    eliminate = eliminate and not options.is_extended
+    if eliminate and (
+        kind in ELIMINATION_PRECONDITIONERS or (kind == "incomplete" and automatic)
+    ):
         eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
-    scaled = None
-    with_factor, automatic = kind == "incomplete", options.preconditioner == "auto"
-    if eliminated is None and (with_factor or (automatic and scalable(qp))):
-        scaled = Scaled.of(qp, with_factor=with_factor)
+    scaled = None if eliminated is not None else _scaled(qp, options, kind)
     inner = qp if eliminated is None else eliminated.qp
     inner = inner if scaled is None else scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
@@ -115,27 +125,35 @@ def prepared(
         options=options, rho=rho, loop=loop, history=history,
         start=_start(problem, loop, options.M, _penalty(rho, tol), carry, scaled),
     )  # fmt: skip
-    return lambda: _certified(task, tol)
+    return lambda: _solve_to_tolerance(task, tol)
+
+
+def _scaled(qp: QP, options: Options, kind: Preconditioner) -> Scaled | None:
+    """Scale the variables of a sparse QP with bounds, but not for a subclass."""
+    with_factor, automatic = kind == "incomplete", options.preconditioner == "auto"
+    if options.is_extended or not (with_factor or (automatic and scalable(qp))):
+        return None
+    return Scaled.of(qp, with_factor=with_factor)
 
 
 def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | None:
-    """Eliminate the free variables of a sequence while one factor serves all.
+    """Eliminate the free variables of a sequence as long as one factor serves all.
 
-    Where the block of the problem before is not that of this one, as in Newton's
-    method, a factor for each problem would cost more than it saves.
+    If the block differs from that of the previous problem, as in Newton's method, a new
+    factor for each problem would cost more than it saves.
     """
     if always or carry is None:
         return eliminate_free(qp, carry and carry.block)
-    found = None if carry.block is None else eliminate_free(qp, carry.block)
-    return None if found is None or found.columns else found
+    reduced = None if carry.block is None else eliminate_free(qp, carry.block)
+    return None if reduced is None or reduced.columns else reduced
 
 
 def _projected(
     qp: QP, options: Options, carry: Carry | None, scaled: Scaled | None
 ) -> Projected:
-    """Homogenise, project, normalise, and look at the spectrum."""
+    """Homogenise, project and normalise the QP; estimate the spectrum."""
     steps = _lanczos_steps(options, qp)
-    find = partial(_find, options, steps, carry)
+    find = partial(_estimated_spectrum, options, steps, carry)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
         problem.factor = scaled.factor()
@@ -152,43 +170,46 @@ def _projected(
 
 
 def _is_whole(qp: QP, problem: Projected) -> bool:
-    """Return whether this process has all of the QP, and P tells its diagonal."""
+    """Return whether this process has all of the QP, and P has a known diagonal."""
     return problem.diagonal.size > 0 and not isinstance(qp.q, DistributedVector)
 
 
-def _find(
+def _estimated_spectrum(
     options: Options,
     steps: int,
     carry: Carry | None,
     F: compiled.Product,
     C: compiled.Rows,
 ) -> Spectrum:
-    """Look at the spectrum, or take over that of the problem before.
+    """Estimate the spectrum of 𝒫F𝒫, or reuse that of the previous problem.
 
-    That serves where a product with the start vector of the Lanczos process, which is
-    always the same, shows about the same quotient; and only for steps by the model,
-    which notice where it is wrong.
+    The previous spectrum is reused if the Rayleigh quotient of the start vector of the
+    Lanczos process, which is always the same, has changed by less than a factor of two.
+    Only steps by the model may do so, because they detect and correct a wrong model.
     """
     if options.norm == "power":
         return by_power(F, C)
     if carry is not None and options.expansion == "model":
-        known, rows = carry.spectrum.ritz, C.given
+        previous, rows = carry.spectrum.ritz, C.source
         v = rows.project(random_start(rows.x_tilde.size))
-        now = float(v @ times_projected(F, rows, v)) / float(v @ v or 1.0)
-        if known is not None and 0.5 * known.at_start < now < 2 * known.at_start:
+        quotient = float(v @ times_projected(F, rows, v)) / float(v @ v or 1.0)
+        if previous and 0.5 * previous.at_start < quotient < 2 * previous.at_start:
             return carry.spectrum.orthogonal_to(rows)
     return by_lanczos(F, C, steps=steps)
 
 
 def _lanczos_steps(options: Options, qp: QP) -> int:
-    """Take few of them for few unknowns, where they would outweigh the CG steps.
+    """Return the number of Lanczos steps.
 
-    And where P offers a preconditioner: the spectrum of torn bodies is flat, so that
-    only its norm is found. With bounds alone fewer are enough: seven or eight for 73 to
-    85 unknowns save as many products as they cost, of which CG takes about ten.
+    Few steps suffice for few unknowns, where more would cost as much as the CG steps;
+    and if P offers a preconditioner, since the spectrum of decomposed bodies is flat
+    and only its norm is used. With bounds alone fewer are enough: seven or eight for 73
+    to 85 unknowns save as many products as they cost, of which CG takes about ten.
     """
-    few = LEAST_LANCZOS if offered(qp) else qp.q.size // (6 if qp.b.size else 10)
-    return min(options.lanczos_steps, max(LEAST_LANCZOS, few))
+    few = qp.q.size // (6 if qp.b.size else 10)
+    if preconditioned_operator(qp):
+        few = MIN_LANCZOS_STEPS
+    return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))
 
 
 def _start(
@@ -199,10 +220,10 @@ def _start(
     carry: Carry | None,
     scaled: Scaled | None,
 ) -> Iterate:
-    """Start from zero, or from where the problem before ended.
+    """Start from zero, or from the solution of the previous problem.
 
-    What was at a bound there begins at that bound here, wherever it is now: rows that
-    slip go on slipping when their friction changes.
+    A component at a bound there starts at that bound here, even if the bound has moved:
+    rows that slip continue to slip when the bound of friction changes.
     """
     C = problem.rows.C
     x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
@@ -216,7 +237,7 @@ def _start(
 
 
 def _penalty(rho: float, tol: float) -> float:
-    """Keep ρ, but below where the rounding of ρQν is seen in the gradient."""
+    """Limit ρ so that the rounding of ρQν in the gradient stays below the tolerance."""
     return min(rho, max(1.0, tol / (10 * EPS)))
 
 
@@ -227,15 +248,18 @@ class OuterLoop:
     solver: compiled.SMALBE
     problem: Projected
     options: Options
-    #: makes the observer of outer iteration k with that right-hand side
+    #: k, right-hand side → observer of outer iteration k
     watch: Callable[[int, Vector], Note] | None
 
     def first(self, x: Vector, mu: Vector, *, M: float, rho: float) -> Iterate:
-        """Start from x, moved into the bounds, and μ; one product, none for x = 0."""
+        """Return the iterate at x, projected onto the bounds, and μ.
+
+        One product, none for x = 0.
+        """
         return Iterate(*self.solver.begin(x, mu, rho), mu, M, rho)
 
     def solve(self, tol: float, at: Iterate) -> Iterate:
-        """Run the outer loop on from `at`, to a tolerance."""
+        """Continue the outer loop from `at` to a tolerance."""
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
             self.options, tol, at, partial(infeasible, problem.rows, problem.bounds),
@@ -246,27 +270,36 @@ class OuterLoop:
 
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product."""
-        found = self.solver.point(at.nu, at.mu, qp.lb, qp.ub)
-        return found or recovered(self.problem, qp, at)
+        point = self.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+        return point or recovered(self.problem, qp, at)
 
 
 def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
-    """Prepare the outer loop, with the preconditioner that is asked for."""
+    """Prepare the outer loop with the preconditioner of the options."""
     if problem.factor is not None:
         solver = compiled.SMALBE(problem, options, False, None)
-    else:
-        kind = chosen(qp, options.preconditioner)
-        solver = compiled.SMALBE(problem, options, kind != "none", structural(qp, kind))
+        watch = None if history is None else partial(history.watch, problem)
+        return OuterLoop(solver, problem, options, watch)
+    own, kind = (
+        options.preconditioner_for(qp),
+        resolved_preconditioner(qp, options.preconditioner),
+    )
+    M = structural_preconditioner(qp, kind) if own is None else checked(own)
+    solver = compiled.SMALBE(
+        problem, options, kind != "none", M, options.step_rule_for(qp)
+    )
     watch = None if history is None else partial(history.watch, problem)
     return OuterLoop(solver, problem, options, watch)
 
 
-def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | None]]:
+def _solve_to_tolerance(
+    task: _Task, tol: float
+) -> tuple[Solution, Callable[[], Carry | None]]:
     """Return a point whose KKT residuals on the original problem are within `tol`.
 
-    They may be CLAIM times that; where they exceed it at all, the tolerance is
+    They may be CLAIM_FACTOR times that; where they exceed it at all, the tolerance is
     tightened once or twice more, and the best of the points is returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
@@ -279,7 +312,7 @@ def _certified(task: _Task, tol: float) -> tuple[Solution, Callable[[], Carry | 
         if at.status is not Status.SOLVED or not at.nu @ at.nu < np.inf:
             break
         point, Fx = _point(task, at)
-        residual = _worst_residual(task, point, Fx, CLAIM * tol)
+        residual = _worst_residual(task, point, Fx, CLAIM_FACTOR * tol)
         if residual < worst:
             result, worst = (point, partial(_carry, task, at)), residual
     return _counted(task, result[0]), result[1]
@@ -306,19 +339,19 @@ def _claimed(
             nowhere = Solution.without_point(task.qp, Status.FAILED, message)
             return (nowhere, _nothing), np.inf, None, tighter
         point, Fx = _point(task, at)
-        worst = _worst_residual(task, point, Fx, CLAIM * tol)
+        worst = _worst_residual(task, point, Fx, CLAIM_FACTOR * tol)
         solved = at.status is Status.SOLVED
-        if worst <= CLAIM * tol:
+        if worst <= CLAIM_FACTOR * tol:
             result = _counted(task, point), partial(_carry, task, at)
             return result, worst, at if solved else None, tighter
         waited = 0 if worst < best / 2 else waited + 1
         best = min(best, worst)
-        if not solved or waited == PATIENCE:
+        if not solved or waited == MAX_IDLE_TIGHTENINGS:
             break
-        # by much where the last one changed little: multipliers may converge so slowly
-        # that one outer iteration meets a tolerance of nearly the same size
-        tighter *= 0.01 if waited else min(0.5, max(0.01, CLAIM * tol / worst))
-        at = _refreshed(task, at, _penalty(task.rho, tighter * tol))
+        # A hundredfold if the last tightening changed little: multipliers may converge
+        # so slowly that one outer iteration meets a slightly smaller tolerance.
+        tighter *= 0.01 if waited else min(0.5, max(0.01, CLAIM_FACTOR * tol / worst))
+        at = _with_exact_gradient(task, at, _penalty(task.rho, tighter * tol))
     message = f"stagnated at residual {worst:.1e}: rounding, or the cost is unbounded"
     if len(at.steps) + len(at.outer) >= options.max_steps:
         message = "step limit"
@@ -326,23 +359,23 @@ def _claimed(
     return (_counted(task, point), _nothing), worst, None, tighter
 
 
-def _refreshed(task: _Task, at: Iterate, rho: float) -> Iterate:
-    """Compute the gradient anew, which the steps only carried along; one product."""
+def _with_exact_gradient(task: _Task, at: Iterate, rho: float) -> Iterate:
+    """Recompute the gradient, which the steps only update; one product."""
     x = task.problem.rows.x_tilde + at.nu
     fresh = task.loop.first(x, at.mu, M=at.M, rho=min(at.rho, rho))
     return fresh._replace(outer=at.outer)
 
 
 def _nothing() -> None:
-    """Leave nothing for the next problem."""
+    """Return None: a failed run passes nothing on."""
 
 
 def _carry(task: _Task, at: Iterate) -> Carry:
     problem, eliminated = task.problem, task.eliminated
     lower, upper = problem.bounds
     side = (at.nu >= upper).astype(np.int8) - (at.nu <= lower).astype(np.int8)
-    held = lower == upper
-    side[held] = -np.sign(at.g[held])  # where it would go
+    fixed = lower == upper
+    side[fixed] = -np.sign(at.g[fixed])  # the bound that a descent step would approach
     x = problem.rows.x_tilde + at.nu
     return Carry(
         x=x if task.scaled is None else x / task.scaled.root,
@@ -354,7 +387,7 @@ def _carry(task: _Task, at: Iterate) -> Carry:
 
 
 def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
-    """Return to the problem as given; the product of what was solved with its x."""
+    """Recover the solution of the original QP; also returns Fx of the inner problem."""
     qp, problem = task.inner, task.problem
     x, a, z_box, Fx = task.loop.recovered(qp, at)
     letters = at.steps
@@ -377,9 +410,9 @@ def recovered(
 ) -> tuple[Vector, Vector, Vector, Vector]:
     """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product.
 
-    Fx − d + Cᵀa is the gradient of the projected problem for a = ‖𝒫F𝒫‖μ − C(Fx − d), up
-    to rounding and ‖Cν‖; a least-squares correction on the free components, where it
-    must vanish, removes what is left.
+    For a = ‖𝒫F𝒫‖μ − C(Fx − d) the residual Fx − d + Cᵀa equals the gradient of the
+    projected problem up to rounding and ‖Cν‖. A least-squares correction of a on the
+    free components, where the residual must vanish, removes these errors.
     """
     C = problem.rows.C
     at_lower, at_upper = at.nu <= problem.bounds[0], at.nu >= problem.bounds[1]
@@ -401,7 +434,7 @@ def recovered(
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
-    """Measure the worst KKT residual; where it is below `enough`, bound it at least."""
+    """Return an upper bound of the worst KKT residual, exact if it exceeds `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
         diagonal = task.scaled.root**2
@@ -417,7 +450,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
 
 
 def _counted(task: _Task, point: Solution) -> Solution:
-    """Note all products, those of the residuals too."""
+    """Update the count of products by those of the residuals."""
     products = task.problem.F.count
     if products == point.counts["P_products"]:
         return point
@@ -440,13 +473,16 @@ COLUMNS = (
 
 @dataclass(frozen=True, eq=False)
 class History:
-    """Rows in the order of `COLUMNS`; gradients and costs of the normalised problem."""
+    """History of a run, rows in the order of `COLUMNS`.
+
+    Gradients and costs are those of the normalised problem.
+    """
 
     began: float = field(default_factory=perf_counter)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
     def watch(self, problem: Projected, outer: int, rhs: Vector) -> Note:
-        """Make the observer of one inner run, whose right-hand side is `rhs`."""
+        """Return the observer of one inner run with the right-hand side `rhs`."""
         C, x_tilde = problem.rows.C, problem.rows.x_tilde
         size = float(np.linalg.norm(x_tilde))
         lower, upper = problem.bounds
@@ -471,7 +507,7 @@ class History:
 
     @property
     def columns(self) -> dict[str, NDArray[Any]]:
-        """The rows as arrays of one length."""
+        """Columns of the history as arrays of equal length."""
         columns = zip(*self.rows, strict=True) if self.rows else ((),) * len(COLUMNS)
         return {
             k: np.array(v)

@@ -1,17 +1,19 @@
-"""Free variables, eliminated: a transform of a QP with its way back.
+"""Elimination of the free variables of a QP: the transform and its inverse.
 
-Where no bound holds x_E, stationarity in E and the equality rows that involve E,
+Let E be the variables without bounds. Stationarity in E and the equality rows that
+involve E,
 
     [P_EE G_Eᵀ] [x_E]   [−q_E − P_EI x_I]
     [G_E   0  ] [ y ] = [ e   − G_I x_I ]
 
-give x_E and y as affine functions of the bounded x_I. What is left is a QP in x_I with
-the bounds, those equality rows that E does not meet, and the Schur complement
+determine x_E and y as affine functions of the bounded x_I. The reduced problem is a QP
+in x_I with the bounds, the equality rows that do not involve E, and the Schur
+complement
 
     P_II − P_IE P_EE⁻¹ P_EI + Tᵀ(G_E P_EE⁻¹ G_Eᵀ)⁻¹T,   T = G_E P_EE⁻¹ P_EI − G_I,
 
-which costs about as much to form as P_EE to factorise. On the duals of contact problems
-E are the supports: P_EE = F_EE is the same in every load step.
+whose assembly costs about as much as the factorisation of P_EE. On duals of contact
+problems E contains the supports, and P_EE = F_EE is the same in every load step.
 """
 
 from __future__ import annotations
@@ -29,9 +31,10 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
-#: singular values of orthonormal rows, cut to E, are zero below and good above these;
-#: rows that hardly meet E would make the reduced matrix as large as they are small
-ZERO, GOOD = 1e-12, 1e-2
+#: Singular values of orthonormal rows, restricted to E: zero below the first, accepted
+#: above the second. Those between would enter the reduced matrix with their
+#: reciprocals, and its rounding would exceed the tolerance
+RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
 
@@ -44,18 +47,18 @@ class FreeBlock(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """A QP in the bounded variables, and its way back."""
+    """A QP in the bounded variables, with the recovery of the others."""
 
     qp: QP  #: P is dense
     recover: Callable[[Solution], Solution]
-    G: Array  #: (m, n) the equality rows as given
-    block: FreeBlock  #: to use again where P_EE is the same
-    columns: int  #: of P_EE that were factorised, 0 where the factor was known
+    G: Array  #: (m, n) equality rows of the original QP
+    block: FreeBlock  #: for later QPs with the same P_EE
+    columns: int  #: columns of P_EE factorised here; 0 if a stored factor was used
 
 
 @dataclass(frozen=True, eq=False)
 class _Saddle:
-    """Solves for x_E and y."""
+    """Solution operator of the saddle point system for x_E and y."""
 
     factor: Array  #: (k, k) of P_EE, in the upper triangle
     G_E: Array  #: (r, k) of full rank
@@ -79,26 +82,27 @@ class _Saddle:
         return S
 
 
-def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
-    """Eliminate the variables without bounds; None where that cannot be done.
+def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | None:
+    """Eliminate the variables without bounds; returns None if that is not possible.
 
-    It needs an explicit P with a positive definite P_EE, consistent equality rows that
-    meet E clearly or not at all, no inequality rows, and variables of both kinds.
+    It requires an explicit P with a positive definite P_EE, variables with and without
+    bounds, no inequality rows, and consistent equality rows whose restrictions to E are
+    either zero or well conditioned.
 
-    known : from an earlier problem; used if its P_EE is this one's
+    previous : block of an earlier problem, used if P_EE is the same
     """
     free = np.isinf(qp.lb) & np.isinf(qp.ub)
     if free.all() or not free.any() or not qp.is_explicit or qp.h.size:
         return None
     rows = orthonormal_rows(qp.A, qp.b)
-    block = _factorised(_block(qp.P, free, free), known)
+    block = _factorised(_block(qp.P, free, free), previous)
     if block is None or not rows.consistent:
         return None
     C_E = rows.C[:, free]
     left, size, _ = np.linalg.svd(C_E, full_matrices=C_E.shape[0] > C_E.shape[1])
-    if ((size > ZERO) & (size < GOOD)).any():
+    if ((size > RANK_ZERO) & (size < RANK_GOOD)).any():
         return None
-    rank = int((size >= GOOD).sum())
+    rank = int((size >= RANK_GOOD).sum())
     meets, others = left[:, :rank], left[:, rank:]
     G, N, Cx = meets.T @ rows.C, others.T @ rows.C, rows.C @ rows.x_tilde
     try:
@@ -122,13 +126,13 @@ def eliminate_free(qp: QP, known: FreeBlock | None = None) -> Eliminated | None:
         y = rows.multipliers(meets @ y_R + others @ s.y)
         return replace(s, x=x, y=y, z_box=z_box)
 
-    columns = 0 if known is block else int(free.sum())
+    columns = 0 if previous is block else int(free.sum())
     return Eliminated(reduced, recover, rows.G, block, columns)
 
 
-def _factorised(P_EE: Array, known: FreeBlock | None) -> FreeBlock | None:
-    if known is not None and np.array_equal(known.matrix, P_EE):
-        return known
+def _factorised(P_EE: Array, previous: FreeBlock | None) -> FreeBlock | None:
+    if previous is not None and np.array_equal(previous.matrix, P_EE):
+        return previous
     try:
         return FreeBlock(P_EE, _cholesky(P_EE))
     except LinAlgError:  # singular: stationarity does not determine x_E
@@ -136,7 +140,7 @@ def _factorised(P_EE: Array, known: FreeBlock | None) -> FreeBlock | None:
 
 
 def _cholesky(M: Array) -> Array:
-    """Return R of M = RᵀR (k, k) in the upper triangle; below is what was there."""
+    """Return R of M = RᵀR (k, k) in the upper triangle; the lower one is arbitrary."""
     factor, info = dpotrf(M.T, clean=False)
     if info:
         raise LinAlgError("not positive definite")
@@ -151,7 +155,7 @@ def _saddle(block: FreeBlock, G_E: Array) -> _Saddle:
 
 
 def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Array:
-    """Return that block of a symmetric P, which looks at P where that is dense."""
+    """Return a block of a symmetric P, as a view if P is dense."""
     if not isinstance(P, np.ndarray):
         return np.asarray(csr_array(P)[rows][:, columns].toarray(), dtype=float)
     at, of = _as_slice(columns), _as_slice(rows)
@@ -161,7 +165,7 @@ def _block(P: Matrix, rows: NDArray[np.bool_], columns: NDArray[np.bool_]) -> Ar
 
 
 def _as_slice(chosen: NDArray[np.bool_]) -> slice | NDArray[np.bool_]:
-    """Give components without a gap as a slice."""
+    """Return a mask as a slice if its components are consecutive."""
     at = np.flatnonzero(chosen)
     whole = at.size and at[-1] - at[0] == at.size - 1
     return slice(int(at[0]), int(at[-1]) + 1) if whole else chosen

@@ -2,11 +2,10 @@
 # cython: initializedcheck=False
 """A proximal augmented Lagrangian, minimised over a box exactly, face after face.
 
-`Faces` keeps the Cholesky factor of its second derivative on the free components. A
-component that becomes free adds a row to it; one that is held takes its row out, and
-Givens rotations, or a factorisation of what lies behind it, mend the rest (Golub and
-Van Loan, Matrix Computations, 4th ed., 6.5.4). `solvers.smalbe.direct` says what it is
-used for.
+`Faces` updates the Cholesky factor of the Hessian on the free components. A component
+that becomes free appends a row; one that reaches a bound removes its row, and Givens
+rotations, or a factorisation of the rows behind it, restore the factor (Golub and Van
+Loan, Matrix Computations, 4th ed., 6.5.4). `solvers.smalbe.direct` uses it.
 """
 
 from cpython.exc cimport PyErr_CheckSignals
@@ -18,9 +17,9 @@ from scipy.linalg.cython_lapack cimport dpotrf
 import numpy as np
 
 cdef double ROUNDING = 8 * 2.0 ** -52  # of a sum of terms, relative to their sizes
-cdef double NEARLY = 0.9  # of the largest inward gradient: freed with it at first
-cdef double FLAT = 1e-12  # of the mean of D: as good as not curved
-cdef int GIVENS = 6  # a row taken out by rotations, in steps of a factorisation
+cdef double RELEASE_SHARE = 0.9  # of the largest inward gradient that is freed with it
+cdef double FLAT = 1e-12  # diagonal entries below this times their mean count as zero
+cdef int GIVENS_COST = 6  # removing a row by rotations, in rows of a factorisation
 
 
 def _whole(a):
@@ -31,10 +30,10 @@ cdef class Faces:
     """½xᵀPx + qᵀx + aᵀCν + ρ/2 ‖Cν‖² + δ/2 ‖x − x_k‖²_D over l ≤ x ≤ u, ν = x − x̃.
 
     P (n, n) is positive semidefinite, C is (r, n). D is the diagonal of P, or its mean
-    where that is nearly zero. a and x_k begin with zeros. L (k, k) is the factor of
+    where that is nearly zero. a and x_k are initially zero. L (k, k) is the factor of
     P + ρCᵀC + δD in the order in which components became free. It is stored by rows,
     which LAPACK reads as the columns of Lᵀ; `among` holds the columns of C in that
-    order, as rows. Nearer to a bound than the rounding of qᵢ/Dᵢ is on it.
+    order, as rows. A component within the rounding of qᵢ/Dᵢ of a bound is set to it.
     """
 
     cdef Py_ssize_t n, k
@@ -52,10 +51,10 @@ cdef class Faces:
     cdef int[::1] order, place
 
     def __init__(self, P, q, C, x_tilde, bounds, double rho, double delta):
-        """Begin at zero, moved into the box; factorise where it is on no bound.
+        """Start from the projection of zero onto the box and factorise on its face.
 
-        rho is relative to ‖P‖ (Frobenius). Raises ArithmeticError where P is not
-        positive semidefinite.
+        rho is relative to ‖P‖ (Frobenius). Raises ArithmeticError if P is not positive
+        semidefinite.
         """
         cdef Py_ssize_t i, n = q.size
         cdef double square = 0.0, mean = 0.0
@@ -90,9 +89,9 @@ cdef class Faces:
         self.enter()
 
     def at(self, const double[::1] a):
-        """Return x, Px and z_box (n,) for multipliers a: −(Px + q + Cᵀa) on bounds.
+        """Return x, Px and z_box (n,) for multipliers a.
 
-        Where a bound cannot bear that, z_box is zero.
+        z_box = −(Px + q + Cᵀa) on bounds where that has the admissible sign, else 0.
         """
         cdef Py_ssize_t i, m, n = self.n
         cdef double total
@@ -119,15 +118,15 @@ cdef class Faces:
     # the factor
 
     cdef int enter(self) except -1:
-        """Have the factor be that of the face where `wanted` components are free."""
-        cdef Py_ssize_t i, j, first = self.k, kept, base, known, a, b
+        """Update the factor to the face where the `wanted` components are free."""
+        cdef Py_ssize_t i, j, first = self.k, kept, base, unchanged, a, b
         cdef int gone = 0, n = self.n, r = max(self.r, 1), s, t, info = 0
         cdef double one = 1.0, minus = -1.0
         for j in range(self.k):
             if not self.wanted[self.order[j]]:
                 gone += 1
                 first = min(first, j)
-        if gone * GIVENS <= first + (self.k - first) / 3:
+        if gone * GIVENS_COST <= first + (self.k - first) / 3:
             for j in range(self.k - 1, first - 1, -1):
                 if not self.wanted[self.order[j]]:
                     self.remove(j)
@@ -144,25 +143,25 @@ cdef class Faces:
                     self.place[i] = -1
             self.k = kept
         self.left += gone
-        known = self.k
+        unchanged = self.k
         for i in range(self.n):
             self.free[i] = self.wanted[i]
             if self.wanted[i] and self.place[i] < 0:
                 self.put(self.k, i)
                 self.k += 1
-        self.joined += self.k - known
+        self.joined += self.k - unchanged
         if self.k == base:
             return 0
         for a in range(base, self.k):
-            for b in range(0 if a >= known else base, a + 1):
+            for b in range(0 if a >= unchanged else base, a + 1):
                 self.L[a, b] = self.P[self.order[a], self.order[b]]
             self.L[a, a] += self.delta * self.D[self.order[a]]
-        s, t = self.k - known, base
+        s, t = self.k - unchanged, base
         if s and t:
             dgemm(b"T", b"N", &t, &s, &r, &self.rho, &self.among[0, 0], &r,
-                  &self.among[known, 0], &r, &one, &self.L[known, 0], &n)
+                  &self.among[unchanged, 0], &r, &one, &self.L[unchanged, 0], &n)
             dtrsm(b"L", b"U", b"T", b"N", &t, &s, &one, &self.L[0, 0], &n,
-                  &self.L[known, 0], &n)
+                  &self.L[unchanged, 0], &n)
         s = self.k - base
         dsyrk(b"U", b"T", &s, &r, &self.rho, &self.among[base, 0], &r, &one,
               &self.L[base, base], &n)
@@ -175,14 +174,14 @@ cdef class Faces:
         return 0
 
     cdef void put(self, Py_ssize_t j, Py_ssize_t i):
-        """Have row j of the factor be that of component i."""
+        """Assign row j of the factor to component i."""
         cdef Py_ssize_t m
         self.order[j], self.place[i], self.among[j, 0] = i, j, 0.0
         for m in range(self.r):
             self.among[j, m] = self.C[m, i]
 
     cdef void remove(self, Py_ssize_t p):
-        """Take row p out of the factor; rotations of columns mend what is below."""
+        """Remove row p of the factor; Givens rotations restore the rows below."""
         cdef Py_ssize_t r, j
         cdef double a, size
         cdef double *row
@@ -211,7 +210,7 @@ cdef class Faces:
     # the method
 
     cdef void gradient(self, const double[::1] x, double[::1] g):
-        """g ← the gradient of f at x; one product. Cν is small, and kept."""
+        """g ← gradient at x, `off` ← Cν; one product."""
         cdef Py_ssize_t i, m, n = self.n
         cdef double weight
         for i in range(n):
@@ -247,29 +246,29 @@ cdef class Faces:
         return sqrt(square)
 
     def penalise(self, double rho):
-        """Change ρ, and factorise anew."""
+        """Change ρ and factorise again."""
         self.rho, self.k = rho, 0
         self.wanted[:] = self.free
         np.asarray(self.place)[:] = -1
         self.enter()
 
     def minimise(self, long most):
-        """Minimise from where x is; False after `most` solves with factors of faces.
+        """Minimise from x on; returns False after `most` solves with factors of faces.
 
-        1. x ← the minimum on its face, which loses what would leave the box.
-        2. Components whose gradient leads from their bound into the box: where there
-           are none, x is the minimum.
+        1. x ← the minimum on its face, reduced until no component leaves the box.
+        2. If no component at a bound has a feasible descent direction, x is the minimum.
         3. Free those whose gradient, relative to √Pᵢᵢ, is at least a share of the
-           largest, and do 1. If that lowered the cost, go to 2. The share is halved
-           where nothing left the face, and NEARLY again where something did.
-        4. Else free the one with the largest. Go to the minimum on that face, or as
-           far as the box lets, hold what stops, again; go to 2.
+           largest, and repeat 1. If the cost has decreased, go to 2. The share is halved
+           if no component left the face, and reset to RELEASE_SHARE otherwise.
+        4. Otherwise free only the component with the largest gradient. Step to the
+           minimum on that face or to the first bound, fix the component that reached it,
+           and repeat; go to 2.
 
-        3 and 4 lower the cost, and each ends at the minimum on a face. No face comes
-        twice, and there are finitely many.
+        Steps 3 and 4 decrease the cost, and each ends at the minimum on a face. So no
+        face occurs twice, and there are finitely many.
         """
         cdef long left
-        self.share = NEARLY
+        self.share = RELEASE_SHARE
         self.wanted[:] = self.free
         self.gradient(self.x, self.g)
         self.shrink(self.x, self.g)
@@ -281,12 +280,12 @@ cdef class Faces:
             self.y[:], self.gy[:] = self.x, self.g
             left = self.left
             self.shrink(self.y, self.gy)
-            self.share = NEARLY if self.left > left else self.share / 2
+            self.share = RELEASE_SHARE if self.left > left else self.share / 2
             if not self.lowered():
                 self.release(1.0)
                 self.y[:], self.gy[:] = self.x, self.g
                 self.advance(self.y, self.gy)
-                if not self.lowered():  # all that is left is rounding
+                if not self.lowered():  # the decrease is within rounding
                     self.wanted[:] = self.face
                     self.enter()
                     return True
@@ -294,7 +293,9 @@ cdef class Faces:
         return False
 
     cdef int shrink(self, double[::1] x, double[::1] g) except -1:
-        """Minimise on the face of `wanted`; hold what leaves the box; until none does."""
+        """Minimise on the face of `wanted`, fixing components that leave the box, until
+        none does.
+        """
         cdef Py_ssize_t i, j
         cdef bint leaves = True
         while leaves:
@@ -314,7 +315,7 @@ cdef class Faces:
         return 0
 
     cdef int advance(self, double[::1] x, double[::1] g) except -1:
-        """Go to the minimum on the face of `wanted`, or to the first bound; and on."""
+        """Step to the minimum on the face of `wanted`, fixing components on the way."""
         cdef Py_ssize_t i, j
         cdef double length = 0.0, s, bound
         while length < 1:
@@ -339,10 +340,11 @@ cdef class Faces:
         return 0
 
     cdef bint release(self, double share):
-        """Want the held ones whose gradient leads into the box; whether there are any.
+        """Mark components at bounds to be freed; returns True if there are any.
 
-        Of these, only what has at least that share of the largest, relative to √Pᵢᵢ,
-        and is no rounding: Σ|Pᵢⱼxⱼ| ≤ √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
+        Marked are those with a feasible descent direction whose gradient, relative to
+        √Pᵢᵢ, is at least that share of the largest and exceeds its rounding, bounded by
+        Σ|Pᵢⱼxⱼ| ≤ √Pᵢᵢ Σ√Pⱼⱼ|xⱼ|.
         """
         cdef Py_ssize_t i, m
         cdef double most = 0.0, total = 0.0, inward, terms, force
@@ -369,7 +371,10 @@ cdef class Faces:
         return most > 0
 
     cdef bint lowered(self):
-        """Whether ½(g_x + g_y)ᵀ(y − x), the change of the cost, is below its noise."""
+        """Return True if the cost falls from x to y by more than rounding.
+
+        The change of a quadratic cost is ½(g_x + g_y)ᵀ(y − x).
+        """
         cdef Py_ssize_t i
         cdef double change = 0.0, step
         for i in range(self.n):

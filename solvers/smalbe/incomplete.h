@@ -101,7 +101,7 @@ INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t coun
 {
     Py_ssize_t n = F->width, half = F->half, sign = j < half ? 1 : -1;
     double *pivot = F->pivot, p = pivot[j], inverse = 1 / p;
-    double l[MOST_DIAGONALS], taken[MOST_DIAGONALS];
+    double l[MAX_DIAGONALS], taken[MAX_DIAGONALS];
     F->inverse[j] = inverse;
     for (Py_ssize_t c = 0; c < count; c++) {
         l[c] = F->bands[c * n + j];
@@ -112,7 +112,7 @@ INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t coun
 #pragma GCC unroll 4
         for (Py_ssize_t d = c + 1; d < count; d++) {
             double fill = l[c] * l[d];
-            int e = F->between[c * MOST_DIAGONALS + d];
+            int e = F->between[c * MAX_DIAGONALS + d];
             if (e >= 0) { /* in the column of the row that is eliminated first */
                 Py_ssize_t near = j + sign * F->offset[c], far = j + sign * F->offset[d];
                 Py_ssize_t column = sign > 0 && near >= half ? far : near;

@@ -68,7 +68,7 @@ def scaled_by_diagonal(matrix, scale):
     cdef double told[3]
     entries = np.empty(len(matrix.data))
     scaled_matrix(&indptr[0], &indices[0], read(matrix.data, held), read(scale, held),
-                  numbers(entries), len(scale), told)
+                  address(entries), len(scale), told)
     return entries, told[0], told[1], told[2]
 
 
@@ -114,7 +114,7 @@ cdef class IncompleteFactor:
 
     def __init__(self, matrix, weights, scale, bint keep=True):
         cdef Py_ssize_t n = matrix.shape[0], i, k, m, entries = 0, pairs = 0, near, used
-        cdef Py_ssize_t offset[16]  # MOST_DIAGONALS
+        cdef Py_ssize_t offset[16]  # MAX_DIAGONALS
         cdef Py_ssize_t count = 0, half, reach = 0, far, column, other, stored
         cdef int first, last
         cdef bint by_bands
@@ -133,7 +133,7 @@ cdef class IncompleteFactor:
                 while m < count and offset[m] != far:
                     m += 1
                 if far and m == count:
-                    if count == MOST_DIAGONALS:
+                    if count == MAX_DIAGONALS:
                         count = n + 1  # too many
                     else:
                         offset[count] = far
@@ -162,7 +162,7 @@ cdef class IncompleteFactor:
         # 3. Room.
         self.integers = <int *> calloc(
             5 * n + 3 + (0 if by_bands else entries) + pairs
-            + MOST_DIAGONALS * MOST_DIAGONALS, sizeof(int)
+            + MAX_DIAGONALS * MAX_DIAGONALS, sizeof(int)
         )
         self.first_pairs = <Py_ssize_t *> calloc(n + 1, sizeof(Py_ssize_t))
         if not self.integers or not self.first_pairs:
@@ -171,7 +171,7 @@ cdef class IncompleteFactor:
         cdef int *row = start + n + 1
         cdef int *target = row + (0 if by_bands else entries)
         cdef int *between = target + pairs
-        self.F.from_ = between + MOST_DIAGONALS * MOST_DIAGONALS
+        self.F.from_ = between + MAX_DIAGONALS * MAX_DIAGONALS
         self.F.to, self.queue = self.F.from_ + n, self.F.from_ + 2 * n
         self.besides = self.F.from_ + 3 * n
         self.values, self.room = Room(n + stored), Room(stored + 5 * n + reach)
@@ -198,10 +198,10 @@ cdef class IncompleteFactor:
         #    column of the one that is eliminated first.
         for m in range(count):
             for k in range(count):
-                between[m * MOST_DIAGONALS + k] = -1
+                between[m * MAX_DIAGONALS + k] = -1
                 for i in range(count):
                     if at_offset[i] == distance(at_offset[m], at_offset[k]):
-                        between[m * MOST_DIAGONALS + k] = <int> i
+                        between[m * MAX_DIAGONALS + k] = <int> i
         pairs = 0
         for i in range(0 if by_bands else n):
             self.first_pairs[i] = pairs
@@ -230,8 +230,8 @@ cdef class IncompleteFactor:
         self.wanted = self.F.inverse + 3 * n
 
     def __dealloc__(self):
-        give_back(self.integers)
-        give_back(self.first_pairs)
+        release_memory(self.integers)
+        release_memory(self.first_pairs)
 
     cdef int enter(self, const double *free, bint may_exceed=False) except -1:
         """Factorise on the face of the components where `free` (n,) is 1, unless the
@@ -298,8 +298,8 @@ cdef class IncompleteFactor:
         """Return S M⁻¹ S v (n,) of the face where `free` (n,) is true, zero elsewhere."""
         result, face = np.empty(self.n), np.asarray(free, dtype=float)
         masked_v = _whole(np.where(free, v, 0.0))
-        self.enter(numbers(face))
-        self.inverse(numbers(masked_v), numbers(masked_v), numbers(result))
+        self.enter(address(face))
+        self.inverse(address(masked_v), address(masked_v), address(result))
         return result
 
 

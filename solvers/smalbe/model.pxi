@@ -1,10 +1,10 @@
-# A quadratic model of the operator, minimised over the set without products with it.
+# A quadratic model of H, minimised over the set without products with H.
 
 
 cdef enum:
-    # Limits of Newton's method and of its line search, which is kept 5 % off the ends of
-    # its interval: 60 steps shrink it to 5 % at least. Behind both is a step with the
-    # largest eigenvalue for τ. Without the search
+    # Limits of Newton's method and of its line search. The search stays 5 % off the ends
+    # of its interval, so that 60 steps shrink it to 5 % at least. If Newton's method does
+    # not end, the step is made with the largest eigenvalue for τ. Without the search
     # `test_it_is_solved_with_fewer_products_than_by_published_rules` fails.
     NEWTON_STEPS = 100
     SEARCH_STEPS = 60
@@ -14,13 +14,12 @@ cdef enum:
 cdef class Model:
     """B = τI + Uᵀ diag(w) U with orthonormal rows U (k, n), the first of a basis.
 
-    U holds the directions in which H is large, with w + τ their eigenvalues, and τ
-    stands for H on all others. Where B is above H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and
-    the minimum of the right side over the set is a gradient projection step in the
-    metric of B. Without U it is the ordinary one, x ← P(x − g/τ), whose length is
-    dictated by ‖H‖; with a few directions taken out, by the rest of the spectrum. That B
-    is above H is tested by the product that each step needs anyway: where it is not, τ
-    is raised.
+    U holds the directions in which H is large, with eigenvalues w + τ, and τ stands for
+    H on their complement. If B ≥ H, f(x + s) ≤ f(x) + gᵀs + ½sᵀBs, and the minimum of
+    the right side over the set is a gradient projection step in the metric of B. Without
+    U it is the ordinary one, x ← P(x − g/τ), whose length ‖H‖ dictates; with the largest
+    eigenvalues removed, the rest of the spectrum does. The product that each step needs
+    anyway tests whether B ≥ H; if not, τ is raised.
     """
 
     cdef double tau
@@ -28,17 +27,17 @@ cdef class Model:
     cdef Basis basis  # None for B = τI
     cdef Room room
     cdef double *w  # (k,)
-    cdef double *root  # of w, and zeros, as many as a row of `DenseBasis.gram` is long
+    cdef double *root  # √w, padded with zeros to a row of `DenseBasis.gram`
 
     @staticmethod
     cdef Model of_norm(double norm, Py_ssize_t n):
-        """B = norm·I: what is known of an H of which only the norm is known."""
+        """Return B = norm·I."""
         cdef Model B = Model.__new__(Model)
         B.tau, B.n = norm, n
         return B
 
     cdef Model with_tail(self, double tau):
-        """Change τ and leave w + τ as it is, where that is above τ."""
+        """Return a model with another τ and the same w + τ, where that exceeds τ."""
         if self.basis is None:
             return Model.of_norm(tau, self.n)
         return self.basis.model(self.k, self.w, self.tau - tau, tau)
@@ -46,10 +45,10 @@ cdef class Model:
     cdef int step(self, const double *x, const double *g, Box box, double *s) except -1:
         """s ← argmin gᵀs + ½sᵀBs, x + s in the set.
 
-        With y = WUs as multiplier, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
-        and y maximises a concave, piecewise quadratic function of k variables whose
-        gradient is Us(y) − W⁻¹y: Newton's method with a line search ends on the right
-        piece.
+        With the multiplier y = WUs, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
+        and y maximises the dual function, which is concave, piecewise quadratic and has
+        the gradient Us(y) − W⁻¹y in k variables. Newton's method with a line search ends
+        on the piece of the maximum.
         """
         cdef Basis U = self.basis
         cdef Py_ssize_t i, newton, search, k = self.k
@@ -67,9 +66,9 @@ cdef class Model:
             for i in range(k):
                 there[i] = y[i] + dy[i]
             begun = U.over_dual.total(dot(U.slope, dy, k))
-            U.tilt(self, x, g, box, s)
+            U.minimise_lagrangian(self, x, g, box, s)
             if not U.over.any(not same(U.piece, U.piece_there, U.places)):
-                U.finish(self, x, g, box, s)  # Newton's method is exact there
+                U.finish(self, x, g, box, s)  # the Newton step is exact on one piece
                 return 0
             U.find_slope(self, s)
             now = U.over_dual.total(dot(U.slope_there, dy, k))
@@ -81,7 +80,7 @@ cdef class Model:
                 t = low + (high - low) * fmin(fmax(share, 0.05), 0.95)
                 for i in range(k):
                     there[i] = y[i] + t * dy[i]
-                U.tilt(self, x, g, box, s)
+                U.minimise_lagrangian(self, x, g, box, s)
                 U.find_slope(self, s)
                 now = U.over_dual.total(dot(U.slope_there, dy, k))
                 if now > 0:
@@ -94,7 +93,9 @@ cdef class Model:
         return Model.of_norm(self.tau + U.largest(self), self.n).step(x, g, box, s)
 
     cdef Model raised(self, const double *s, double square, double sHs):
-        """Raise τ, at most tenfold, until sᵀBs reaches sᵀHs; leave w + τ as it is.
+        """Return the model with τ raised, at most tenfold, so that sᵀBs = sᵀHs.
+
+        w + τ is unchanged.
 
         square : ‖s‖²
         """
@@ -107,15 +108,14 @@ cdef class Model:
         return self.with_tail(fmin(tau, 10 * self.tau))
 
     cdef int enter(self, const double *free) except -1:
-        """Prepare `inverse` for the face where `free` is 1, elsewhere 0."""
+        """Prepare `inverse` for the face where `free` is 1."""
         if self.basis is not None:
             self.basis.enter(self, free)
         return 0
 
     cdef double inverse(self, const double *free, const double *v, const double *along,
                         double *z) except? -1:
-        """z ← B_FF⁻¹v for v that is zero off the face F; returns this process' zᵀ`along`.
-        """
+        """z ← B_FF⁻¹v for a v that is zero off the face F; returns the local zᵀ`along`."""
         if self.basis is not None:
             return self.basis.inverse(self, free, v, along, z)
         copy_scaled(1 / self.tau, v, z, self.n)
@@ -123,16 +123,16 @@ cdef class Model:
 
 
 cdef class Basis:
-    """Orthonormal rows U (k, n) of models, and the room for their multipliers.
+    """Orthonormal rows U (k, n) of models, and the workspace for their multipliers.
 
-    `slope`, `piece` and `y` belong to where Newton's method is, those `_there` to where
-    it looks.
+    `slope`, `piece` and `y` belong to the iterate of Newton's method, those with `_there`
+    to its trial point.
     """
 
     cdef Py_ssize_t n, k
-    cdef Py_ssize_t places  # components whose pieces are looked at
-    cdef Reduction over  # the processes that share vectors (n,)
-    cdef Reduction over_dual  # those that share multipliers (k,)
+    cdef Py_ssize_t places  # number of components that can be on a bound
+    cdef Reduction over  # processes that share vectors (n,)
+    cdef Reduction over_dual  # processes that share multipliers (k,)
     cdef Room dual
     cdef double *y
     cdef double *dy
@@ -143,7 +143,7 @@ cdef class Basis:
     cdef double *piece_there
 
     cdef int make_room(self, Py_ssize_t stride) except -1:
-        """Make room for multipliers of so many numbers each."""
+        """Allocate multipliers of `stride` numbers each."""
         self.dual = Room(5 * stride + 2 * self.places)
         self.y, self.dy = self.dual.at, self.dual.at + stride
         self.y_there, self.slope = self.dy + stride, self.dy + 2 * stride
@@ -153,31 +153,30 @@ cdef class Basis:
         return 0
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        """Return a model with w + shift (k,) for the first rows, where that is positive.
-        """
+        """Return a model of the first k rows with weights w + shift, where positive."""
         raise NotImplementedError
 
     cdef int begin(self, Model B, const double *x, const double *g, Box box,
                    double *s) except -1:
-        """Find s, piece and slope for y = 0."""
+        """Compute s, piece and slope for y = 0."""
         raise NotImplementedError
 
     cdef int newton(self, Model B) except -1:
-        """Find the step dy from `slope` and `piece`."""
+        """Compute the Newton step dy from `slope` and `piece`."""
         raise NotImplementedError
 
-    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
                   double *s) except -1:
-        """Find s(y) and its piece at `y_there`, of the places."""
+        """Compute s(y) and its piece at `y_there`, for the components with bounds."""
         raise NotImplementedError
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        """Find Us(y) − W⁻¹y at `y_there`, after `tilt`."""
+        """Compute Us(y) − W⁻¹y at `y_there`, after `minimise_lagrangian`."""
         raise NotImplementedError
 
     cdef int finish(self, Model B, const double *x, const double *g, Box box,
                     double *s) except -1:
-        """Complete s(y) at `y_there`, of all components."""
+        """Complete s(y) at `y_there` for the components without bounds."""
         raise NotImplementedError
 
     cdef double largest(self, Model B) except? -1:
@@ -199,10 +198,10 @@ cdef class Basis:
 
 @cython.final
 cdef class DenseBasis(Basis):
-    """An array U (k, n), and U_F U_Fᵀ of the face F for which it was asked last.
+    """An array U (k, n), with U_F U_Fᵀ of the latest face F.
 
-    Only components from `first` on, `size` of them, have bounds, and are looked at in a
-    face; all others are free in each.
+    Bounds occur only in the range of `size` components from `first` on; all others are
+    free in every face.
     """
 
     cdef Py_ssize_t stride, first, size, flips
@@ -210,43 +209,43 @@ cdef class DenseBasis(Basis):
     cdef Room room
     cdef int *where  # (size + 3,)
     cdef double *U
-    cdef double *bounded  # (k, size) the columns of those with bounds
-    cdef double *columns  # the same by columns (size, stride)
-    cdef double *others  # U_f U_fᵀ of the others; as `gram` by rows of `stride` numbers
+    cdef double *bounded  # (k, size) columns of U in that range
+    cdef double *columns  # the same, stored by columns (size, stride)
+    cdef double *others  # U_f U_fᵀ of the components outside of it; rows as in `gram`
     cdef double *gram  # (k, k) upper triangle
-    cdef double *held
+    cdef double *active
     cdef double *core  # τI + W¹ᐟ² U_F U_Fᵀ W¹ᐟ², factorised
-    cdef double *pivots  # their inverses
+    cdef double *pivots  # reciprocal pivots of `core`
     cdef double *c
     cdef double *fixed
     cdef double *t  # (n,)
 
     @staticmethod
     cdef DenseBasis zeros(Py_ssize_t k, Py_ssize_t n, Py_ssize_t first, Py_ssize_t size):
-        cdef DenseBasis made = DenseBasis.__new__(DenseBasis)
+        cdef DenseBasis new = DenseBasis.__new__(DenseBasis)
         cdef Py_ssize_t stride = (k + 3) & ~3
-        made.k, made.n, made.stride, made.first, made.size = k, n, stride, first, size
-        made.places, made.flips = size, size + 1
-        made.over = made.over_dual = Reduction()
-        made.room = Room(
+        new.k, new.n, new.stride, new.first, new.size = k, n, stride, first, size
+        new.places, new.flips = size, size + 1
+        new.over = new.over_dual = Reduction()
+        new.room = Room(
             (k + 1) * n + k * size + stride * (3 * stride + size + 3) + 2 * size + 2
         )
-        made.U = made.room.at
-        made.bounded = made.U + k * n
-        made.columns = made.bounded + k * size
-        made.others = made.columns + stride * size
-        made.gram = made.others + stride * stride
-        made.core = made.gram + stride * stride
-        made.pivots = made.core + stride * stride
-        made.c, made.fixed = made.pivots + stride, made.pivots + 2 * stride
-        made.t = made.fixed + stride
-        made.held = made.t + n
-        made.where = <int *> (made.held + size)
-        made.make_room(stride)
-        return made
+        new.U = new.room.at
+        new.bounded = new.U + k * n
+        new.columns = new.bounded + k * size
+        new.others = new.columns + stride * size
+        new.gram = new.others + stride * stride
+        new.core = new.gram + stride * stride
+        new.pivots = new.core + stride * stride
+        new.c, new.fixed = new.pivots + stride, new.pivots + 2 * stride
+        new.t = new.fixed + stride
+        new.active = new.t + n
+        new.where = <int *> (new.active + size)
+        new.make_room(stride)
+        return new
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
-        # the rows that are left out are the last as a rule, and the basis serves as it is
+        # rows left out are usually the last ones; then the basis itself serves
         cdef Model B = Model.__new__(Model)
         cdef Py_ssize_t i, kept = 0, last = -1, n = self.n
         cdef DenseBasis chosen = self
@@ -272,7 +271,7 @@ cdef class DenseBasis(Basis):
         return B
 
     cdef void split(self) noexcept:
-        """Find what belongs to the components with bounds, and to the others."""
+        """Separate the components that may have bounds from the others, once."""
         cdef Py_ssize_t i, j, stride = self.stride
         if self.is_split:
             return
@@ -286,55 +285,55 @@ cdef class DenseBasis(Basis):
         for j in range(self.k):
             self.others[j * stride + j] = 1.0
         for i in range(self.size):
-            self.where[i], self.held[i] = i, 1.0
+            self.where[i], self.active[i] = i, 1.0
         self.change(self.size, self.others)
         for i in range(self.k):
             for j in range(i):
                 self.others[i * stride + j] = self.others[j * stride + i]
 
     cdef void change(self, Py_ssize_t count, double *gram) noexcept:
-        """Take the components in `where` that are held now from it, add the others."""
+        """Subtract components in `where` that are active now from gram; add the others."""
         cdef Py_ssize_t c, q
         cdef double sign[4]
         for c in range(0, count, 4):
             for q in range(4):
                 sign[q] = 0.0
                 if c + q < count:
-                    sign[q] = 1 - 2 * self.held[self.where[c + q]]
+                    sign[q] = 1 - 2 * self.active[self.where[c + q]]
                 else:
                     self.where[c + q] = 0
             add_gram(sign, self.columns, self.where + c, gram, self.stride)
 
     cdef void face(self, const double *piece) noexcept:
-        """Bring `gram` to the face where `piece` (size,) is zero.
+        """Update `gram` to the face where `piece` (size,) is zero.
 
-        The rows are orthonormal, so that it is I less what is held; after as many
-        changes as there are components it is summed up anew, by what is held or by
-        what is not, whichever is less.
+        The rows are orthonormal, so that gram = I − the sum over active components. To
+        limit rounding it is summed again after as many changes as components, over the
+        active or the free components, whichever are fewer.
         """
         cdef Py_ssize_t i, count, stride = self.stride
-        cdef bint is_held
+        cdef bint sums_active
         self.split()
         if self.flips > self.size:
             self.flips = count = 0
             for i in range(self.size):
                 count += piece[i] != 0
-            is_held = 2 * count > self.size
+            sums_active = 2 * count > self.size
             memcpy(self.gram, self.others, stride * stride * sizeof(double))
-            if not is_held:
+            if not sums_active:
                 memset(self.gram, 0, stride * stride * sizeof(double))
                 for i in range(self.k):
                     self.gram[i * stride + i] = 1.0
             for i in range(self.size):
-                self.held[i] = is_held
-        count = changed(piece, self.held, self.size, self.where)
+                self.active[i] = sums_active
+        count = changed(piece, self.active, self.size, self.where)
         self.flips += count
         self.change(count, self.gram)
 
     cdef int factor(self, Model B, const double *piece) except -1:
-        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ², where F is where `piece` (size,) is zero.
+        """Factorise τI + W¹ᐟ² U_FU_Fᵀ W¹ᐟ² for the face F where `piece` (size,) is zero.
 
-        It is not below τI, however large W is.
+        This form is bounded below by τI, however large W is.
         """
         self.face(piece)
         scaled(B.root, self.gram, B.tau, self.core, B.k, self.stride)
@@ -367,7 +366,7 @@ cdef class DenseBasis(Basis):
             self.dy[i] *= B.root[i] * B.tau
         return 0
 
-    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
                   double *s) except -1:
         cdef Py_ssize_t o = self.first
         combination(1.0, self.bounded, self.y_there, g + o, self.t, B.k, self.size)
@@ -375,8 +374,7 @@ cdef class DenseBasis(Basis):
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` is U times the first
-        # part of it
+        # components without bounds have s = −(g + Uᵀy)/τ; `fixed` = −Ug/τ of these
         cdef Py_ssize_t i
         rows_times(self.bounded, s + self.first, self.slope_there, B.k, self.size)
         for i in range(B.k):
@@ -433,30 +431,30 @@ cdef class DenseBasis(Basis):
 
 @cython.final
 cdef class FactoredBasis(Basis):
-    """C = L⁻¹G of sparse rows, which a model has with one weight w: the penalty's.
+    """The rows C = L⁻¹G of sparse G, with one weight w, that of the penalty.
 
-    B = τI + w Gᵀ(GGᵀ)⁻¹G, and its multipliers are y = w(GGᵀ)⁻¹Gs: the gradient of the
-    dual function is Gs(y) − GGᵀy/w. Of components without bounds s is −(g + Gᵀy)/τ, so
-    that only those with bounds, b, are looked at for each y:
+    B = τI + w Gᵀ(GGᵀ)⁻¹G with multipliers y = w(GGᵀ)⁻¹Gs; the gradient of the dual
+    function is Gs(y) − GGᵀy/w. Components without bounds have s = −(g + Gᵀy)/τ, so that
+    only those with bounds, b, are evaluated for each y:
 
         Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
 
-    given : a `solvers.smalbe.rows.SparseRows`
+    source : a `solvers.smalbe.rows.SparseRows`
     """
 
     cdef Rows rows
-    cdef object given, solve
-    cdef object x_b, g_b, low_b, high_b, tilted_b, s_b, Gg, weights
+    cdef object source, solve
+    cdef object x_b, g_b, low_b, high_b, gradient_b, s_b, Gg, weights
 
     @staticmethod
     cdef FactoredBasis of(Rows rows):
-        cdef FactoredBasis made = FactoredBasis.__new__(FactoredBasis)
-        made.rows, made.given, made.n = rows, rows.given, rows.n
-        made.over, made.over_dual = rows.over, rows.over_rows
-        made.k, made.places = rows.given.unit.shape[0], rows.given.bounded.size
-        made.make_room(made.k)
-        made.s_b = np.empty(made.places)
-        return made
+        cdef FactoredBasis new = FactoredBasis.__new__(FactoredBasis)
+        new.rows, new.source, new.n = rows, rows.source, rows.n
+        new.over, new.over_dual = rows.over, rows.over_rows
+        new.k, new.places = rows.source.unit.shape[0], rows.source.bounded.size
+        new.make_room(new.k)
+        new.s_b = np.empty(new.places)
+        return new
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
         cdef Model B
@@ -469,12 +467,12 @@ cdef class FactoredBasis(Basis):
 
     cdef int begin(self, Model B, const double *x, const double *g, Box box,
                    double *s) except -1:
-        b, n = self.given.bounded, self.n
-        self.x_b, self.g_b = seen(x, n)[b], seen(g, n)[b]
-        self.low_b, self.high_b = seen(box.lower, n)[b], seen(box.upper, n)[b]
-        self.Gg = np.asarray(self.given.unit @ seen(g, n))
+        b, n = self.source.bounded, self.n
+        self.x_b, self.g_b = view(x, n)[b], view(g, n)[b]
+        self.low_b, self.high_b = view(box.lower, n)[b], view(box.upper, n)[b]
+        self.Gg = np.asarray(self.source.unit @ view(g, n))
         memset(self.y_there, 0, self.k * sizeof(double))
-        self.tilt(B, x, g, box, s)
+        self.minimise_lagrangian(B, x, g, box, s)
         self.find_slope(B, s)
         memset(self.y, 0, self.k * sizeof(double))
         memcpy(self.slope, self.slope_there, self.k * sizeof(double))
@@ -483,32 +481,32 @@ cdef class FactoredBasis(Basis):
 
     cdef int newton(self, Model B) except -1:
         free = np.ones(self.n, dtype=bool)
-        free[self.given.bounded] = seen(self.piece, self.places) == 0
-        solve = self.given.gram.in_face(free, B.tau / B.w[0])
-        take(B.tau * np.asarray(solve(seen(self.slope, self.k))), self.k, self.dy, "dy")
+        free[self.source.bounded] = view(self.piece, self.places) == 0
+        solve = self.source.gram.in_face(free, B.tau / B.w[0])
+        copy_result(B.tau * np.asarray(solve(view(self.slope, self.k))), self.k, self.dy, "dy")
         return 0
 
-    cdef int tilt(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
                   double *s) except -1:
-        y = seen(self.y_there, self.k)
-        self.tilted_b = self.g_b + np.asarray(self.given.of_bounded.T @ y)
-        tilted(numbers(self.x_b), numbers(self.tilted_b), B.tau, numbers(self.low_b),
-               numbers(self.high_b), numbers(self.s_b), self.piece_there, self.places)
+        y = view(self.y_there, self.k)
+        self.gradient_b = self.g_b + np.asarray(self.source.of_bounded.T @ y)
+        model_minimiser(address(self.x_b), address(self.gradient_b), B.tau, address(self.low_b),
+               address(self.high_b), address(self.s_b), self.piece_there, self.places)
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        held = self.given.of_bounded @ (self.tilted_b / B.tau + self.s_b)
-        GGy = np.asarray(self.given.gram.product(seen(self.y_there, self.k)))
+        part = self.source.of_bounded @ (self.gradient_b / B.tau + self.s_b)
+        GGy = np.asarray(self.source.gram.product(view(self.y_there, self.k)))
         shift = self.Gg / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy
-        take(np.asarray(held) - shift, self.k, self.slope_there, "slope")
+        copy_result(np.asarray(part) - shift, self.k, self.slope_there, "slope")
         return 0
 
     cdef int finish(self, Model B, const double *x, const double *g, Box box,
                     double *s) except -1:
-        tilt = np.asarray(self.given.unit.T @ seen(self.y_there, self.k))
-        step = -(seen(g, self.n) + tilt) / B.tau
-        step[self.given.bounded] = self.s_b
-        return take(step, self.n, s, "s")
+        Gty = np.asarray(self.source.unit.T @ view(self.y_there, self.k))
+        step = -(view(g, self.n) + Gty) / B.tau
+        step[self.source.bounded] = self.s_b
+        return copy_result(step, self.n, s, "s")
 
     cdef double largest(self, Model B) except? -1:
         return B.w[0]
@@ -524,14 +522,16 @@ cdef class FactoredBasis(Basis):
         return 0
 
     cdef int enter(self, Model B, const double *free) except -1:
-        is_free = seen(free, self.n) > 0
-        self.solve = self.given.gram.in_face(is_free, B.tau / B.w[0])
-        self.weights = seen(free, self.n) / B.tau
+        is_free = view(free, self.n) > 0
+        self.solve = self.source.gram.in_face(is_free, B.tau / B.w[0])
+        self.weights = view(free, self.n) / B.tau
         return 0
 
     cdef double inverse(self, Model B, const double *free, const double *v,
                         const double *along, double *z) except? -1:
-        y = self.solve(self.given.unit @ seen(v, self.n))
-        found = self.given.weighted_difference(seen(v, self.n), y, self.weights)
-        take(found, self.n, z, "z")
+        y = self.solve(self.source.unit @ view(v, self.n))
+        difference = self.source.weighted_difference(
+            view(v, self.n), y, self.weights
+        )
+        copy_result(difference, self.n, z, "z")
         return dot(z, along, self.n)

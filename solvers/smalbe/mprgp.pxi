@@ -1,29 +1,28 @@
-# MPRGP over the operations of this folder: it knows neither bounds nor processes.
+# MPRGP, written in the operations of this folder, without bounds and processes.
 
 
-# Rounding of a cost, relative to the sum of its absolute terms: errors of k terms grow
-# like √k·2⁻⁵³, so that this covers 8·10⁵ of them. With zero,
-# `test_a_solve_that_rounding_stops_ends` takes 4000 products for 1000.
+# Rounding of a cost, relative to the sum of its absolute terms: the error of a sum of k
+# terms grows like √k·2⁻⁵³, so that this covers 8·10⁵ terms. With zero,
+# `test_a_solve_that_rounding_stops_ends` takes 4000 products instead of 1000.
 cdef double NOISE = 1e-13
 
-# Least slope along a direction of CG, relative to that of z, of which it is the part
-# conjugate to those before. In exact arithmetic both are the same, as the gradient is
-# orthogonal to all directions taken. Below, the gradient has drifted: more is to be gained
-# along these. Without it `test_rounding_along_directions_that_were_taken_is_taken_out`
-# fails.
-cdef double DRIFT = 0.5
+# Smallest ratio of gᵀp to φᵀz for a CG direction p, the part of z conjugate to the earlier
+# directions. In exact arithmetic both are equal, because g is orthogonal to all earlier
+# directions. A smaller ratio shows that rounding has brought back gradient along these.
+# Without it `test_rounding_along_directions_that_were_taken_is_taken_out` fails.
+cdef double MIN_SLOPE_RATIO = 0.5
 
 cdef enum:
-    # Directions of CG that are kept on a face: two passes over them are 400 vectors, what
-    # a product with a dense F of 800 unknowns reads. With 3 of them
+    # Directions of CG stored for a face: two passes over them read 400 vectors, as much as
+    # a product with the triangle of a dense F of 800 unknowns. With 3 directions
     # `test_conjugate_to_all_directions_cg_ends_after_as_many_steps_as_unknowns` fails.
-    KEPT = 200
-    # Proportionings by the model that did not halve ‖β‖², before one along −β. Without a
-    # limit `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
-    MOST_IDLE = 2
-    # Steps of a run after which its progress is looked at first, ten times what a
-    # preconditioned dual takes. `test_a_solve_that_rounding_stops_ends` fails without it.
-    FIRST_LOOK = 500
+    MAX_DIRECTIONS = 200
+    # Proportionings by the model in a row that may fail to halve ‖β‖² before one along −β.
+    # Without a limit `test_a_model_that_leaves_the_chopped_gradient_gives_way` fails.
+    MAX_IDLE = 2
+    # Steps before the first check for stagnation, ten times what a preconditioned dual
+    # takes. Without it `test_a_solve_that_rounding_stops_ends` fails.
+    FIRST_CHECK = 500
     # CG steps on a face before a factor is brought to it that has components besides. A
     # factor costs as much as two or three steps; with 2, as with a factor for every face,
     # bearings and torsion with n = 100 to 300 take up to a quarter more time.
@@ -36,6 +35,7 @@ cdef enum:
     PROJCG = 1
     MIXED = 2
     MODEL = 3
+    OWN = 4
 
 
 cdef double change_along(const Line *line, double alpha) noexcept:
@@ -44,7 +44,7 @@ cdef double change_along(const Line *line, double alpha) noexcept:
 
 
 cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
-    """Make room for so many numbers, and keep those that are there."""
+    """Reallocate an array to `size` numbers; its contents are preserved."""
     held = <double *> realloc(held, max(size, 1) * sizeof(double))
     if not held:
         raise MemoryError
@@ -53,13 +53,13 @@ cdef double *enlarged(double *held, Py_ssize_t size) except NULL:
 
 @cython.final
 cdef class Directions:
-    """The last conjugate directions that CG took on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
+    """The latest conjugate directions of CG on a face, scaled to pᵢᵀHpⱼ = δᵢⱼ.
 
-    In exact arithmetic CG is conjugate to all k of them through the last. Rounding
-    undoes that after some dozens of steps, and a new right-hand side on the same face
-    (a multiplier step's) at once. With all of them at hand neither does, for two passes
-    over k vectors a step (Farhat, Crivelli and Roux, Comput. Methods Appl. Mech. Engrg.
-    117, 1994, 195-209).
+    In exact arithmetic, conjugacy to the last direction implies conjugacy to all k.
+    Rounding destroys this after some dozens of steps, and a new right-hand side on the
+    same face (a multiplier step) does at once. Explicit conjugation to all of them
+    costs two passes over k vectors per step (Farhat, Crivelli and Roux, Comput. Methods
+    Appl. Mech. Engrg. 117, 1994, 195-209).
 
     free : the face, 1 where a component is off the boundary (n,)
     """
@@ -79,22 +79,22 @@ cdef class Directions:
         self.free = self.share + most + 1
 
     def __dealloc__(self):
-        give_back(self.p)
-        give_back(self.Hp)
-        give_back(self.share)
+        release_memory(self.p)
+        release_memory(self.Hp)
+        release_memory(self.share)
 
     cdef void begin(self, const double *free) noexcept:
-        """Forget all, on another face."""
+        """Discard all directions; those to come belong to the face `free`."""
         self.count = self.oldest = 0
         if self.n and self.most:
             memcpy(self.free, free, self.n * sizeof(double))
 
     cdef bint is_on(self, const double *free) except -1:
-        """Return whether they are directions on that face."""
+        """Return True if the directions belong to the face `free`."""
         return not self.over.any(not same(self.free, free, self.n))
 
     cdef int add(self, const double *p, const double *Hp, double curvature) except -1:
-        """Add one with pᵀHp, in place of the oldest where there are too many."""
+        """Add p with its pᵀHp; replaces the oldest direction if there is no room."""
         cdef Py_ssize_t at = self.count
         if not self.most:
             return 0
@@ -110,7 +110,7 @@ cdef class Directions:
         return 0
 
     cdef double conjugate(self, const double *phi, double *p) except? -1:
-        """Take from p its part along them; returns φᵀp before that, 0 without any."""
+        """Make p conjugate to all directions; returns φᵀp of the old p, 0 without any."""
         if not self.count:
             return 0.0
         rows_times(self.Hp, p, self.share, self.count, self.n)
@@ -120,7 +120,7 @@ cdef class Directions:
         return self.share[self.count]
 
     cdef int minimise(self, const double *g, double *s, double *Hs) except -1:
-        """Find s and Hs, for which x − s minimises the cost along all of them."""
+        """Compute s and Hs such that x − s minimises the cost along all directions."""
         rows_times(self.p, g, self.share, self.count, self.n)
         self.over.add(self.share, self.count)
         memset(s, 0, self.n * sizeof(double))
@@ -136,39 +136,40 @@ cdef class MPRGP:
     Minimises ½xᵀHx − bᵀx over a set (Dostál 2009, the paper's reference [3], Chapter 5;
     Dostál and Schöberl 2005), H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ. With the gradient g = Hx − b, the
     free gradient φ (g where x is off the boundary), the chopped gradient β (the part of
-    g on the boundary that leads inside) and the projected gradient g^P = φ + β, each
-    step is one of
+    g on the boundary whose descent direction is feasible) and the projected gradient
+    g^P = φ + β, each step is one of
 
     * c, conjugate gradient: minimise along p on the face, if that stays feasible; p is
       made conjugate to all `Directions` taken on the face, not to the last alone
-    * b, beyond: conjugate gradients on the face as if it had no boundary, for the
+    * b, beyond: conjugate gradients on the face without its bounds, to prepare an
       expansion
     * e, expansion of the active set, by one of the expansions of
       `solvers.smalbe.options`
-    * f, fallback: an expansion that gained too little, done anew in the safe way
+    * f, fallback: the safe expansion, after one that gained too little
     * p, proportioning: free components, by the model or along −β
 
-    Proportioning when  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃ that no step
-    of length ᾱ = 1/τ takes beyond the boundary.
+    Proportioning if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃, for which
+    x − φ̃/τ stays in the set.
 
-    Every step but projcg's lessens the cost, and by the model τI as much as the rate of
-    the book needs. Expansion never frees a component that the half step left on the
-    boundary, but for the first expansion by a model of directions: from one
-    proportioning to the next the active set only grows. docs/smalbe.md: what follows.
+    Every step except that of projcg decreases the cost, and with the model τI by as much
+    as the rate of the book requires. Except for the first expansion by a model with
+    directions, an expansion does not free components that the half step left on the
+    boundary: from one proportioning to the next the active set only grows.
+    docs/smalbe.md draws the conclusions.
     """
 
     cdef Product F
     cdef Py_ssize_t n
     cdef Rows rows
     cdef Box set
-    cdef Box face_set  # of the step that follows a half step
+    cdef Box face_set  # set of the step that follows a half step
     cdef Reduction over
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
     cdef bint reduced, proportions_by_model
     cdef int expansion
-    cdef bint in_two  # whether CG steps go through memory twice: φ, `free` not stored
-    cdef Room room  # of all that is written
+    cdef bint in_two  # CG passes over memory twice; φ and `free` are not stored
+    cdef Room room  # memory of all vectors
     cdef double *rhs  # b of the inner problem
     cdef double *x
     cdef double *g
@@ -186,25 +187,26 @@ cdef class MPRGP:
     cdef double *g0
     cdef double *Cv
     cdef double *Cw
-    cdef double *Cx  # where it is known, see `violation`
+    cdef double *Cx  # valid if `knows_Cx`, see `violation`
     cdef bint knows_Cx
-    cdef Line line  # along which the last product was
+    cdef Line line  # line of the last product
     cdef Parts parts  # of the gradient at x
     cdef double sums[2]
     cdef double z_Hp
-    cdef double expected_slope  # φᵀz, of which p is the part conjugate to `directions`
-    cdef double at_drift  # ‖φ‖² when rounding along them was taken out last
+    cdef double expected_slope  # φᵀz, equal to gᵀp in exact arithmetic
+    cdef double phi_square_at_drift  # ‖φ‖² at the last `minimise_along_directions`
     cdef Model B  # of H; ᾱ = 1/τ is the length of gradient projection steps
     cdef Model preconditioner  # inverted in the face; None for none
     cdef object M  # v → Mv of a structural preconditioner; None for none
-    cdef double M_scale  # ‖𝒫F𝒫‖, for M is one of F
-    cdef object counts  # of its products
+    cdef double M_scale  # ‖𝒫F𝒫‖: M approximates F⁻¹, not H⁻¹
+    cdef object counts  # counts of applications of M
+    cdef object step_rule  # of a subclass (`solvers.smalbe.extension`); None for none
     cdef IncompleteFactor factor  # of the free part of a sparse P; None for none
     cdef long layers  # of neighbours that a proportioning lets go as well
     cdef Directions directions
 
     cdef int make_room(self) except -1:
-        """Make room for the vectors."""
+        """Allocate the vectors."""
         cdef Py_ssize_t n = self.n, r = self.rows.r
         self.room = Room(16 * n + 3 * r)
         cdef double *at = self.room.at
@@ -216,7 +218,7 @@ cdef class MPRGP:
         at += 4 * n
         self.face_set = Box.of(at, at + n, n, self.over)
         self.rhs, self.g0 = at + 2 * n, at + 3 * n
-        self.x0 = self.z  # which is found anew after each expansion
+        self.x0 = self.z  # z is recomputed after each expansion
         at += 4 * n
         self.Cv, self.Cw, self.Cx = at, at + r, at + 2 * r
         return 0
@@ -224,61 +226,60 @@ cdef class MPRGP:
     # the algorithm
 
     cdef bint minimise(self, long most, bytearray trace, note) except -1:
-        """Run MPRGP from x and g; return whether it stopped by `stops`.
+        """Run MPRGP from x and g; return True if it ended by `stops`.
 
-        Else it took `most` steps, no step leads on, or it *stagnates*: over as many
-        steps as it took before these (at least `FIRST_LOOK`), the least ‖g^P‖ was not
-        halved and the cost fell by no more than the rounding of its terms. Rounding then
-        leaves no direction that is conjugate to those before and along which the cost
-        falls.
+        Otherwise it took `most` steps, found no step, or *stagnated*: at the checks,
+        whose distance doubles from `FIRST_CHECK` on, the smallest ‖g^P‖ had not been
+        halved since the last one, and the cost had decreased by no more than the rounding
+        of its terms.
 
-        trace : the letters of the steps are added to it
-        note : called with letter, x and g after each step; None for nobody
+        trace : receives the letters of the steps
+        note : called with letter, x and g after each step; or None
         """
         cdef long idle = 0, inside = 0  # CG steps in this face
-        cdef long look = FIRST_LOOK
-        cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at last look
+        cdef long check = FIRST_CHECK
+        cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at the last check
         cdef int letter
         cdef bint has_expanded = False
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
-        cdef double weight, began, gamma = 0.0  # of p ← φ − γp, where that is put off
+        cdef double weight, began, gamma = 0.0  # of the deferred update p ← φ − γp
         self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
             not self.is_preconditioned()
         )
-        # 1. The face of x, the minimum along the directions that are known on it, and
-        #    the first direction of conjugate gradients.
+        # 1. The face of x, the minimum along the stored directions on it, and the first
+        #    direction of conjugate gradients.
         self.split()
         self.minimise_along_directions()
-        began, self.at_drift = self.parts.phi_square, INFINITY
+        began, self.phi_square_at_drift = self.parts.phi_square, INFINITY
         self.layers = 0
         self.first_direction()
         self.expected_slope = self.directions.conjugate(self.phi, self.p)
         while True:
-            PyErr_CheckSignals()  # an interrupt ends it
-            # 2. Stop where the projected gradient is small, or rounding is all there is.
+            PyErr_CheckSignals()  # so that Ctrl-C ends the loop
+            # 2. Stop if the projected gradient is small, or on stagnation.
             if self.stops():
                 return 1
             if len(trace) >= most:
                 return 0
             least = fmin(least, self.parts.phi_square + self.parts.beta_square)
-            if len(trace) >= look:
+            if len(trace) >= check:
                 self.terms_of_cost()
                 if not cost - self.sums[0] > NOISE * self.sums[1] and 4 * least > before:
                     return 0
                 before, least, cost = fmin(least, before), INFINITY, self.sums[0]
-                look = 2 * len(trace)
+                check = 2 * len(trace)
             weight = self.parts.reduced_square if self.reduced else self.parts.phi_square
             if self.parts.beta_square > self.Gamma_square * weight:
-                # 3. Proportioning: more is to be gained on the boundary than inside.
+                # 3. Proportioning: the boundary promises more decrease than the face.
                 idle = idle + 1 if self.parts.beta_square > chopped / 2 else 0
                 chopped = self.parts.beta_square
                 letter = self.proportion(
                     self.proportions_by_model
-                    and (idle < MOST_IDLE or self.B.basis is None)
+                    and (idle < MAX_IDLE or self.B.basis is None)
                 )
             else:
-                # 4. The trial step of conjugate gradients: α_cg, and α_f, as far as
-                #    it is feasible.
+                # 4. The trial step of conjugate gradients: α_cg, and α_f, the largest
+                #    feasible length.
                 if self.in_two:
                     self.lengths_of_next(gamma)
                 else:
@@ -288,12 +289,12 @@ cdef class MPRGP:
                 if self.line.cg <= self.line.feasible:
                     # 5. Conjugate gradient step, and the next direction.
                     gamma = self.minimise_along_p()
-                    self.tell(b"c", trace, note)
+                    self.record_step(b"c", trace, note)
                     inside += 1
                     if inside == SETTLED and self.factor is not None:
                         self.settle()
                     continue
-                # 6. Expansion: the face has a boundary in the way.
+                # 6. Expansion: the CG step would leave the set.
                 letter = self.expand(
                     not has_expanded,
                     max(inside, 1 if self.factor is None else BEYOND), began, trace
@@ -302,12 +303,12 @@ cdef class MPRGP:
                 has_expanded = True
             if not letter:
                 return 0
-            # 7. On the new face, begin anew with the preconditioned free gradient.
+            # 7. Restart CG on the new face with the preconditioned free gradient.
             self.directions.begin(self.free)
             inside, began, gamma = 0, self.parts.phi_square, 0.0
-            self.at_drift = INFINITY
+            self.phi_square_at_drift = INFINITY
             self.first_direction()
-            self.tell(letter, trace, note)
+            self.record_step(letter, trace, note)
 
     cdef int settle(self) except -1:
         """Begin CG anew on this face if the factor has components besides."""
@@ -317,10 +318,10 @@ cdef class MPRGP:
         return 0
 
     cdef bint stops(self) except -1:
-        """Return whether the present point is precise enough."""
+        """Return True if x is accurate enough."""
         raise NotImplementedError
 
-    cdef int tell(self, int letter, bytearray trace, note) except -1:
+    cdef int record_step(self, int letter, bytearray trace, note) except -1:
         trace.append(letter)
         if note is not None:
             note(chr(letter), self.over.vector(copied(self.x, self.n)),
@@ -330,13 +331,13 @@ cdef class MPRGP:
     # 1. The face
 
     cdef int split(self) except -1:
-        """Split the gradient at x by the face on which x lies."""
+        """Compute φ, `free` and `parts` at x."""
         return self.set.split(
             self.x, self.g, self.B.tau, self.phi, self.free, &self.parts
         )
 
     cdef int minimise_along_directions(self) except -1:
-        """Minimise along the directions known on this face, as far as is feasible."""
+        """Minimise along the stored directions of this face, as far as feasible."""
         if not self.directions.most:
             return 0
         if self.directions.count and self.directions.is_on(self.free):
@@ -355,7 +356,7 @@ cdef class MPRGP:
         return self.preconditioner is not None and self.preconditioner.basis is not None
 
     cdef int first_direction(self) except -1:
-        """Prepare the preconditioner for the face, and let p be the direction z."""
+        """Prepare the preconditioner for the face and set p to z."""
         if self.in_two:
             memset(self.p, 0, self.n * sizeof(double))  # φ is added with the product
             return 0
@@ -367,14 +368,14 @@ cdef class MPRGP:
         return 0
 
     cdef const double *preconditioned_gradient(self) except NULL:
-        """Return z, φ preconditioned in the face; this process' zᵀHp is kept.
+        """Return z, φ preconditioned in the face; stores the local part of zᵀHp.
 
-        With P = B_FF⁻¹ of the model alone, z = Pφ; with a structural M, which does not
-        know of ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
+        With P = B_FF⁻¹ of the model alone, z = Pφ; with an M that approximates F⁻¹
+        without ρQ, z = P(‖𝒫F𝒫‖ M − I)Pφ + Pφ (`solvers.smalbe.preconditioner`).
         """
         cdef Py_ssize_t i, n = self.n
         cdef double *rest = self.t
-        cdef double *again = self.s
+        cdef double *Mz = self.s
         if not self.is_preconditioned():
             return self.phi
         if self.factor is not None:
@@ -383,19 +384,19 @@ cdef class MPRGP:
         self.z_Hp = self.preconditioner.inverse(self.free, self.phi, self.Hp, self.z)
         if self.M is not None:
             self.counts["preconditioner_applies"] += 1
-            take(self.M(self.over.vector(seen(self.z, n))), n, again, "M @ v")
+            copy_result(self.M(self.over.vector(view(self.z, n))), n, Mz, "M @ v")
             for i in range(n):
-                rest[i] = self.free[i] * (self.M_scale * again[i] - self.z[i])
-            self.z_Hp += self.preconditioner.inverse(self.free, rest, self.Hp, again)
-            add(1.0, again, self.z, n)
+                rest[i] = self.free[i] * (self.M_scale * Mz[i] - self.z[i])
+            self.z_Hp += self.preconditioner.inverse(self.free, rest, self.Hp, Mz)
+            add(1.0, Mz, self.z, n)
         return self.z
 
     # 3. Proportioning
 
     cdef int proportion(self, bint by_model) except -1:
-        """Take a step that frees components; 0 where none leads on.
+        """Take a step that frees components; returns its letter, 0 if there is none.
 
-        It ends at the opposite boundary at the latest.
+        The step ends at the opposite boundary at the latest.
         """
         cdef double *beta = self.s
         cdef double length
@@ -414,9 +415,9 @@ cdef class MPRGP:
     cdef int step_by_model(self) except -1:
         """Minimise the model over the set, then the cost along that step.
 
-        0 where there is nothing to gain, or the cost falls without end. Above H, the
-        model makes the minimising length at least 1. Where the product shows that it is
-        not above, it is raised; the line search lessens the cost anyway.
+        Returns 0 if the step is zero or the cost is unbounded along it. If B ≥ H the
+        minimising length is at least 1. If the product shows that B is not above H, B is
+        raised; the line search decreases the cost in either case.
         """
         cdef double length
         self.B.step(self.x, self.g, self.set, self.s)
@@ -429,18 +430,18 @@ cdef class MPRGP:
         return 1
 
     cdef double searched(self, double *s, double *Hs) except? -1:
-        """Find the length along s of the least cost, in the set where 1 is not beyond.
+        """Return the length of least cost along x + αs, at most max(1, α_f).
 
-        0 for s = 0, inf where the cost falls without end. It turns s round, so that
-        x − αs is where it leads, and leaves its `lengths` in `line`; one product.
+        0 for s = 0, inf if the cost is unbounded. Replaces s by −s, so that the step is
+        x − αs, and stores its `lengths` in `line`; one product.
         """
-        if not self.over.any(turn_round(s, self.n)):
+        if not self.over.any(negate(s, self.n)):
             return 0
         self.lengths_along(s, Hs)
         return fmin(self.line.cg, fmax(1.0, self.line.feasible))
 
     cdef int raise_model(self, const double *s, const double *Hs) except -1:
-        """Raise the model to what a product shows."""
+        """Raise the model to the curvature that a product shows."""
         cdef double sums[2]
         sums[0], sums[1] = dot(s, s, self.n), dot(s, Hs, self.n)
         self.over.add(sums, 2)
@@ -471,7 +472,7 @@ cdef class MPRGP:
         return 0
 
     cdef int lengths_along(self, double *p, double *Hp) except -1:
-        """Hp ← H p, and the `lengths` of x − αp, which are kept in `line`; one product."""
+        """Hp ← H p, and `line` ← the `lengths` of x − αp; one product."""
         if self.rows.exist or not self.F.rows.data:
             self.H(p, Hp)
             self.set.lengths(self.x, self.g, p, Hp, &self.line)
@@ -483,7 +484,7 @@ cdef class MPRGP:
         return 0
 
     cdef int lengths_of_next(self, double gamma) except -1:
-        """p ← φ − γp, and the `lengths_along` it; one product."""
+        """p ← φ − γp, then `lengths_along` p; one product."""
         self.F.count += 1
         self.set.next_product_and_lengths(
             &self.F.rows, self.inverse_norm, gamma, self.x, self.g, self.p, self.Hp,
@@ -494,20 +495,20 @@ cdef class MPRGP:
     # 5. The conjugate gradient step
 
     cdef double minimise_along_p(self) except? -1:
-        """Take the CG step along `line`, and find the next direction.
+        """Take the CG step along `line` and compute the next direction.
 
-        Where rounding has brought the gradient back along directions that were taken,
-        minimise along all of them again, without a product; but only where ‖φ‖ has been
-        halved since the last time, or rounding is all that is left of it.
+        If rounding has brought back gradient along earlier directions, minimise along
+        all of them again, without a product. This is done only after ‖φ‖ has been halved
+        since the last time: at the level of rounding it would be repeated for ever.
 
-        Return γ of p ← φ − γp where that is put off, 0 else.
+        Returns γ of a deferred update p ← φ − γp, 0 if p is up to date.
         """
         cdef double length = self.line.cg, curvature = self.line.curvature, z_Hp
         cdef const double *z
         cdef bint knows_Cx = self.knows_Cx
         cdef bint drifts = self.directions.count and (
-            self.line.slope < DRIFT * self.expected_slope
-            and 4 * self.parts.phi_square < self.at_drift
+            self.line.slope < MIN_SLOPE_RATIO * self.expected_slope
+            and 4 * self.parts.phi_square < self.phi_square_at_drift
         )
         if drifts and self.line.slope <= 0:
             length = 0.0
@@ -516,7 +517,7 @@ cdef class MPRGP:
         self.to(length, self.p, self.Hp)
         if drifts:
             self.minimise_along_directions()
-            self.at_drift = self.parts.phi_square
+            self.phi_square_at_drift = self.parts.phi_square
             self.first_direction()
             self.expected_slope = self.directions.conjugate(self.phi, self.p)
             return 0
@@ -532,11 +533,11 @@ cdef class MPRGP:
             return 0
         if z != self.phi:
             z_Hp = self.over.total(self.z_Hp)
-        turn(z, z_Hp / curvature, self.p, self.n)
+        update_direction(z, z_Hp / curvature, self.p, self.n)
         return 0
 
     cdef int to(self, double alpha, const double *p, const double *Hp) except -1:
-        """x ← x − αp, and its face; the gradient follows without a product."""
+        """x ← x − αp; updates gradient and face without a product."""
         cdef bint stored = not self.in_two
         self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau,
                          self.phi if stored else NULL, self.free if stored else NULL,
@@ -549,18 +550,27 @@ cdef class MPRGP:
     cdef int expand(
         self, bint is_first, long most, double enough, bytearray trace
     ) except -1:
-        """Expand the active set; returns the letter of the step, 0 where none leads on.
+        """Expand the active set; returns the letter of the step, 0 if there is none.
 
-        is_first : of the run; most, enough : see `minimise_beyond`
+        is_first : true for the first expansion of the run
+        most, enough : see `minimise_beyond`
         """
         cdef Py_ssize_t n = self.n
         cdef double cg = self.line.cg
         self.knows_Cx = False
-        if self.expansion in (PROJCG, MIXED) and isfinite(cg):
+        cdef double required = 0.0  # twice the decrease that x2 must attain
+        cdef bint has_trial = self.expansion == OWN
+        if has_trial:
+            self.trial_of_rule(self.x2)
+            # B = τI with τ = ‖H‖/`alpha` here: φ̃ᵀφ/(2‖H‖), times 2
+            required = self.parts.reduced_square / (self.alpha * self.B.tau)
+        elif self.expansion in (PROJCG, MIXED) and isfinite(cg):
+            has_trial = True
             self.set.project(self.x, cg, self.p, self.x2)
+        if has_trial:
             self.gradient(self.x2, self.g2)
             if self.expansion == PROJCG or (
-                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g)
+                self.cost(self.x2, self.g2) <= self.cost(self.x, self.g) - required
             ):
                 memcpy(self.x, self.x2, n * sizeof(double))
                 memcpy(self.g, self.g2, n * sizeof(double))
@@ -573,26 +583,56 @@ cdef class MPRGP:
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
-        return b"f" if self.expansion == MIXED else b"e"
+        return b"f" if self.expansion in (MIXED, OWN) else b"e"
+
+    cdef int trial_of_rule(self, double *y) except -1:
+        """y ← P(x_trial − x̃), where the step rule of a subclass leads.
+
+        The rule is shown x = x̃ + ν, and gradient and lengths without the factor
+        1/‖𝒫F𝒫‖ of H: those of the augmented Lagrangian of the QP as given.
+        """
+        cdef Py_ssize_t i, n = self.n
+        cdef const double *shift = self.rows.x_tilde
+        cdef double size = 1 / self.inverse_norm
+        arrays = np.empty((5, n))
+        cdef double *x = address(arrays)
+        for i in range(n):
+            x[i] = shift[i] + self.x[i]
+            x[n + i] = size * self.g[i]
+            x[2 * n + i] = size * self.p[i]
+            x[3 * n + i] = shift[i] + self.set.lower[i]
+            x[4 * n + i] = shift[i] + self.set.upper[i]
+        trial = self.step_rule(Step(
+            *map(self.over.vector, arrays), self.line.cg * self.inverse_norm,
+            self.line.feasible * self.inverse_norm, self.inverse_norm / self.B.tau,
+        ))  # fmt: skip
+        copy_result(trial, n, y, "the trial point of the step rule")
+        for i in range(n):
+            if not isfinite(y[i]):
+                raise ValueError("the step rule returned a point that is not finite")
+        add(-1.0, shift, y, n)
+        self.set.project(y, 0.0, y, y)
+        return 0
 
     cdef int expand_by_model(
         self, bint is_first, long most, double enough, bytearray trace
     ) except -1:
-        """Project z, where CG leads beyond the set, on it in the metric of the model.
+        """Project the infeasible CG point z onto the set, in the metric of the model.
 
-        z is x − α_cg p, and in a flat spectrum, where active sets change least in a
-        step, what CG makes of it on the face without a boundary. The cost is known at z
-        and beyond it bounded by the model where that is above H,
+        z is x − α_cg p; in a flat spectrum, where a step changes the active set little,
+        CG continues from there on the face without its bounds. The cost is known at z
+        and, if B ≥ H, bounded around it by
 
-            f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr,
+            f(z + r) ≤ f(z) + g(z)ᵀr + ½rᵀBr.
 
-        and z + r is where the right side is least, with the tail of B divided by the
-        relaxation, as gradient projection steps are longer than 1/‖H‖. What the half
-        step left on the boundary stays there, unless this is the first expansion, before
-        which the active set is a guess, and the model knows more than a norm. From the
-        half step it goes all the way to z + r if the cost ends below that at x, else as
-        far as that lessens the cost. Where B = τI and that is less than φ̃ᵀφ/2τ, by which
-        gradient projection from x lessens the cost where τ ≥ ‖H‖, this is what is done.
+        z + r minimises the right side over the set, with the tail of B divided by the
+        relaxation ᾱ‖H‖, by which steps of gradient projection exceed 1/‖H‖. Components
+        that the half step put on the boundary stay there, except in the first expansion
+        of a model with directions: before it the active set is only a guess. From the
+        half step the method goes all the way to z + r if the cost there is below that at
+        x, else to the minimum along the line. If B = τI and the decrease is less than
+        φ̃ᵀφ/2τ, which gradient projection from x attains for τ ≥ ‖H‖, the latter is done
+        instead.
         """
         cdef Py_ssize_t n = self.n
         cdef double *s = self.s
@@ -604,7 +644,7 @@ cdef class MPRGP:
         cdef double change = change_along(&self.line, feasible)  # of the cost, from x
         cdef double least = self.parts.reduced_square / (2 * tau)
         cdef bint is_flat = self.B.basis is None, release = is_first and not is_flat
-        self.set.leave(feasible, beyond, release, self.x, self.g, self.p, self.Hp,
+        self.set.leave_box(feasible, beyond, release, self.x, self.g, self.p, self.Hp,
                        self.x0, self.g0, self.free, self.face_set, z, z_g)
         if beyond and is_flat:
             self.minimise_beyond(most, enough, trace)
@@ -639,11 +679,11 @@ cdef class MPRGP:
         return b"e"
 
     cdef int minimise_beyond(self, long most, double enough, bytearray trace) except -1:
-        """Go on with CG from z on the face as if it had no boundary.
+        """Continue CG from z on the face without its bounds.
 
-        Until ‖φ‖² is what it was when the face was entered, `enough`, and for at most as
-        many steps as were taken inside (one, if there were none; BEYOND, if CG is
-        preconditioned by a factor and took fewer).
+        enough : ‖φ‖² at which to stop, its value when the face was entered
+        most : largest number of steps, that of the CG steps on this face, but at least 1,
+            and BEYOND if CG is preconditioned by a factor
         """
         cdef Py_ssize_t n = self.n
         cdef long step
@@ -656,7 +696,7 @@ cdef class MPRGP:
             if self.factor is not None:
                 masked(self.free, self.g2, self.phi, n)
                 self.sums[1] = self.factor.inverse(self.phi, self.Hp, self.t)
-            self.turn_beyond(self.sums[1] / curvature)
+            self.update_direction_beyond(self.sums[1] / curvature)
             slope, curvature = self.sums[0], self.sums[1]
             trace.append(c'b')
             if curvature <= 0:
@@ -666,26 +706,26 @@ cdef class MPRGP:
             self.over.add(self.sums, 2)
         return 0
 
-    cdef int turn_beyond(self, double gamma) except -1:
-        """p ← φ − γp at z, Hp ← H p; `sums` are φᵀp and pᵀHp; one product."""
+    cdef int update_direction_beyond(self, double gamma) except -1:
+        """p ← φ − γp at z, Hp ← H p, `sums` ← φᵀp and pᵀHp; one product."""
         if self.factor is not None:
-            turn(self.t, gamma, self.p, self.n)
+            update_direction(self.t, gamma, self.p, self.n)
             self.H(self.p, self.Hp)
             self.sums[0] = dot(self.phi, self.p, self.n)
             self.sums[1] = dot(self.p, self.Hp, self.n)
             return 0
         if self.rows.exist or not self.F.rows.data:
-            self.sums[0] = turn_freely(self.g2, self.free, gamma, self.p, self.n)
+            self.sums[0] = update_free_direction(self.g2, self.free, gamma, self.p, self.n)
             self.H(self.p, self.Hp)
             self.sums[1] = dot(self.p, self.Hp, self.n)
             return self.over.add(self.sums, 2)
         self.F.count += 1
-        sparse_turn_freely(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
+        sparse_update_free_direction(&self.F.rows, self.inverse_norm, self.g2, self.free, gamma,
                            self.p, self.Hp, self.sums)
         return 0
 
     cdef int project_gradient(self, double tau) except -1:
-        """Take the step of plain gradient projection from where the expansion began."""
+        """Take a step of gradient projection from the point before the expansion."""
         cdef Py_ssize_t n = self.n
         cdef double length
         memcpy(self.x, self.x0, n * sizeof(double))
@@ -699,7 +739,7 @@ cdef class MPRGP:
         self.to(length, self.s, self.Hs)
         return b"f"
 
-    # 2. Sums that say when to stop
+    # 2. Sums of the stopping tests
 
     cdef double cost(self, const double *x, const double *g) except? -1:
         """Return xᵀHx − 2bᵀx, twice the cost, from the gradient."""
@@ -710,7 +750,7 @@ cdef class MPRGP:
         return self.over.total(sum_)
 
     cdef int terms_of_cost(self) except -1:
-        """Find `sums`, twice the cost at x, and the sum of its absolute terms."""
+        """`sums` ← twice the cost at x, and the sum of its absolute terms."""
         cdef double term, sum_ = 0.0, size = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -721,7 +761,7 @@ cdef class MPRGP:
         return self.over.add(self.sums, 2)
 
     cdef double violation(self) except? -1:
-        """Find ‖Cx‖ at the iterate; CG steps have brought Cx along."""
+        """Return ‖Cx‖ at the iterate; CG steps update Cx without a product."""
         if not self.knows_Cx:
             self.rows.times(self.x, self.Cx)
             self.knows_Cx = True

@@ -7,19 +7,23 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from mortarbench.harness import QP
 from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
-#: std: the CG step as far as it is feasible, then x ← x − ᾱφ̃ (the book's; 2 products)
-#: projcg: x ← P(x − α_cg p), whatever the cost (PERMON's; 2 products)
-#: mixed: projcg; where it raised the cost, std (ESPRESO's; 2 or 3 products)
-#: model: where CG leads, projected in the metric of the model (ours; 2 products, 1
-#: where the CG step as far as it is feasible was all; one for each step beyond the box,
-#: one more where it gained less than gradient projection must)
+#: Rule of the expansion step, with its products.
+#: std: the CG step up to the boundary, then x ← x − ᾱφ̃ (textbook; 2)
+#: projcg: x ← P(x − α_cg p), even if the cost rises (PERMON; 2)
+#: mixed: projcg; std if the cost would rise (ESPRESO; 2 or 3)
+#: model: the CG point, projected in the metric of the model (ours; 2, or 1 if the step
+#: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
+#: decrease is below that of gradient projection)
 Expansion = Literal["std", "projcg", "mixed", "model"]
-#: cg: minimise along −β, as far as feasible (the book's; 1 product)
-#: model: a step of the model; for B = I/ᾱ a projected gradient step (1 product); else
-#: cg where from one to the next twice in a row ‖β‖² was not halved
+#: Rule of the proportioning step; each takes 1 product.
+#: cg: minimise along −β, as far as feasible (textbook)
+#: model: minimise the model over the box; for B = I/ᾱ a projected gradient step. After
+#: two such steps that did not halve ‖β‖², one of cg
 Proportioning = Literal["cg", "model"]
 EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 Norm = Literal["lanczos", "power"]
@@ -28,31 +32,30 @@ Eliminate = Literal["never", "sequences", "always"]
 
 @dataclass(frozen=True)
 class Options:
-    """What one can choose."""
+    """Options of SMALBE."""
 
     expansion: Expansion = "model"  #: see `solvers.smalbe.options`
     proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
     #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, and 1e6 where P offers a preconditioner
     rho: float = 0.0
-    rho_growth: float = 1.0  #: factor of ρ where the Lagrangian grew too little
-    M: float = 1.0  #: precision of the inner runs at the start, relative to ‖𝒫F𝒫‖
-    beta: float = 0.5  #: factor of M where the Lagrangian grew too little
+    rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grew too little
+    M: float = 1.0  #: initial precision of the inner runs, relative to ‖𝒫F𝒫‖
+    beta: float = 0.5  #: factor of M if the Lagrangian grew too little
     eta: float = 0.1  #: largest ‖g^P‖/‖b‖ at which an inner run may end
     Gamma: float = 1.0  #: proportioning constant Γ of MPRGP
-    # after multiplier steps, too; where P is sparse, a product costs less
+    # for a sparse P, conjugation to all directions would cost more than a product
     recycle: bool = True  #: CG conjugate to all its directions on a face; P not sparse
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
-    norm: Norm = "lanczos"  #: what finds ‖𝒫F𝒫‖
-    lanczos_steps: int = (
-        12  #: products spent on it; at most n/6 (n/10 without rows), or 5
-    )
+    norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
+    # n/10 where there are bounds alone
+    lanczos_steps: int = 12  #: its products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others need all of P
-    eliminate: Eliminate = "sequences"  #: when free variables go by a Cholesky factor
-    energy: float = 50.0  #: estimated energy error/tol to reach, too; 0: whatever
-    history: bool = False  #: keep a row per step
-    max_steps: int = 200_000  #: of MPRGP and outer iterations, in total
+    eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
+    energy: float = 50.0  #: limit of the estimated energy error, times tol; 0: no limit
+    history: bool = False  #: whether to record each step
+    max_steps: int = 200_000  #: limit of MPRGP steps and outer iterations, in total
 
     def __post_init__(self) -> None:
         positive(
@@ -79,6 +82,31 @@ class Options:
         model = self.expansion == "model" or self.preconditioner in ("auto", "model")
         if self.norm == "power" and model:
             raise ValueError(
-                "norm = 'power' finds no Ritz vectors; expected 'lanczos', or "
+                "norm = 'power' computes no Ritz vectors; expected 'lanczos', or "
                 "expansion and preconditioner other than 'model'"
             )
+
+    def preconditioner_for(self, qp: QP) -> Operator | None:
+        """Return v ↦ Mv for this QP, or None for the option `preconditioner`.
+
+        For subclasses (`solvers.smalbe.extension`). M approximates P⁻¹ and must be
+        symmetric positive definite; the loop restricts it to the face.
+        """
+        return None
+
+    def step_rule_for(self, qp: QP) -> StepRule | None:
+        """Return a rule for this QP, or None for the option `expansion`.
+
+        For subclasses (`solvers.smalbe.extension`). The rule is asked for a trial point
+        wherever a CG step would leave the box.
+        """
+        return None
+
+    @property
+    def is_extended(self) -> bool:
+        """True for a subclass with a preconditioner or a step rule of its own."""
+        own = type(self)
+        return (
+            own.preconditioner_for is not Options.preconditioner_for
+            or own.step_rule_for is not Options.step_rule_for
+        )

@@ -1,18 +1,19 @@
-# The outer loop, and the way back to the problem as given.
+# The outer loop, and the recovery of x and its multipliers.
 
 
-# Largest penalty: rounding of ρQν, 2⁻⁵³ρ‖ν‖, is 1e-6 of ‖ν‖ there, and all that a
-# gradient shows beyond. Without it models are indefinite
-# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`), and with 1e3
+# Largest penalty. There the rounding of ρQν, 2⁻⁵³ρ‖ν‖, reaches 1e-6 of ‖ν‖; beyond, it
+# would dominate the gradient. Without a limit models become indefinite
+# (`test_rows_that_contradict_each_other_by_rounding_end_the_solve`); with 1e3
 # `test_a_stalled_multiplier_is_helped_by_a_larger_penalty` fails.
-cdef double MOST_RHO = 1e10
-# Factor of the products spent that the energy error may cost; a quarter, as
-# `test_an_energy_error_that_is_too_large_costs_some_more_products` says.
-cdef double FOR_ENERGY = 1.25
-# Least τ of a model, relative to the norm: steps are no longer than 1e4 times those of
-# plain gradient projection. With zero, a spectrum that ends leaves τ = 0, and no step
+cdef double MAX_RHO = 1e10
+# Products allowed in total, relative to those spent when the gradient was small enough:
+# the energy error may cost a quarter more
+# (`test_an_energy_error_that_is_too_large_costs_some_more_products`).
+cdef double ENERGY_BUDGET = 1.25
+# Smallest τ of a model relative to the norm: steps are at most 1e4 times as long as those
+# of plain gradient projection. With zero, an F of low rank leaves τ = 0 and thus no step
 # (`test_what_once_failed`).
-cdef double TAIL = 1e-4
+cdef double MIN_TAIL = 1e-4
 # ‖g^P‖ at which the KKT residual is asked for first and from which on it no longer counts,
 # in units of tol‖b‖. At a residual of 1e-6 strings have 1e-4, and bearings 1e-5.
 cdef double FIRST_JUDGED = 1e3
@@ -30,26 +31,27 @@ cdef class SMALBE(MPRGP):
     problem : a `solvers.smalbe.projected.Projected`
     options : a `solvers.smalbe.options.Options`
     M : None, or v → Mv of a structural preconditioner
-    preconditioned : whether the model, or M, preconditions in the face
+    preconditioned : true if the model, or M, preconditions in the face
+    step_rule : None, or a `solvers.smalbe.extension.StepRule` in place of the expansion
     """
 
     cdef double norm, tail, b_size
     cdef bint plain, preconditioned
-    cdef Py_ssize_t found  # directions of the model: C, then Ritz vectors
-    cdef list held  # the arrays that are read
-    cdef Basis basis  # these directions, None where there are none
-    cdef Room above  # (found,) their eigenvalues above the tail
+    cdef Py_ssize_t n_directions  # of the model: rows of C, then Ritz vectors
+    cdef list owners  # references to the arrays that are read
+    cdef Basis basis  # these directions; None without any
+    cdef Room above  # (n_directions,) their eigenvalues above the tail
     cdef const double *b
     cdef const double *q
-    cdef const double *diagonal  # NULL where an operator does not tell
-    cdef Model known
-    cdef double known_rho
+    cdef const double *diagonal  # NULL for an operator without a diagonal
+    cdef Model cached_model
+    cdef double cached_rho
     cdef double M_now, tol, energy, small_gradient, coarse_gradient
     cdef Judge judge  # of KKT residuals; None where ‖g^P‖ says when to stop
     cdef double next_judged  # ‖g^P‖ from which on it is asked
-    cdef long most_products  # where the energy error may still cost something
+    cdef long most_products  # limit up to which the energy error is reduced
 
-    def __init__(self, problem, options, bint preconditioned, M=None):
+    def __init__(self, problem, options, bint preconditioned, M=None, step_rule=None):
         cdef const double *lower
         cdef const double *upper
         spectrum, bounds = problem.spectrum, problem.bounds
@@ -57,97 +59,99 @@ cdef class SMALBE(MPRGP):
         self.n, self.over = self.F.n, self.F.over
         self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
         self.M_scale = spectrum.norm
-        self.held, self.rows = [], problem.C
-        self.b, self.q = read(problem.b, self.held), read(problem.q, self.held)
-        lower, upper = read(bounds[0], self.held), read(bounds[1], self.held)
+        self.owners, self.rows = [], problem.C
+        self.b, self.q = read(problem.b, self.owners), read(problem.q, self.owners)
+        lower, upper = read(bounds[0], self.owners), read(bounds[1], self.owners)
         self.set = Box.of(lower, upper, self.n, self.over)
         if len(problem.diagonal):
-            self.diagonal = read(problem.diagonal, self.held)
+            self.diagonal = read(problem.diagonal, self.owners)
         self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
         self.reduced = options.reduced
         self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.step_rule = step_rule
+        if step_rule is not None:
+            self.expansion = OWN
         self.proportions_by_model = options.proportioning == "model"
-        self.plain = options.expansion != "model"
+        self.plain = self.expansion != MODEL
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
-        kept = KEPT if options.recycle and not issparse(self.F.matrix) else 0
+        kept = MAX_DIRECTIONS if options.recycle and not issparse(self.F.matrix) else 0
         self.directions = Directions(self.n, kept, self.over)
-        self.find_directions(spectrum.ritz)
+        self.choose_directions(spectrum.ritz)
         self.make_room()
 
     # the model
 
-    cdef int find_directions(self, ritz) except -1:
-        """Choose the directions of models, and the tail.
+    cdef int choose_directions(self, ritz) except -1:
+        """Choose the directions of the models, and the tail.
 
-        The last but one Ritz value, with its residual, is taken for the norm of 𝒫F𝒫 on
-        what the Ritz vectors before it leave (the last, where the process came to its
-        end; the first whose residual exceeds its value); ρQ is taken as it is. Where
-        that is too little, MPRGP raises τ by what its products show. In a flat spectrum
-        a short process finds not even the first eigenvector, and Ritz vectors that are
-        none would slow CG down: then only the norm is used. Many sparse rows come of
-        many subdomains, and there no eigenvalue stands apart.
+        The tail bounds 𝒫F𝒫 on the complement of the directions that are kept: it is the
+        last Ritz value but one plus its residual (the last, if the process ended by
+        itself; the first whose residual exceeds its value). If that is too small, MPRGP
+        raises τ by the curvature that its products show. ρQ enters as it is. In a flat
+        spectrum a short process does not even find the first eigenvector, and Ritz
+        vectors that are not eigenvectors would slow CG down: then only the norm is
+        used. Sparse rows come from many subdomains, whose spectrum is flat as well.
         """
-        cdef Py_ssize_t i, found, kept = 0, n = self.n, r = self.rows.r
+        cdef Py_ssize_t i, n_directions, kept = 0, n = self.n, r = self.rows.r
         cdef Py_ssize_t first = 0, last = n
         cdef const double *value = NULL
         cdef const double *residual = NULL
         cdef DenseBasis basis
-        cdef list held = []
+        cdef list owners = []
         if ritz is not None:
-            value, residual = read(ritz.values, held), read(ritz.residuals, held)
-            found = len(ritz.values)
-            kept = max(found - (1 if residual[found - 1] <= 1e-10 * value[0] else 2), 0)
+            value, residual = read(ritz.values, owners), read(ritz.residuals, owners)
+            n_directions = len(ritz.values)
+            kept = max(n_directions - (1 if residual[n_directions - 1] <= 1e-10 * value[0] else 2), 0)
             for i in range(kept):
                 if residual[i] > value[i]:
                     kept = i
                     break
-            if residual[0] > FOUND * value[0]:
+            if residual[0] > RITZ_RESIDUAL * value[0]:
                 kept = 0
-            self.tail = fmax((value[kept] + residual[kept]) / self.norm, TAIL)
+            self.tail = fmax((value[kept] + residual[kept]) / self.norm, MIN_TAIL)
         if not self.rows.C:
-            self.found, self.above = 1, Room(1)
+            self.n_directions, self.above = 1, Room(1)
             self.above.at[0] = -self.tail
             if self.rows.exist:
                 self.basis = FactoredBasis.of(self.rows)
             return 0
-        self.found = kept + r
-        self.above = Room(self.found)
-        for i in range(self.found):
+        self.n_directions = kept + r
+        self.above = Room(self.n_directions)
+        for i in range(self.n_directions):
             self.above.at[i] = -self.tail
             if i >= r:
                 self.above.at[i] += (value[i - r] + residual[i - r]) / self.norm
-        if not self.found:
+        if not self.n_directions:
             return 0
         while first < n and not self.set.has_bound(first):
             first += 1
         while last > first and not self.set.has_bound(last - 1):
             last -= 1
-        basis = DenseBasis.zeros(self.found, n, first, last - first)
+        basis = DenseBasis.zeros(self.n_directions, n, first, last - first)
         memcpy(basis.U, self.rows.C, r * n * sizeof(double))
         if kept:
-            memcpy(basis.U + r * n, read(ritz.vectors, held), kept * n * sizeof(double))
-        self.basis, self.rows.C = basis, basis.U  # read once, not from farther caches
-        self.rows.held.append(basis)
+            memcpy(basis.U + r * n, read(ritz.vectors, owners), kept * n * sizeof(double))
+        self.basis, self.rows.C = basis, basis.U  # one copy stays in the cache
+        self.rows.owners.append(basis)
         return 0
 
     cdef Model model(self, double rho):
-        """Model H by the Ritz pairs and the penalty ρ."""
+        """Return the model of H by the Ritz pairs and the penalty ρ."""
         cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
         cdef Room w
         if self.basis is None:
             return Model.of_norm(self.tail, self.n)
-        if self.known is None or self.known_rho != rho:
-            w = Room(self.found)
-            for i in range(self.found):
+        if self.cached_model is None or self.cached_rho != rho:
+            w = Room(self.n_directions)
+            for i in range(self.n_directions):
                 w.at[i] = self.above.at[i] + (rho if i < of_rows else 0.0)
-            self.known = self.basis.model(self.found, w.at, 0.0, self.tail)
-            self.known_rho = rho
-        return self.known
+            self.cached_model = self.basis.model(self.n_directions, w.at, 0.0, self.tail)
+            self.cached_rho = rho
+        return self.cached_model
 
     cdef Model model_of_penalty(self, double rho):
-        """Model H by I + (ρ − 1)Q, all that is known without Ritz pairs; by I for ρ < 1.
-        """
+        """Return the model I + (ρ − 1)Q of H without Ritz pairs; I for ρ < 1."""
         cdef Py_ssize_t i, of_rows = self.rows.r if self.rows.C else 1
         cdef Room w = Room(of_rows)
         if not self.rows.exist:
@@ -174,10 +178,10 @@ cdef class SMALBE(MPRGP):
     def precondition(self, free, v, double rho):
         """Return v (n,) preconditioned in the face of the free components (n,)."""
         cdef Py_ssize_t n = self.n
-        cdef list held = []
+        cdef list owners = []
         is_free = np.asarray(free, dtype=float)
-        memcpy(self.free, numbers(is_free), n * sizeof(double))
-        masked(self.free, read(v, held), self.phi, n)
+        memcpy(self.free, address(is_free), n * sizeof(double))
+        masked(self.free, read(v, owners), self.phi, n)
         self.rho, self.in_two = rho, False
         self.choose_models()
         self.first_direction()
@@ -186,20 +190,21 @@ cdef class SMALBE(MPRGP):
     # the start
 
     def begin(self, x, mu, double rho):
-        """Return ν (n,), x moved into the set, and its gradient with multipliers μ.
+        """Return ν (n,), the projection of x onto the set minus x̃, and its gradient.
 
-        One product, none for x = 0: there 𝒫ν = −𝒫x̃ = 0, and Hν = ρQν.
+        The gradient contains the multipliers μ. Costs one product, none for x = 0:
+        there 𝒫ν = −𝒫x̃ = 0 and Hν = ρQν.
         """
         cdef Py_ssize_t i, n = self.n
-        cdef list held = []
+        cdef list owners = []
         start, gradient = np.empty(n), np.zeros(n)
         cdef bint moved = False
-        cdef double *nu = numbers(start)
-        cdef double *g = numbers(gradient)
+        cdef double *nu = address(start)
+        cdef double *g = address(gradient)
         if rho != self.rho:
-            self.directions.begin(self.free)  # of another H
+            self.directions.begin(self.free)  # H has changed
         self.rho = rho
-        self.set.project(read(x, held), 1.0, self.rows.x_tilde, nu)
+        self.set.project(read(x, owners), 1.0, self.rows.x_tilde, nu)
         for i in range(n):
             moved = moved or nu[i] + self.rows.x_tilde[i] != 0
         if self.over.any(moved):
@@ -208,54 +213,54 @@ cdef class SMALBE(MPRGP):
             self.rows.times(nu, self.Cv)
             self.rows.combine(rho, self.Cv, g, g)
         add(-1.0, self.b, g, n)
-        self.rows.combine(1.0, read(mu, held), g, g)
+        self.rows.combine(1.0, read(mu, owners), g, g)
         return self.over.vector(start), self.over.vector(gradient)
 
     # the algorithm
 
     def solve(self, options, double tol, at, infeasible, watch=None):
-        """Run the outer loop on from `at`.
+        """Continue the outer loop from the iterate `at`.
 
         For k = 0, 1, …:
 
         1. MPRGP on ½νᵀHν − (b − Cᵀμ)ᵀν until ‖g^P‖ < min(M‖Cν‖, η‖b‖).
         2. If the Lagrangian L(ν, μ) = ½νᵀHν − bᵀν + μᵀCν grew by less than ρ/2·‖Cν‖²
            since the last k: M ← βM, and ρ ← ρ·growth.
-        3. μ ← μ + ρCν; the gradient grows by ρQν, no product is needed. H is the same,
-           so that on an unchanged face the directions of CG go on to serve.
+        3. μ ← μ + ρCν; the gradient grows by ρQν, without a product. H is unchanged, so
+           that the directions of CG stay conjugate on an unchanged face.
 
-        until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, in the rows as given, ‖Gν‖ ≤ tol‖e‖.
-        (Where b is zero, it is the gradient at the start, and where e is, ν that Cν is
-        compared with.) What the gradient means in the energy norm is estimated, too
-        (`energy_error`): ‖b‖ may be the gap of supports, beside which contact is small.
-        It may cost a quarter more products, not more: where stiffnesses differ much,
-        rounding can keep it away.
+        until ‖g^P‖ ≤ tol‖b‖, ‖Cν‖ ≤ tol‖x̃‖ and, for the original rows, ‖Gν‖ ≤ tol‖e‖.
+        (If b = 0, the initial gradient takes its place; if e = 0, ν that of x̃.) The
+        error in the energy norm is estimated as well (`energy_error`): ‖b‖ may consist
+        of the gaps of supports, beside which contact forces are small. It may cost a
+        quarter more products and not more: where stiffnesses differ much, rounding can
+        keep it above its limit for ever.
 
-        4. Two safeguards: where two outer iterations in a row did not halve ‖Cν‖, ρ ←
-           10ρ up to MOST_RHO, or, where it is small enough and only the gradient is not,
-           M ← M/10: in the end an inner run meets the tolerance, or stagnates. CᵀCν is
-           tried as proof that there is no feasible point.
+        4. Safeguards. If two outer iterations in a row did not halve ‖Cν‖: ρ ← 10ρ up to
+           MAX_RHO, or, if ‖Cν‖ is small enough and only the gradient is not, M ← M/10,
+           so that an inner run finally meets the tolerance, or stagnates. CᵀCν is tested
+           as a certificate of infeasibility.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
         `OuterIteration`, and the status.
 
         at : an `Iterate`
-        infeasible : asked whether ν proves that
-        watch : makes the observer of outer iteration k with that right-hand side, which
-            is told the letter of each step, x and g
+        infeasible : ν → True if ν proves that there is no feasible point
+        watch : k, right-hand side → observer of outer iteration k, called with the
+            letter of each step, x and g; or None
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
         cdef long left = options.max_steps - len(at.steps) - len(at.outer)
         cdef bint stopped, enough, solved, stalled
-        memcpy(self.x, numbers(at.nu), n * sizeof(double))
-        memcpy(self.g, numbers(at.g), n * sizeof(double))
+        memcpy(self.x, address(at.nu), n * sizeof(double))
+        memcpy(self.g, address(at.g), n * sizeof(double))
         if at.rho != self.rho or not at.outer:
             self.directions.begin(self.free)
         self.rho, self.M_now, self.tol, self.energy = at.rho, at.M, tol, options.energy
         self.most_products, self.knows_Cx = 0, False
         multipliers = np.array(at.mu)
-        cdef double *mu = numbers(multipliers)
+        cdef double *mu = address(multipliers)
         self.b_size = sqrt(self.over.total(dot(self.b, self.b, n)))
         if not self.b_size:
             self.b_size = sqrt(self.over.total(dot(self.g, self.g, n)))
@@ -295,7 +300,7 @@ cdef class SMALBE(MPRGP):
             if solved:
                 status = "solved"
                 break
-            # 4. What helps where multipliers do not.
+            # 4. Safeguards.
             errors = [*errors, error][len(errors) > 2:]
             stalled = len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
             if (not stopped or stalled) and infeasible(
@@ -308,9 +313,9 @@ cdef class SMALBE(MPRGP):
             if stalled and self.rows.are_met(self.x, self.Cv, tol, self.b_size):
                 self.M_now /= 10
             elif stalled:
-                if self.rho >= MOST_RHO:
+                if self.rho >= MAX_RHO:
                     break
-                self.change_penalty(fmin(10 * self.rho, MOST_RHO))
+                self.change_penalty(fmin(10 * self.rho, MAX_RHO))
         if self.factor is not None:
             self.counts["factorisations"] = self.factor.factorisations
             self.counts["preconditioner_applies"] = self.factor.solves
@@ -319,7 +324,7 @@ cdef class SMALBE(MPRGP):
                 self.rows.over_rows.vector(multipliers), self.M_now, self.rho, done, status)
 
     cdef bint stops(self) except -1:
-        """Return whether an inner run may end."""
+        """Return True if the inner run may end."""
         cdef double size = sqrt(self.parts.phi_square + self.parts.beta_square)
         if self.judge is not None:
             return self.is_judged_solved(size)
@@ -347,24 +352,25 @@ cdef class SMALBE(MPRGP):
         return False
 
     cdef bint is_accurate(self) except -1:
-        """Return whether rows are met and the energy error is small, or cost its share.
+        """Return True if the rows are met, and the energy error is small or has used its
+        share of products.
         """
         self.rows.times(self.x, self.Cv)
         if not self.rows.are_met(self.x, self.Cv, self.tol, self.b_size):
             return False
         if not self.most_products:
-            self.most_products = <long> (FOR_ENERGY * self.F.count)
+            self.most_products = <long> (ENERGY_BUDGET * self.F.count)
         if not self.energy or self.F.count >= self.most_products:
             return True
         return self.energy_error() <= self.energy * self.tol
 
     cdef double energy_error(self) except? -1:
-        """Estimate the relative energy error from what is left of the gradient.
+        """Estimate the relative energy error from the remaining gradient.
 
-        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, of which every
-        rᵢ²/F_ii is a lower bound. The root of their sum was 0.8 to 8.4 times below the
-        certified error of the contact problems at hand. Gradients that are rounding of
-        q do not count. Zero where F is an operator.
+        ‖x − x*‖_F² = rᵀF_ff⁻¹r with the gradient r on the free set, and each rᵢ²/F_ii is
+        a lower bound of it. On contact problems the root of their sum was 0.8 to 8.4
+        times smaller than the certified error. Gradients within the rounding of q are
+        left out. Zero for an operator F without a diagonal.
         """
         cdef double energy = 0.0, most = 0.0, error
         cdef Py_ssize_t i
@@ -380,7 +386,7 @@ cdef class SMALBE(MPRGP):
         return sqrt(error / fabs(energy)) if energy else 0.0
 
     cdef double lagrangian(self, const double *mu) except? -1:
-        """Return L(ν, μ) from the gradient; Cν is in `Cv`."""
+        """Return L(ν, μ), computed from the gradient; expects Cν in `Cv`."""
         cdef double sum_ = 0.0
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -390,44 +396,44 @@ cdef class SMALBE(MPRGP):
         )
 
     cdef int change_penalty(self, double rho) except -1:
-        """Change ρ; the gradient follows without a product."""
+        """Change ρ and update the gradient, without a product."""
         self.rows.times(self.x, self.Cv)
         self.rows.add(rho - self.rho, self.Cv, self.g)
         self.rho = rho
-        self.directions.begin(self.free)  # of another H
+        self.directions.begin(self.free)  # H has changed
         return 0
 
-    # back to the problem as given
+    # recovery
 
     def point(self, nu, mu, lb, ub):
-        """Return x, a, z_box and Fx of the problem with the rows Cx = Cx̃; one product.
+        """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        As `solvers.smalbe.driver.recovered`; a (r,) belongs to those rows. None where
-        they are too nearly dependent on the free components for normal equations, or
-        sparse.
+        The computation of `solvers.smalbe.driver.recover`, with normal equations for the
+        correction of a. None if C is sparse, or so nearly dependent on the free
+        components that normal equations would lose the correction.
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
-        cdef list held = []
+        cdef list owners = []
         if not self.rows.C and (self.rows.exist or self.over.ranks is not None):
             return None
         result, multipliers = np.zeros((3, n)), np.zeros(r)
         cdef Room room = Room(r * r)
         cdef double *S = room.at
         cdef const double *C = self.rows.C
-        cdef const double *v = numbers(nu)
-        cdef const double *at_mu = numbers(mu)
-        cdef double *a = numbers(multipliers)
-        cdef double *x = numbers(result)
+        cdef const double *v = address(nu)
+        cdef const double *at_mu = address(mu)
+        cdef double *a = address(multipliers)
+        cdef double *x = address(result)
         cdef double *z_box = x + n
         cdef double *Fx = z_box + n
         cdef double *rest = self.s
         cdef double *free = self.x2
         cdef double *t = self.t
         cdef double *da = self.Cv
-        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper, read(lb, held),
-                 read(ub, held), x, free, n)
+        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper, read(lb, owners),
+                 read(ub, owners), x, free, n)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
@@ -452,5 +458,5 @@ cdef class SMALBE(MPRGP):
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, C, da, rest, r, n)
-        held_by(v, self.set.lower, self.set.upper, rest, z_box, n)
+        bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
         return result[0], multipliers, result[1], result[2]

@@ -1,27 +1,28 @@
 """Preconditioners of the CG steps in a face F of the box.
 
-All are masked: z_F = (M φ_F)_F with one M for every face, but for `model`, which is
-inverted in the face (model.pxi), and `incomplete`, which is factorised there
-(incomplete.pxi; `solvers.smalbe.scaled`). The structural ones, for a dual with
+All except `model`, which is inverted in the face (model.pxi), and `incomplete`, which
+is factorised there (incomplete.pxi; `solvers.smalbe.scaled`), are masked:
+z_F = (M φ_F)_F with one M for all faces. The structural ones, for a dual with
 F = BK⁺Bᵀ, are
 
     lumped      M = B_D K_bb B_Dᵀ
     dirichlet   M = B_D S_bb B_Dᵀ,   S_bb = K_bb − K_bi K_ii⁻¹ K_ib
 
 where b are the components that B touches, i the others, and B_D = (BWBᵀ)⁻¹BW with the
-compliances W = diag(K_bb)⁻¹ as weights, so that where bodies meet the softer one takes
-more of a jump (Rixen and Farhat 1999). An operator P may offer its own
+compliances W = diag(K_bb)⁻¹ as weights, so that the softer of two bodies takes the
+larger part of a jump (Rixen and Farhat 1999). An operator P may offer its own
 (`harness.operators.Preconditioned`).
 
 Inside SMALBE, H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ is approximated in a face by the model of the penalty
 B = I + (ρ − 1)Q, whose inverse there, P = B_FF⁻¹, is nearly the projector on C_Fν = 0;
-M takes the place of the unit matrix on what that leaves:
+M replaces the identity on the range of that projector:
 
     P (‖𝒫F𝒫‖ M_FF − I) P + P
 
-It is positive definite (0 < P ≤ I), and right where C_F C_Fᵀ has small eigenvalues, as
-those of motions that gluing hardly feels and contact does. The projector 𝒫 of the whole
-instead, which mixes free components with held ones, would undo what a large ρ achieves.
+This is positive definite (0 < P ≤ I), and accurate even where C_F C_Fᵀ has small
+eigenvalues, such as those of motions that contact rows resist and gluing rows hardly
+do. The projector 𝒫 of all components in its place would mix free components with active
+ones and undo the effect of a large ρ.
 """
 
 from __future__ import annotations
@@ -32,13 +33,13 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.sparse import csc_matrix, diags_array, issparse
 
-from mortarbench.harness import QP, Structure, Vector
+from mortarbench.harness import QP, Structure
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.harness.operators import Preconditioned, SerialisableOperator
 from mortarbench.solvers.smalbe.compiled import pairs_of_columns
+from mortarbench.solvers.smalbe.extension import Operator
 from mortarbench.solvers.smalbe.rows import Mask
 
-Operator = Callable[[Vector], Vector]
 Preconditioner = Literal[
     "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
@@ -53,19 +54,19 @@ MAX_PAIRS = 2.0
 DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 
-def offered(qp: QP) -> Preconditioned | None:
-    """Give what P offers preconditioners by, if it does."""
+def preconditioned_operator(qp: QP) -> Preconditioned | None:
+    """Return the operator by which P offers preconditioners, or None."""
     if qp.is_explicit:
         return None
     product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else qp.P
     return product if isinstance(product, Preconditioned) else None
 
 
-def chosen(qp: QP, kind: Preconditioner) -> Preconditioner:
-    """Choose for `auto`: Dirichlet's where offered, a cheap factor, else the model."""
+def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
+    """Resolve ``auto``: dirichlet if offered, a cheap factor, else model."""
     if kind != "auto":
         return kind
-    if offered(qp):
+    if preconditioned_operator(qp):
         return "dirichlet"
     return "incomplete" if has_sparse_factor(qp) else "model"
 
@@ -100,40 +101,46 @@ def _pairs(qp: QP) -> float:
     return pairs_of_columns(P if P.format in ("csr", "csc") else csc_matrix(P))
 
 
-def lacking(qp: QP, kind: Preconditioner) -> str | None:
-    """Say what `qp` lacks for this preconditioner, or None."""
+def missing_data(qp: QP, kind: Preconditioner) -> str | None:
+    """Return the reason why `qp` has no such preconditioner, or None."""
     if kind == "incomplete" and not has_sparse_factor(qp):
         return (
             "preconditioner 'incomplete' needs a sparse P with a positive diagonal and "
             "few entries per row, and bounds only"
         )
     if kind == "diagonal" and qp.diagonal() is None:
-        return "preconditioner 'diagonal' needs a P that tells its diagonal"
-    if kind in ("lumped", "dirichlet") and qp.structure is None and not offered(qp):
+        return "preconditioner 'diagonal' needs a P with a known diagonal"
+    if (
+        kind in ("lumped", "dirichlet")
+        and qp.structure is None
+        and not preconditioned_operator(qp)
+    ):
         return f"preconditioner {kind!r} needs a QP with structure; 'diagonal' does not"
     return None
 
 
-def structural(qp: QP, kind: Preconditioner) -> Operator | None:
-    """Return M as a function; None for kinds that need none."""
+def structural_preconditioner(qp: QP, kind: Preconditioner) -> Operator | None:
+    """Return M as a function; None for the kinds ``model`` and ``none``."""
     if kind not in STRUCTURAL:
         return None
     diagonal = qp.diagonal()
     if kind == "diagonal" and diagonal is not None:
         inverse = 1 / np.where(diagonal > 0, diagonal, 1.0)
         return lambda v: inverse * v
-    if (operator := offered(qp)) is not None:
+    if (operator := preconditioned_operator(qp)) is not None:
         return operator.preconditioner(kind, "stiffness")
     if qp.structure is None:
-        raise ValueError(lacking(qp, kind))
+        raise ValueError(missing_data(qp, kind))
     return _of_stiffness(qp.structure, _lumped if kind == "lumped" else _schur)
 
 
 def _of_stiffness(
     structure: Structure, of_interface: Callable[[csc_matrix, Mask], Operator]
 ) -> Operator:
-    """Return B_D S B_Dᵀ with the stiffness S of the interface."""
-    from sksparse.cholmod import cholesky  # late: other preconditioners do without
+    """Return v ↦ B_D S B_Dᵀ v with the stiffness S of the interface."""
+    from sksparse.cholmod import (
+        cholesky,
+    )  # late: the other preconditioners need no CHOLMOD
 
     acting = np.ones(structure.K.shape[0], dtype=bool)
     acting[structure.fixed] = False
@@ -155,7 +162,7 @@ def _lumped(K: csc_matrix, touched: Mask) -> Operator:
 
 
 def _schur(K: csc_matrix, touched: Mask) -> Operator:
-    """Apply S_bb: one solve with K_ii."""
+    """Return the product with the Schur complement S_bb, one solve with K_ii each."""
     from sksparse.cholmod import cholesky
 
     K_bb, K_ib = K[touched][:, touched], csc_matrix(K[~touched][:, touched])

@@ -1,11 +1,11 @@
-# What is done once: rows, the upper end of the spectrum, and the normalised problem.
+# Preparation: orthonormal rows, the upper end of the spectrum, the normalised problem.
 
 
 def orthonormal(G, e):
     """Orthonormalise the rows of Gx = e, G (m, n), by a pivoted QR factorisation.
 
-    Returns the fields of `DenseRows` but the last, and the factorisation that
-    multipliers need: R (r, r), the rows kept (r,), their sizes (m,).
+    Returns the fields of `DenseRows` except `multipliers`, and the factorisation for
+    these: R (r, r), the independent rows (r,), the norms of all rows (m,).
     """
     cdef Py_ssize_t i, j, m = G.shape[0], n = G.shape[1], w = min(m, n)
     cdef int rows = m, columns = n, info = 0, most = 64 * (m + n), r = 0
@@ -13,11 +13,11 @@ def orthonormal(G, e):
     cdef double least_pivot = 1.0
     sizes, x_tildes, unit = np.ones(m), np.zeros(n), np.empty((m, n))
     pivots = np.zeros(m, dtype=np.int32)
-    cdef double *size = numbers(sizes)
-    cdef double *x_tilde = numbers(x_tildes)
-    cdef double *A = numbers(unit)  # A (m, n) by rows is (n, m) by columns
-    cdef const double *given = numbers(G)
-    cdef const double *right = numbers(e)
+    cdef double *size = address(sizes)
+    cdef double *x_tilde = address(x_tildes)
+    cdef double *A = address(unit)  # A (m, n) by rows is (n, m) by columns
+    cdef const double *given = address(G)
+    cdef const double *right = address(e)
     cdef int[::1] pivot = pivots
     cdef Room room = Room(w + most)
     cdef double *t = room.at
@@ -37,7 +37,7 @@ def orthonormal(G, e):
             r += 1
             least_pivot = fmin(least_pivot, fabs(A[i * n + i]))
     triangle, products = np.zeros((r, r)), np.empty((m, r))
-    R, GC = numbers(triangle), numbers(products)
+    R, GC = address(triangle), address(products)
     for i in range(r):
         for j in range(i, r):
             R[i * r + j] = A[j * n + i]
@@ -65,7 +65,7 @@ def orthonormal(G, e):
 
 # Pivots of normalised rows below this are rounding: some hundred times 2⁻⁵³. With zero
 # `test_a_repeated_row_must_ask_for_the_same` fails, with 1e-9
-# `test_nearly_parallel_rows_are_independent`.
+# `test_nearly_parallel_rows_are_independent` does.
 cdef double RANK = 1e-13
 
 
@@ -77,10 +77,10 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     cdef Py_ssize_t i, j, r = len(triangle)
     cdef double s
     result = np.zeros(m)
-    cdef double *y = numbers(result)
-    cdef const double *R = numbers(triangle)
-    cdef const double *size = numbers(sizes)
-    cdef const double *a = numbers(shares)
+    cdef double *y = address(result)
+    cdef const double *R = address(triangle)
+    cdef const double *size = address(sizes)
+    cdef const double *a = address(shares)
     cdef const int[::1] kept = rows_kept
     for i in range(r - 1, -1, -1):  # Rz = a, y = z/size
         s = a[i]
@@ -90,51 +90,52 @@ def multipliers(Py_ssize_t m, triangle, rows_kept, sizes, shares):
     return result
 
 
-# Ratio of Ritz values of one size, seen after FEW steps: with κ = 10, CG halves its error
+# Ratio of Ritz values of one size, view after FLAT_STEPS steps: with κ = 10, CG halves its error
 # in every step, and five more products would cost more than they save.
-cdef double FLAT = 10.0
+cdef double FLAT_RATIO = 10.0
 
 cdef enum:
-    FEW = 5
+    FLAT_STEPS = 5
 
 
 cdef bint is_flat(const double *diagonal, const double *off) noexcept nogil:
-    """Whether all Ritz values of the first FEW steps are of one size.
+    """Return True if the Ritz values of the first FLAT_STEPS steps are within FLAT_RATIO.
 
-    The diagonal holds Rayleigh quotients, which lie between the least and the largest.
+    The diagonal holds Rayleigh quotients, which lie between the smallest Ritz value and
+    the largest: their ratio is a cheap first test.
     """
-    cdef double theta[FEW]
-    cdef double between[FEW]
+    cdef double theta[FLAT_STEPS]
+    cdef double between[FLAT_STEPS]
     cdef double none, least = diagonal[0], largest = diagonal[0]
-    cdef int order = FEW, one = 1, info = 0, i
-    for i in range(1, FEW):
+    cdef int order = FLAT_STEPS, one = 1, info = 0, i
+    for i in range(1, FLAT_STEPS):
         least = diagonal[i] if diagonal[i] < least else least
         largest = diagonal[i] if diagonal[i] > largest else largest
-    if least < largest / FLAT:
+    if least < largest / FLAT_RATIO:
         return False
-    memcpy(theta, diagonal, FEW * sizeof(double))
-    memcpy(between, off, FEW * sizeof(double))
+    memcpy(theta, diagonal, FLAT_STEPS * sizeof(double))
+    memcpy(between, off, FLAT_STEPS * sizeof(double))
     dstev(b"N", &order, theta, between, &none, &one, &none, &info)
-    return theta[0] >= theta[FEW - 1] / FLAT
+    return theta[0] >= theta[FLAT_STEPS - 1] / FLAT_RATIO
 
 
 def lanczos(Product F, Rows C, start, int steps):
-    """Find upper Ritz pairs of 𝒫F𝒫 from start (n,): the fields of `Ritz`.
+    """Compute upper Ritz pairs of 𝒫F𝒫 from start (n,); returns the fields of `Ritz`.
 
-    One product for each of the steps, of which there are no more than 𝒫 has a range;
-    fully reorthogonalised. What three terms leave is of the size of the next vector, so
-    that one pass over all vectors makes it orthogonal to them to rounding. The residual
-    of the pair (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends
-    after FEW steps where all Ritz values are of one size: conjugate gradients need few
-    steps there, and no model. Without vectors where the first pair is not found: then
-    no model holds any.
+    Lanczos process with full reorthogonalisation; one product per step, and at most as
+    many steps as 𝒫 has rank. The three-term recurrence leaves a vector of the size of
+    the next β, so that one pass of orthogonalisation suffices. The residual of the pair
+    (θ, Vᵀs) is |β sₖ| with the last off-diagonal entry β. The process ends after
+    FLAT_STEPS steps if all Ritz values are within FLAT_RATIO: CG then needs few steps and
+    no model. No vectors are returned if the first pair has not converged, since no model
+    uses them.
 
-    C : rows that span what 𝒫 leaves out
+    C : rows that span the kernel of 𝒫
     """
     cdef Py_ssize_t i, k, n = F.n
     cdef int kept = 0, info = 0
     cdef Reduction over = F.over
-    steps = min(steps, <long> over.total(n) - len(C.given.C))
+    steps = min(steps, <long> over.total(n) - len(C.source.C))
     cdef Room room = Room((steps + 2) * n + C.r + (steps + 5) * steps)
     cdef double *basis = room.at
     cdef double *v = basis + steps * n
@@ -149,7 +150,7 @@ def lanczos(Product F, Rows C, start, int steps):
     cdef double *residual
     cdef double *vector
     cdef double beta, largest = 0.0, at_start
-    memcpy(v, numbers(start), n * sizeof(double))
+    memcpy(v, address(start), n * sizeof(double))
     C.project(v, Cv)
     beta = sqrt(over.total(dot(v, v, n)))
     for k in range(steps if beta else 0):
@@ -171,7 +172,7 @@ def lanczos(Product F, Rows C, start, int steps):
         kept = k + 1
         if beta <= 1e-12 * largest:
             break
-        if kept == FEW and is_flat(diagonal, off):
+        if kept == FLAT_STEPS and is_flat(diagonal, off):
             break
     if not kept:
         return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
@@ -179,37 +180,37 @@ def lanczos(Product F, Rows C, start, int steps):
     beta = off[kept - 1]
     dstev(b"V", &kept, diagonal, off, S, &kept, space, &info)
     values, residuals = np.empty(kept), np.empty(kept)
-    value, residual = numbers(values), numbers(residuals)
+    value, residual = address(values), address(residuals)
     for i in range(kept):  # in descending order
         k = kept - 1 - i
         value[i] = diagonal[k]
         residual[i] = beta * fabs(S[k * kept + kept - 1])
-    vectors = np.zeros((kept if residual[0] <= FOUND * value[0] else 0, n))
-    vector = numbers(vectors)
+    vectors = np.zeros((kept if residual[0] <= RITZ_RESIDUAL * value[0] else 0, n))
+    vector = address(vectors)
     for i in range(len(vectors)):
         k = kept - 1 - i
         add_combination(1.0, basis, S + k * kept, vector + i * n, kept, n)
     return values, residuals, vectors, at_start
 
 
-# Residual over value of the first Ritz pair where the spectrum decays: after twelve steps
-# it is 1e-12 and less on duals of contact, and 1e-2 on a Laplacian. With 1 or 1e-14,
-# `test_compiled_and_written_steps_are_the_same` fails.
-cdef double FOUND = 1e-3
+# Largest residual of the first Ritz pair, relative to its value, in a spectrum that
+# decays: after twelve steps it is at most 1e-12 on duals of contact, and 1e-2 on a
+# Laplacian. With 1 or 1e-14 `test_compiled_and_written_steps_are_the_same` fails.
+cdef double RITZ_RESIDUAL = 1e-3
 
 
 def homogenised(Product F, Rows C, q, lb, ub, double norm):
     """Return b (n,) and the bounds of ν = x − x̃; one product, unless x̃ = 0."""
     cdef Py_ssize_t i, n = F.n
-    cdef list held = []
+    cdef list owners = []
     cdef Reduction over = F.over
     cdef Room room = Room(C.r)
-    found = np.zeros((3, n))
+    result = np.zeros((3, n))
     cdef const double *shift = C.x_tilde
-    cdef const double *cost = read(q, held)
-    cdef const double *low = read(lb, held)
-    cdef const double *high = read(ub, held)
-    cdef double *b = numbers(found)
+    cdef const double *cost = read(q, owners)
+    cdef const double *low = read(lb, owners)
+    cdef const double *high = read(ub, owners)
+    cdef double *b = address(result)
     cdef double square[2]
     cdef bint moved = False
     square[:] = [0.0, 0.0]
@@ -225,7 +226,7 @@ def homogenised(Product F, Rows C, q, lb, ub, double norm):
     square[1] = dot(b, b, n)
     over.add(square, 2)
     if square[1] <= 1e-28 * square[0]:
-        memset(b, 0, n * sizeof(double))  # nothing but rounding errors is left of d
+        memset(b, 0, n * sizeof(double))  # d was in the span of Cᵀ up to rounding
     scale(1 / norm, b, n)
-    bounds = over.vector(found[1]), over.vector(found[2])
-    return over.vector(found[0]), bounds
+    bounds = over.vector(result[1]), over.vector(result[2])
+    return over.vector(result[0]), bounds

@@ -24,17 +24,17 @@ from mortarbench.solvers.smalbe.rows import (
 )
 from mortarbench.solvers.smalbe.spectrum import Ritz, power_method, random_start
 
-NOTHING = 1e-13  #: a norm of 𝒫F𝒫 below this times that of F is rounding
+NORM_ROUNDING = 1e-13  #: 𝒫F𝒫 counts as zero if its norm is below this times ‖F‖
 
 
 class Spectrum(NamedTuple):
     """The norm and the upper end of the spectrum of 𝒫F𝒫."""
 
     norm: float  #: ‖𝒫F𝒫‖, positive
-    ritz: Ritz | None  #: None after the power method, which finds nothing else
+    ritz: Ritz | None  #: None after the power method
 
     def orthogonal_to(self, rows: Rows) -> Spectrum:
-        """Project the Ritz vectors of a problem with slightly other rows."""
+        """Return the spectrum with Ritz vectors projected onto the kernel of `rows`."""
         if self.ritz is None or not isinstance(rows, DenseRows):
             return self
         V, R = np.linalg.qr(rows.project(self.ritz.vectors.T))
@@ -48,13 +48,13 @@ class Projected:
 
     F: Product
     rows: Rows
-    C: compiled.Rows  #: these, for the compiled loop
+    C: compiled.Rows  #: `rows` as the compiled loop takes them
     spectrum: Spectrum
     b: Vector
     bounds: tuple[Vector, Vector]  #: of ν = x − x̃
-    q: Vector  #: as given
-    diagonal: Vector  #: of F; empty where an operator does not tell
-    #: besides products with F
+    q: Vector  #: of the original QP
+    diagonal: Vector  #: of F; empty for an operator without one
+    #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
     #: of the free part of a sparse F in scaled variables; None for none
     factor: compiled.IncompleteFactor | None = None
@@ -63,17 +63,17 @@ class Projected:
 
 
 class OuterIteration(NamedTuple):
-    """One outer iteration, as it ended."""
+    """Result of one outer iteration."""
 
     trace: str  #: the steps of its inner run
-    M: float  #: with which that ran
-    rho: float  #: with which that ran
+    M: float  #: precision M of its inner run
+    rho: float  #: penalty ρ of its inner run
     infeasibility: float  #: ‖Cν‖
-    lagrangian: float  #: L(ν, μ), μ as in the inner run
+    lagrangian: float  #: L(ν, μ) with the μ of the inner run
 
 
 class Iterate(NamedTuple):
-    """The state of the outer loop."""
+    """State of the outer loop."""
 
     nu: Vector  #: (n,)
     g: Vector  #: Hν − b + Cᵀμ
@@ -85,7 +85,7 @@ class Iterate(NamedTuple):
 
     @property
     def steps(self) -> str:
-        """All inner steps so far, one letter each."""
+        """Letters of all inner steps so far."""
         return "".join([o.trace for o in self.outer])
 
 
@@ -94,7 +94,7 @@ def projected_problem(
 ) -> Projected:
     """Homogenise, project and normalise; one product with F and those of `find`.
 
-    find : looks for the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or one that is known
+    find : estimates the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or a stored result
     """
     over = Reduction()
     if isinstance(qp.q, DistributedVector):
@@ -111,7 +111,7 @@ def projected_problem(
 
 
 def _diagonal(qp: QP) -> Vector:
-    """Copy the diagonal of P; empty where that is an operator that does not tell."""
+    """Return a copy of the diagonal of P; empty for an operator without one."""
     if isinstance(qp.P, np.ndarray):
         return qp.P.diagonal().astype(float)
     diagonal = qp.diagonal()
@@ -119,23 +119,23 @@ def _diagonal(qp: QP) -> Vector:
 
 
 def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
-    """Take the mean eigenvalue of P for a norm where 𝒫F𝒫 is zero, or rounding."""
+    """Replace a norm that is zero up to rounding by the mean eigenvalue of P."""
     mean = float(np.add.reduce(diagonal)) / max(diagonal.size, 1)
-    if spectrum.norm > NOTHING * mean:
+    if spectrum.norm > NORM_ROUNDING * mean:
         return spectrum
     return spectrum._replace(norm=mean or 1.0)
 
 
 def by_lanczos(F: Product, C: compiled.Rows, *, steps: int) -> Spectrum:
-    """Find the norm and the upper Ritz pairs; `steps` products."""
-    start = random_start(C.given.x_tilde.size)
+    """Estimate the norm and the upper Ritz pairs by `steps` products."""
+    start = random_start(C.source.x_tilde.size)
     ritz = Ritz(*compiled.lanczos(F, C, start, steps))
     return Spectrum(ritz.norm or 1.0, ritz)
 
 
 def by_power(F: Product, C: compiled.Rows) -> Spectrum:
-    """Find the norm as PERMON does; up to 50 products."""
-    rows = C.given
+    """Estimate the norm by PERMON's power method; up to 50 products."""
+    rows = C.source
     norm = power_method(partial(times_projected, F, rows), rows.x_tilde.size)
     return Spectrum(norm or 1.0, None)
 

@@ -1,21 +1,21 @@
-# A bound of the KKT residuals of the problem as given, without a product. Scales and errors
-# are those of `harness.verify.kkt`, from `harness/verify/scales.h`.
+# An upper bound of the KKT residuals of the original QP, without a product. Scales and
+# errors are those of `harness.verify.kkt`, from `harness/verify/scales.h`.
 
 
 def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     """Bound the worst of `harness.kkt_residuals` from above, without products.
 
-    With the least scale of energy that it may use, and nothing excused as rounding:
-    where this is small, so are the residuals. inf where nothing can be said.
+    Uses the smallest scale of energy that `kkt_residuals` may use and attributes nothing
+    to rounding, so that a small bound implies small residuals. inf if no bound is known.
 
     s : a `Solution` without multipliers of inequality rows
-    diagonal : of P (n,), empty for an operator that does not tell
-    G : the equality rows, an array or what multiplies
-    over : the processes that share vectors (n,)
+    diagonal : diagonal of P (n,), empty for an operator without one
+    G : the equality rows, an array or an operator
+    over : processes that share vectors (n,)
     """
     cdef Py_ssize_t i, n = len(diagonal), m = len(s.y)
     cdef bint is_dense = isinstance(G, np.ndarray)
-    cdef list held = []
+    cdef list owners = []
     cdef double sums[3]
     cdef double most[2]
     cdef double least, energy, worst, size_of_all
@@ -28,21 +28,21 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     cdef double *missed = own_size + n
     cdef double *own = missed + m
     cdef double *known = own + m
-    cdef const double *q = read(qp.q, held)
-    cdef const double *d = read(diagonal, held)
-    cdef const double *x = read(s.x, held)
-    cdef const double *y = read(s.y, held)
-    cdef const double *z = read(s.z_box, held)
-    cdef const double *Fx = read(Px, held)
-    cdef const double *lb = read(qp.lb, held)
-    cdef const double *ub = read(qp.ub, held)
-    cdef const double *e = read(qp.b, held)
+    cdef const double *q = read(qp.q, owners)
+    cdef const double *d = read(diagonal, owners)
+    cdef const double *x = read(s.x, owners)
+    cdef const double *y = read(s.y, owners)
+    cdef const double *z = read(s.z_box, owners)
+    cdef const double *Fx = read(Px, owners)
+    cdef const double *lb = read(qp.lb, owners)
+    cdef const double *ub = read(qp.ub, owners)
+    cdef const double *e = read(qp.b, owners)
     # 1. The forces Gᵀy + z, and the energy.
     if is_dense:
         memcpy(forces, z, n * sizeof(double))
-        add_combination(1.0, read(G, held), y, forces, m, n)
+        add_combination(1.0, read(G, owners), y, forces, m, n)
     else:
-        take(G.T @ s.y, n, forces, "Gᵀy")
+        copy_result(G.T @ s.y, n, forces, "Gᵀy")
         add(1.0, z, forces, n)
     least = terms_of_energy(q, d, x, z, Fx, lb, ub, forces, size, n, sums, most)
     over.add(sums, 3)
@@ -66,13 +66,13 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     # 3. The rows.
     sizes_of_variables(energy, q, d, x, Fx, size, own_size, n)
     if is_dense:
-        terms_of_rows(read(G, held), e, x, own_size, size, m, n, missed, own, known)
+        terms_of_rows(read(G, owners), e, x, own_size, size, m, n, missed, own, known)
     else:
-        take(G @ s.x - qp.b, m, missed, "Gx − e")
+        copy_result(G @ s.x - qp.b, m, missed, "Gx − e")
         size_of_rows = abs(G)
-        own_x, known_x = over.vector(seen(own_size, n)), over.vector(seen(size, n))
-        take(size_of_rows @ own_x, m, own, "own terms")
-        take(size_of_rows @ known_x, m, known, "known terms")
+        own_x, known_x = over.vector(view(own_size, n)), over.vector(view(size, n))
+        copy_result(size_of_rows @ own_x, m, own, "own terms")
+        copy_result(size_of_rows @ known_x, m, known, "known terms")
     for i in range(m):
         if not isfinite(missed[i]):
             return INFINITY

@@ -1,20 +1,20 @@
 """Equality rows Gx = e as orthonormal rows C: dense, or by a sparse Cholesky factor.
 
-Few rows are orthonormalised by a pivoted QR factorisation, which also finds their rank
-(`DenseRows`). Thousands of sparse ones, as the rigid modes of subdomains give, are only
-divided by their norms, and
+A few rows are orthonormalised by a pivoted QR factorisation, which also reveals their
+rank (`DenseRows`). Thousands of sparse rows, such as those of the rigid modes of
+subdomains, are only divided by their norms, and
 
     GGᵀ = LLᵀ,   C = L⁻¹G,   𝒫 = I − CᵀC = I − Gᵀ(GGᵀ)⁻¹G
 
-are applied by products with G and solves with L (`SparseRows`); they must be
+are applied by products with G and solves with L (`SparseRows`); the rows must be
 independent. A model of the penalty ρCᵀC (model.pxi) needs solves with G_F G_Fᵀ + κGGᵀ
-on a face F. These differ from (1 + κ)GGᵀ in rows that bounded components touch, and in
-contact few subdomains have any: with those rows c last, only the Schur complement of
-GGᵀ on them is factorised anew (`_Bordered`).
+on a face F. These matrices differ from (1 + κ)GGᵀ only in rows with entries in bounded
+components, and in contact problems few subdomains have any: with those rows c ordered
+last, each face only needs a factorisation of the Schur complement on c (`_Bordered`).
 
-On several ranks this is the *coarse problem*, with a row for each rigid mode of all
-subdomains. Each rank eliminates the rows of its own (`_OverRanks`), unless it shares
-many with others: then all ranks do the same.
+On several ranks this is the *coarse problem*, with a row for each rigid mode of every
+subdomain. Each rank eliminates its local rows (`_OverRanks`). If it shares many of them
+with other ranks, all ranks factorise the whole matrix instead.
 """
 
 from __future__ import annotations
@@ -53,11 +53,11 @@ from mortarbench.solvers.smalbe import compiled
 Mask: TypeAlias = NDArray[np.bool_]
 SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
 
-INCONSISTENT = 1e-8  #: of x̃ and e, by which rows with a solution may be missed
-RANK = 1e-13  #: pivots of the normalised rows below this are rounding errors
-FREE_RANK = 1e-10  #: singular values of C on the free components below are rounding
-MOST_BORDER = 2000  #: rows that bounded components touch, whose block is dense
-MOST_DENSE = 50_000  #: entries of C beyond which sparse rows stay sparse
+CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to x̃ and e
+RANK = 1e-13  #: smaller pivots of normalised rows count as rounding
+FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
+MAX_BORDER = 2000  #: limit of rows with bounded components: their block is dense
+MAX_DENSE_ENTRIES = 50_000  #: limit of entries of C; larger sparse rows stay sparse
 
 
 class Transposed(Protocol):
@@ -79,12 +79,12 @@ class Orthonormal(Protocol):
 class Rows(ABC):
     """Equality rows Gx = e as Cx = C x̃ with orthonormal C."""
 
-    G: Matrix  #: (m, n) as given
+    G: Matrix  #: (m, n) original rows
     C: Orthonormal  #: (r, n)
     e_size: float  #: ‖e‖
-    least_pivot: float  #: of the factorisation, 1 for orthogonal rows
+    least_pivot: float  #: smallest pivot of the normalised rows, 1 for orthogonal ones
     x_tilde: Vector  #: (n,) the shortest x with Gx = e
-    consistent: bool  #: whether there is one
+    consistent: bool  #: true if Gx = e has a solution
     multipliers: Callable[[Vector], Vector]  #: a (r,) → y (m,) with Gᵀy = Cᵀa
 
     def project(self, v: Vector) -> Vector:
@@ -97,12 +97,12 @@ class Rows(ABC):
 
     @property
     def no_multipliers(self) -> Vector:
-        """Multipliers a (r,) of Cx = Cx̃ that are zero."""
+        """Zero multipliers (r,) of Cx = Cx̃."""
         return np.zeros(len(self.C))
 
     @abstractmethod
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        """Find the a (r,) with the least ‖(r + Cᵀa)_F‖."""
+        """Return the a (r,) with the least ‖(r + Cᵀa)_F‖ on the free components F."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,12 +119,12 @@ class DenseRows(Rows):
 
 @dataclass(frozen=True, eq=False)
 class SparseRows(Rows):
-    """Sparse, independent equality rows, of which GGᵀ is factorised."""
+    """Sparse, independent equality rows with a Cholesky factor of GGᵀ."""
 
-    unit: SparseColumns  #: (r, n) the rows of G divided by their norms
-    gram: GramFactor  #: of these
-    bounded: NDArray[np.int64]  #: (b,) components that have a bound
-    of_bounded: SparseColumns  #: (r, b) the columns of `unit` of these
+    unit: SparseColumns  #: (r, n) rows of G divided by their norms
+    gram: GramFactor  #: of `unit`
+    bounded: NDArray[np.int64]  #: (b,) components with a bound
+    of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         y, unit = self.gram.backward(a), self.unit
@@ -133,7 +133,7 @@ class SparseRows(Rows):
         return np.asarray(s * v + t * np.asarray(unit.T @ y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
-        """Return v − Gᵀy of the normalised rows G, times weights."""
+        """Return weights times (v − Gᵀy), with the normalised rows G."""
         if isinstance(self.unit, _LocalRows):
             return self.unit.T.weighted_difference(v, y, weights)
         return np.asarray((v - np.asarray(self.unit.T @ y)) * weights)
@@ -153,7 +153,7 @@ class SparseRows(Rows):
 
 
 class GramFactor(Protocol):
-    """GGᵀ = LLᵀ (r, r) of sparse, normalised rows G."""
+    """Factor of GGᵀ = LLᵀ (r, r) for sparse, normalised rows G."""
 
     def product(self, y: Vector) -> Vector:
         """Return GGᵀy."""
@@ -165,17 +165,17 @@ class GramFactor(Protocol):
         """Return L⁻ᵀa."""
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return solves with G_F G_Fᵀ + shift·GGᵀ."""
+        """Return the solution operator of G_F G_Fᵀ + shift·GGᵀ."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Whole:
-    """One factor of all rows; on several ranks the same on each."""
+    """Factor of all rows, replicated on every rank."""
 
     unit: SparseColumns  #: G
     matrix: csc_matrix  #: GGᵀ
     factor: Factor
-    bordered: _Bordered | None  #: None where most rows touch bounded components
+    bordered: _Bordered | None  #: None if most rows have bounded components
 
     def product(self, y: Vector) -> Vector:
         return np.asarray(self.matrix @ y)
@@ -196,21 +196,21 @@ class _Whole:
             try:
                 factor = self.factor.cholesky(with_int32(of_free + shift * self.matrix))
             except CholmodNotPositiveDefiniteError:
-                shift = min(100 * shift, 1.0)  # with 1 at last: GGᵀ has a factor
+                shift = min(100 * shift, 1.0)  # ends at 1, as GGᵀ has a factor
         return lambda t: np.asarray(factor(t))
 
 
 class OuterProducts(NamedTuple):
-    """The entries of gⱼgⱼᵀ for columns gⱼ (b,) of a sparse matrix."""
+    """Entries of gⱼgⱼᵀ for columns gⱼ (b,) of a sparse matrix."""
 
     size: int  #: b
-    place: NDArray[np.int64]  #: (e,) of each entry in (b, b), row by row
+    place: NDArray[np.int64]  #: (e,) flat index of each entry in (b, b)
     value: Vector  #: (e,)
-    column: NDArray[np.int64]  #: (e,) the j of each
+    column: NDArray[np.int64]  #: (e,) column j of each entry
 
     @classmethod
     def of(cls, G: csr_array, columns: Mask) -> OuterProducts:
-        """List those of some columns (n,) of G (b, n)."""
+        """List the entries for the masked columns (n,) of G (b, n)."""
         part = csc_array(G)[:, columns]
         entries = np.diff(part.indptr)[np.repeat(
             np.arange(part.shape[1]), np.diff(part.indptr)
@@ -224,24 +224,24 @@ class OuterProducts(NamedTuple):
         return cls(G.shape[0], place, part.data[left] * part.data[right], number)
 
     def summed(self, some: Mask) -> NDArray[np.float64]:
-        """Add them up for some of all columns (n,): (b, b)."""
+        """Return the sum of gⱼgⱼᵀ (b, b) over the masked columns (n,)."""
         value = np.where(some[self.column], self.value, 0.0)
-        found = np.bincount(self.place, value, self.size**2)
-        return np.asarray(found.reshape(self.size, self.size), dtype=float)
+        total = np.bincount(self.place, value, self.size**2)
+        return np.asarray(total.reshape(self.size, self.size), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
 class _OverRanks:
-    """Each rank has the rows that its columns touch, see `harness.distributed.factor`.
+    """Factor over ranks: each has the rows with entries in its columns.
 
-    What a face holds changes the rows that bounded components touch, the *changing*
-    ones.
+    See `harness.distributed.factor`. The *changing* rows are those with entries in
+    bounded components; active bounds of a face change their block of GGᵀ.
     """
 
-    matrix: csc_array  #: G_p G_pᵀ of the columns of this rank
+    matrix: csc_array  #: G_p G_pᵀ of the columns of rank p
     local: LocalFactor
     factor: SummedFactor
-    bounded: OuterProducts  #: of its bounded components, on the border
+    bounded: OuterProducts  #: of its bounded components, restricted to border rows
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
@@ -254,16 +254,16 @@ class _OverRanks:
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         with self.local.at.ranks.clocked("coarse"):
-            held = self.bounded.summed(~np.asarray(free))
-            return self.factor.shifted(shift, held)
+            active = self.bounded.summed(~np.asarray(free))
+            return self.factor.shifted(shift, active)
 
 
 @dataclass(frozen=True, eq=False)
 class _LocalRows:
-    """The rows of distributed columns that a rank touches: products are additive.
+    """Rows with entries in the columns of this rank; products are additive over ranks.
 
-    Held once, component by component. Both products then go along the components, and
-    jump about among the rows alone, which are few and stay in the cache.
+    Only Gᵀ is stored, by components. Both products then pass over the components in
+    order and access the rows, which are few, at random: these stay in the cache.
     """
 
     transposed: CompressedRows  #: (n_p, k)
@@ -271,7 +271,7 @@ class _LocalRows:
 
     @classmethod
     def of(cls, G: csc_array, ranks: Ranks) -> _LocalRows:
-        """Hold G (k, n_p)."""
+        """Store G (k, n_p)."""
         return cls(CompressedRows(G.T), ranks)
 
     @property
@@ -296,34 +296,34 @@ class _LocalRowsTransposed:
 
     def combined(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
         """Return sv + tGᵀy, in one pass."""
-        found = self.rows.transposed.combined(s, v, t, y)
-        return distributed(found, self.rows.ranks)
+        total = self.rows.transposed.combined(s, v, t, y)
+        return distributed(total, self.rows.ranks)
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
-        """Return v − Gᵀy times weights, in one pass."""
-        found = self.rows.transposed.weighted_difference(v, y, weights)
-        return distributed(found, self.rows.ranks)
+        """Return weights times (v − Gᵀy), in one pass."""
+        difference = self.rows.transposed.weighted_difference(v, y, weights)
+        return distributed(difference, self.rows.ranks)
 
 
 @dataclass(frozen=True, eq=False)
 class _Bordered:
-    """S = GGᵀ = LLᵀ with the rows c that bounded components touch last.
+    """Factor of S = GGᵀ = LLᵀ in which rows c with bounded components come last.
 
-    L_cc L_ccᵀ is the Schur complement of S on c, and that of (1 + κ)S − G_H G_Hᵀ with
-    held components H is (1 + κ)L_cc L_ccᵀ − (G_H G_Hᵀ)_cc.
+    L_cc L_ccᵀ is the Schur complement of S on c, and that of (1 + κ)S − G_H G_Hᵀ for
+    active components H is (1 + κ)L_cc L_ccᵀ − (G_H G_Hᵀ)_cc.
     """
 
-    order: NDArray[np.int64]  #: (r,) rows, those of c last
+    order: NDArray[np.int64]  #: (r,) permutation of the rows, c last
     factor: Factor  #: of S in that order
     L_cc: NDArray[np.float64]
-    #: held components H (n,) → (G_H G_Hᵀ)_cc
-    held: Callable[[Mask], NDArray[np.float64]]
+    #: mask H (n,) of active components → (G_H G_Hᵀ)_cc
+    active_block: Callable[[Mask], NDArray[np.float64]]
 
-    def solver(self, held: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return solves with (1 + shift)S − G_H G_Hᵀ."""
+    def solver(self, active: Mask, shift: float) -> Callable[[Vector], Vector]:
+        """Return the solution operator of (1 + shift)S − G_H G_Hᵀ, H = `active`."""
         L_cc, n = self.L_cc, self.order.size
         inner, scale = slice(0, n - len(L_cc)), 1 + shift
-        changed = scale * (L_cc @ L_cc.T) - self.held(held)
+        changed = scale * (L_cc @ L_cc.T) - self.active_block(active)
         schur = factor_above(changed, shift, L_cc), True
 
         def solve(t: Vector) -> Vector:
@@ -340,7 +340,7 @@ class _Bordered:
 def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
     last = _gram(unit, bounded).diagonal() > 0
     c, rest = np.flatnonzero(last), np.flatnonzero(~last)
-    if c.size > MOST_BORDER:
+    if c.size > MAX_BORDER:
         return None
     if rest.size:
         rest = rest[analyze(with_int32(gram[rest][:, rest]), use_long=False).P()]
@@ -352,14 +352,14 @@ def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered
     touching = unit[c]
     if isinstance(touching, DistributedColumns):
         return _Bordered(
-            order, factor, L_cc, lambda held: touching.gram(held).toarray()
+            order, factor, L_cc, lambda active: touching.gram(active).toarray()
         )
     return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
 
 
 @dataclass(frozen=True, eq=False)
 class _Factored:
-    """C = L⁻¹G of normalised rows G (r, n) with the Cholesky factor L of GGᵀ."""
+    """Operator C = L⁻¹G for normalised rows G (r, n), L the Cholesky factor of GGᵀ."""
 
     unit: SparseColumns
     gram: GramFactor
@@ -381,24 +381,24 @@ class _FactoredTransposed:
     C: _Factored
 
     def __matmul__(self, a: Vector) -> Vector:
-        found: Vector = self.C.unit.T @ self.C.gram.backward(a)
-        return found
+        product: Vector = self.C.unit.T @ self.C.gram.backward(a)
+        return product
 
 
 def is_sparse(G: Matrix) -> bool:
-    """Whether rows G (m, n) are too many to be held as an array."""
+    """Return True if rows G (m, n) are too many for an array."""
     if isinstance(G, DistributedColumns):
         return True
-    return bool(issparse(G) and G.shape[0] * G.shape[1] > MOST_DENSE)
+    return bool(issparse(G) and G.shape[0] * G.shape[1] > MAX_DENSE_ENTRIES)
 
 
 def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
-    """Orthonormalise the rows of G (m, n), as sparse ones where they are many.
+    """Orthonormalise the rows of G (m, n), by a sparse factor if they are many.
 
-    Rows that depend on each other are taken as dense ones. Where these are too many, or
-    on several ranks, as many of them as are independent stand for all.
+    Linearly dependent rows are treated as dense. If they are too many for that, or
+    distributed over ranks, a maximal independent subset replaces them.
 
-    bounded : (n,) components that have a bound
+    bounded : (n,) mask of components with a bound
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
@@ -415,18 +415,18 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
 
 
 def _factored(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
-    """Factorise GGᵀ; None where rows depend on each other."""
+    """Factorise GGᵀ; returns None for linearly dependent rows."""
     over_ranks = isinstance(G, DistributedColumns)
     return (rows_over_ranks if over_ranks else sparse_rows)(G, e, bounded)
 
 
 def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
-    """Take independent rows of G (m, n) for all of them; the others get no multiplier.
+    """Replace G (m, n) by independent rows; the multipliers of the others are zero.
 
     Raises
     ------
     ValueError
-        Where rounding hides which of them are independent.
+        If rounding hides which of the rows are independent.
 
     """
     gram = _gram(G)
@@ -450,13 +450,13 @@ def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
 
 
 def _consistent(missed: Vector, x_tilde: Vector, e: Vector) -> bool:
-    """Return whether rows of length one, missed by `missed` (m,), have a solution."""
+    """Return True if unit rows with the least-squares error `missed` are consistent."""
     scale = np.abs(x_tilde).max(initial=0.0) + np.abs(e).max(initial=0.0)
-    return bool((np.abs(missed) <= INCONSISTENT * scale).all())
+    return bool((np.abs(missed) <= CONSISTENCY_TOL * scale).all())
 
 
 def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
-    """Factorise GGᵀ of sparse G (m, n); None where rows depend on each other."""
+    """Factorise GGᵀ of sparse G (m, n); returns None for linearly dependent rows."""
     size = np.sqrt(_gram(G).diagonal())
     if not (size > 0).all():
         return None
@@ -467,7 +467,7 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
         factor.cholesky_inplace(gram)
     except CholmodNotPositiveDefiniteError:
         return None
-    least = float(factor.D().min())  # pivots may be negative, too
+    least = float(factor.D().min())  # CHOLMOD accepts negative pivots
     if least <= RANK:
         return None
     b = np.flatnonzero(np.asarray(bounded))
@@ -484,9 +484,9 @@ def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None
 def rows_over_ranks(
     G: DistributedColumns, e: Vector, bounded: Mask
 ) -> SparseRows | None:
-    """Factorise GGᵀ of G (m, n) rank by rank; None where rows depend on each other.
+    """Factorise GGᵀ of G (m, n) over ranks; returns None for linearly dependent rows.
 
-    e : (m,) the same on all ranks
+    e : (m,) replicated on all ranks
     """
     ranks, part = G.ranks, G.part
     size = np.sqrt(ranks.total(part.power(2).sum(axis=1)))
@@ -527,7 +527,7 @@ def rows_over_ranks(
 
 
 def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
-    """Return G_F G_Fᵀ of the columns F (n,), or of all."""
+    """Return G_F G_Fᵀ for the columns F (n,), by default all."""
     if isinstance(G, DistributedColumns):
         return G.gram(columns)
     part = G if columns is None else G[:, np.flatnonzero(columns)]
@@ -535,25 +535,25 @@ def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
 
 
 def _columns(G: SparseColumns, at: NDArray[np.int64]) -> SparseColumns:
-    """Return some of the columns."""
+    """Return the columns `at`."""
     if isinstance(G, DistributedColumns):
         return DistributedColumns(csr_array(G.part[:, at]), G.ranks)
     return csr_array(G[:, at])
 
 
 def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
-    """Multiply row i with s[i]."""
+    """Multiply row i by s[i]."""
     if isinstance(G, DistributedColumns):
         return G.scaled(s)
     return csr_array(diags_array(s) @ G)
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
-    """Find C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
+    """Compute C by a pivoted QR factorisation of the normalised rows of G (m, n)."""
     if not e.size:
         return _no_rows(G.shape[1])
-    found, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))
-    dense, C, GC, e_size, least_pivot, x_tilde, consistent = found
+    rows, triangle = compiled.orthonormal(as_dense(G), np.ascontiguousarray(e, float))
+    dense, C, GC, e_size, least_pivot, x_tilde, consistent = rows
     multipliers = partial(compiled.multipliers, e.size, *triangle)
     return DenseRows(
         dense, C, e_size, least_pivot, x_tilde, consistent, multipliers, GC
@@ -572,7 +572,7 @@ def _themselves(a: Vector) -> Vector:
 
 
 def as_dense(G: Matrix) -> NDArray[np.float64]:
-    """Return a matrix as an array, row by row."""
+    """Return a matrix as a C-contiguous array."""
     if not G.shape[0]:
         return np.zeros(G.shape)
     dense = G.toarray() if hasattr(G, "toarray") else G

@@ -7,13 +7,13 @@ reference [3], Chapter 6; equation (2) of the paper).
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.
-4. The outer loop (outer.pxi) over MPRGP (mprgp.pxi). Without equalities one run of
-   MPRGP is left.
+4. Run the outer loop (outer.pxi) over MPRGP (mprgp.pxi); without equality rows this is
+   one run of MPRGP.
 
-What is ours: the Lanczos process that finds the norm finds the upper Ritz pairs too.
-With them and with C it gives a model of H (model.pxi), which serves three times: for
-steps that change the face, as preconditioner in the face, and to make a large ρ
-harmless. The presets are the methods as others run them.
+New in this implementation: the Lanczos process that estimates the norm also yields the
+upper Ritz pairs. These and C define a model of H (model.pxi) with three uses: steps
+that change the face, a preconditioner in the face, and a large ρ without loss of
+conditioning. The presets reproduce the methods of other codes.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from typing import ClassVar
 from mortarbench.harness import QP, About, Solution
 from mortarbench.solvers.smalbe.driver import Carry, prepared
 from mortarbench.solvers.smalbe.options import Options
-from mortarbench.solvers.smalbe.preconditioner import lacking
+from mortarbench.solvers.smalbe.preconditioner import missing_data
 
 
 @dataclass(frozen=True)
 class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equalities; needs only products with P.
 
-    `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. A point is claimed
-    solved only if its KKT residuals on the original problem are within 5·tol as well.
+    `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. The solver claims
+    success only if the KKT residuals of the original QP are within 5·tol as well.
     """
 
     about: ClassVar[About] = About(
@@ -55,7 +55,7 @@ class SMALBE(Options):
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
             return "takes bounds and equality rows, no inequality rows"
-        return lacking(qp, self.preconditioner)
+        return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         solve = prepared(qp, tol, self, None, eliminate=self.eliminate == "always")
@@ -66,7 +66,11 @@ class SMALBE(Options):
         return lambda qp: prepare(qp, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
-        """Begin a sequence, warm: with points, multipliers, Ritz pairs and factors."""
+        """Start a sequence in which each QP passes its results on to the next.
+
+        Passed on are the point, multipliers, Ritz pairs and the factor of the free
+        block.
+        """
         carry: Carry | None = None
 
         def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
@@ -84,23 +88,24 @@ class SMALBE(Options):
         return prepare
 
 
-#: PERMON's constants and step rules (notes in docs/performance.md): MPRGP with its
-#: standard expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
+#: constants and step rules of PERMON (docs/performance.md): MPRGP with the standard
+#: expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
 PERMON = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,
     reduced=False, alpha=2.0, norm="power", eliminate="never", energy=0.0,
     recycle=False,
 )  # fmt: skip
 
-#: ESPRESO's: projected CG steps with a check of the cost, gradient projection as
-#: proportioning, everything relative to ‖𝒫F𝒫‖
+#: those of ESPRESO: projected CG steps with a check of the cost, gradient projection as
+#: proportioning, all constants relative to ‖𝒫F𝒫‖
 ESPRESO = SMALBE(
     expansion="mixed", proportioning="model", preconditioner="none", rho=1.0,
     beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never", energy=0.0,
     recycle=False,
 )  # fmt: skip
 
-#: the textbook's (the paper's reference [3]): Γ = 1, reduced free gradient, fixed ᾱ
+#: those of the textbook (the paper's reference [3]): Γ = 1, reduced free gradient,
+#: fixed ᾱ
 PAPER = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.0,
     eliminate="never", energy=0.0, recycle=False,

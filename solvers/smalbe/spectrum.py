@@ -16,29 +16,30 @@ class Ritz(NamedTuple):
     """Ritz pairs, in descending order of their values."""
 
     values: Vector  #: (k,)
-    residuals: Vector  #: (k,) ‖Hv − θv‖: an eigenvalue lies that near to θ
-    #: (k, n) orthonormal rows; (0, n) where the compiled process found no first pair
+    residuals: Vector  #: (k,) ‖Hv − θv‖, the largest distance of θ from an eigenvalue
+    #: (k, n) orthonormal rows; (0, n) if the first pair has not converged
     vectors: NDArray[np.float64]
-    at_start: float  #: vᵀHv/‖v‖² of the start vector
+    at_start: float  #: Rayleigh quotient of the start vector
 
     @property
     def norm(self) -> float:
-        """θ₁ and its residual: an upper bound for the eigenvalue that θ₁ approaches."""
+        """θ₁ plus its residual, an upper bound of the eigenvalue near θ₁."""
         return float(self.values[0] + self.residuals[0])
 
 
 @lru_cache(maxsize=8)
 def random_start(n: int) -> Vector:
-    """Draw the same vector (n,) every time: no answer may depend on luck."""
+    """Return a fixed random vector (n,): results must be reproducible."""
     start = np.random.default_rng(19640229).standard_normal(n)
     start.flags.writeable = False
     return start
 
 
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:
-    """Estimate ‖H‖ as PERMON does: from ones, to 1e-4, at most 50 products.
+    """Estimate ‖H‖ by PERMON's power method: from ones, to 1e-4, at most 50 products.
 
-    The Rayleigh quotient stays below ‖H‖; there is no safety factor.
+    The Rayleigh quotient is a lower bound of ‖H‖; like PERMON, no safety factor is
+    used.
     """
     v = np.full(n, 1 / np.sqrt(n))
     estimate = 0.0

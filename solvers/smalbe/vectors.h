@@ -1,8 +1,8 @@
-/* The loops over vectors of MPRGP (`solvers/smalbe/kernels.py` has them in NumPy).
+/* Loops over vectors of MPRGP (`tests/support/textbook/kernels.py` has them in NumPy).
 
-   Compiled twice, for processors with AVX2 and FMA and for all others; which one runs is
-   decided when the module is loaded. Selections are written as expressions, so that the
-   compiler can do four components at once. */
+   Each function is compiled twice, for processors with AVX2 and FMA and for all others;
+   the loader chooses. Selections are written as expressions, so that the compiler can
+   process four components at once. */
 
 #include <limits.h>
 #include <math.h>
@@ -22,8 +22,8 @@
 typedef const double *restrict in;
 typedef double *restrict out;
 
-/* Four components at once; what the compiler makes of the loops below on its own is not
-   as fast where several sums are taken in one pass. */
+/* Four components at once. Written out, because the vectoriser of the compiler produces
+   slower code for loops that accumulate several sums in one pass. */
 typedef double __attribute__((vector_size(32), aligned(8), may_alias)) four;
 #define FOUR(a) (*(const four *) (a))
 #define EACH(s) ((four){(s), (s), (s), (s)})
@@ -44,7 +44,7 @@ typedef struct {
     const double *data, *diagonals;
 } sparse;
 
-enum { MOST_DIAGONALS = 16 };
+enum { MAX_DIAGONALS = 16 };
 
 /* y = s (f₁w₁ + f₂w₂ + …), componentwise. */
 INLINE void
@@ -79,8 +79,8 @@ INLINE void
 rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, in v,
                   out y)
 {
-    const double *f[2 * MOST_DIAGONALS], *w[2 * MOST_DIAGONALS];
-    Py_ssize_t from[2 * MOST_DIAGONALS], to[2 * MOST_DIAGONALS];
+    const double *f[2 * MAX_DIAGONALS], *w[2 * MAX_DIAGONALS];
+    Py_ssize_t from[2 * MAX_DIAGONALS], to[2 * MAX_DIAGONALS];
     Py_ssize_t terms = 0, size = last - first, missing = 0;
     for (Py_ssize_t d = 1 - F->count; d < F->count; d++) {
         Py_ssize_t o = F->offset[d < 0 ? -d : d], shift = d < 0 ? -o : o;
@@ -101,7 +101,7 @@ rows_by_diagonals(const sparse *F, Py_ssize_t first, Py_ssize_t last, double s, 
                 y[j] += s * f[t][j] * w[t][j];
         return;
     }
-    switch (terms) { /* the number of terms known, the loop over them is none */
+    switch (terms) { /* with a constant number of terms the inner loop unrolls */
     case 3: sum_of_terms(f, w, 3, s, y, size); break;
     case 5: sum_of_terms(f, w, 5, s, y, size); break;
     case 9: sum_of_terms(f, w, 9, s, y, size); break;
@@ -134,14 +134,14 @@ TWICE static void sparse_product(const sparse *F, double s, in v, out y)
         some_rows(F, i, i + BLOCK < F->n ? i + BLOCK : F->n, s, v, y + i);
 }
 
-/* How far from row i the columns of its entries are at most. */
+/* Half bandwidth: the largest |i − j| with F[i, j] ≠ 0, or n if F is stored by rows. */
 INLINE Py_ssize_t reach(const sparse *F)
 {
     return F->count ? F->offset[F->count - 1] : F->n;
 }
 
 /* p = φ − γp with φ = g on free components, zero on others; returns φᵀp. */
-INLINE double turn_block(in g, in free, double gamma, out p, Py_ssize_t n)
+INLINE double direction_block(in g, in free, double gamma, out p, Py_ssize_t n)
 {
     double slope = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -152,30 +152,30 @@ INLINE double turn_block(in g, in free, double gamma, out p, Py_ssize_t n)
     return slope;
 }
 
-TWICE static double turn_freely(in g, in free, double gamma, out p, Py_ssize_t n)
+TWICE static double update_free_direction(in g, in free, double gamma, out p, Py_ssize_t n)
 {
-    return turn_block(g, free, gamma, p, n);
+    return direction_block(g, free, gamma, p, n);
 }
 
-/* `turn_freely`, then Hp = s F p, in one go through memory; told = φᵀp, pᵀHp. */
-TWICE static void sparse_turn_freely(const sparse *F, double s, in g, in free,
-                                     double gamma, out p, out Hp, out told)
+/* `update_free_direction`, then Hp = s F p, in one go through memory; result = φᵀp, pᵀHp. */
+TWICE static void sparse_update_free_direction(const sparse *F, double s, in g, in free,
+                                     double gamma, out p, out Hp, out result)
 {
-    Py_ssize_t n = F->n, turned = 0;
-    told[0] = told[1] = 0;
+    Py_ssize_t n = F->n, updated = 0;
+    result[0] = result[1] = 0;
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
         Py_ssize_t last = i + BLOCK < n ? i + BLOCK : n;
         Py_ssize_t to = last + reach(F) < n ? last + reach(F) : n;
-        told[0] += turn_block(g + turned, free + turned, gamma, p + turned, to - turned);
-        turned = to;
+        result[0] += direction_block(g + updated, free + updated, gamma, p + updated, to - updated);
+        updated = to;
         some_rows(F, i, last, s, p, Hp + i);
         for (Py_ssize_t j = i; j < last; j++)
-            told[1] += p[j] * Hp[j];
+            result[1] += p[j] * Hp[j];
     }
 }
 
-/* Find the diagonals of F by its rows: their offsets, as many as there are, 0 where more
-   than `most`. slot (n,) is room. */
+/* Write the offsets of the nonzero diagonals of F and return their number, or 0 if
+   there are more than `most`. slot (n,) is workspace. */
 static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *offset,
                                  signed char *slot)
 {
@@ -202,7 +202,7 @@ static Py_ssize_t find_diagonals(const sparse *F, Py_ssize_t most, Py_ssize_t *o
     return count;
 }
 
-/* diagonals (count, n), zeros at first, with the slots that `find_diagonals` left. */
+/* Fill diagonals (count, n), initially zero, by the slots that `find_diagonals` wrote. */
 static void fill_diagonals(const sparse *F, const signed char *slot, double *diagonals)
 {
     for (Py_ssize_t i = 0; i < F->n; i++)
@@ -287,7 +287,7 @@ TWICE static double scale_free(double s, in free, in v, out z, Py_ssize_t n)
     return along;
 }
 
-/* Whether a and b have the same components. */
+/* Return 1 if a and b have the same components, else 0. */
 TWICE static int same(in a, in b, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
@@ -331,7 +331,7 @@ TWICE static void rows_times(in U, in v, out c, Py_ssize_t k, Py_ssize_t n)
     for (; i + 8 <= k; i += 8)
         some_rows_times(U + i * n, v, c + i, 8, n);
     U += i * n, c += i;
-    switch (k - i) { /* the number of rows known, the loop over them is none */
+    switch (k - i) { /* with a constant number of rows the inner loop unrolls */
     case 1: some_rows_times(U, v, c, 1, n); break;
     case 2: some_rows_times(U, v, c, 2, n); break;
     case 3: some_rows_times(U, v, c, 3, n); break;
@@ -375,7 +375,7 @@ TWICE static void combination(double s, in U, in c, const double *v, double *y,
         in V = U + (last - rows) * n;
         for (Py_ssize_t j = 0; j < rows; j++)
             sc[j] = s * c[last - rows + j];
-        switch (rows) { /* the number of rows known, the loop over them is none */
+        switch (rows) { /* with a constant number of rows the inner loop unrolls */
         case 1: add_rows(V, sc, v, y, 1, n); break;
         case 2: add_rows(V, sc, v, y, 2, n); break;
         case 3: add_rows(V, sc, v, y, 3, n); break;
@@ -402,14 +402,13 @@ typedef long long __attribute__((vector_size(32))) mask;
 #define ABSOLUTE(a) \
     ((four) ((mask) (a) & (mask){LLONG_MAX, LLONG_MAX, LLONG_MAX, LLONG_MAX}))
 
-/* What a step x - αp meets in a block: the α at which it is on the first bound, where
-   that is below `least`; pᵀHp and gᵀp are added to told[3] and told[2], unless that is
-   NULL.
+/* Return the α at which x - αp reaches the first bound within a block, or `least` if that
+   is smaller. Adds pᵀHp to result[3] and gᵀp to result[2] unless result is NULL.
 
-   Few blocks have a component that is on its bound before the first of those before:
-   whether one is needs no division. */
+   Most blocks reach no bound before α = `least`. The test for this needs no division, so
+   divisions are left to the few blocks that pass it. */
 INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
-                            double least, out told)
+                            double least, out result)
 {
     four zero = EACH(0), curvature = zero, slope = zero, most = EACH(least);
     mask nearer = (mask) zero;
@@ -423,17 +422,17 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
         } else {
             nearer |= (room < most * q) & (q > zero);
         }
-        if (told) {
+        if (result) {
             curvature += q * FOUR(Hp + j);
             slope += q * FOUR(g + j);
         }
     }
-    if (told) {
-        told[3] += total(curvature);
-        told[2] += total(slope);
+    if (result) {
+        result[3] += total(curvature);
+        result[2] += total(slope);
         for (Py_ssize_t j = whole; j < n; j++) {
-            told[3] += p[j] * Hp[j];
-            told[2] += g[j] * p[j];
+            result[3] += p[j] * Hp[j];
+            result[2] += g[j] * p[j];
         }
     }
     Py_ssize_t from = nearer[0] | nearer[1] | nearer[2] | nearer[3] ? 0 : whole;
@@ -455,7 +454,7 @@ INLINE double lengths_block(in x, in g, in p, in Hp, in lower, in upper, Py_ssiz
 
 /* p = φ − γp with the free gradient φ at x. */
 INLINE void
-turn_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
+update_direction_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
 {
     four length = EACH(gamma);
     Py_ssize_t i = 0;
@@ -471,30 +470,30 @@ turn_at(in x, in g, in lower, in upper, double gamma, out p, Py_ssize_t n)
     }
 }
 
-/* α of x - αp: told = the minimising, the largest feasible, gᵀp, pᵀHp. Hp = s F p is found
-   first, in the same go through memory; and before, where p is `turning`, p = φ − γp, as
-   far as the product needs it. */
-INLINE void find_lengths(const sparse *F, double s, int turning, double gamma, in x,
+/* result = α_cg, α_f, gᵀp, pᵀHp of the line x - αp. Each block of Hp = s F p is computed
+   in the same pass over memory; if `is_update`, p = φ − γp is computed ahead of it, as far
+   as the product reads p. */
+INLINE void find_lengths(const sparse *F, double s, int is_update, double gamma, in x,
                          in g, double *p, out Hp, in lower, in upper, Py_ssize_t n,
-                         out told)
+                         out result)
 {
     double feasible = INFINITY;
-    Py_ssize_t turned = 0;
-    told[2] = told[3] = 0;
+    Py_ssize_t updated = 0;
+    result[2] = result[3] = 0;
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
         Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
-        if (turning) {
+        if (is_update) {
             Py_ssize_t to = i + size + reach(F) < n ? i + size + reach(F) : n;
-            turn_at(x + turned, g + turned, lower + turned, upper ? upper + turned : NULL,
-                    gamma, p + turned, to - turned);
-            turned = to;
+            update_direction_at(x + updated, g + updated, lower + updated, upper ? upper + updated : NULL,
+                    gamma, p + updated, to - updated);
+            updated = to;
         }
         some_rows(F, i, i + size, s, p, Hp + i);
         feasible = lengths_block(x + i, g + i, p + i, Hp + i, lower + i,
-                                 upper ? upper + i : NULL, size, feasible, told);
+                                 upper ? upper + i : NULL, size, feasible, result);
     }
-    told[0] = told[3] > 0 ? told[2] / told[3] : INFINITY;
-    told[1] = feasible;
+    result[0] = result[3] > 0 ? result[2] / result[3] : INFINITY;
+    result[1] = feasible;
 }
 
 INLINE double first_of_blocks(in x, in p, in lower, in upper, double least, Py_ssize_t n)
@@ -511,53 +510,52 @@ INLINE double first_of_blocks(in x, in p, in lower, in upper, double least, Py_s
     return least;
 }
 
-/* The α at which x - αp meets its first bound; inf where it meets none.
+/* Return the α at which x - αp reaches its first bound; inf if it reaches none.
 
-   upper : NULL where no component has a bound above */
+   upper : NULL if no component has an upper bound */
 TWICE static double first_bound(in x, in p, in lower, in upper, Py_ssize_t n)
 {
     return first_of_blocks(x, p, lower, upper, INFINITY, n);
 }
 
-/* α of x - αp: told = the minimising, the largest feasible where that is less, else inf,
-   gᵀp, pᵀHp.
+/* result = α_cg, α_f if that is smaller than α_cg, else inf, gᵀp, pᵀHp of x - αp.
 
-   upper : NULL where no component has a bound above */
+   upper : NULL if no component has an upper bound */
 TWICE static void lengths(in x, in g, in p, in Hp, in lower, in upper, Py_ssize_t n,
-                          out told)
+                          out result)
 {
     double slope = 0, curvature = 0, feasible;
     for (Py_ssize_t i = 0; i < n; i++) {
         slope += g[i] * p[i];
         curvature += p[i] * Hp[i];
     }
-    told[0] = curvature > 0 ? slope / curvature : INFINITY;
-    feasible = first_of_blocks(x, p, lower, upper, told[0], n);
-    told[1] = feasible < told[0] ? feasible : INFINITY;
-    told[2] = slope;
-    told[3] = curvature;
+    result[0] = curvature > 0 ? slope / curvature : INFINITY;
+    feasible = first_of_blocks(x, p, lower, upper, result[0], n);
+    result[1] = feasible < result[0] ? feasible : INFINITY;
+    result[2] = slope;
+    result[3] = curvature;
 }
 
 TWICE static void sparse_lengths(const sparse *F, double s, in x, in g, double *p,
-                                 out Hp, in lower, in upper, out told)
+                                 out Hp, in lower, in upper, out result)
 {
     if (upper)
-        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, upper, F->n, told);
+        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, upper, F->n, result);
     else
-        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, NULL, F->n, told);
+        find_lengths(F, s, 0, 0, x, g, p, Hp, lower, NULL, F->n, result);
 }
 
 /* p = φ − γp with the free gradient φ at x, and the `sparse_lengths` along it. */
-TWICE static void sparse_turn(const sparse *F, double s, double gamma, in x, in g,
-                              double *p, out Hp, in lower, in upper, out told)
+TWICE static void sparse_update_direction(const sparse *F, double s, double gamma, in x, in g,
+                              double *p, out Hp, in lower, in upper, out result)
 {
     if (upper)
-        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, upper, F->n, told);
+        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, upper, F->n, result);
     else
-        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, told);
+        find_lengths(F, s, 1, gamma, x, g, p, Hp, lower, NULL, F->n, result);
 }
 
-/* Where x - s is; on the bound that is nearer than rounding. */
+/* Return x - step, or the bound if that is within rounding of it. */
 INLINE double moved(double x, double step, double lower, double upper)
 {
     double to = x - step, noise = ROUNDING * (fabs(x) + fabs(step));
@@ -576,10 +574,10 @@ move_block(double alpha, out x, out g, in p, in Hp, in lower, in upper, Py_ssize
     }
 }
 
-/* Adds to told, which begins as zeros. */
+/* `split` for a block; adds to result. */
 INLINE void
 split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ssize_t n,
-            out told)
+            out result)
 {
     double phi_square = 0, beta_square = 0, reduced = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -597,45 +595,46 @@ split_block(in x, in g, in lower, in upper, double tau, out phi, out free, Py_ss
         beta_square += b * b;
         reduced += cut * f;
     }
-    told[0] += phi_square;
-    told[1] += beta_square;
-    told[2] += reduced;
+    result[0] += phi_square;
+    result[1] += beta_square;
+    result[2] += reduced;
 }
 
-/* x = x - αp and g = g - αHp, what is nearer to a bound than rounding on it; x₀, g₀ and
-   `free` (1, others 0) as they were before. The box of the step that follows, where
-   components on a bound are held there unless it may `release` them; z = x - βp and its
-   gradient. */
-TWICE static void leave(double alpha, double beta, int release, out x, out g, in p, in Hp,
+/* x = x - αp and g = g - αHp; components within rounding of a bound are set to it. x₀,
+   g₀ and `free` (1 on the face, else 0) receive the state before. box_lower, box_upper:
+   the box of the next step, which fixes components on a bound unless `release`. z = x - βp
+   and its gradient z_g. */
+TWICE static void leave_box(double alpha, double beta, int release, out x, out g, in p, in Hp,
                         in lower, in upper, out x0, out g0, out free, out box_lower,
                         out box_upper, out z, out z_g, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
         double low = lower[i], high = upper[i], was = x[i], push = g[i];
         double to = moved(was, alpha * p[i], low, high), now = push - alpha * Hp[i];
-        int held = ((to <= low) | (to >= high)) & !release;
+        int is_active = ((to <= low) | (to >= high)) & !release;
         x0[i] = was;
         g0[i] = push;
         free[i] = (was > low) & (was < high) ? 1.0 : 0.0;
         x[i] = to;
         g[i] = now;
-        box_lower[i] = held ? to : low;
-        box_upper[i] = held ? to : high;
+        box_lower[i] = is_active ? to : low;
+        box_upper[i] = is_active ? to : high;
         z[i] = to - beta * p[i];
         z_g[i] = now - beta * Hp[i];
     }
 }
 
-/* φ, free components (1, others 0); told = ‖φ‖², ‖β‖², φ̃ᵀφ with ᾱ = 1/τ. */
+/* Compute φ and `free` (1 on free components, else 0); result = ‖φ‖², ‖β‖², φ̃ᵀφ with
+   ᾱ = 1/τ. */
 TWICE static void split(in x, in g, in lower, in upper, double tau, out phi, out free,
-                        Py_ssize_t n, out told)
+                        Py_ssize_t n, out result)
 {
-    told[0] = told[1] = told[2] = 0;
-    split_block(x, g, lower, upper, tau, phi, free, n, told);
+    result[0] = result[1] = result[2] = 0;
+    split_block(x, g, lower, upper, tau, phi, free, n, result);
 }
 
 INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upper,
-                       double tau, out phi, out free, Py_ssize_t n, out told)
+                       double tau, out phi, out free, Py_ssize_t n, out result)
 {
     four zero = EACH(0), phi_square = zero, beta_square = zero, reduced = zero;
     four phi_Hp = zero, length = EACH(alpha), rounding = EACH(ROUNDING), t = EACH(tau);
@@ -675,36 +674,36 @@ INLINE void advance_by(double alpha, out x, out g, in p, in Hp, in lower, in upp
         reduced += cut * f;
         phi_Hp += f * FOUR(Hp + i);
     }
-    told[0] = total(phi_square);
-    told[1] = total(beta_square);
-    told[2] = total(reduced);
-    told[3] = total(phi_Hp);
+    result[0] = total(phi_square);
+    result[1] = total(beta_square);
+    result[2] = total(reduced);
+    result[3] = total(phi_Hp);
     for (Py_ssize_t i = whole; i < n; i++) {
         double above = upper ? upper[i] : INFINITY, f, inside;
         move_block(alpha, x + i, g + i, p + i, Hp + i, lower + i, &above, 1);
-        split_block(x + i, g + i, lower + i, &above, tau, &f, &inside, 1, told);
-        told[3] += f * Hp[i];
+        split_block(x + i, g + i, lower + i, &above, tau, &f, &inside, 1, result);
+        result[3] += f * Hp[i];
         if (phi)
             phi[i] = f, free[i] = inside;
     }
 }
 
-/* x = x - αp and g = g - αHp, what is nearer to a bound than rounding on it, and what
-   `split` does, in one go through memory; told[3] = φᵀHp.
+/* x = x - αp and g = g - αHp, components within rounding of a bound set to it, and
+   `split`, in one pass over memory; result[3] = φᵀHp.
 
-   upper : NULL where no component has a bound above
-   phi, free : NULL where they are not asked for */
+   upper : NULL if no component has an upper bound
+   phi, free : NULL if not needed */
 TWICE static void advance(double alpha, out x, out g, in p, in Hp, in lower, in upper,
-                          double tau, out phi, out free, Py_ssize_t n, out told)
+                          double tau, out phi, out free, Py_ssize_t n, out result)
 {
     if (upper && phi)
-        advance_by(alpha, x, g, p, Hp, lower, upper, tau, phi, free, n, told);
+        advance_by(alpha, x, g, p, Hp, lower, upper, tau, phi, free, n, result);
     else if (phi)
-        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, phi, free, n, told);
+        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, phi, free, n, result);
     else if (upper)
-        advance_by(alpha, x, g, p, Hp, lower, upper, tau, NULL, NULL, n, told);
+        advance_by(alpha, x, g, p, Hp, lower, upper, tau, NULL, NULL, n, result);
     else
-        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, NULL, NULL, n, told);
+        advance_by(alpha, x, g, p, Hp, lower, NULL, tau, NULL, NULL, n, result);
 }
 
 INLINE double within_block(in x, in from, in g, in lower, in upper, int release, out s,
@@ -714,26 +713,26 @@ INLINE double within_block(in x, in from, in g, in lower, in upper, int release,
     for (Py_ssize_t i = 0; i < n; i++) {
         double to = x[i] + s[i], noise = ROUNDING * (fabs(x[i]) + fabs(s[i]));
         int down = to - lower[i] <= noise, up = upper[i] - to <= noise;
-        int held = (lower[i] == upper[i]) & !release;
+        int is_active = (lower[i] == upper[i]) & !release;
         to = up ? upper[i] : to;
         to = (down ? lower[i] : to) - from[i];
-        s[i] = held ? 0.0 : to;
+        s[i] = is_active ? 0.0 : to;
         slope += g[i] * s[i];
     }
     return slope;
 }
 
-/* s = x + s - from, where x + s is in the box up to rounding, and on bounds that it
-   reaches; zero where the box leaves no choice, unless that is a `release`. Returns gᵀs. */
+/* s = x + s - from, with x + s set to a bound within rounding of it; zero on components
+   that the box fixes, unless `release`. Returns gᵀs. */
 TWICE static double within(in x, in from, in g, in lower, in upper, int release, out s,
                            Py_ssize_t n)
 {
     return within_block(x, from, g, lower, upper, release, s, n);
 }
 
-/* r = x - s - z and its product Hr = g - Hs - z_g; z = r; told = ‖r‖², rᵀHr. */
+/* r = x - s - z and its product Hr = g - Hs - z_g; z = r; result = ‖r‖², rᵀHr. */
 TWICE static void rest_of_step(in x, in g, in s, in Hs, in z_g, out z, Py_ssize_t n,
-                               out told)
+                               out result)
 {
     double square = 0, curvature = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -742,12 +741,12 @@ TWICE static void rest_of_step(in x, in g, in s, in Hs, in z_g, out z, Py_ssize_
         curvature += r * (g[i] - Hs[i] - z_g[i]);
         z[i] = r;
     }
-    told[0] = square;
-    told[1] = curvature;
+    result[0] = square;
+    result[1] = curvature;
 }
 
 /* p = z - γp; returns zᵀp. */
-TWICE static double turn(in z, double gamma, out p, Py_ssize_t n)
+TWICE static double update_direction(in z, double gamma, out p, Py_ssize_t n)
 {
     double slope = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -757,9 +756,9 @@ TWICE static double turn(in z, double gamma, out p, Py_ssize_t n)
     return slope;
 }
 
-/* x = x - αp and g = g - αHp on a face without bounds; told = ‖φ‖², φᵀHp. */
+/* x = x - αp and g = g - αHp on a face without bounds; result = ‖φ‖², φᵀHp. */
 TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in free,
-                                 Py_ssize_t n, out told)
+                                 Py_ssize_t n, out result)
 {
     double phi_square = 0, phi_Hp = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -770,11 +769,11 @@ TWICE static void advance_freely(double alpha, out x, out g, in p, in Hp, in fre
         phi_square += f * f;
         phi_Hp += f * Hp[i];
     }
-    told[0] = phi_square;
-    told[1] = phi_Hp;
+    result[0] = phi_square;
+    result[1] = phi_Hp;
 }
 
-/* Uᵀ by rows of `stride` numbers, those from column k on as they are. */
+/* columns = Uᵀ, stored with `stride` numbers per row; entries from k on are untouched. */
 TWICE static void transposed(in U, out columns, Py_ssize_t k, Py_ssize_t n,
                              Py_ssize_t stride)
 {
@@ -802,24 +801,24 @@ TWICE static void add_gram(in s, in V, const int *restrict row, out S, Py_ssize_
     }
 }
 
-/* The components where held (1, others 0) is not that piece differs from zero: how many,
-   and which; held changes there. */
-TWICE static Py_ssize_t changed(in piece, out held, Py_ssize_t n, int *restrict where)
+/* Write to `where` the components at which is_active (1 or 0) differs from piece ≠ 0, and
+   update is_active; returns their number. */
+TWICE static Py_ssize_t changed(in piece, out is_active, Py_ssize_t n, int *restrict where)
 {
     Py_ssize_t count = 0;
     four zero = EACH(0);
     for (Py_ssize_t i = 0; i < n; i += 8) {
         if (i + 8 <= n) { /* few blocks have any */
-            mask other = ((FOUR(piece + i) != zero) ^ (FOUR(held + i) != zero))
-                         | ((FOUR(piece + i + 4) != zero) ^ (FOUR(held + i + 4) != zero));
+            mask other = ((FOUR(piece + i) != zero) ^ (FOUR(is_active + i) != zero))
+                         | ((FOUR(piece + i + 4) != zero) ^ (FOUR(is_active + i + 4) != zero));
             if (!(other[0] | other[1] | other[2] | other[3]))
                 continue;
         }
         for (Py_ssize_t j = i; j < n && j < i + 8; j++) {
             double now = piece[j] != 0 ? 1.0 : 0.0;
             where[count] = (int) j;
-            count += held[j] != now;
-            held[j] = now;
+            count += is_active[j] != now;
+            is_active[j] = now;
         }
     }
     return count;
@@ -849,7 +848,7 @@ TWICE static int eliminated(double *S, double *inverse, Py_ssize_t k, Py_ssize_t
             return 0;
         inverse[i] = 1 / r[i];
         for (Py_ssize_t j = i & ~(Py_ssize_t) 3; j < i; j++)
-            r[j] = 0; /* means nothing, and would grow from face to face */
+            r[j] = 0; /* not part of R, and would grow from face to face */
         for (Py_ssize_t j = i + 1; j < k; j++) {
             four s = EACH(r[j] * inverse[i]);
             for (Py_ssize_t l = j & ~(Py_ssize_t) 3; l < stride; l += 4)
@@ -898,7 +897,7 @@ TWICE static void solve(const double *R, const double *inverse, double *y,
     }
 }
 
-INLINE void tilted_block(in x, in g, double tau, in lower, in upper, out s, out piece,
+INLINE void model_minimiser_block(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
     double length = 1 / tau;
@@ -914,26 +913,26 @@ INLINE void tilted_block(in x, in g, double tau, in lower, in upper, out s, out 
     }
 }
 
-/* Minimise gᵀs + τ/2‖s‖² over the box; piece: -1 at the lower bound, 1 at the upper;
-   NULL where it is not asked for. */
-TWICE static void tilted(in x, in g, double tau, in lower, in upper, out s, out piece,
+/* s = argmin gᵀs + τ/2‖s‖² over the box; piece: -1 at the lower bound, 1 at the upper, 0
+   between; NULL if not needed. */
+TWICE static void model_minimiser(in x, in g, double tau, in lower, in upper, out s, out piece,
                          Py_ssize_t n)
 {
     if (piece)
-        tilted_block(x, g, tau, lower, upper, s, piece, n);
+        model_minimiser_block(x, g, tau, lower, upper, s, piece, n);
     else
-        tilted_block(x, g, tau, lower, upper, s, NULL, n);
+        model_minimiser_block(x, g, tau, lower, upper, s, NULL, n);
 }
 
-/* `tilted` from x, then `within`, in one go through memory. Returns the latter's gᵀs, g at
-   `from`. */
-TWICE static double tilted_within(in x, in x_g, double tau, in from, in g, in lower,
+/* `model_minimiser` from x, then `within`, in one pass over memory. Returns gᵀs with the
+   gradient g at `from`. */
+TWICE static double model_minimiser_within(in x, in x_g, double tau, in from, in g, in lower,
                                   in upper, out s, Py_ssize_t n)
 {
     double slope = 0;
     for (Py_ssize_t i = 0; i < n; i += BLOCK) {
         Py_ssize_t size = n - i < BLOCK ? n - i : BLOCK;
-        tilted_block(x + i, x_g + i, tau, lower + i, upper + i, s + i, NULL, size);
+        model_minimiser_block(x + i, x_g + i, tau, lower + i, upper + i, s + i, NULL, size);
         slope += within_block(x + i, from + i, g + i, lower + i, upper + i, 0, s + i,
                               size);
     }
@@ -952,8 +951,8 @@ TWICE static void projected(in x, in g, double tau, in lower, in upper, out y,
     }
 }
 
-/* s = -s; whether it is not zero. */
-TWICE static int turn_round(out s, Py_ssize_t n)
+/* s = -s; returns 1 if s ≠ 0, else 0. */
+TWICE static int negate(out s, Py_ssize_t n)
 {
     Py_ssize_t any = 0;
     for (Py_ssize_t i = 0; i < n; i++) {
@@ -966,8 +965,8 @@ TWICE static int turn_round(out s, Py_ssize_t n)
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 #define SMALLER(a, b) ((a) < (b) ? (a) : (b))
 
-/* x = shift + ν, within lb and ub, and on them where ν is on its bounds (the sum may
-   differ from that in the last bit); `free` is 1 where ν is on none, 0 elsewhere. */
+/* x = shift + ν, clipped to [lb, ub], and equal to lb or ub where ν is at its bound: the
+   sum alone may differ from it in the last bit. `free` is 1 where ν is at no bound. */
 TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, out x,
                            out free, Py_ssize_t n)
 {
@@ -981,8 +980,8 @@ TWICE static void restored(in nu, in shift, in lower, in upper, in lb, in ub, ou
     }
 }
 
-/* The multipliers z of the bounds that ν is on, where the gradient without them is g. */
-TWICE static void held_by(in nu, in lower, in upper, in g, out z, Py_ssize_t n)
+/* z = multipliers of the bounds that ν is at, from the gradient g without them. */
+TWICE static void bound_multipliers(in nu, in lower, in upper, in g, out z, Py_ssize_t n)
 {
     for (Py_ssize_t i = 0; i < n; i++) {
         double push = LARGER(g[i], 0), pull = SMALLER(g[i], 0);
@@ -997,8 +996,8 @@ TWICE static void masked(in free, in a, out t, Py_ssize_t n)
         t[i] = free[i] * a[i];
 }
 
-/* Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components where the gradient leads into the box, and is
-   more than `noise`. */
+/* Return Σ (‖𝒫F𝒫‖ gᵢ)²/Fᵢᵢ over the components along which the cost decreases within the
+   box and whose gradient exceeds `noise`. */
 TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, double norm,
                                   double noise, Py_ssize_t n)
 {
@@ -1006,16 +1005,16 @@ TWICE static double inward_energy(in x, in g, in lower, in upper, in diagonal, d
     for (Py_ssize_t i = 0; i < n; i++) {
         double r = norm * g[i], d = diagonal[i] > 0 ? diagonal[i] : 1;
         int inward = ((g[i] < 0) & (x[i] < upper[i])) | ((g[i] > 0) & (x[i] > lower[i]));
-        int told = (diagonal[i] > 0) & (fabs(r) > noise) & inward;
-        total += told ? r * r / d : 0;
+        int result = (diagonal[i] > 0) & (fabs(r) > noise) & inward;
+        total += result ? r * r / d : 0;
     }
     return total;
 }
 
-/* Terms of the energy of a point with forces = Gᵀy + z: sums = xᵀFx, qᵀx, the work of the
-   bounds; most = the largest |z (x - bound)|, the largest size of a component; size (n,) of
-   each, the largest of its |Fx|, |q| and |forces|. Returns the least positive diagonal
-   entry, inf where there is none; -1 where x is outside of the bounds. */
+/* Terms of the energy of a point with forces = Gᵀy + z: sums = xᵀFx, qᵀx, work of the
+   bounds; most = largest |z (x - bound)|, largest component of size; size (n,) =
+   max(|Fx|, |q|, |forces|) by components. Returns the smallest positive diagonal entry,
+   inf if there is none, -1 if x violates a bound. */
 TWICE static double
 terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, out size,
                 Py_ssize_t n, out sums, out most)
@@ -1044,8 +1043,8 @@ terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, o
     return outside ? -1 : least;
 }
 
-/* The worst error of stationarity, at least `worst`, where forces become the residual
-   Fx + q + forces; inf where that is not finite. */
+/* Return the largest error of stationarity, but at least `worst`; forces become the
+   residual Fx + q + forces. Returns inf if a residual is not finite. */
 TWICE static double
 worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, in lb,
                 in ub, in size, out forces, Py_ssize_t n, double worst)
@@ -1068,7 +1067,8 @@ worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, i
     return isfinite(all) ? worst : INFINITY;
 }
 
-/* The sizes of variables by an energy, zero where it knows of none, and without one. */
+/* size = scale of each variable by the energy, 0 if that gives none; own = scale without
+   the energy. */
 TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in Fx, out size,
                                      out own, Py_ssize_t n)
 {
@@ -1079,7 +1079,7 @@ TWICE static void sizes_of_variables(double energy, in q, in diagonal, in x, in 
     }
 }
 
-/* Gx - e, and the sums |G| own_size and |G| size of rows G (m, n). */
+/* missed = Gx - e, own = |G| own_size, known = |G| size, for rows G (m, n). */
 TWICE static void
 terms_of_rows(in rows, in e, in x, in own_size, in size, Py_ssize_t m, Py_ssize_t n,
               out missed, out own, out known)

@@ -27,7 +27,7 @@ def record(run_id="a", **changes):
         form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
         verdict=Verdict.VERIFIED,
     )  # fmt: skip
-    return blank.but(**changes)
+    return blank.replace(**changes)
 
 
 @pytest.fixture
@@ -70,8 +70,11 @@ def refused(capsys, monkeypatch, tmp_path):
         ({"tol": -1e-6}, "expected a number above 0"),
         ({"tol": 10**30}, "expected a number above 0, at most 1"),
         ({"accuracy": 0.0}, "accuracy = 0.0; expected"),
-        ({"solve_seconds": -2e-6}, "solve_seconds = -2e-06; expected no negative"),
-        ({"gap": -1.0}, "gap = -1.0; expected no negative number"),
+        (
+            {"solve_seconds": -2e-6},
+            "solve_seconds = -2e-06; expected a number of at least 0",
+        ),
+        ({"gap": -1.0}, "gap = -1.0; expected a number of at least 0"),
         ({"ranks": 0}, "ranks = 0; expected a number of ranks, 1 or more"),
         ({"ranks": -2}, "ranks = -2; expected a number of ranks, 1 or more"),
         ({"total_seconds": 1e308}, "total_seconds = 1e+308; expected 0, or 1e-12 to"),
@@ -287,7 +290,7 @@ def test_minus_zero_is_zero():
 def test_how_much_memory_a_case_may_take_can_be_raised(monkeypatch):
     monkeypatch.setenv(CASE_VARIABLE, "0.5")
     with pytest.raises(
-        InputError, match="or MORTARBENCH_CASE_MIB set to what there is"
+        InputError, match="or MORTARBENCH_CASE_MIB set to the memory available"
     ):
         parse("beam-ring/Nr=30/Nh=15/dual", PROBLEMS)
     monkeypatch.setenv(CASE_VARIABLE, "1000")

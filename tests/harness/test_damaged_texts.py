@@ -37,8 +37,8 @@ from mortarbench.harness.suite.growth import as_toml
 from mortarbench.harness.suite.solver_options import as_given, options_for, swept
 from mortarbench.harness.suite.suite import load_suite, read_stored
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.bodies import assembled
-from mortarbench.problems.models.description import described_bodies
+from mortarbench.problems.contact.bodies import assemble_stiffness
+from mortarbench.problems.models.description import read_bodies
 from mortarbench.registries import Registries
 from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.folder import compose, write_report
@@ -179,11 +179,11 @@ def test_a_damaged_description_of_bodies_is_read_or_refused(tmp_path, count):
     (tmp_path / "two.msh").write_text(MESH)
     chance, path = random.Random(count), tmp_path / "bodies.toml"
     path.write_text(BODIES)
-    assert assembled(described_bodies(path, "strain")).K.shape == (16, 16)
+    assert assemble_stiffness(read_bodies(path, "strain")).K.shape == (16, 16)
     for _ in range(count):
         text = damaged_texts.damaged(BODIES, chance)
         written(path, text)
-        tried(text, lambda: assembled(described_bodies(path, "strain")))
+        tried(text, lambda: assemble_stiffness(read_bodies(path, "strain")))
 
 
 @COUNTS

@@ -195,7 +195,7 @@ def test_the_same_of_two_machines_is_kept_apart_and_marked(
     measure("b")
     orders = [
         {
-            r.but(run_id="").to_json()
+            r.replace(run_id="").to_json()
             for r in mb.merge(
                 tmp_path / x, tmp_path / y, out=tmp_path / f"{x}{y}"
             ).records

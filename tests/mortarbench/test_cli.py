@@ -812,7 +812,7 @@ def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
         parse("well/n=2/primal", FAMILIES),
         SolverSpec(name="exact", label="exact"),
         options={}, tol=1e-8, repeat=0, environment="here",
-    ).but(verdict=Verdict.VERIFIED)  # fmt: skip
+    ).replace(verdict=Verdict.VERIFIED)  # fmt: skip
 
     with shown_on(terminal) as bar:
         bar.start(1234)

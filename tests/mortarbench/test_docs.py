@@ -7,6 +7,7 @@ from importlib.metadata import version
 import pytest
 import yaml
 
+from mortarbench.answer import solve
 from mortarbench.case import build
 from mortarbench.cli.list_ import solvers_page
 from mortarbench.cli.main import _parser as command_line_parser
@@ -65,6 +66,19 @@ def test_the_elastic_family_of_the_plug_in_page_is_one(tmp_path):
     table = page.partition("may be relied on")[2].partition("## What")[0]
     rows = "".join(re.findall(r"^\| (`.*?) \|", table, re.M))
     assert set(re.findall(r"`(\w+)`", rows)) == set(elastic.__all__)
+
+
+def test_the_steps_that_their_page_shows_solve(tmp_path):
+    """With every damping, from cautious to none, and as an option of a command."""
+    page = (ROOT / "docs/own-steps.md").read_text("utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    path = tmp_path / "damped.py"
+    path.write_text(code)
+    for options in ({}, {"damping": 0.0}, {"damping": 0.7}, {"damping": 1.0}):
+        answer = solve("string/n=60/primal", "damped", plugins=[path], options=options)
+        assert str(answer.verdict) == "verified"
+        assert answer.solution.counts["preconditioner_applies"] > 0
+        assert answer.solution.counts["expansion"] > 0
 
 
 def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():

@@ -348,7 +348,7 @@ def test_in_a_notebook_a_run_is_a_bar_and_above_it_what_was_not_verified(
         sys.modules, "IPython.display", SimpleNamespace(display=display)
     )
     good = results.records[0]
-    bad = good.but(verdict=Verdict.WRONG, solver="<osqp>")
+    bad = good.replace(verdict=Verdict.WRONG, solver="<osqp>")
 
     with shown(None) as progress:
         progress.start(2)

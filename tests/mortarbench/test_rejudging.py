@@ -38,7 +38,7 @@ def record(claimed, found, tol, **changes):
         solver="a", options={}, tol=tol, repeat=0, block=0, verdict=status,
         claimed=claimed.value, **found._asdict(),
     )  # fmt: skip
-    return Record.from_json(made.but(**changes).to_json())
+    return Record.from_json(made.replace(**changes).to_json())
 
 
 @given(st.sampled_from(list(Status)), residuals, tolerances)
@@ -93,7 +93,7 @@ def test_a_sweep_is_judged_at_its_accuracy_not_at_what_was_asked_for():
     ],
 )
 def test_what_no_residual_decided_stands(changes, factor):
-    stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).but(**changes)
+    stored = record(Status.SOLVED, Residuals(0, 1e-9, 0, 0), 1e-6).replace(**changes)
 
     assert rejudged(stored, factor) is changes["verdict"]
 
@@ -122,7 +122,7 @@ def folder(tmp_path):
 def test_a_verdict_that_the_residuals_beside_it_refute_is_told(tmp_path, capsys):
     changed = record(Status.SOLVED, Residuals(0, 0.5, 0, 0), 1e-6)
     with Journal(tmp_path, "test") as journal:
-        journal.append(changed.but(verdict=Verdict.VERIFIED))
+        journal.append(changed.replace(verdict=Verdict.VERIFIED))
     read_evidence(tmp_path)
 
     message = capsys.readouterr().err

@@ -119,7 +119,7 @@ def test_two_tolerances_with_one_answer_are_one_point():
     ],
 )
 def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
-    records = [r.but(**ending) if r.tol == 1e-8 else r for r in sweep()]
+    records = [r.replace(**ending) if r.tol == 1e-8 else r for r in sweep()]
 
     assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
     assert time_at_accuracy(outcomes(records), 1e-5).kind == "between"
@@ -127,14 +127,14 @@ def test_what_a_limit_ended_or_nothing_certifies_is_no_point_of_a_curve(ending):
 
 def test_one_repeat_that_failed_takes_the_point_away():
     records = sweep()
-    records[-1] = records[-1].but(verdict=Verdict.FAILED, claimed="failed")
+    records[-1] = records[-1].replace(verdict=Verdict.FAILED, claimed="failed")
 
     assert time_at_accuracy(outcomes(records), 1e-7).kind == "not reached"
 
 
 def test_a_certified_error_counts_though_the_residuals_refute_the_claim():
     """The loose end of a sweep that is judged at a strict accuracy."""
-    refuted = [r.but(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
+    refuted = [r.replace(verdict=Verdict.INACCURATE, accuracy=1e-12) for r in sweep()]
 
     assert time_at_accuracy(outcomes(refuted), 1e-5).kind == "between"
 
@@ -149,7 +149,7 @@ def test_many_curves_at_once_are_fitted_as_one_by_one():
 
 def test_the_largest_error_of_the_repeats_is_the_error():
     records = [
-        r.but(energy_bound=0.5) if (r.tol, r.repeat) == (1e-8, 2) else r
+        r.replace(energy_bound=0.5) if (r.tol, r.repeat) == (1e-8, 2) else r
         for r in sweep()
     ]
 
@@ -158,7 +158,7 @@ def test_the_largest_error_of_the_repeats_is_the_error():
 
 def test_the_interval_comes_from_the_repeats_and_is_the_same_every_time():
     scattered = [
-        r.but(total_seconds=r.total_seconds * (1 + 0.5 * (r.repeat % 2)))
+        r.replace(total_seconds=r.total_seconds * (1 + 0.5 * (r.repeat % 2)))
         for r in sweep(repeats=6)
     ]
     found, again = (time_at_accuracy(outcomes(scattered), 1e-5) for _ in range(2))
@@ -179,7 +179,7 @@ def test_intervals_of_medians_hold_the_true_time_nearly_as_often_as_they_say(n):
     rng, held = np.random.default_rng(161803), 0
     for trial in range(n):
         records = [
-            r.but(
+            r.replace(
                 total_seconds=1e-3 * r.tol**-0.25 * np.exp(0.1 * rng.standard_normal()),
                 run_id=f"{trial}-{i}",
             )
@@ -271,7 +271,7 @@ def test_two_tolerances_are_no_sweep(page):
 
 def test_the_curve_joins_what_counts_and_the_rest_is_hollow():
     records = [
-        r.but(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
+        r.replace(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-8 else r
         for r in sweep()
     ]  # fmt: skip
@@ -328,7 +328,7 @@ def test_answers_that_never_are_good_enough_have_no_price(page):
 
 def test_a_solve_that_a_limit_ended_is_not_the_loosest_that_was_enough(page):
     records = [
-        r.but(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
+        r.replace(claimed="iteration_limit", verdict=Verdict.ITERATION_LIMIT)
         if r.tol == 1e-4 else r
         for r in sweep()
     ]  # fmt: skip

@@ -91,7 +91,8 @@ def test_wherever_times_are_shown_the_report_says_what_is_not_in_them(measured, 
 
 def test_exponents_are_given_against_both_sizes_and_both_are_named(measured, page):
     records = [
-        r.but(quantities=r.quantities | {"equality_rows": 0}) for r in grown(measured)
+        r.replace(quantities=r.quantities | {"equality_rows": 0})
+        for r in grown(measured)
     ]
     times, counts = section(page(records), "scaling").tables
     against_n, against_m = rows(times)[-2:]

@@ -138,7 +138,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
 
 def test_one_unverified_repeat_voids_the_time(measured, evidence):
     records = timed(measured, "a", [0.01, 0.01, 0.01])
-    records[1] = records[1].but(verdict=Verdict.INACCURATE)
+    records[1] = records[1].replace(verdict=Verdict.INACCURATE)
     page = compose(evidence(records))
     assert table(page, "times")[0]["a"].kind == "void"
     assert table(page, "verdicts")[0]["a"].text == "inaccurate (1 of 3 repeats)"

@@ -83,7 +83,7 @@ def test_a_null_arm_is_paired_with_its_solver(record, section, factor, held):
 def test_a_null_arm_does_not_win(record, section):
     records = [record(), record("b", total_seconds=0.02)]
     null = record("a (A/A)", role="null", total_seconds=0.009, dualise_seconds=0.1)
-    records = [r.but(dualise_seconds=0.1) for r in records]
+    records = [r.replace(dualise_seconds=0.1) for r in records]
     for table in section([*records, null], "times").tables:
         (row,) = rows(table)
         assert [row[s].kind for s in ("a", "b", "a (A/A)")] == ["best", "", ""]

@@ -61,7 +61,9 @@ def bent(
 ) -> Solution:
     """Bend bodies in the way that costs least energy."""
     whole, x = mechanics.whole, s.x.astype(Real)
-    v = whole.relaxed(whole.relaxed(rng.standard_normal(x.size).astype(Real)))
+    v = whole.apply_inverse(
+        whole.apply_inverse(rng.standard_normal(x.size).astype(Real))
+    )
     far = size * whole.norm(x) / whole.norm(v)
     return replace(s, x=(x + far * v).astype(np.float64))
 

@@ -1,4 +1,4 @@
-"""What tests/problems/feti/test_emission.py runs on several ranks; prints JSON.
+"""What tests/problems/feti/test_distributed_dual.py runs on several ranks; prints JSON.
 
 Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The shares that
 ranks emit are put together here, and compared with the QP that one process emits.
@@ -16,14 +16,14 @@ from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.duality.divided import torn_path
-from mortarbench.problems.duality.problem import chosen
+from mortarbench.problems.duality.decomposed import decomposed_path
+from mortarbench.problems.duality.problem import qp_choice
 from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.feti.subdomains import OwnSubdomains, subdomains_of
-from mortarbench.problems.feti.torn import Kind
+from mortarbench.problems.feti.subdomain_classes import SubdomainClass
+from mortarbench.problems.feti.subdomains import LocalSubdomains, subdomains_of
 from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.torn_bodies import parts_of
+from tests.support.decomposed_bodies import parts_of
 
 
 def probe(n):
@@ -37,14 +37,14 @@ def told(name, ranks):
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
     share = made.share().qp
     rows = share.P.halo.rows
-    own = rows[share.P.halo.own]
+    own = rows[share.P.halo.owned]
     mine = own_subdomains(name, ranks)
     B = share.P.local.B.tocoo()
     Fx, factorised = forming(lambda: share.P @ probe(made.variables)[own])
     return ranks.comm.gather({
         "factorised": factorised,
         "formed": [
-            named(group.kind, group.touched)
+            named(group.template, group.touched)
             for group in share.P.local.packed.groups if group.explicit
         ],
         "sizes": [made.variables, made.equality_rows],
@@ -61,11 +61,14 @@ def own_subdomains(name, ranks):
     """Hold what ranks hold, whose shares are those of the first problem of a path."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
-        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
-        path = torn_path(problem, choice, ranks, reference_over_ranks)
-        return path.problem(choice.step, choice.iterate).posed.dual.own
+        problem, choice = (
+            case.family.stated(case.params),
+            qp_choice("dual", case.params),
+        )
+        path = decomposed_path(problem, choice, ranks, reference_over_ranks)
+        return path.problem(choice.step, choice.iterate).problem.dual.subdomains
     problem = parts_of(name)
-    return OwnSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
+    return LocalSubdomains(problem, ranks, subdomains_of(problem, ranks.size))
 
 
 def named(kind, touched):
@@ -75,17 +78,17 @@ def named(kind, touched):
 
 def forming(act):
     """Return what an act gives, and the kinds that this rank factorises in it."""
-    factor, names = Kind.border_factor, []
+    factor, names = SubdomainClass.border_factor, []
 
     def noted(kind, touched):
         names.append(named(kind, touched))
         return factor(kind, touched)
 
-    Kind.border_factor = noted
+    SubdomainClass.border_factor = noted
     try:
         return act(), names
     finally:
-        Kind.border_factor = factor
+        SubdomainClass.border_factor = factor
 
 
 def compared(name, everyone):

@@ -56,7 +56,7 @@ def beside_one_process(name, found):
         one = {"objective": case.qp.objective(whole.x)}
         one |= kkt_residuals(case.qp, whole)._asdict()
         try:
-            certificate = certify(case.mechanics, case.mechanics.back(whole))
+            certificate = certify(case.mechanics, case.mechanics.to_primal(whole))
             bound, parts = certificate.bound, certificate.parts
         except UncertifiableError:
             bound, parts = np.nan, {}

@@ -126,7 +126,7 @@ class ExactSolution:
         return self.length(self.u)
 
     def answer(self) -> Solution:
-        """Return u and λ in doubles, as `Mechanics.back` would give them."""
+        """Return u and λ in doubles, as `Mechanics.to_primal` would give them."""
         m = self.mechanics
         u, lam = (np.array([_float(x) for x in v]) for v in (self.u, self.multipliers))
         contact = m.primal.h.size
@@ -172,7 +172,7 @@ def _given(
     """Solve with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
-    free, closed = np.setdiff1d(np.arange(len(K)), exact.held), states == CLOSED
+    free, closed = np.setdiff1d(np.arange(len(K)), exact.fixed), states == CLOSED
     lam = np.where(
         states == LOWER, exact.lower, np.where(states == UPPER, exact.upper, 0)
     )

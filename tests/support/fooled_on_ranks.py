@@ -23,11 +23,11 @@ from mortarbench.harness.verify.admissible import UncertifiableError
 from mortarbench.harness.verify.over_ranks import certify_over_ranks
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.feti.emission import dual_on, emitted
+from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import parts_of
 from tests.support.disturbed import DISTURBANCES
 from tests.support.held_by_contact import disc_between_plates, disc_in_parts
-from tests.support.torn_bodies import parts_of
 
 #: of a disc between plates: what holds it but contact, and where all of it is
 DISCS = {
@@ -119,12 +119,12 @@ class BoundSearch:
                 u[components] = part
             m = self.mechanics
             motion, contact = m.exact.motion(u), m.exact.contact
-            inside = (motion[contact] <= 0).all() and not u[m.exact.held].any()
+            inside = (motion[contact] <= 0).all() and not u[m.exact.fixed].any()
             lengths = [m.norm(v - truth.u) for v in (u, claimed.astype(Real))]
-            still = *lengths, bool(inside), m.still(u - truth.u)
+            still = *lengths, bool(inside), m.without_rigid_motion(u - truth.u)
         of_u, of_answer, inside, off = self.ranks.comm.bcast(still)
         jump = own.parts.spread.astype(Real) @ off[own.components] - found.off
-        torn = own.among.total(float(jump @ own.parts.product(jump)))[0]
+        torn = own.reduction.total(float(jump @ own.parts.product(jump)))[0]
         return of_u, of_answer, float(np.hypot(of_u, np.sqrt(max(torn, 0)))), inside
 
     def tried(self, s):
@@ -168,7 +168,7 @@ class BoundSearch:
 
 def problem_of(problem, ranks):
     """Emit a problem; return what this rank has of its bodies."""
-    share = emitted(dual_on(problem, ranks), None)
+    share = distributed_qp(dual_on(problem, ranks), None)
     qp = share.share().qp
     nothing = Solution(
         status=Status.FAILED, x=0 * qp.q, y=0 * qp.b, z=qp.h, z_box=0 * qp.q

@@ -16,14 +16,14 @@ from mortarbench.harness import Case
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import (
     Mesh,
@@ -151,7 +151,8 @@ def _case(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, "dual",
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
+        floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip

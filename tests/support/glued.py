@@ -15,9 +15,9 @@ from scipy.sparse import bsr_array, csr_array, diags_array, eye_array, vstack
 
 from mortarbench.harness import Vector
 from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies, SubdomainClass
 from mortarbench.problems.feti.subdomains import GLUE, Weights
-from mortarbench.problems.feti.tearing import Part, blocks, classify
-from mortarbench.problems.feti.torn import Kind, Torn
+from mortarbench.problems.feti.tearing import SubdomainMesh, blocks, classify
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -31,8 +31,8 @@ class Decomposition:
     node: Nodes  #: (M,) node of the whole mesh that each torn node is a copy of
     nodes: int  #: of the whole mesh
     start: NDArray[np.int64]  #: (S + 1,) first torn node of each subdomain, and M
-    parts: tuple[Part, ...]  #: the first subdomain of each kind
-    kind: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
+    parts: tuple[SubdomainMesh, ...]  #: the first subdomain of each kind
+    class_of: NDArray[np.int64]  #: (S,) of each subdomain, a place in `parts`
     #: (S, dim, dim) turns the part of its kind into each subdomain: x = Q x_part + t
     rotation: NDArray[np.float64]
     label: NDArray[np.int64]  #: (E,) subdomain of each cell of the whole mesh
@@ -40,7 +40,7 @@ class Decomposition:
     @property
     def subdomain(self) -> NDArray[np.int64]:
         """Subdomain of each torn node, (M,)."""
-        return np.repeat(np.arange(self.kind.size), np.diff(self.start))
+        return np.repeat(np.arange(self.class_of.size), np.diff(self.start))
 
 
 def structured_bodies(
@@ -86,10 +86,10 @@ def decompose(
     node = copies % n
     corner = corner.reshape(cells.shape) - start[label[by_label], None]
 
-    def part(s: int) -> Part:
+    def part(s: int) -> SubdomainMesh:
         mine = slice(first_cell[s], first_cell[s + 1])
         own = node[start[s] : start[s + 1]]
-        return Part(points[own], corner[mine], material[by_label[mine]])
+        return SubdomainMesh(points[own], corner[mine], material[by_label[mine]])
 
     def key(s: int) -> tuple[bytes, bytes]:
         mine = part(s)
@@ -99,13 +99,13 @@ def decompose(
     first, kind, rotation = classify(map(key, range(S)), torn)
     return Decomposition(
         node=node, nodes=n, start=start, parts=tuple(map(part, first)),
-        kind=kind, rotation=rotation, label=label,
+        class_of=kind, rotation=rotation, label=label,
     )  # fmt: skip
 
 
 def glue(
     decomposition: Decomposition,
-    kinds: tuple[Kind, ...],
+    classes: tuple[SubdomainClass, ...],
     *,
     load: Vector,
     supports: csr_array,
@@ -115,7 +115,7 @@ def glue(
     E: Vector,
     shape: Vector | float = 1.0,
     rows: str = "orthonormal",
-) -> Torn:
+) -> DecomposedBodies:
     """Pose a contact problem of the whole on the subdomains.
 
     Parameters
@@ -152,8 +152,8 @@ def glue(
     scale = np.sqrt(np.append((E_of * shape)[of_row], softest / norm**2))
     values = np.zeros(of_row.size)
     values[: reached.nnz] = np.repeat(supported, np.diff(reached.indptr))
-    return Torn(
-        kinds=kinds, kind=decomposition.kind, spread=T,
+    return DecomposedBodies(
+        classes=classes, class_of=decomposition.class_of, spread=T,
         B=csr_array(diags_array(scale) @ vstack([B_E @ turn, B_I])),
         c=scale * np.append(values, c), scale=scale[of_row.size :],
         f=average @ load, equalities=of_row.size,

@@ -19,21 +19,21 @@ from mortarbench.problems.contact.bodies import (
     Bodies,
     ContactPair,
     assemble,
-    clamped,
-    floating,
-    supported,
+    factorise_clamped,
+    factorise_floating,
+    factorise_supported,
 )
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
 from mortarbench.problems.duality.dualisation import Transformed
-from mortarbench.problems.duality.problem import stated
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.duality.problem import elastic_bodies_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
-from mortarbench.problems.feti.subdomains import ProblemInParts
-from tests.support.torn_bodies import parts_by, torn_by
+from mortarbench.problems.feti.subdomains import DecomposedProblem
+from tests.support.decomposed_bodies import parts_by, torn_by
 
 PRESSURE = 1e7  #: Pa
 
@@ -63,8 +63,9 @@ def disc_between_plates(
     primal = primal_qp(bodies, rows)
     return contact_case(
         bodies, primal, form,
-        floating=lambda: floating(bodies), clamped=lambda: clamped(bodies),
-        supported=lambda: supported(bodies),
+        floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_supported(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
 
@@ -81,12 +82,12 @@ def disc_in_parts(
     tilt: float = 0.0,
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
-) -> ProblemInParts:
+) -> DecomposedProblem:
     """Describe the dual of `disc_between_plates`, cut into so many parts by METIS."""
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
-    return parts_by(bodies, stated(bodies).shape.layout(parts), primal)
+    return parts_by(bodies, elastic_bodies_of(bodies).shape.layout(parts), primal)
 
 
 def torn_disc_between_plates(
@@ -101,8 +102,8 @@ def torn_disc_between_plates(
     bodies = _disc_and_plates(n, True, False, turn, 0.0, 0.0, (70e9, 200e9, 70e9))
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
-    layout = stated(bodies).shape.layout(parts)
-    return torn_dual(torn_by(bodies, layout, primal), primal)
+    layout = elastic_bodies_of(bodies).shape.layout(parts)
+    return feti_dual(torn_by(bodies, layout, primal), primal)
 
 
 def _disc_and_plates(
@@ -181,7 +182,7 @@ def stored_solution(
     """
     primal = mechanics.primal
     K, B = primal.P.toarray(), primal.G.toarray()
-    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.held)
+    free = np.setdiff1d(np.arange(len(K)), mechanics.exact.fixed)
     rows = B[closed][:, free]
     loose = _loose(rows, mechanics.inverse.kernel[free])
     rows = np.vstack([rows, loose.T])

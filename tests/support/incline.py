@@ -13,7 +13,12 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.case_forms import case_of
-from mortarbench.problems.duality.problem import Choice, ContactProblem, by_keys, stated
+from mortarbench.problems.duality.problem import (
+    Choice,
+    ContactProblem,
+    elastic_bodies_of,
+    keyed_linearisation,
+)
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import join, prefixed, rectangle
 from mortarbench.solvers.reference.solve import reference_solution
@@ -49,10 +54,11 @@ def incline(ratio: float, slope: float = 0.1) -> Bodies:
 def block_on_incline(ratio: float, law: FrictionLaw, *, form: str = "dual") -> Case:
     """Emit the QP of the block under a law of friction, in one form."""
     bodies = incline(ratio)
-    of = stated(bodies)
+    of = elastic_bodies_of(bodies)
     problem = ContactProblem(
-        bodies=of, linearise=by_keys({"contact": "mortar", "basis": "dual"}),
+        bodies=of,
+        linearise=keyed_linearisation({"contact": "mortar", "basis": "dual"}),
         stages=load_steps(1, 1, of.forces, of.fixed, (law,)),
-        pressed=float(np.abs(bodies.f).sum()),
+        initial_force=float(np.abs(bodies.f).sum()),
     )  # fmt: skip
     return case_of(problem, form, Choice(), reference_solution)

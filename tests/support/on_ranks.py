@@ -138,9 +138,9 @@ def factors(ranks):
 
 def projected(qp, most):
     """Project and solve in a face, where ranks may share that many rows."""
-    kept, factor.FILL = factor.FILL, most
+    kept, factor.MAX_FILL = factor.MAX_FILL, most
     problem = projected_problem(qp, partial(by_lanczos, steps=3))
-    factor.FILL = kept
+    factor.MAX_FILL = kept
     rows, loop = problem.rows, outer_loop(problem, qp, SMALBE(preconditioner="model"))
     v = qp.q + rows.x_tilde
     free = np.isinf(qp.lb) | (v > 0)
@@ -154,7 +154,7 @@ def operator(name, ranks):
     whole = qp.P.build()
     share = whole.share(qp, ranks)
     P, x = share.qp.P, np.random.default_rng(1).standard_normal(qp.q.size)
-    own = P.halo.rows[P.halo.own]
+    own = P.halo.rows[P.halo.owned]
     errors = {
         "product": (P @ x[own], whole(x)[own]),
         "diagonal": (P.diagonal(), whole.diagonal()[own]),
@@ -168,10 +168,10 @@ def operator(name, ranks):
         str(k): float(np.abs(np.asarray(a) - b).max() / np.abs(b).max())
         for k, (a, b) in errors.items()
     }
-    by_rank, alike = projected(share.qp, factor.FILL), projected(share.qp, 0)
+    by_rank, alike = projected(share.qp, factor.MAX_FILL), projected(share.qp, 0)
     worst["coarse"] = float(np.abs(by_rank - alike).max() / np.abs(alike).max())
     solved = share.whole(SMALBE().prepare(share.qp, TOL)())
-    everywhere = ranks.comm.gather((worst, own.size, P.local.domains.kind.size))
+    everywhere = ranks.comm.gather((worst, own.size, P.local.domains.class_of.size))
     if solved is None:
         return None
     alone = SMALBE().prepare(qp, TOL)()

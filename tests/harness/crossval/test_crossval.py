@@ -11,9 +11,9 @@ from scipy.sparse import csc_array
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, Case, Mechanics, Solution, Status, no_rows
 from mortarbench.harness.crossval.assessment import assess, distances, energy_allowed
-from mortarbench.harness.crossval.comparison import brief, compared
+from mortarbench.harness.crossval.comparison import brief, compare_answers
 from mortarbench.harness.crossval.discretisation import read_discretisation
-from mortarbench.harness.crossval.ground_truth import Given, ground_truth_of
+from mortarbench.harness.crossval.ground_truth import StoredAnswer, ground_truth_of
 from mortarbench.harness.files.qpfile import qp_digest, save_qp
 from mortarbench.harness.files.store import write_point
 from mortarbench.harness.names import parse
@@ -59,13 +59,13 @@ def write(folder, answers, tol=1e-8):
         for label, text, answer in answers:
             record = record_of(text, label, tol)
             if isinstance(answer, Verdict):
-                journal.append(record.but(verdict=answer, message="as it ended"))
+                journal.append(record.replace(verdict=answer, message="as it ended"))
                 continue
             case = cases.setdefault(text, built(text))
-            record = record.but(qp=qp_digest(case.qp, serialised=True))
+            record = record.replace(qp=qp_digest(case.qp, serialised=True))
             record = judged(record, case.qp, answer)
             if np.isfinite(answer.x).all():
-                record = record.but(vectors=save_solution(folder, answer))
+                record = record.replace(vectors=save_solution(folder, answer))
             journal.append(record)
     return folder
 
@@ -117,7 +117,7 @@ def disturbed(case, s, size):
     point = reference_point(case.mechanics, reference_solution)
     if case.qp.h.size:
         v = rng.standard_normal(s.x.size)
-        v[case.mechanics.exact.held] = 0
+        v[case.mechanics.exact.fixed] = 0
     else:
         v = np.abs(rng.standard_normal(s.x.size)) * (s.x != 0)
         if case.qp.b.size:  # what the rigid motions do not feel
@@ -208,7 +208,7 @@ def test_forces_that_are_right_are_nobody_else_s(truths, tmp_path, cli):
 
 def test_rows_that_are_closed_in_truth_and_open_in_an_answer_are_listed(truths):
     case, s = truths[2, "dual-bounds"]
-    back, nothing = case.mechanics.back, replace(s, x=np.zeros_like(s.x))
+    back, nothing = case.mechanics.to_primal, replace(s, x=np.zeros_like(s.x))
     point = reference_point(case.mechanics, reference_solution)
 
     exact, _ = assess(case.mechanics, point, back(s), 1e-8)
@@ -232,7 +232,7 @@ def test_a_multiplier_that_pulls_is_found_with_its_row(form, truths, tmp_path, c
     code, verdict = verdict_on(cli, write(tmp_path, answers))
 
     assert (code, culprits(verdict)) == (1, {"pulls"})
-    pulling = case.mechanics.back(wrong).z < 0
+    pulling = case.mechanics.to_primal(wrong).z < 0
     assert verdict["disagreements"][0]["pulls"] == np.flatnonzero(pulling).tolist()
 
 
@@ -269,9 +269,9 @@ class Dense:
         return np.asarray(B @ (B @ self.inverse).T)
 
 
-def given(case, label, s, tol=1e-8):
-    record = record_of(f"{BEAM}/primal", label, tol).but(claimed=s.status.value)
-    return Given(record=record, label=label, repeats=1, case=case, solution=s)
+def stored_answer(case, label, s, tol=1e-8):
+    record = record_of(f"{BEAM}/primal", label, tol).replace(claimed=s.status.value)
+    return StoredAnswer(record=record, label=label, repeats=1, case=case, solution=s)
 
 
 @pytest.fixture
@@ -284,7 +284,7 @@ def duplicate():
         lb=np.full(2, -np.inf), ub=np.full(2, np.inf),
     )  # fmt: skip
     mechanics = Mechanics(
-        primal=primal, back=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
+        primal=primal, to_primal=lambda s: s, factorise=lambda: Dense(K), mesh_size=1.0,
         rigid=np.zeros((2, 0)),
     )  # fmt: skip
     return Case(qp=primal, recover=lambda s: s.x, quantities=lambda s: {},
@@ -310,7 +310,7 @@ def test_a_certificate_that_the_reference_contradicts_is_our_fault(
         for path in (tmp_path / "journal").iterdir():
             path.unlink()
         with Journal(tmp_path, "here") as journal:
-            journal.append(record.but(energy_bound=bound))
+            journal.append(record.replace(energy_bound=bound))
 
         found, verdict = verdict_on(cli, tmp_path)
 
@@ -321,9 +321,9 @@ def test_a_certificate_that_the_reference_contradicts_is_our_fault(
 
 def test_different_multipliers_of_one_contact_force_agree(duplicate):
     shares = {"first": (1.5, 0.0), "second": (0.0, 1.5), "both": (0.5, 1.0)}
-    answers = [given(duplicate, k, pushed(z)) for k, z in shares.items()]
+    answers = [stored_answer(duplicate, k, pushed(z)) for k, z in shares.items()]
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert found.truth == "reference"
     assert len(found.pairs) == 3
@@ -358,12 +358,17 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
     monkeypatch.setattr(
         "mortarbench.harness.crossval.comparison.ground_truth_of", doubtful
     )
-    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
     s = pushed((1.5, 0.0))
-    answers = [given(case, "a", s), given(case, "b", replace(s, iterations=3))]
+    answers = [
+        stored_answer(case, "a", s),
+        stored_answer(case, "b", replace(s, iterations=3)),
+    ]
     silent = replace(s, iterations=3, status=Status.FAILED)
 
-    found = compared("wall", [*answers, given(case, "c", silent)], finds_nothing, None)
+    found = compare_answers(
+        "wall", [*answers, stored_answer(case, "c", silent)], finds_nothing, None
+    )
 
     assert not any(a.refuted for a in found.answers)
     assert [(p.a, p.b) for p in found.unresolved] == [(0, 1)]
@@ -372,10 +377,12 @@ def test_two_claims_too_far_apart_are_reported_even_where_none_is_refuted(
 
 def test_without_a_reference_the_certificate_tells_who_is_off(duplicate):
     good, bad = pushed((1.5, 0.0)), pushed((1.5, 0.0), (0.45, 0.9))
-    answers = [given(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))]
-    answers.append(given(duplicate, "good", good))
+    answers = [
+        stored_answer(duplicate, "bad", s) for s in (bad, replace(bad, x=bad.x * 1.1))
+    ]
+    answers.append(stored_answer(duplicate, "good", good))
 
-    found = compared("wall", answers, finds_nothing, None)
+    found = compare_answers("wall", answers, finds_nothing, None)
 
     assert found.truth == "good on primal"
     assert "it found nothing" in found.note
@@ -546,10 +553,10 @@ def test_mechanics_that_fail_leave_the_residuals(duplicate):
         raise ZeroDivisionError("no factor")
 
     mechanics = replace(duplicate.mechanics, factorise=factorise)
-    answers = [given(replace(duplicate, mechanics=mechanics), k, pushed(z))
+    answers = [stored_answer(replace(duplicate, mechanics=mechanics), k, pushed(z))
                for k, z in {"good": (1.5, 0.0), "bad": (1.6, 0.0)}.items()]  # fmt: skip
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert found.truth == ""
     assert "no factor" in found.note
@@ -578,8 +585,8 @@ def test_cases_that_cannot_be_built_as_they_were_are_listed(truths, tmp_path, cl
     with Journal(tmp_path, "here") as journal:
         for r in read_journal(tmp_path):
             if r.family == "beam-ring":
-                other = r.but(solver="other", run_id="other", qp="0" * 16)
-                journal.append(other.but(case=f"{BEAM}/step=1/dual-bounds",
+                other = r.replace(solver="other", run_id="other", qp="0" * 16)
+                journal.append(other.replace(case=f"{BEAM}/step=1/dual-bounds",
                                          params={**r.params, "step": 1}))  # fmt: skip
 
     code, verdict = verdict_on(cli, tmp_path)
@@ -657,11 +664,11 @@ def test_a_way_back_that_fails_costs_that_answer_only(duplicate):
             raise ZeroDivisionError("no way back")
         return s
 
-    case = replace(duplicate, mechanics=replace(duplicate.mechanics, back=back))
-    answers = [given(case, k, pushed(z)) for k, z in
+    case = replace(duplicate, mechanics=replace(duplicate.mechanics, to_primal=back))
+    answers = [stored_answer(case, k, pushed(z)) for k, z in
                {"a": (1.5, 0.0), "lost": (0.0, 1.5)}.items()]  # fmt: skip
 
-    found = compared("wall", answers, reference_solution, None)
+    found = compare_answers("wall", answers, reference_solution, None)
 
     assert [a.assessment is None for a in found.answers] == [False, True]
     assert "no way back" in found.answers[1].remarks[0]
@@ -720,8 +727,10 @@ def test_a_case_of_another_version_has_no_finer_mesh(cli, tmp_path):
     exact = reference_solution(built(text).qp)
     folder = write(tmp_path / "out", [("exact", text, exact)])
     with Journal(folder, "there") as journal:
-        old = record_of(text, "old").but(params={"size": 3}, case="obstacle/size=3/x")
-        journal.append(old.but(verdict=Verdict.FAILED))
+        old = record_of(text, "old").replace(
+            params={"size": 3}, case="obstacle/size=3/x"
+        )
+        journal.append(old.replace(verdict=Verdict.FAILED))
 
     assert [d["case"] for d in verdict_on(cli, folder)[1]["discretisation"]] == [
         "obstacle/dim=1/n=12"

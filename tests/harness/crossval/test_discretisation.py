@@ -15,10 +15,10 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.crossval.discretisation import (
     FILE,
-    MOST_UNKNOWNS,
+    MAX_UNKNOWNS,
     Level,
     discretisation_errors,
-    estimated,
+    estimate_error,
     read_discretisation,
 )
 from mortarbench.harness.crossval.mesh_refinement import prolongation
@@ -26,7 +26,7 @@ from mortarbench.harness.names import assemble, completed, parse
 from mortarbench.harness.plugin import as_family
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.models.hertz import halved
+from mortarbench.problems.models.hertz import insert_midpoints
 from mortarbench.problems.models.obstacle import (
     exact_energy,
     exact_height,
@@ -163,9 +163,9 @@ def test_halving_removes_the_error_of_a_whole_cylinder_with_the_rate_of_its_elem
 
 def test_halved_cells_keep_every_node():
     x = np.array([0.0, 1, 3, 7])
-    assert halved(x, 0).tolist() == x.tolist()
-    assert halved(x, 2)[::4].tolist() == x.tolist()
-    assert halved(x, 1)[1::2].tolist() == [0.5, 2, 5]
+    assert insert_midpoints(x, 0).tolist() == x.tolist()
+    assert insert_midpoints(x, 2)[::4].tolist() == x.tolist()
+    assert insert_midpoints(x, 1)[1::2].tolist() == [0.5, 2, 5]
 
 
 def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):
@@ -180,14 +180,14 @@ def test_under_a_point_load_only_the_next_mesh_is_spoken_of(tmp_path):
 
 @pytest.mark.parametrize("rate", [1.0, 1.5, 2.0])
 def test_the_rate_and_the_error_of_a_sequence_that_has_them_are_found(rate):
-    found = estimated("box", converging(0.6, rate, 3))
+    found = estimate_error("box", converging(0.6, rate, 3))
 
     assert found.rate == pytest.approx(rate)
     assert found.error == pytest.approx(0.6 / 2)
 
 
 def test_two_meshes_tell_their_difference_only():
-    found = estimated("box", levels(0.3), note="the next one would be too large")
+    found = estimate_error("box", levels(0.3), note="the next one would be too large")
 
     assert (found.kind, found.rate) == ("change", None)
     assert found.note == "the next one would be too large"
@@ -195,7 +195,7 @@ def test_two_meshes_tell_their_difference_only():
 
 
 def test_what_hardly_falls_is_not_extrapolated():
-    found = estimated("box", levels(0.3, 0.29))
+    found = estimate_error("box", levels(0.3, 0.29))
 
     assert found.kind == "change"
     assert "slowly" in found.note
@@ -203,7 +203,7 @@ def test_what_hardly_falls_is_not_extrapolated():
 
 def test_what_grows_is_not_said_to_fall():
     """The second halving changes 2^1.45 = 2.73 times as much as the first."""
-    found = estimated("box", levels(0.1, 0.1 * 2**1.45))
+    found = estimate_error("box", levels(0.1, 0.1 * 2**1.45))
 
     assert (found.kind, found.error) == ("change", found.change)
     assert "does not fall" in found.note
@@ -212,7 +212,7 @@ def test_what_grows_is_not_said_to_fall():
 
 
 def test_what_the_reference_does_not_know_is_no_discretisation_error():
-    found = estimated("box", levels(1e-3, bound=1e-2))
+    found = estimate_error("box", levels(1e-3, bound=1e-2))
 
     assert found.kind == "rounding"
     assert found.error >= 1e-2
@@ -270,7 +270,7 @@ def test_what_cannot_be_told_has_its_reason(tmp_path):
     assert {d.kind for d in (*found, *large, *late)} == {"unknown"}
     assert "it is Monday" in found[0].note
     assert "bare offers no refined mesh" in found[1].note
-    assert f"{MOST_UNKNOWNS:,}" in large[0].note
+    assert f"{MAX_UNKNOWNS:,}" in large[0].note
     assert "time" in late[0].note
     assert late[0].levels == large[0].levels == ()
 
@@ -438,5 +438,5 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
     assert found.error is not None
     assert ("chords of an arc stay corners" in str(found)) is is_arc
     assert (
-        "for pressures, mesh anew" in mesh_table([found]).rows[0][-1].text
+        "for pressures, generate a finer mesh" in mesh_table([found]).rows[0][-1].text
     ) is is_arc

@@ -11,7 +11,7 @@ from scipy.sparse import csc_array
 
 from mortarbench.harness.distributed import factor
 from mortarbench.harness.distributed.factor import (
-    FILL,
+    MAX_FILL,
     DependentRowsError,
     factor_above,
     independent_rows,
@@ -220,18 +220,18 @@ def test_dependent_rows_of_one_rank_are_refused_on_all(where):
 
 
 @pytest.mark.parametrize(
-    ("shared", "few"), [(0, True), (FILL, True), (FILL + 1, False)]
+    ("shared", "few"), [(0, True), (MAX_FILL, True), (MAX_FILL + 1, False)]
 )
 def test_few_rows_are_shared_where_their_dense_factor_is_the_lesser_work(shared, few):
-    """s² entries against FILL for each of s rows; no inner ones here."""
+    """s² entries against MAX_FILL for each of s rows; no inner ones here."""
     at = on_threads(2, lambda ranks: touched_rows(np.arange(shared), ranks).few_shared)
     assert at == [few, few]
 
 
 @pytest.mark.parametrize(("inner", "few"), [(6, True), (5, False)])
 def test_inner_rows_of_all_ranks_make_shared_ones_few(inner, few, monkeypatch):
-    """With FILL = 8 and s = 12:  s² = 144 ≤ 8 (12 + inner)  from six inner rows on."""
-    monkeypatch.setattr(factor, "FILL", 8)
+    """With MAX_FILL = 8, s = 12:  s² = 144 ≤ 8 (12 + inner)  from six inner rows on."""
+    monkeypatch.setattr(factor, "MAX_FILL", 8)
 
     def work(ranks):
         mine = 12 + np.array_split(np.arange(inner), 2)[ranks.rank]

@@ -11,8 +11,8 @@ from mortarbench.harness.distributed import vectors
 from mortarbench.harness.distributed.vectors import (
     PARTS,
     DistributedColumns,
+    DistributedQP,
     DistributedVector,
-    Emitted,
     Ranks,
     distributed,
 )
@@ -44,7 +44,7 @@ def test_a_total_is_the_sum_in_the_order_of_the_ranks(count):
 
 def test_few_numbers_are_gathered_so_that_all_ranks_round_alike(monkeypatch):
     """MPI may add in any order; the sum of what was gathered has one order."""
-    assert vectors.FEW >= 1
+    assert vectors.MAX_ORDERED_SUM >= 1
     reduced = []
     ranks = Ranks(
         SimpleNamespace(
@@ -54,9 +54,9 @@ def test_few_numbers_are_gathered_so_that_all_ranks_round_alike(monkeypatch):
                                            np.copyto(found, part)),
         )
     )  # fmt: skip
-    for count in (1, vectors.FEW, vectors.FEW + 1):
+    for count in (1, vectors.MAX_ORDERED_SUM, vectors.MAX_ORDERED_SUM + 1):
         assert (ranks.total(np.ones(count)) == 1).all()
-    assert reduced == [vectors.FEW + 1]
+    assert reduced == [vectors.MAX_ORDERED_SUM + 1]
 
 
 def test_neighbours_exchange_consecutive_parts_and_count_what_they_send():
@@ -217,7 +217,7 @@ def test_what_is_neither_by_components_nor_a_reduction_is_refused():
 
 
 def test_sizes_of_an_emitted_qp_are_those_of_the_whole():
-    emitted = Emitted(
+    emitted = DistributedQP(
         variables=7, equality_rows=3, bounds=2, share=None, digest=None, answer=None
     )
     assert emitted.sizes == {

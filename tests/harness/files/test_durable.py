@@ -18,11 +18,11 @@ from mortarbench.harness import InputError
 from mortarbench.harness.errors import FaultError
 from mortarbench.harness.files import durable
 from mortarbench.harness.files.durable import (
-    full_disk_told,
     refuse_full_disk,
     remove_unfinished,
     replace_file,
     replacing,
+    report_full_disk,
 )
 from mortarbench.harness.files.lines import Lines
 from mortarbench.harness.processes import measurement as remote
@@ -210,14 +210,14 @@ def test_a_run_goes_on_from_lines_that_were_edited_before_it_began(lines):
 def test_of_a_full_disk_it_is_said_which_and_how_to_go_on(tmp_path):
     said = "free some space, and the same command continues"
     for code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        with pytest.raises(InputError) as e, full_disk_told(tmp_path / "none"):
+        with pytest.raises(InputError) as e, report_full_disk(tmp_path / "none"):
             raise OSError(code, os.strerror(code))
         message = str(e.value)
         assert message.startswith(f"{tmp_path / 'none'} cannot be written: ")
         assert message.endswith(said)
         assert os.strerror(code) in message
         assert "MiB free" in message
-    with pytest.raises(OSError, match="else"), full_disk_told(tmp_path):
+    with pytest.raises(OSError, match="else"), report_full_disk(tmp_path):
         raise OSError(errno.EIO, "else")
 
 

@@ -285,7 +285,9 @@ def test_a_gzip_file_that_expands_is_refused_while_it_is_counted(
     assert (tmp_path / name).stat().st_size < 2**21
     monkeypatch.setenv(VARIABLE, "32")
 
-    with pytest.raises(InputError, match=r"expands to would take more than 32 MiB"):
+    with pytest.raises(
+        InputError, match=r"its expanded content would take more than 32 MiB"
+    ):
         build(tmp_path / name)
 
 
@@ -336,12 +338,12 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
             "P_indices": np.array([0, 1, 2, 3, 4, 5, 0]),
             "P_indptr": np.array([0, 1, 2, 3, 4, 5, 7])}),
         declared("P_data holds NaN or inf", {"P_data": np.full(3, np.nan)}),
-        declared("A is no matrix", {"A_indices": np.array([N])}),
-        declared("A is no matrix", {"A_indices": np.array([-1])}),
-        declared("A is no matrix", {"A_shape": np.array([-1, 6])}),
-        declared("A is no matrix", {"A_shape": np.array([1, N])}),
+        declared("A is not a matrix", {"A_indices": np.array([N])}),
+        declared("A is not a matrix", {"A_indices": np.array([-1])}),
+        declared("A is not a matrix", {"A_shape": np.array([-1, 6])}),
+        declared("A is not a matrix", {"A_shape": np.array([1, N])}),
         declared("QP.A has shape", {"A_shape": np.array([2**40, 6])}),
-        declared("A is no matrix", {"A_indptr": np.zeros((7, 2), dtype=int)}),
+        declared("A is not a matrix", {"A_indptr": np.zeros((7, 2), dtype=int)}),
         declared("indptr decreases", {
             "A_indptr": np.array([0, 1, -2**31, -1, 1, 1, 1], dtype=np.int32)}),
         declared("must hold integers", {"A_indices": np.array([0.5])}),
@@ -350,15 +352,15 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("QP.q holds NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
         declared("bounds hold NaN", {"lb": np.full(6, np.nan)}),
         declared("QP.h has shape", {"h": np.ones((2, 1))}),
-        declared("meta is no text", {"meta": np.array([1, 2])}),
-        declared("meta is no JSON object", {"meta": text([])}),
+        declared("meta is not a text", {"meta": np.array([1, 2])}),
+        declared("meta is not a JSON object", {"meta": text([])}),
         declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
         declared("constant are no finite", {"meta": text({"scale": 10**400})}),
         declared("constant are no finite", {"meta": text('{"scale": NaN}')}),
         declared("constant are no finite", {"meta": text({"scale": True})}),
         declared("Exceeds the limit", {"meta": text('{"scale": 1' + "0" * 5000 + "}")}),
-        declared("dense is no list", {"meta": text({"dense": 3})}),
-        declared("dense is no list", {"meta": text({"dense": [["P"]]})}),
+        declared("dense is not a list", {"meta": text({"dense": 3})}),
+        declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
         declared("do not fit each other", {"fixed": np.array([9]), **ONE_BY_ONE}),
@@ -450,9 +452,9 @@ def test_a_hostile_mat_file_is_refused_before_it_is_read(
     ("changes", "message"),
     [
         ({"P": np.array([[np.inf]])}, "inf"),
-        ({"q": np.array([[1.0, "a"]], dtype=object)}, "q is no matrix of numbers"),
-        ({"q": np.ones(1) * 1j}, "q is no matrix of numbers"),
-        ({"q": {"a": 1}}, "q is no matrix of numbers"),
+        ({"q": np.array([[1.0, "a"]], dtype=object)}, "q is not a matrix of numbers"),
+        ({"q": np.ones(1) * 1j}, "q is not a matrix of numbers"),
+        ({"q": {"a": 1}}, "q is not a matrix of numbers"),
         ({"q": np.ones((1, 1, 2))}, "q has 3 dimensions"),
         ({"l": csc_matrix((2**31 - 1, 1))}, "would take 1638. MiB|would take"),
         ({"lb": np.array([np.nan]), "ub": np.ones(1), "h": 0, "G": 0}, "NaN|missing"),
@@ -507,11 +509,11 @@ def test_a_file_above_the_limit_is_not_even_digested(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        (b"1.5", b"1_5", "'1_5' is no number"),
+        (b"1.5", b"1_5", "'1_5' is not a number"),
         (b"1.5", b"1e400", "'1e400' exceeds"),
-        (b"1.5", b"inf", "'inf' is no finite number"),
-        (b"1.5", b"nan", "'nan' is no number"),
-        (b"1.5", "\u0661".encode(), "is no number"),
+        (b"1.5", b"inf", "'inf' is not a finite number"),
+        (b"1.5", b"nan", "'nan' is not a number"),
+        (b"1.5", "\u0661".encode(), "is not a number"),
         (b"-3.0", b"inf", "constant of the objective is infinite"),
         (b"2.5", b"-1e999", "'-1e999' exceeds"),
         (b" UP BND", b" UP" * 10**5 + b" BND", "line 18"),
@@ -545,8 +547,8 @@ def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path)
         (b"$Nodes\n6", b"$Nodes\n999999999999", "not a .msh|would take"),
         (b"6 2 1 0", b"2000000000 2 1 0", "not a .msh|would take"),
         (b"2 5 4", b"2 5 77", "not a .msh|not in the file"),
-        (b"1 2 5 4", b"1 2 5 0", "nodes below 1"),
-        (b"1 2 5 4", b"1 2 5 -1", "nodes below 1"),
+        (b"1 2 5 4", b"1 2 5 0", "node numbers below 1"),
+        (b"1 2 5 4", b"1 2 5 -1", "node numbers below 1"),
         (b"6 2 1 0", b"6 inf 1 0", "coordinates beyond"),
         (b"6 2 1 0", b"6 1e308 1 0", "coordinates beyond"),
         (b"6 2 1 0", b"6 nan 1 0", "coordinates beyond"),
@@ -571,7 +573,7 @@ def test_a_hostile_mesh_is_refused(tmp_path, cheaply, old, new, message):
 def test_nodes_below_one_are_refused_in_format_4_too(tmp_path, node):
     (tmp_path / "a.msh").write_bytes(MSH_41.replace(b"2 1 2 5 4", b"2 1 2 5 " + node))
 
-    with pytest.raises(InputError, match=r"nodes below 1|not a \.msh"):
+    with pytest.raises(InputError, match=r"node numbers below 1|not a \.msh"):
         read_msh(tmp_path / "a.msh")
 
 

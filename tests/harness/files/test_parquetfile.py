@@ -115,12 +115,12 @@ def columns(**changes):
         ({"P": [1.0, 2.0], "q": [1.0, 1.0]}, r"QP.P has shape \(1, 2\), expected \(2,"),
         ({"P": [1.0] * 3, "q": [1.0, 1.0]}, "P has 3 entries; expected rows of 2"),
         ({"P": [np.nan]}, "P holds NaN or inf"),
-        ({"P": ["one"]}, "P is no list of numbers"),
+        ({"P": ["one"]}, "P is not a list of numbers"),
         ({"q": None}, "P or q is null"),
         ({"b": [3.0]}, r"QP.A has shape \(0, 1\), expected \(1, 1\)"),
         ({"lb": [2.0], "ub": [1.0]}, "bounds cross"),
         ({"ub": "left out"}, "no column ub"),
-        ({"P": 3.0}, "P is no list of numbers"),
+        ({"P": 3.0}, "P is not a list of numbers"),
     ],
 )
 def test_what_is_no_problem_is_refused_in_one_line(path, changes, message):

@@ -144,7 +144,7 @@ class Bench:
         record = new_record(
             CASE, SolverSpec(name=solver, label=solver),
             options={}, tol=1e-6, repeat=0, environment="",
-        ).but(qp=self.digest)  # fmt: skip
+        ).replace(qp=self.digest)  # fmt: skip
         request = dict(
             qp=str(self.folder / "qp.npz"), out=str(self.folder / "point.npz"),
             sample_seconds=SAMPLE_SECONDS,

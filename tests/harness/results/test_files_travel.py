@@ -239,7 +239,7 @@ def test_what_is_too_large_stays_and_is_named(tmp_path, monkeypatch):
 
 def test_copies_of_a_folder_have_a_limit_together(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(copies, "MOST_FOLDER_MIB", 2)
+    monkeypatch.setattr(copies, "MAX_FOLDER_MIB", 2)
     sources = []
     for i in range(3):
         path = Path(f"{i}.mat")
@@ -290,7 +290,7 @@ def test_a_digest_of_a_journal_leads_nowhere(here, digits):
     (here / "secret.npz").write_bytes(b"secret")
     source = SourceFile(path="qps/qp.npz", sha256=digits, suffix=".npz")
 
-    with pytest.raises(InputError, match="is no digest; expected 12 hex digits"):
+    with pytest.raises(InputError, match="is not a digest; expected 12 hex digits"):
         Copies(here / "run").locate(source)
 
 

@@ -125,7 +125,7 @@ def test_what_is_no_digest_leads_nowhere(tmp_path, digest):
     np.savez(tmp_path / "outside.npz", **FIELDS)
 
     for load in (load_fields, load_history, lambda f, d: load_solution(f, d, "solved")):
-        with pytest.raises(InputError, match="is no digest"):
+        with pytest.raises(InputError, match="is not a digest"):
             load(folder, digest)
 
 
@@ -155,7 +155,7 @@ def test_commands_on_records_whose_digests_lead_out_read_nothing_there(
 
     code, _, err = command("report", folder, "--format", "md")
     assert (code, err) == (0, "")
-    assert "is no digest" in (folder / "report" / "report.md").read_text()
+    assert "is not a digest" in (folder / "report" / "report.md").read_text()
     for arguments in (("validate", folder), ("replay", folder, "a1")):
         code, _, err = command(*arguments)
         assert code == 2

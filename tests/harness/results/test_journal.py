@@ -21,7 +21,7 @@ def record(run_id, **changes):
         form="plain", sizes={}, solver="a", options={}, tol=1e-6, repeat=0, block=0,
         verdict=Verdict.VERIFIED,
     )  # fmt: skip
-    return blank.but(**changes)
+    return blank.replace(**changes)
 
 
 def ids(folder):

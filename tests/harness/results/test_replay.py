@@ -139,7 +139,7 @@ def rewrite(record, **changes):
         for line in journal.read_text().splitlines()
         if json.loads(line)["run_id"] != record.run_id
     ]
-    journal.write_text("\n".join([*others, record.but(**changes).to_json()]) + "\n")
+    journal.write_text("\n".join([*others, record.replace(**changes).to_json()]) + "\n")
 
 
 def test_another_verdict_is_told_and_counts_as_no(cli, stored):

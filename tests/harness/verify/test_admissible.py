@@ -6,7 +6,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness.mechanics import Exact, Real
 from mortarbench.harness.verify import admissible as module
-from mortarbench.harness.verify.admissible import admissible, inside_at_rows
+from mortarbench.harness.verify.admissible import admissible, feasible_at_rows
 from tests.support.held_by_contact import disc_between_plates
 
 
@@ -16,14 +16,14 @@ def moved(B, c, u, *, R=None, softness=None, closed=None):
     m, n = B.shape
     exact = Exact(
         f=np.zeros(n, dtype=Real), B=csr_array(B), c=c, lower=np.zeros(m, dtype=Real),
-        upper=np.full(m, np.inf, dtype=Real), held=np.zeros(0, dtype=np.int64),
-        loose=np.ones(m, dtype=Real),
+        upper=np.full(m, np.inf, dtype=Real), fixed=np.zeros(0, dtype=np.int64),
+        compliance=np.ones(m, dtype=Real),
     )  # fmt: skip
     R = np.zeros((n, 0)) if R is None else np.array(R, dtype=float)
     softness = np.ones(n) if softness is None else np.array(softness, dtype=float)
     closed = np.zeros(m, dtype=bool) if closed is None else np.array(closed)
     with np.errstate(all="ignore"):  # as `certify` does
-        return inside_at_rows(exact, R, softness, u, closed)
+        return feasible_at_rows(exact, R, softness, u, closed)
 
 
 def test_what_penetrates_nothing_stays():
@@ -71,7 +71,7 @@ def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypa
     u = 1e-3 * rng.standard_normal(mechanics.exact.f.size).astype(Real)
     none = np.zeros(mechanics.exact.c.size, dtype=bool)
     by_factor = admissible(mechanics, u, none)
-    monkeypatch.setattr(module, "DENSE", 2)
+    monkeypatch.setattr(module, "MAX_DENSE_ROWS", 2)
     by_iterations = admissible(mechanics, u, none)
 
     far = mechanics.norm(by_factor - u)

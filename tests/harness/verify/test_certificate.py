@@ -182,7 +182,7 @@ def effectivities(name: str, form: str, labels: Sequence[str]) -> list[float]:
             s = solver.prepare(case.qp, tol)()
             if not has_point(s):
                 continue
-            s = case.mechanics.back(s)
+            s = case.mechanics.to_primal(s)
             c = certify(case.mechanics, s)
             assert holds(problem, s, c)
             true = np.hypot(problem.error(c.u), problem.error(c.equilibrium))
@@ -225,7 +225,7 @@ def test_so_are_those_of_the_fleet(name):
 def test_smalbe_reaches_six_digits_of_the_energy_norm_at_1e8(name):
     case = parse(name, PROBLEMS).build(reference_solution)
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-8)()
-    assert certify(case.mechanics, case.mechanics.back(s)).bound <= 1e-6
+    assert certify(case.mechanics, case.mechanics.to_primal(s)).bound <= 1e-6
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -63,7 +63,7 @@ class Known:
     exact: ReferencePoint
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.back` would give it."""
+        """The solution as `Mechanics.to_primal` would give it."""
         mechanics, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + mechanics.rows.T @ lam)
@@ -240,7 +240,7 @@ def test_what_solvers_return_is_bounded_in_every_form(name):
             for tol in (1e-3, 1e-6):
                 s = solver.prepare(case.qp, tol)()
                 assert kkt_residuals(case.qp, s).worst <= 100 * tol
-                back = case.mechanics.back(s)
+                back = case.mechanics.to_primal(s)
                 c = certify(case.mechanics, back)
                 assert holds(problem, back, c)
                 found.append(c.bound)

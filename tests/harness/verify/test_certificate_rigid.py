@@ -13,7 +13,11 @@ from mortarbench.harness import Case, Solution, Status, UncertifiableError, cert
 from mortarbench.harness.mechanics import Extended, Mechanics, Real, cancelling
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify import certificate
-from mortarbench.harness.verify.admissible import _newton, admissible, balanced
+from mortarbench.harness.verify.admissible import (
+    _newton,
+    admissible,
+    balanced_partition,
+)
 from mortarbench.harness.verify.certificate import Certificate, _charge, _Reach
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.references import reference_point
@@ -117,7 +121,7 @@ def _swapped_rows(m, s, size, rng):
 
 def _softest_modes(m, s, size, rng):
     """Disturb by what little force bends most."""
-    v = m.relaxed(m.relaxed(rng.standard_normal(s.x.size).astype(Real)))
+    v = m.apply_inverse(m.apply_inverse(rng.standard_normal(s.x.size).astype(Real)))
     return replace(s, x=s.x + (size * m.norm(s.x) / m.norm(v) * v).astype(np.float64))
 
 
@@ -185,7 +189,7 @@ def test_a_disc_between_plates_is_certified_to_six_digits(form, tilt, contact):
     )
     s = SOLVERS["piqp"].prepare(case.qp, 1e-10)()
     assert kkt_residuals(case.qp, s).worst < 1e-9
-    found = certify(case.mechanics, case.mechanics.back(s))
+    found = certify(case.mechanics, case.mechanics.to_primal(s))
     assert found.bound <= 1e-6
     assert found.seminorm
 
@@ -201,7 +205,7 @@ def test_a_free_plate_on_a_disc_rests_on_no_row_at_the_end_of_the_arc(
     form = "dual" if solver == "smalbe" else "primal"
     case = disc_between_plates(9, form=form, contact=contact, basis=basis)
     s = SOLVERS[solver].prepare(case.qp, 1e-8)()
-    at = case.mechanics.back(s)
+    at = case.mechanics.to_primal(s)
     far = case.mechanics.primal.h > 0.05  # 15 cm
 
     assert s.status is Status.SOLVED
@@ -260,7 +264,7 @@ def test_gaps_change_with_the_deformation_by_no_more_than_the_compliance():
     split = Undivided(mechanics)
     for i in (0, 3):
         row = mechanics.exact.B[[i]].toarray()[0]
-        v = mechanics.relaxed(row)
+        v = mechanics.apply_inverse(row)
         attained = float(row @ v) / mechanics.norm(v)
         pressed = np.zeros_like(mechanics.exact.c)
         pressed[i] = 1
@@ -318,7 +322,7 @@ def test_balanced_forces_balance_to_the_last_digits_of_their_terms(name):
     rng, motions = np.random.default_rng(1), mechanics.motions
     for size in (1e-12, 1e-3):
         start = np.maximum(lam * (1 + size * rng.standard_normal(lam.size)), 0)
-        found = balanced(mechanics, start, u)
+        found = balanced_partition(mechanics, start, u)
         left = (
             motions.felt.T @ mechanics.exact.f - motions.KR.T @ u - motions.G.T @ found
         )

@@ -134,7 +134,7 @@ def solved(name: str, labels=tuple(SOLVERS)):
                 s = solver.prepare(case.qp, tol)()
             except (ArithmeticError, ValueError, RuntimeError, np.linalg.LinAlgError):
                 continue  # a crash is no answer, and for other tests
-            s = case.mechanics.back(s)
+            s = case.mechanics.to_primal(s)
             if np.isfinite(s.x).all() and np.isfinite(s.z).all():
                 yield f"{label} to {tol}", s
 

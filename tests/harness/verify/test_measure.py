@@ -265,7 +265,7 @@ def test_a_malformed_answer_is_a_failure_with_a_short_message(qp, wrong, message
 def test_a_history_that_would_fill_the_disk_is_dropped_and_the_answer_kept(
     qp, monkeypatch
 ):
-    monkeypatch.setattr(answers, "MOST_HISTORY", 100)
+    monkeypatch.setattr(answers, "MAX_HISTORY_BYTES", 100)
 
     class Verbose(type(PLUGIN.solvers["honest"])):
         def act(self, qp):
@@ -358,7 +358,7 @@ def test_a_small_operator_is_multiplied_out_for_who_needs_its_entries(by_product
 
 
 def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
-    monkeypatch.setattr(measuring, "MOST_ASSEMBLED", 2)
+    monkeypatch.setattr(measuring, "MAX_ASSEMBLED_ROWS", 2)
     s = measure(ReadsEntries(), by_products, 1e-6).solution
 
     assert s.status is Status.DECLINED

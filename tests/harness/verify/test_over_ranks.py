@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mortarbench.harness.distributed import mpi
-from mortarbench.harness.distributed.vectors import EMITTED
+from mortarbench.harness.distributed.vectors import DISTRIBUTED_DIGEST
 from tests.support import ROOT, SUPPORT
 
 pytestmark = pytest.mark.together
@@ -157,7 +157,7 @@ def test_digests_tell_qps_apart_and_not_the_ranks_that_emit_them(found):
 
     assert all(by_ranks == by_one for by_ranks, by_one in digests)
     assert len({digest for digest, _ in digests}) == len(found)
-    assert all(digest.startswith(EMITTED) for digest, _ in digests)
+    assert all(digest.startswith(DISTRIBUTED_DIGEST) for digest, _ in digests)
 
 
 SEARCHED = (

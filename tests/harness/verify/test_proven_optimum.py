@@ -468,7 +468,7 @@ def test_an_objective_that_cancels_is_right_to_the_digits_of_its_terms():
 
 
 def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
-    stored = new_record(decided_by="reference", optimum_error=5e-8).but(
+    stored = new_record(decided_by="reference", optimum_error=5e-8).replace(
         claimed="solved", primal=1e-6, dual=0.0, complementarity=0.0, gap=0.0,
         verdict=verdict(Status.SOLVED, Residuals(1e-6, 0, 0, 0), TOL, error=5e-8),
     )  # fmt: skip
@@ -480,14 +480,14 @@ def test_the_verdict_at_another_factor_is_that_of_the_error_to_the_optimum():
 
 def test_without_a_reference_the_verdict_at_another_factor_is_that_of_the_residuals():
     found = dict(claimed="solved", primal=5e-8, dual=0.0, complementarity=0.0, gap=0.0)
-    stored = new_record().but(**found, verdict=Verdict.VERIFIED)
+    stored = new_record().replace(**found, verdict=Verdict.VERIFIED)
 
     assert rejudged(stored, 10) is Verdict.VERIFIED
     assert rejudged(stored, 1) is Verdict.INACCURATE
 
 
 def test_without_a_point_the_verdict_is_the_same_at_every_factor():
-    stored = new_record().but(claimed="solved", verdict=Verdict.WRONG)
+    stored = new_record().replace(claimed="solved", verdict=Verdict.WRONG)
 
     assert rejudged(stored, 1e9) is Verdict.WRONG
 

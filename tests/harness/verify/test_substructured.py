@@ -21,22 +21,22 @@ from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
-    OwnBodies,
+    LocalBodies,
     _OnRanks,
     certify_over_ranks,
 )
 from mortarbench.harness.verify.references import ReferencePoint, reference_point
-from mortarbench.harness.verify.substructured import neighbour, still
+from mortarbench.harness.verify.substructured import neighbour, without_rigid_motion
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
-from mortarbench.problems.feti.own_bodies import own_bodies
+from mortarbench.problems.feti.local_bodies import local_bodies
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.substructures import LocalProblems
 from mortarbench.problems.models import beam_ring, hertz, patch
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.decomposed_bodies import labelled_subdivision, parts_by
 from tests.support.disturbed import DISTURBANCES
-from tests.support.torn_bodies import labelled, parts_by
 
 CASES = (
     "beam-ring/Nr=3/Nh=2/step=10",
@@ -79,10 +79,10 @@ class Known:
 
     mechanics: Mechanics
     exact: ReferencePoint
-    own: OwnBodies
+    own: LocalBodies
 
     def solution(self) -> Solution:
-        """The solution as `Mechanics.back` would give it."""
+        """The solution as `Mechanics.to_primal` would give it."""
         m, primal = self.mechanics, self.mechanics.primal
         u, lam = (v.astype(np.float64) for v in (self.exact.u, self.exact.multipliers))
         y = -primal.A @ (primal.P @ u + primal.q + m.rows.T @ lam)
@@ -108,15 +108,17 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
     case = parse(f"{name}/primal", PROBLEMS).build(reference_solution)
     whole, bodies = case.mechanics, bodies_of(name)
     assert whole is not None
-    layout = labelled(bodies, boxes(bodies, parts))
+    layout = labelled_subdivision(bodies, boxes(bodies, parts))
 
     def never() -> Any:
         raise AssertionError("certificates of subdomains need no factor of the whole")
 
     subdomains = on_one_process(parts_by(bodies, layout, whole.primal, whole.friction))
-    own = own_bodies(subdomains)
+    own = local_bodies(subdomains)
     mechanics = replace(
-        whole, factorise=never, in_parts=lambda u, z: certify_over_ranks(own, u, z)
+        whole,
+        factorise=never,
+        certify_by_subdomains=lambda u, z: certify_over_ranks(own, u, z),
     )
     vars(mechanics)["whole"] = whole
     return Known(mechanics, reference_point(whole, reference_solution), own)
@@ -133,7 +135,7 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
         and worst <= ROUNDED * within + slack
         and (lam >= exact.lower).all() and (lam <= exact.upper).all()
         and (motion[exact.contact] <= 0).all()
-        and (found.u[exact.held] == 0).all()
+        and (found.u[exact.fixed] == 0).all()
     )  # fmt: skip
 
 
@@ -185,7 +187,7 @@ def test_bounds_are_about_those_of_the_whole(name: str) -> None:
         for label in ("clarabel", "piqp"):
             case = parse(f"{name}/dual", PROBLEMS).build(reference_solution)
             assert case.mechanics is not None
-            s = case.mechanics.back(SOLVERS[label].prepare(case.qp, tol)())
+            s = case.mechanics.to_primal(SOLVERS[label].prepare(case.qp, tol)())
             one, other = (certify(m, s) for m in (case.mechanics, problem.mechanics))
             assert holds(problem, s, other)
             if one.bound > NOISE:
@@ -213,7 +215,7 @@ def excess_of_rounding(name: str, tols: tuple[float, ...]) -> list[float]:
         for label in ("smalbe", "feti"):
             if SOLVERS[label].declines(case.qp):
                 continue
-            s = case.mechanics.back(SOLVERS[label].prepare(case.qp, tol)())
+            s = case.mechanics.to_primal(SOLVERS[label].prepare(case.qp, tol)())
             found = certify(case.mechanics, s)
             points = found.u, s.x.astype(Real)
             error = max(whole.norm(v - exact.u) for v in points) / exact.norm
@@ -238,10 +240,10 @@ def test_forces_of_subdomains_balance_and_add_up_to_the_residual() -> None:
     mechanics, parts = problem.mechanics, problem.own.parts
     rng, exact = np.random.default_rng(5), problem.exact
     u = exact.u + 1e-3 * np.abs(exact.u).max() * rng.standard_normal(exact.u.size)
-    u[mechanics.exact.held] = 0
+    u[mechanics.exact.fixed] = 0
     split = _OnRanks(problem.own)
     near = neighbour(split, split.residual(u).rho + split.pulled(exact.multipliers))
-    held = mechanics.exact.held
+    held = mechanics.exact.fixed
     b = parts.product(near.d)
     whole = mechanics.stiffness @ u - mechanics.exact.f
     whole = whole + mechanics.exact.B.T @ exact.multipliers
@@ -260,10 +262,12 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     mechanics, parts = problem.mechanics, problem.own.parts
     split = _OnRanks(problem.own)
     u = rng.standard_normal(mechanics.exact.f.size).astype(Real)
-    u[mechanics.exact.held] = 0
+    u[mechanics.exact.fixed] = 0
     apart = parts.kernel @ rng.standard_normal(parts.kernel.shape[1])
     together = split.averaged(split.spread(u) + 100 * apart)
-    left = still(split, together - u)  # contact alone holds a body of the patch
+    left = without_rigid_motion(
+        split, together - u
+    )  # contact alone holds a body of the patch
 
     assert np.abs(left).max() < 1e-9
 
@@ -271,7 +275,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
 def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
     parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
-    K = block_diag([parts.torn.kinds[k].K for k in parts.torn.kind])
+    K = block_diag([parts.torn.classes[k].K for k in parts.torn.class_of])
     rng = np.random.default_rng(6)
     v = rng.standard_normal(K.shape[0])
     b = v - parts.kernel @ (parts.kernel.T @ v)

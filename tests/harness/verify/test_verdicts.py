@@ -11,9 +11,9 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Case, Solution, Status, Verdict
 from mortarbench.harness.distributed.vectors import (
-    Answered,
     DistributedColumns,
-    Emitted,
+    DistributedQP,
+    Evaluation,
     Ranks,
     Share,
     distributed,
@@ -64,7 +64,7 @@ def fault(_):
 
 
 class Broken:
-    back = staticmethod(fault)
+    to_primal = staticmethod(fault)
 
 
 def test_a_measurement_has_a_name_that_nothing_but_what_is_measured_changes():
@@ -180,7 +180,9 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
     monkeypatch.setattr(
         "mortarbench.harness.verify.verdicts.perf_counter", lambda: next(looks)
     )
-    fields, note = certified(case(mechanics=SimpleNamespace(back=lambda s: s)), POINT)
+    fields, note = certified(
+        case(mechanics=SimpleNamespace(to_primal=lambda s: s)), POINT
+    )
 
     assert fields.pop("certify_seconds") == 2.0
     if is_bounded:
@@ -191,7 +193,7 @@ def test_what_certifying_takes_is_noted_whether_it_ends_in_a_bound_or_not(
         assert (fields, note) == ({}, "no energy_bound: no admissible pair")
 
 
-class Alone:
+class SerialComm:
     """A communicator of one process."""
 
     size, rank = 1, 0
@@ -209,7 +211,7 @@ class Alone:
 
 def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
     """Evaluate a point of the QP above, with the bound ¼ in place of the row."""
-    ranks = Ranks(Alone())
+    ranks = Ranks(SerialComm())
 
     def slices(v):
         return distributed(np.array(v, dtype=float), ranks)
@@ -222,8 +224,8 @@ def on_one_rank(x=POINT.x, certifiable=None, quantities=None):
         )  # fmt: skip
         return Share(qp, lambda s: s)
 
-    answered = Answered(certifiable, quantities)
-    emitted = Emitted(2, 1, 3, share, lambda: "", lambda s: answered)
+    answered = Evaluation(certifiable, quantities)
+    emitted = DistributedQP(2, 1, 3, share, lambda: "", lambda s: answered)
     s = replace(POINT, x=slices(x), z=QP_.h[:0], z_box=slices([0.5, 0]))
     return evaluated_by_ranks(emitted, s, ranks)
 

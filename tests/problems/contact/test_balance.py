@@ -1,4 +1,4 @@
-"""Loads that nothing balances, against what plain mechanics and linprog say of them."""
+"""Unbalanced loads, compared with statics and with a linear program."""
 
 import numpy as np
 import pytest
@@ -25,18 +25,18 @@ def blocks(*, fixed, forces, gap=0.0):
 
     def nodes(body, place):
         first, _, second = place.partition(" ")
-        found = sides[f"{body}_{first}"]
-        return np.intersect1d(found, sides[f"{body}_{second}"]) if second else found
+        side = sides[f"{body}_{first}"]
+        return np.intersect1d(side, sides[f"{body}_{second}"]) if second else side
 
     load = np.zeros((len(mesh.points), 2))
     for b, corner, force in forces:
         load[nodes(b, corner)] += force
-    held = [
+    fixed_dofs = [
         2 * nodes(b, place) + "xy".index(c) for b, place, axes in fixed for c in axes
     ]
     bodies = assemble(
         mesh, body, names=("lower", "upper"), materials=(Material(1e9, 0.3),) * 2,
-        plane="strain", units=(4.0, 1e6), fixed=np.unique(np.concatenate(held)),
+        plane="strain", units=(4.0, 1e6), fixed=np.unique(np.concatenate(fixed_dofs)),
         load=load.ravel(),
         pairs=(ContactPair(sides["upper_bottom"], sides["lower_top"]),),
     )  # fmt: skip
@@ -44,34 +44,34 @@ def blocks(*, fixed, forces, gap=0.0):
     return bodies, rows.B
 
 
-HELD = ("lower", "bottom", "xy")
+SUPPORT = ("lower", "bottom", "xy")
 DOWN = [("upper", "top left", [0, -1e6]), ("upper", "top right", [0, -1e6])]
 
 
-def test_what_presses_down_within_the_support_is_balanced():
+def test_loads_that_press_down_within_the_support_are_balanced():
     for share in (0.5, 0.01, 0.99, 1.0):  # up to its very edge
         forces = [
             ("upper", "top left", [0, -2e6 * share]),
             ("upper", "top right", [0, -2e6 * (1 - share)]),
         ]
-        check_balance(*blocks(fixed=[HELD], forces=forces))
+        check_balance(*blocks(fixed=[SUPPORT], forces=forces))
 
 
 @pytest.mark.parametrize(
-    ("fixed", "forces", "told"),
+    ("fixed", "forces", "message"),
     [
-        ([HELD], [*DOWN, ("upper", "top left", [10, 0])],
+        ([SUPPORT], [*DOWN, ("upper", "top left", [10, 0])],
          "body 'upper': nothing balances its load in x; expected a support"),
-        ([HELD], [("upper", "top left", [0, 5]), ("upper", "top right", [0, 5])],
+        ([SUPPORT], [("upper", "top left", [0, 5]), ("upper", "top right", [0, 5])],
          "body 'upper': nothing balances its load in y;"),
-        ([HELD], [("upper", "top left", [-3, 5])],
+        ([SUPPORT], [("upper", "top left", [-3, 5])],
          "body 'upper': nothing balances its load in x and y;"),
         ([("lower", "bottom", "y")], [*DOWN, ("lower", "top left", [9, 0])],
          "body 'lower': nothing balances its load in x;"),
-        ([HELD], [*DOWN, ("upper", "top left", [0, 1.5e6])],
+        ([SUPPORT], [*DOWN, ("upper", "top left", [0, 1.5e6])],
          "body 'upper': nothing balances the moment of its load: it can turn about "
          "(1, "),
-        ([HELD, ("upper", "bottom left", "xy")], [("upper", "bottom right", [0, 7])],
+        ([SUPPORT, ("upper", "bottom left", "xy")], [("upper", "bottom right", [0, 7])],
          "body 'upper': nothing balances the moment of its load: it can turn about "
          "(-1, 0) m;"),
         ([("upper", "top left", "xy"), ("upper", "top right", "y"),
@@ -79,15 +79,15 @@ def test_what_presses_down_within_the_support_is_balanced():
          "body 'lower': nothing balances its load in y;"),
     ],
 )  # fmt: skip
-def test_a_load_that_nothing_balances_is_named(fixed, forces, told):
+def test_an_unbalanced_load_is_refused_by_name(fixed, forces, message):
     with pytest.raises(InputError) as e:
         check_balance(*blocks(fixed=fixed, forces=forces))
 
-    assert str(e.value).startswith(told)
+    assert str(e.value).startswith(message)
 
 
 def test_bodies_that_can_only_move_together_are_both_named():
-    """The lower one is pushed up against the upper one, which nothing holds down."""
+    """The lower block is pushed up against the upper one, which is not supported."""
     fixed = [("lower", "left", "x"), ("upper", "left", "x")]
     forces = [("lower", "bottom left", [0, 4]), ("lower", "bottom right", [0, 4])]
     with pytest.raises(InputError) as e:
@@ -100,13 +100,14 @@ def test_bodies_that_can_only_move_together_are_both_named():
 
 def test_bodies_that_supports_hold_need_no_contact():
     bodies, rows = blocks(
-        fixed=[HELD, ("upper", "top", "xy")], forces=[("upper", "bottom left", [5, 5])]
+        fixed=[SUPPORT, ("upper", "top", "xy")],
+        forces=[("upper", "bottom left", [5, 5])],
     )
     check_balance(bodies, rows[:0])
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_refused_is_what_a_linear_program_finds_a_free_motion_for(seed):
+def test_loads_are_refused_where_a_linear_program_has_a_free_motion(seed):
     """max fᵀr over rigid r with B_D r = 0, B r ≤ 0 and components of at most 1."""
     rng = np.random.default_rng(seed)
     places = ("left", "bottom", "top", "right", "top left", "bottom right")
@@ -123,11 +124,11 @@ def test_refused_is_what_a_linear_program_finds_a_free_motion_for(seed):
     ]
     bodies, B = blocks(fixed=fixed, forces=forces)
     R = bodies.rigid
-    found = linprog(
+    program = linprog(
         -(R.T @ bodies.f), A_ub=B @ R, b_ub=np.zeros(B.shape[0]),
         A_eq=bodies.B_D @ R, b_eq=np.zeros(bodies.B_D.shape[0]), bounds=(-1, 1),
     )  # fmt: skip
-    if -found.fun > 1e-4:
+    if -program.fun > 1e-4:
         with pytest.raises(InputError, match="nothing balances"):
             check_balance(bodies, B)
     else:

@@ -1,4 +1,4 @@
-"""Node-to-segment rows against geometry done by hand."""
+"""Node-to-segment rows, compared with hand-computed geometry."""
 
 import numpy as np
 import pytest
@@ -150,7 +150,7 @@ def test_a_master_of_one_segment_has_an_inside_and_two_ends():
     assert at.normal == pytest.approx(np.array([[0, 1]] * 3))
 
 
-def test_segments_without_length_change_nothing():
+def test_segments_of_zero_length_have_no_effect():
     """Every node of the roof occurs twice; forces go to one node of each place."""
     slave = np.array([[0.2, 0.5], [0.6, 1.1], [1.0, 1.2], [1.0, 1.2], [2.5, 0.0]])
     once = rows(slave, ROOF)

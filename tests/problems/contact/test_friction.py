@@ -1,4 +1,4 @@
-"""Laws of friction and the fixed point of Coulomb's, of one node by hand."""
+"""Laws of friction and the fixed point of Coulomb's law, by hand for one node."""
 
 from itertools import pairwise
 from types import SimpleNamespace
@@ -12,11 +12,11 @@ from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
+    coulomb_fixed_point,
     forces_at_nodes,
     friction_of,
-    iterate_of,
     law_of,
-    settled,
+    select_iterate,
 )
 
 FORCE = 6.0  #: normal force without friction
@@ -31,18 +31,18 @@ def friction(mu, bound=0.0, cohesion=0.0):
 
 
 def lifted(by):
-    """Normal force of which a part of the friction's bound is taken away."""
+    """Return a normal force that decreases by a multiple of the bound of friction."""
     return lambda one: FORCE - by * one.bound
 
 
 @pytest.mark.parametrize("cohesion", [0.0, 0.25])
-def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(cohesion):
+def test_the_fixed_point_satisfies_coulombs_law(cohesion):
     """g = c + μ(6 − g)  with μ = ½: g = (c + 3)/1.5."""
-    found = settled(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
+    iterates = coulomb_fixed_point(friction(0.5, 1.0, cohesion), lifted(1.0), step=1)
 
-    assert found[-1].bound == pytest.approx((cohesion + 3) / 1.5, rel=1e-10)
-    assert found[-1].unsettled == 0
-    for one, after in pairwise(found):
+    assert iterates[-1].bound == pytest.approx((cohesion + 3) / 1.5, rel=1e-10)
+    assert iterates[-1].unsettled == 0
+    for one, after in pairwise(iterates):
         demanded = cohesion + 0.5 * (FORCE - one.bound)
         assert after.bound == pytest.approx(demanded)
         off = abs(one.bound - demanded) / one.bound
@@ -50,47 +50,47 @@ def test_the_bound_settles_where_it_is_what_the_law_makes_of_its_normal_force(co
 
 
 def test_a_bound_of_zero_is_as_far_from_the_law_as_the_law_demands():
-    first, *others = settled(friction(0.5), lifted(0.0), step=1)
+    first, *others = coulomb_fixed_point(friction(0.5), lifted(0.0), step=1)
 
     assert first.unsettled == 3.0
     assert [float(one.bound[0]) for one in others] == [3.0]
 
 
-def test_a_law_that_asks_for_nothing_is_settled_at_once():
-    (only,) = settled(friction(0.0), lifted(1.0), step=1)
+def test_a_coefficient_of_zero_converges_at_once():
+    (only,) = coulomb_fixed_point(friction(0.0), lifted(1.0), step=1)
 
     assert (only.bound, only.unsettled) == (0, 0)
 
 
-def test_bounds_that_go_apart_are_refused_with_the_nearest_and_the_last():
-    """μ = 1.01: each is 1.01 times as far from the fixed point, on the other side."""
+def test_divergence_is_refused_with_the_smallest_and_the_last_residual():
+    """μ = 1.01: iterates alternate, at distances that grow by the factor 1.01."""
     calls = []
 
     def normal(one):
         calls.append(float(one.bound[0]))
         return FORCE - one.bound
 
-    with pytest.raises(InputError, match="load step 7 does not settle") as e:
-        settled(friction(1.01, 3.0), normal, step=7)
+    with pytest.raises(InputError, match="does not converge in load step 7") as e:
+        coulomb_fixed_point(friction(1.01, 3.0), normal, step=7)
 
     assert "\n" not in str(e.value)
     assert 31 <= len(calls) <= 33
-    assert f"after {len(calls)} Tresca problems" in str(e.value)
+    assert f"after {len(calls)} Tresca problems," in str(e.value)
     demanded = 1.01 * (FORCE - np.array(calls))
     off = abs(np.array(calls) - demanded) / calls
     assert f"is {off[-1]:.1e}, and was {off.min():.1e} at best" in str(e.value)
 
 
-def test_bounds_that_creep_end_at_a_thousand():
-    """Each is a thousandth nearer to a point that it never comes to."""
+def test_slow_convergence_ends_after_a_thousand_problems():
+    """The distance to the limit shrinks by a thousandth per iterate."""
     calls = []
 
     def normal(one):
         calls.append(one)
         return one.bound * (1 + 1e-3 * 0.999 ** len(calls))
 
-    with pytest.raises(InputError, match="after 1000 Tresca problems"):
-        settled(friction(1.0, 1.0), normal, step=1)
+    with pytest.raises(InputError, match="after 1000 Tresca problems,"):
+        coulomb_fixed_point(friction(1.0, 1.0), normal, step=1)
 
     assert len(calls) == 1000
 
@@ -101,23 +101,21 @@ def test_a_bound_that_holds_no_equilibrium_is_named():
             raise ArithmeticError("no optimal point")
         return FORCE - one.bound
 
-    with pytest.raises(
-        InputError, match=r"step 3: no equilibrium.* the 2\. bound"
-    ) as e:
-        settled(friction(0.5, 1.0), normal, step=3)
+    with pytest.raises(InputError, match=r"step 3: no equilibrium.* bound 2 of") as e:
+        coulomb_fixed_point(friction(0.5, 1.0), normal, step=3)
     assert str(e.value).endswith("no optimal point")
 
 
 def test_iterates_of_a_fixed_point_count_from_one_and_zero_is_the_last():
     problems = ["first", "second", "third"]
 
-    assert [iterate_of(problems, i, 1) for i in (0, 1, 2, 3)] == [
+    assert [select_iterate(problems, i, 1) for i in (0, 1, 2, 3)] == [
         "third", "first", "second", "third",
     ]  # fmt: skip
     with pytest.raises(
         PastEndError, match="iterate=4: the fixed point of step 5 has 3"
     ):
-        iterate_of(problems, 4, 5)
+        select_iterate(problems, 4, 5)
 
 
 def test_nodes_are_pressed_and_never_pulled():
@@ -126,12 +124,12 @@ def test_nodes_are_pressed_and_never_pulled():
     assert force.tolist() == [0, 3, 0, 0, 2]
 
 
-def test_a_law_reads_what_is_its_own():
-    given = {"bound": 5.0, "mu": 0.3}
+def test_a_law_reads_only_its_own_parameter():
+    keys = {"bound": 5.0, "mu": 0.3}
 
-    assert law_of({"friction": "none", **given}) == FrictionLaw()
-    assert law_of({"friction": "tresca", **given}) == FrictionLaw("tresca", bound=5.0)
-    assert law_of({"friction": "coulomb", **given}) == FrictionLaw("coulomb", mu=0.3)
+    assert law_of({"friction": "none", **keys}) == FrictionLaw()
+    assert law_of({"friction": "tresca", **keys}) == FrictionLaw("tresca", bound=5.0)
+    assert law_of({"friction": "coulomb", **keys}) == FrictionLaw("coulomb", mu=0.3)
     assert [FrictionLaw(kind).acts for kind in ("none", "tresca", "coulomb")] == [
         False, True, True,
     ]  # fmt: skip
@@ -147,15 +145,15 @@ def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_fo
     )  # fmt: skip
     laws = FrictionLaw("tresca", bound=20.0), FrictionLaw("coulomb", mu=0.5)
     before, pressed = np.array([7.0, 8.0, 9.0]), np.array([1.0, 1.0, 3.0, 1.0, 5.0])
-    found = friction_of(bodies, rows, laws, before, pressed)
+    discrete = friction_of(bodies, rows, laws, before, pressed)
 
-    assert found.cohesion.tolist() == [20 * 0.5 / 10, 0, 0]
-    assert found.mu.tolist() == [0, 0.5, 0.5]
-    assert found.bound.tolist() == [1, 0.5 * 3, 0.5 * 5]
-    assert found.start.tolist() == [7, 8, 9]
+    assert discrete.cohesion.tolist() == [20 * 0.5 / 10, 0, 0]
+    assert discrete.mu.tolist() == [0, 0.5, 0.5]
+    assert discrete.bound.tolist() == [1, 0.5 * 3, 0.5 * 5]
+    assert discrete.start.tolist() == [7, 8, 9]
 
 
-def test_without_rows_there_is_no_friction():
+def test_without_rows_friction_is_empty():
     rows = SimpleNamespace(row=np.zeros(0, dtype=np.int64))
 
     assert friction_of(None, rows, (), np.zeros(0), np.zeros(0)) is NO_FRICTION

@@ -1,4 +1,4 @@
-"""Mortar integrals against exact numbers, invariants and rates."""
+"""Mortar integrals: exact values, invariants and rates of convergence."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def arcs(n, master_share=0.9):
 # exact numbers --------------------------------------------------------------------
 
 
-def test_normals_of_a_known_polyline():
+def test_normals_of_a_polyline_by_hand():
     normal = surface(np.array([[0.0, 0], [4, 3], [7, 7]]), "slave").node_normal
 
     expected = [[3 / 5, -4 / 5], [np.sqrt(0.5), -np.sqrt(0.5)], [4 / 5, -3 / 5]]
@@ -124,7 +124,7 @@ def test_the_gap_of_parallel_sides_is_their_distance_in_every_row(basis):
 
 @pytest.mark.parametrize("basis", BASES)
 def test_a_linear_gap_is_exact_at_the_nodes_with_the_dual_basis(basis):
-    """With Φ biorthogonal ∫Φ_j g/∫N_j is g_j; with N it is an average."""
+    """For biorthogonal Φ, ∫Φ_j g/∫N_j is g_j; for N it is an average."""
     slave, master = flat(4, 0.5, rightwards=True), np.array([[2.0, 0.2], [-1.0, -0.1]])
     gap = 0.5 - 0.1 * slave[:, 0]
     _, c, *_ = rows(slave, master, basis=basis)
@@ -156,7 +156,7 @@ def test_the_constraint_is_on_the_total_displacement(basis):
 @pytest.mark.parametrize(
     "right", [0.5, 0.2, 0.05, 1e-6], ids=lambda r: f"to {r} of the last"
 )
-def test_the_dual_basis_is_biorthogonal_on_what_is_covered(right):
+def test_the_dual_basis_is_biorthogonal_on_the_covered_part(right):
     """∫Φ_j N_k = δ_jk ∫N_k per segment, the last of four covered in part."""
     slave = flat(4, 0.0, rightwards=True, right=4.0)
     s, m = sides(slave, flat(7, -0.1, rightwards=False, left=-1.0, right=3 + right))
@@ -196,7 +196,7 @@ def test_D_of_the_dual_basis_is_diagonal_on_straight_sides_and_equals_the_cover(
 
 
 def test_a_row_of_the_dual_basis_pulls_the_slave_along_the_normal_of_its_node():
-    """Whatever the master's mesh: ∫Φ_j ν is a sum of exact integrals, n_j ∫N_j."""
+    """For any master mesh, ∫Φ_j ν = n_j ∫N_j: the quadrature is exact."""
     s, m = sides(*arcs(20))
     edge = np.linalg.norm(np.diff(s.x, axis=0), axis=1)
     share = (np.append(0, edge) + np.append(edge, 0)) / 2
@@ -256,12 +256,12 @@ def test_the_search_loses_no_overlap(seed, monkeypatch):
     slave, master = arcs(70)
     s, m = sides(slave + 0.02 * rng.standard_normal(slave.shape),
                  master + 0.02 * rng.standard_normal(master.shape))  # fmt: skip
-    found = overlaps(s, m)
+    segments = overlaps(s, m)
     pairs = np.divmod(np.arange(70 * 63), 63)
-    monkeypatch.setattr(module, "facing", lambda s, m: pairs)
+    monkeypatch.setattr(module, "facing_segments", lambda s, m: pairs)
 
-    assert len(found.slave) > 100
-    for one, other in zip(found, overlaps(s, m), strict=True):
+    assert len(segments.slave) > 100
+    for one, other in zip(segments, overlaps(s, m), strict=True):
         assert (one == other).all()
 
 
@@ -393,7 +393,7 @@ def test_sides_beside_each_other_have_no_row(basis):
 
 
 @pytest.mark.parametrize("basis", BASES)
-def test_a_side_that_runs_the_wrong_way_faces_nothing(basis):
+def test_a_reversed_side_has_no_contact_rows(basis):
     slave, master = flat(7, 0.25, rightwards=True), flat(5, 0.0, rightwards=False)
 
     assert rows(slave[::-1], master, basis=basis).B.shape == (0, 28)

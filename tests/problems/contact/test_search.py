@@ -1,16 +1,16 @@
-"""The search against all pairs, and what it visits."""
+"""Closest-point search, compared with all pairs, and its number of visits."""
 
 import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.problems.contact import segment_search as search
-from mortarbench.problems.contact.segment_search import Reach, facing, nearest
+from mortarbench.problems.contact.segment_search import Reach, facing_segments, nearest
 from mortarbench.problems.contact.surface import surface
 
 
 def all_pairs(x, chain):
-    """Distance of each point from each segment, (s, e)."""
+    """Return the distance of each point from each segment, (s, e)."""
     edge = np.diff(chain, axis=0)
     offset = x[:, None] - chain[:-1]
     xi = np.einsum("sex,ex->se", offset, edge) / (edge**2).sum(axis=1)
@@ -36,11 +36,11 @@ def test_the_closest_segment_of_the_whole_chain_is_found(segments, roughness):
     rng = np.random.default_rng(577215)
     chain = arc(segments) + roughness * rng.standard_normal((segments + 1, 2))
     x = rng.uniform(-1, 3, (200, 2))
-    found = nearest(x, surface(chain, "master"))
+    closest = nearest(x, surface(chain, "master"))
     distance = all_pairs(x, chain)
 
-    start, edge = chain[found.segment], np.diff(chain, axis=0)[found.segment]
-    reached = np.linalg.norm(x - start - found.xi[:, None] * edge, axis=1)
+    start, edge = chain[closest.segment], np.diff(chain, axis=0)[closest.segment]
+    reached = np.linalg.norm(x - start - closest.xi[:, None] * edge, axis=1)
     assert reached == pytest.approx(distance.min(axis=1), rel=1e-12)
 
 
@@ -49,10 +49,10 @@ def test_the_closest_segment_is_found_on_a_chain_that_returns_to_its_start():
     circle = np.column_stack([np.cos(theta), np.sin(theta)])
     circle[-1] = circle[0]
     x = np.random.default_rng(141421).uniform(-2, 2, (100, 2))
-    found = nearest(x, surface(circle, "master"))
+    closest = nearest(x, surface(circle, "master"))
 
     distance = all_pairs(x, circle)
-    assert np.take_along_axis(distance, found.segment[:, None], 1)[:, 0] == (
+    assert np.take_along_axis(distance, closest.segment[:, None], 1)[:, 0] == (
         pytest.approx(distance.min(axis=1), rel=1e-12)
     )
 
@@ -61,17 +61,17 @@ def test_the_closest_segment_is_found_where_a_chain_runs_in_loops():
     """Every four segments return to their start: their chord has no direction."""
     square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     loops = np.concatenate([np.tile(square, (5, 1)), square[:1]])
-    found = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), surface(loops, "m"))
+    closest = nearest(np.array([[0.5, -1], [2, 0.5], [0.5, 0.9]]), surface(loops, "m"))
 
-    assert found.segment.tolist() == [0, 1, 2]
+    assert closest.segment.tolist() == [0, 1, 2]
 
 
 def test_of_two_equally_close_segments_the_first_along_the_chain_is_taken():
     down = np.column_stack([np.zeros(65), np.arange(64, -1, -1.0)])
     corner = np.concatenate([down, down[-2::-1, ::-1]])  # (0, 64) → origin → (64, 0)
-    found = nearest(np.array([[20.5, 20.5]]), surface(corner, "master"))
+    closest = nearest(np.array([[20.5, 20.5]]), surface(corner, "master"))
 
-    assert (found.segment.tolist(), found.xi.tolist()) == ([43], [0.5])
+    assert (closest.segment.tolist(), closest.xi.tolist()) == ([43], [0.5])
 
 
 @pytest.mark.parametrize("segments", [500, 2000])
@@ -92,7 +92,7 @@ def test_far_queries_visit_few_chords_each(segments, monkeypatch):
 
 @pytest.mark.parametrize("segments", SIZES)
 def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
-    """With a point on the inner side of each of the two normals (x − p) × n."""
+    """Pairs with a point on the inner side of each of the normals, by (x − p) × n."""
     rng = np.random.default_rng(577215)
     bent = arc(40) + 0.002 * rng.standard_normal((41, 2))
     slave, master = surface(bent, "s"), surface(bent_beam(segments), "m")
@@ -107,14 +107,14 @@ def test_segments_that_face_one_another_are_found_among_all_pairs(segments):
     first = np.maximum(side(first, begins), side(first, ends)) >= 0
     second = np.minimum(side(last, begins), side(last, ends)) <= 0
 
-    assert np.array_equal(facing(slave, master), np.nonzero(first & second))
+    assert np.array_equal(facing_segments(slave, master), np.nonzero(first & second))
 
 
 @pytest.mark.parametrize("segments", [500, 2000])
 def test_few_master_segments_face_a_slave_segment(segments):
     slave, master = surface(arc(segments), "s"), surface(bent_beam(segments), "m")
 
-    assert len(facing(slave, master)[0]) <= 6 * segments
+    assert len(facing_segments(slave, master)[0]) <= 6 * segments
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_few_master_segments_face_a_slave_segment(segments):
     [({"cosine": -1.5}, "cosine=-1.5"), ({"cosine": float("nan")}, "cosine=nan"),
      ({"distance": 0.0}, "distance=0.0"), ({"distance": float("nan")}, "distance=nan")],
 )  # fmt: skip
-def test_a_reach_that_means_nothing_is_refused(wrong, message):
+def test_an_invalid_reach_is_refused(wrong, message):
     with pytest.raises(InputError, match=message):
         Reach(**wrong)
 
@@ -131,6 +131,6 @@ def test_by_default_the_larger_side_bounds_the_distance():
     small, large = surface(arc(4, 0.1), "s"), surface(arc(4, 2.0), "m")
 
     expected = 2 * np.sqrt(5)  # the box around a half circle is 2r × r
-    assert Reach().within(small, large) == pytest.approx(expected)
-    assert Reach().within(large, small) == pytest.approx(expected)
-    assert Reach(distance=0.25).within(small, large) == 0.25
+    assert Reach().max_distance(small, large) == pytest.approx(expected)
+    assert Reach().max_distance(large, small) == pytest.approx(expected)
+    assert Reach(distance=0.25).max_distance(small, large) == 0.25

@@ -1,4 +1,4 @@
-"""What is told of each contact pair, against forces in equilibrium and Hertz."""
+"""Results per contact pair, compared with equilibrium and Hertz."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from mortarbench.harness import Solution, Status
 from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.sides import contact_sides, rows_of_pairs
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.hertz import HertzPlane
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import nodal_lengths
@@ -22,8 +22,8 @@ METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
 
 @pytest.mark.parametrize(("contact", "basis"), METHODS[1:])
 def test_a_uniform_pressure_is_uniform_along_the_side(contact, basis):
-    given = {**ContactPatch().defaults, "contact": contact, "basis": basis}
-    case = ContactPatch().build("primal", given, reference_solution)
+    params = {**ContactPatch().defaults, "contact": contact, "basis": basis}
+    case = ContactPatch().build("primal", params, reference_solution)
     (side,) = case.fields(Clarabel().prepare(case.qp, 1e-12)()).contacts
 
     assert side.name == "upper on lower"
@@ -42,13 +42,13 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
         8, contact=contact, basis=basis, disc_is_slave=disc_is_slave
     )
     s = Clarabel().prepare(case.qp, 1e-10)()
-    found, sides = case.quantities(s)["contacts"], case.fields(s).contacts
+    contacts, sides = case.quantities(s)["contacts"], case.fields(s).contacts
     on = ("disc on {}", "{} on disc")[not disc_is_slave]
     total = 3 * PRESS
 
-    assert list(found) == [on.format("lower"), on.format("upper")]
+    assert list(contacts) == [on.format("lower"), on.format("upper")]
     for (name, pair), plate, sign in zip(
-        found.items(), ("lower", "upper"), (-1, 1), strict=True
+        contacts.items(), ("lower", "upper"), (-1, 1), strict=True
     ):
         assert pair["force"][plate] == pytest.approx(
             [0, sign * total], abs=3e-5 * total
@@ -66,7 +66,7 @@ def test_each_pair_of_a_disc_between_plates_carries_the_load(
 
 
 def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
-    """A row of the dual basis presses at its node and pulls a little beside it."""
+    """A row of the dual basis pushes at its node, and pulls slightly beside it."""
     case = disc_between_plates(8, contact="mortar", basis="dual", rollers=True)
     s = Clarabel().prepare(case.qp, 1e-10)()
     active = np.split(s.z > 1e-6 * s.z.max(), 2)
@@ -76,19 +76,19 @@ def test_neighbours_of_pressed_nodes_on_a_curved_side_do_not_press():
         assert (force > 1e-6 * force.max()).sum() > expected.sum()
 
 
-def test_hertz_is_found_along_the_side():
+def test_the_pressure_along_the_side_is_that_of_hertz():
     case = HertzPlane().build("primal", HertzPlane().defaults, reference_solution)
     s = Clarabel().prepare(case.qp, 1e-10)()
-    found = case.quantities(s)
-    pair = found["contacts"]["cylinder on rigid"]
+    values = case.quantities(s)
+    pair = values["contacts"]["cylinder on rigid"]
 
     assert pair["force"] == {"cylinder": pytest.approx([0, 1e7], rel=1e-6, abs=1e-2)}
-    assert pair["largest_pressure"] == pytest.approx(found["p_max"], rel=1e-4)
+    assert pair["largest_pressure"] == pytest.approx(values["p_max"], rel=1e-4)
     assert pair["half_width"] == pytest.approx(0.68078e-3, abs=0.68078e-3 / 10)
 
 
-def test_a_node_that_faces_nothing_has_no_gap_and_no_pressure():
-    """The blocks moved by half their width: half the slave side is beside the other."""
+def test_a_node_without_a_row_has_no_gap_and_no_pressure():
+    """Blocks displaced by half their width: half of the slave side faces no master."""
     bodies = model({**ContactPatch().defaults, "lower": 8, "upper": 8})
     bodies.mesh.points[bodies.body_of_node == 1, 0] += 0.5 - 1e-3
     rows = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
@@ -108,7 +108,7 @@ def test_a_node_that_faces_nothing_has_no_gap_and_no_pressure():
     assert side.pressure[x < 0.9].min() > 0
 
 
-def test_pairs_that_share_a_slave_side_are_told_apart():
+def test_rows_of_pairs_with_a_common_slave_side_are_distinguished():
     bodies = model({**ContactPatch().defaults, "lower": 6, "upper": 4})
     (pair,) = bodies.pairs
     left, right = pair.master[:3], pair.master[2:]
@@ -125,8 +125,8 @@ def test_pairs_that_share_a_slave_side_are_told_apart():
         if contact == "nts":
             assert one.stop == len(pair.slave)
         for part, master in ((one, left), (two, right)):
-            held = np.concatenate([pair.slave, master])
-            assert set(rows.B[part].indices // 2) <= set(held.tolist())
+            side_nodes = np.concatenate([pair.slave, master])
+            assert set(rows.B[part].indices // 2) <= set(side_nodes.tolist())
 
 
 def test_lengths_are_those_of_the_undeformed_side():

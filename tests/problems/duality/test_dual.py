@@ -11,7 +11,7 @@ from mortarbench.harness import QP, Solution, Status, kkt_residuals, no_rows
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -294,7 +294,7 @@ def test_a_path_of_many_steps_recovers_only_what_is_asked_for(factorise, transfo
         model(*geometry),
         Counted(getattr(bodies_of(*geometry), factorise)),
     )
-    path = path_of(
+    path = load_path(
         bodies, linearisation(bodies, "nts", "dual"), lambda: inverse,
         reference_solution, 6, transform=transform,
     )  # fmt: skip
@@ -321,4 +321,6 @@ def test_a_dual_solution_has_its_displacements_on_the_contact_sides(
     s = reference_solution(dual.qp)
     sides, u = np.unique(primal.G.indices), dual.recover(s).x
 
-    assert dual.touched(s)[sides] == pytest.approx(u[sides], abs=1e-9 * abs(u).max())
+    assert dual.interface_displacement(s)[sides] == pytest.approx(
+        u[sides], abs=1e-9 * abs(u).max()
+    )

@@ -153,7 +153,7 @@ def equilibrium():
     last = path.iterations(1)[-1]
     lam = path._at_places(last)
     at = path._configuration(last.answer.x, last.load_factor, last.gaps)
-    assert path.residual(at, lam, 1.0) <= newton.SETTLED
+    assert path.residual(at, lam, 1.0) <= newton.TOLERANCE
     assert lam.min() >= 0
     return path, at, lam
 
@@ -165,8 +165,8 @@ def test_the_residual_holds_the_largest_penetration(equilibrium):
     gap[open_row] = -0.25
     free = lam.copy()
     free[at.rows.place[open_row]] = 0.0  # no multiplier: it is no gap under one
-    balanced = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
-    assert path.residual(balanced, free, 1.0) == pytest.approx(0.25, rel=1e-9)
+    balanced_partition = at._replace(gap=gap, r=-(at.rows.B.T @ free[at.rows.place]))
+    assert path.residual(balanced_partition, free, 1.0) == pytest.approx(0.25, rel=1e-9)
 
 
 def test_the_residual_holds_gaps_under_multipliers_by_their_share(equilibrium):
@@ -236,7 +236,7 @@ def test_a_step_has_to_bring_its_share_of_the_predicted_decrease(table, length):
         load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
     )
     start = configuration(0.0, 0.0, -0.5)
-    at, taken, _ = path._moved(start, posed, np.zeros(1), weight=2.0, best=1.5)
+    at, taken, _ = path._line_search(start, posed, np.zeros(1), weight=2.0, best=1.5)
     assert taken == length
     assert at.u[0] == length
 
@@ -249,7 +249,9 @@ def test_a_full_step_that_halves_the_least_residual_is_taken_whatever_it_costs()
     )
     start = configuration(0.0, 0.0, -0.5)
     for best, length in ((2.0, 1.0), (1.99, 0.5)):
-        _, taken, _ = path._moved(start, posed, np.zeros(1), weight=2.0, best=best)
+        _, taken, _ = path._line_search(
+            start, posed, np.zeros(1), weight=2.0, best=best
+        )
         assert taken == length
 
 
@@ -259,7 +261,7 @@ def searched(table, start, best=1.5, weight=2.0, steps=1):
     posed = SimpleNamespace(
         load_factor=1.0, answer=SimpleNamespace(x=np.array([1.0])), gaps=None
     )
-    return path._moved(start, posed, np.zeros(1), weight=weight, best=best)[1]
+    return path._line_search(start, posed, np.zeros(1), weight=weight, best=best)[1]
 
 
 def test_only_a_full_step_may_halve_the_residual_instead():
@@ -288,12 +290,12 @@ def test_rounding_of_the_energies_does_not_shorten_a_step(strain, potential):
 class Loaded(newton.NewtonPath):
     """Loads of which only steps up to `reference` come to an equilibrium."""
 
-    _unfit = ""
+    _kernel_defect = ""
 
     def _start(self, k):
         return (k - 1) / self.steps, None
 
-    def _solved(self, load_factor, u, lam):
+    def _solve_load(self, load_factor, u, lam):
         self.cells.append(load_factor)
         if load_factor - u > self.reference:
             raise newton.NoEquilibriumError("no")
@@ -309,13 +311,13 @@ class Loaded(newton.NewtonPath):
 def loaded(largest, k=1, steps=1):
     asked = []
     path = Loaded(bodies=None, cells=asked, gaps=None, reference=largest, steps=steps)
-    return path._stepped(k)[1], asked
+    return path._load_step(k)[1], asked
 
 
 def test_a_load_step_is_halved_until_its_parts_are_small_enough():
     """Step 3 of 4 goes from ½ to ¾."""
     path = Loaded(bodies=None, cells=[], gaps=None, reference=2.0)
-    assert path._stepped(1) == (1.0, 1)  # one step unless told
+    assert path._load_step(1) == (1.0, 1)  # one step unless told
     assert loaded(0.3, k=3, steps=4) == (1, [0.75])
     assert loaded(0.07, k=3, steps=4) == (
         4, [0.75, 0.625, 0.5625, 0.625, 0.6875, 0.75],
@@ -337,13 +339,13 @@ def test_a_step_that_fails_is_tried_down_to_its_256th():
     asked = []
     path = Loaded(bodies=None, cells=asked, gaps=None, reference=0.0)
     with pytest.raises(InputError, match="the load factor 0; beyond it, no; expected"):
-        path._stepped(1)
+        path._load_step(1)
     assert asked == [2.0**-i for i in range(9)]
 
 
 def test_each_step_has_its_own_parts_and_iterations():
     class Counted(newton.NewtonPath):
-        def _stepped(self, k):
+        def _load_step(self, k):
             return [f"{k}.{i}" for i in (1, 2, 3)], 10 * k
 
     path = Counted(bodies=None, cells=None, gaps=None, reference=None, steps=3)
@@ -375,7 +377,7 @@ class Iterated(newton.NewtonPath):
     def residual(self, at, lam, load_factor):
         return 9.0
 
-    def _posed(self, at, lam, load_factor, gaps):
+    def _linearise(self, at, lam, load_factor, gaps):
         self.reference["posed"].append(gaps)
         n = len(self.reference["posed"])
         answer = SimpleNamespace(z=self.reference["lam"](n))
@@ -387,7 +389,7 @@ class Iterated(newton.NewtonPath):
     def _at_places(self, at):
         return at.answer.z
 
-    def _moved(self, at, posed, lam, weight, best):
+    def _line_search(self, at, posed, lam, weight, best):
         self.reference["weights"].append(weight)
         return at, *self.reference["moves"](len(self.reference["posed"]))
 
@@ -395,14 +397,14 @@ class Iterated(newton.NewtonPath):
         return 1e-9
 
 
-def iterated(moves, lam=lambda n: np.ones(1), keeping=None):
+def iterated(moves, lam=lambda n: np.ones(1), keep_segments=None):
     """Return what one load takes, and what was asked of the iterations."""
     log = {"posed": [], "weights": [], "moves": moves, "lam": lam}
-    gaps = newton.Gaps(linearise=None, keeping=keeping)
+    gaps = newton.Gaps(linearise=None, keep_segments=keep_segments)
     bodies = SimpleNamespace(length=2.0)
     path = Iterated(bodies=bodies, cells=None, gaps=gaps, reference=log)
     try:
-        return path._solved(1.0, np.zeros(1), np.zeros(1)), log
+        return path._solve_load(1.0, np.zeros(1), np.zeros(1)), log
     except newton.NoEquilibriumError as e:
         return str(e), log
 
@@ -425,7 +427,7 @@ def test_full_steps_settle_to_the_tolerance_and_rounding(length, residual, settl
 
 def test_a_load_has_a_number_of_iterations():
     message, log = iterated(lambda n: (1.0, 1.0))
-    assert len(log["posed"]) == newton.MOST_ITERATIONS
+    assert len(log["posed"]) == newton.MAX_ITERATIONS
     assert message == "at 1, 60 iterations left a residual of 1.0e+00"
 
 
@@ -442,12 +444,14 @@ def test_nodes_that_press_keep_their_segments_where_nothing_settles(size):
     """After 20 iterations; at the displacement in m, that is times the length 2."""
     kept = []
 
-    def keeping(u, pressing):
+    def keep_segments(u, pressing):
         kept.append((u.tolist(), pressing.tolist()))
         return newton.Gaps(linearise="kept")
 
     _, log = iterated(
-        lambda n: (1.0, 1.0), lambda n: size * np.array([1.0, 0.0, 0.5, 1e-12]), keeping
+        lambda n: (1.0, 1.0),
+        lambda n: size * np.array([1.0, 0.0, 0.5, 1e-12]),
+        keep_segments,
     )
     assert kept == [([8.0], [True, False, True, False])]
     of = [gaps.linearise for gaps in log["posed"]]
@@ -499,13 +503,13 @@ def test_what_rounding_leaves_is_that_of_forces_within_cells(equilibrium):
 )
 def test_rounding_is_told_as_its_share_of_the_load(load, factor, share, monkeypatch):
     """Cells of size 2 and |K|·1 = (8, 8), of which the second is held."""
-    monkeypatch.setattr(newton, "SETTLED", 1e-16)
+    monkeypatch.setattr(newton, "TOLERANCE", 1e-16)
     bodies = small_bodies(np.array([[4.0, -4.0], [-4.0, 4.0]]), [load, 7.0])
     cells = SimpleNamespace(volumes=np.array([[3.0, 1.0], [2.0, 2.0]]))
     path = newton.NewtonPath(bodies=bodies, cells=cells, gaps=None, reference=None)
     left = 2 * np.finfo(float).eps * share
     assert f"leaves {left:.0e} of the forces" in path._advice(factor)
-    monkeypatch.setattr(newton, "SETTLED", 1.01 * left)
+    monkeypatch.setattr(newton, "TOLERANCE", 1.01 * left)
     assert path._advice(factor).startswith("a smaller load")
 
 
@@ -575,7 +579,7 @@ def test_a_tangent_that_cannot_be_made_convex_ends_the_load(monkeypatch):
     def fails(cells, tangents, positive):
         raise ArithmeticError("never")
 
-    monkeypatch.setattr(newton, "convexified", fails)
+    monkeypatch.setattr(newton, "convex_tangent", fails)
     with pytest.raises(newton.NoEquilibriumError, match="never"):
         path._convex(at, np.zeros(path._places), None)
 
@@ -634,13 +638,13 @@ def test_rotations_either_way_are_rotations(monkeypatch, sign):
 
 def test_the_penalty_outweighs_every_multiplier_so_far(monkeypatch):
     """The penalty function is exact for weights above ‖λ‖∞, and the last stay."""
-    seen, move = [], newton.NewtonPath._moved
+    seen, move = [], newton.NewtonPath._line_search
 
     def spied(self, at, posed, lam, weight, best):
         seen.append((lam.max(), weight))
         return move(self, at, posed, lam, weight, best)
 
-    monkeypatch.setattr(newton.NewtonPath, "_moved", spied)
+    monkeypatch.setattr(newton.NewtonPath, "_line_search", spied)
     hertz._newton_path.cache_clear()  # another test may have solved it
     plane_path().iterations(1)
     assert len(seen) >= 3
@@ -663,7 +667,7 @@ def test_a_load_step_that_fails_comes_in_parts(monkeypatch):
     whole = ring_path(steps=1)
     expected = whole.iterations(1)[-1].answer.x
     beam_ring._newton_path.cache_clear()
-    monkeypatch.setattr(newton, "MOST_ITERATIONS", 5)
+    monkeypatch.setattr(newton, "MAX_ITERATIONS", 5)
     path = ring_path(steps=1)
 
     assert whole.parts(1) == 1
@@ -687,7 +691,7 @@ def test_the_line_search_decreases_the_penalty_function():
 
 
 def test_an_impossible_load_says_where_it_stopped(monkeypatch):
-    monkeypatch.setattr(newton, "HALVINGS", 0)
+    monkeypatch.setattr(newton, "MAX_HALVINGS", 0)
     path = plane_path(n=1, load=1e5, material="svk")
 
     with pytest.raises(
@@ -703,11 +707,11 @@ def test_a_load_lost_in_rounding_is_to_be_larger_and_one_beyond_all_smaller(
     monkeypatch,
 ):
     """A tiny load has an equilibrium, that of linear elasticity; F does not show it."""
-    monkeypatch.setattr(newton, "HALVINGS", 0)
-    monkeypatch.setattr(newton, "MOST_ITERATIONS", 5)
+    monkeypatch.setattr(newton, "MAX_HALVINGS", 0)
+    monkeypatch.setattr(newton, "MAX_ITERATIONS", 5)
     with pytest.raises(InputError, match=r"expected a larger load, or kinematics=lin"):
         plane_path(load=1e-3).iterations(1)
-    monkeypatch.setattr(newton, "MOST_ITERATIONS", 1)
+    monkeypatch.setattr(newton, "MAX_ITERATIONS", 1)
     with pytest.raises(InputError, match=r"expected a smaller load"):
         plane_path(load=9.0).iterations(1)  # no other test has kept its iterations
 
@@ -725,7 +729,7 @@ def test_supports_that_leave_a_rotation_are_refused():
     rows = csr_array(eye_array(bodies.mesh.dofs, format="csr")[one_node])
 
     with pytest.raises(InputError, match="supports leave body 'beam' to rotate"):
-        newton.translations_left(replace(bodies, B_D=rows))
+        newton.free_translations(replace(bodies, B_D=rows))
 
 
 def test_paths_are_those_of_the_keys():

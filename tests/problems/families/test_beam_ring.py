@@ -1,4 +1,4 @@
-"""The paper's benchmark against counts, an independent code and the equations."""
+"""The paper's benchmark, compared with its counts, equations and independent codes."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 
 from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.suite.suite import load_suite
-from mortarbench.problems.contact.bodies import clamped, floating
+from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.duality.dualisation import dual_bounds, dualise
-from mortarbench.problems.duality.undivided import primal_qp, whole_path
+from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.registries import suites_folder
@@ -24,8 +24,8 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 FAMILY = BeamRing()
 
 
-def build(form, **given):
-    return FAMILY.build(form, FAMILY.complete(given), reference_solution)
+def build(form, **keys):
+    return FAMILY.build(form, FAMILY.complete(keys), reference_solution)
 
 
 def physical(case, solver, tol):
@@ -47,7 +47,7 @@ def test_counts_of_table_1():
 
 @pytest.mark.parametrize(("radial", "nodes"), [(6, 424), (3, 313)])
 def test_the_papers_313_nodes_belong_to_half_as_many_radial_layers(radial, nodes):
-    """Erratum: text and Table 1 mean 2·Nh layers, Figure 2 was drawn with Nh."""
+    """Erratum: text and Table 1 imply 2·Nh layers, Figure 2 shows Nh."""
     assert len(model(4, 3, radial, "strain").mesh.points) == nodes
 
 
@@ -96,9 +96,9 @@ def test_ten_steps_on_the_papers_largest_mesh(form, solver, tol):
 
 @pytest.mark.parametrize("plane", ["strain", "stress"])
 def test_every_form_gives_the_same_displacement_energy_and_multipliers(plane):
-    """And the recovered points satisfy the KKT conditions of the primal problem."""
-    given = dict(Nr=4, Nh=3, steps=3, step=2, plane=plane)
-    cases = {form: build(form, **given) for form in FAMILY.forms}
+    """The recovered points satisfy the KKT conditions of the primal problem (1)."""
+    keys = dict(Nr=4, Nh=3, steps=3, step=2, plane=plane)
+    cases = {form: build(form, **keys) for form in FAMILY.forms}
     bounds = reference_solution(cases["dual-bounds"].qp)
     dual = SMALBE().prepare(cases["dual"].qp, 1e-12)()
     u = cases["dual-bounds"].recover(bounds)
@@ -126,7 +126,9 @@ def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
     rows = node_to_segment(bodies.mesh.points, np.zeros(848), *bodies.pairs[0])
     primal = primal_qp(bodies, rows)
     way = dualise if transform == "dual" else dual_bounds
-    inverse = floating(bodies) if transform == "dual" else clamped(bodies)
+    inverse = (
+        factorise_floating(bodies) if transform == "dual" else factorise_clamped(bodies)
+    )
     new = way(primal, inverse)
 
     back = new.recover(SMALBE().prepare(new.qp, 1e-11)())
@@ -135,16 +137,16 @@ def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
     assert abs(back.y).max() > 0.1  # the clamps carry the load
 
 
-def test_steps_are_the_same_in_whatever_order_they_are_asked_for():
+def test_load_steps_do_not_depend_on_the_order_of_requests():
     def gaps(step, params):
         return FAMILY.build("primal", params, reference_solution).qp.h
 
     orders = [(5, 2, 4), (2, 4, 5)]
     seen = []
     for order in orders:
-        whole_path.cache_clear()
-        given = {k: FAMILY.complete(dict(Nr=4, Nh=3, steps=5, step=k)) for k in order}
-        seen.append({k: gaps(k, given[k]) for k in order})
+        monolithic_path.cache_clear()
+        keys = {k: FAMILY.complete(dict(Nr=4, Nh=3, steps=5, step=k)) for k in order}
+        seen.append({k: gaps(k, keys[k]) for k in order})
 
     for k in (2, 4, 5):
         assert (seen[0][k] == seen[1][k]).all()
@@ -192,7 +194,7 @@ def test_forces_are_in_equilibrium():
 
 
 def test_no_contact_no_force():
-    """Lifted by its load, the beam leaves the ring alone: λ_I = 0 exactly."""
+    """Under an upward load the beam does not touch the ring: λ_I = 0 exactly."""
     case = build("dual-bounds", Nr=4, Nh=3, steps=1)
     primal = build("primal", Nr=4, Nh=3, steps=1)
     gaps = primal.qp.h
@@ -235,8 +237,8 @@ def test_linearised_to_convergence_it_has_the_reference_values(
     """Computed with an independent prototype of the same discretisation."""
     contact, size, plane = (*problem.split(), "strain")[:3]
     Nr = int(size)
-    given = dict(Nr=Nr, Nh=Nr // 2, steps=1, relin=14, plane=plane, contact=contact)
-    case = build("dual-bounds", **given)
+    keys = dict(Nr=Nr, Nh=Nr // 2, steps=1, relin=14, plane=plane, contact=contact)
+    case = build("dual-bounds", **keys)
     s = reference_solution(case.qp)
     result, nodes = case.quantities(s), case.recover(s).reshape(-1, 2)
     points = model(Nr, Nr // 2, Nr, plane).mesh.points
@@ -252,8 +254,8 @@ def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
     halves the error; three linearisations of one full load step leave less than ten
     steps do."""
 
-    def tip(**given):
-        case = build("dual-bounds", Nr=10, Nh=5, **given)
+    def tip(**keys):
+        case = build("dual-bounds", Nr=10, Nh=5, **keys)
         return case.quantities(reference_solution(case.qp))["tip"][1]
 
     exact = tip(steps=1, relin=14)
@@ -269,8 +271,8 @@ def test_the_papers_load_steps_are_of_first_order_and_three_passes_beat_ten():
 )
 def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
     def force(contact, Nr):
-        given = dict(steps=1, relin=10, contact=contact, basis=basis)
-        case = build("dual-bounds", Nr=Nr, Nh=Nr // 2, **given)
+        keys = dict(steps=1, relin=10, contact=contact, basis=basis)
+        case = build("dual-bounds", Nr=Nr, Nh=Nr // 2, **keys)
         return case.quantities(reference_solution(case.qp))["contact_force"][0]
 
     apart = [abs(force("mortar", Nr) / force("nts", Nr) - 1) for Nr in (8, 16, 32)]
@@ -280,7 +282,7 @@ def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "message"),
     [
         ({"Nr": 0}, "Nr=0 must be at least 1"),
         ({"steps": 3, "step": 4}, "step=4 must be in 1..steps=3"),
@@ -290,11 +292,11 @@ def test_mortar_agrees_with_node_to_segment_as_the_mesh_is_refined(basis):
         ),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
+def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
     with pytest.raises(InputError, match="beam-ring: ") as e:
         FAMILY.check(FAMILY.complete(bad))
 
-    assert told in str(e.value)
+    assert message in str(e.value)
 
 
 def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():

@@ -1,4 +1,4 @@
-"""The cantilever at finite strain: the elastica, convergence, and what is refused."""
+"""The cantilever at finite strain: elastica, convergence, refused keys."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 import mortarbench as mb
 from mortarbench.harness import InputError, no_rows
-from mortarbench.problems.contact.bodies import assemble, clamped
+from mortarbench.problems.contact.bodies import assemble, factorise_clamped
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.duality.newton_case import newton_path
 from mortarbench.problems.fem.elasticity import Material
@@ -21,7 +21,7 @@ from mortarbench.problems.models.cantilever import beam, elastica
     ("load", "deflection", "shortening"),
     [(1, 0.30172077, 0.05643324), (10, 0.81060902, 0.55499560)],
 )
-def test_the_elastica_has_the_known_digits(load, deflection, shortening):
+def test_the_elastica_has_published_digits(load, deflection, shortening):
     assert elastica(load) == pytest.approx((deflection, shortening), abs=6e-9)
 
 
@@ -51,16 +51,16 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
     case, answer = emitted(f"cantilever/load={load}/ny={ny}/dual")
 
     assert answer.verdict == "verified"
-    found = answer.quantities
-    assert abs(found["deflection_error"]) < 0.01
-    assert abs(found["shortening_error"]) < 0.01
-    assert found["clipped_in_step"] == 0
-    assert found["load_parts"] == 1
-    assert found["residual"] < 1e-8
+    values = answer.quantities
+    assert abs(values["deflection_error"]) < 0.01
+    assert abs(values["shortening_error"]) < 0.01
+    assert values["clipped_in_step"] == 0
+    assert values["load_parts"] == 1
+    assert values["residual"] < 1e-8
     # at the end of Newton's method the model of the QP is the potential itself
     s = answer.solution
     objective = case.made.scale * case.qp.objective(s.x) + case.made.constant
-    assert objective == pytest.approx(found["energy"], rel=1e-9)
+    assert objective == pytest.approx(values["energy"], rel=1e-9)
 
 
 @pytest.mark.parametrize("material", ["neo-hooke", "svk"])
@@ -72,14 +72,14 @@ def test_newton_converges_quadratically(material):
     bodies = beam(4.0, 2.0, (16, 4), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": material}, None)
 
-    found = path.iterations(1)
+    iterations = path.iterations(1)
 
-    end, K = found[-1].answer.x, found[-1].primal.P
-    errors = [np.sqrt((at.u - end) @ (K @ (at.u - end))) for at in found]
+    end, K = iterations[-1].answer.x, iterations[-1].primal.P
+    errors = [np.sqrt((at.u - end) @ (K @ (at.u - end))) for at in iterations]
     errors = np.array(errors) / np.sqrt(end @ (K @ end))
     assert errors[-1] < 1e-6
     assert (errors[-4:] < 30 * errors[-5:-1] ** 2).all()
-    assert [at.length for at in found[-4:]] == [1, 1, 1, 1]
+    assert [at.length for at in iterations[-4:]] == [1, 1, 1, 1]
 
 
 def test_deflections_converge_with_the_square_of_the_size_of_cells():
@@ -95,21 +95,21 @@ def test_deflections_converge_with_the_square_of_the_size_of_cells():
 
 
 def test_nearly_incompressible_beams_do_not_lock():
-    """Four points a cell would make it stiffer by ν²/(1 − 2ν)/ny², more than twice."""
+    """Four dilatations a cell would be stiffer by ν²/(1 − 2ν)/ny², more than twice."""
     _, answer = emitted("cantilever/nu=0.49/ny=3/slenderness=10/load=1/dual")
 
     assert abs(answer.quantities["deflection_error"]) < 0.06
 
 
 def test_every_iteration_is_a_convex_qp_in_the_total_displacement():
-    """Its Hessian is positive definite; each begins where the line search ended."""
+    """Hessians are positive definite; each starts at the end of the line search."""
     bodies = beam(6.0, 5.0, (24, 2), 0.3)
     path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
 
-    found = path.iterations(1)
+    iterations = path.iterations(1)
 
-    assert len(found) > 3
-    for at, following in zip(found, found[1:] + found[-1:], strict=True):
+    assert len(iterations) > 3
+    for at, following in zip(iterations, iterations[1:] + iterations[-1:], strict=True):
         P = at.primal.P.toarray()
         assert (P == P.T).all()
         assert np.linalg.eigvalsh(P)[0] > 0
@@ -152,7 +152,7 @@ def test_for_small_loads_finite_and_linear_displacements_differ_by_their_square(
     for load in (0.02, 0.01):
         bodies = beam(6.0, load, (12, 2), 0.3)
         path = newton_path(bodies, no_contact(bodies), {"material": "neo-hooke"}, None)
-        linear = clamped(bodies)(bodies.f)
+        linear = factorise_clamped(bodies)(bodies.f)
         differences.append(np.abs(path.iteration(1).answer.x - linear).max())
 
     assert np.log2(differences[0] / differences[1]) == pytest.approx(2, abs=0.01)

@@ -1,4 +1,4 @@
-"""Friction of families of one's own: the same as that of the family that has keys."""
+"""Elastic families of plug-ins, compared with the built-in family."""
 
 from dataclasses import replace
 
@@ -34,28 +34,28 @@ def test_it_is_the_case_of_the_family_with_keys(form, law, keys):
     np.testing.assert_array_equal(case.qp.lb, own.qp.lb)
     np.testing.assert_array_equal(case.qp.ub, own.qp.ub)
     s = reference_solution(own.qp)
-    found = own.quantities(s)
-    assert ("slip" in found) == (law is not None)
-    assert found["energy"] == case.quantities(s)["energy"]
+    values = own.quantities(s)
+    assert ("slip" in values) == (law is not None)
+    assert values["energy"] == case.quantities(s)["energy"]
 
 
 @pytest.mark.parametrize(
-    ("law", "told"),
+    ("law", "message"),
     [(FrictionLaw("oily"), "friction 'oily' is unknown; expected one of none, tresca"),
      (FrictionLaw("tresca", bound=-1.0), "bound = -1; expected a traction of 0"),
      (FrictionLaw("coulomb", mu=float("nan")), "mu = nan; expected a number"),
      (FrictionLaw("coulomb", mu=0.3), "expected reference=")],
 )  # fmt: skip
-def test_laws_that_are_none_are_refused_in_one_line(law, told):
+def test_invalid_laws_are_refused_in_one_line(law, message):
     with pytest.raises(InputError) as e:
         one_step(model(PATCH.complete({})), "dual", friction=law)
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
 def test_friction_may_hold_a_load_along_the_side():
-    """Without it nothing balances the shear of the upper block."""
+    """Without friction, the shear on the upper block is not balanced."""
     bodies = model(PATCH.complete(STRETCHED))
     upper = bodies.body_of_node == 1
     free = ~np.isin(bodies.B_D.indices, 2 * np.flatnonzero(upper))
@@ -67,8 +67,8 @@ def test_friction_may_hold_a_load_along_the_side():
         one_step(pushed, "dual")
     law = FrictionLaw("tresca", bound=1e5)
     case = one_step(pushed, "dual", friction=law)
-    found = case.quantities(reference_solution(case.qp))
-    assert found["contact_force"][0] == pytest.approx(0.01e6, rel=1e-6)
+    values = case.quantities(reference_solution(case.qp))
+    assert values["contact_force"][0] == pytest.approx(0.01e6, rel=1e-6)
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
@@ -80,17 +80,17 @@ def test_bodies_in_parts_are_those_in_one_piece(glue):
     assert parts.qp.A.shape[0] == 3 * 5
 
     exact = whole.quantities(reference_solution(whole.qp))
-    found = parts.quantities(SMALBE().prepare(parts.qp, 1e-9)())
+    values = parts.quantities(SMALBE().prepare(parts.qp, 1e-9)())
     for name in ("energy", "multiplier_sum", "dissipation"):
-        assert found[name] == pytest.approx(exact[name], rel=1e-6)
+        assert values[name] == pytest.approx(exact[name], rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("form", "keys", "told"),
+    ("form", "keys", "message"),
     [("primal", {"parts": 5}, "parts with form primal is not built"),
      ("dual", {"parts": 1}, "parts=1 of 2 bodies"),
      ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
 )  # fmt: skip
-def test_parts_that_there_cannot_be_are_refused(form, keys, told):
-    with pytest.raises(InputError, match=told):
+def test_impossible_parts_are_refused(form, keys, message):
+    with pytest.raises(InputError, match=message):
         one_step(model(PATCH.complete({})), form, **keys)

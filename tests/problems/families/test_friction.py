@@ -1,4 +1,4 @@
-"""Friction against limits, digits of other codes, and the laws themselves."""
+"""Friction: limits, digits of other codes, and the laws themselves."""
 
 from functools import cache
 
@@ -10,7 +10,7 @@ from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.balance import check_balance
-from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped
+from mortarbench.problems.contact.bodies import ContactPair, assemble, factorise_clamped
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.node_to_segment import (
@@ -18,7 +18,7 @@ from mortarbench.problems.contact.node_to_segment import (
     rows_along,
 )
 from mortarbench.problems.contact.surface import tangents
-from mortarbench.problems.duality.undivided import path_of
+from mortarbench.problems.duality.monolithic import load_path
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import dofs_of, rectangle
 from mortarbench.problems.models.patch import model
@@ -32,7 +32,7 @@ SMALL = "beam-ring/Nr=3/Nh=2/steps=1"
 
 @cache
 def solved(name):
-    """The case, its solution, and its quantities."""
+    """Return the case, its solution and its quantities."""
     case = parse(name, PROBLEMS).build(reference_solution)
     s = reference_solution(case.qp)
     return case, s, case.quantities(s)
@@ -51,58 +51,58 @@ DIGITS = [
     [pytest.param(*row, marks=[pytest.mark.slow] * (row[0] < 0.6)) for row in DIGITS],
 )
 def test_coulomb_on_the_benchmark_has_the_digits_of_another_code(mu, tip, force, stick):
-    _, _, found = solved(
+    _, _, values = solved(
         f"beam-ring/steps=1/relin=8/friction=coulomb/mu={mu}/dual-bounds"
     )
 
-    assert found["tip"][1] == pytest.approx(tip, abs=6e-6)
-    assert found["contact_force"][1] / 1e8 == pytest.approx(force, abs=6e-5)
-    assert (found["stick"], found["slip"], found["open"]) == (stick, 8 - stick, 53)
-    assert found["friction_residual"] <= 1e-10
+    assert values["tip"][1] == pytest.approx(tip, abs=6e-6)
+    assert values["contact_force"][1] / 1e8 == pytest.approx(force, abs=6e-5)
+    assert (values["stick"], values["slip"], values["open"]) == (stick, 8 - stick, 53)
+    assert values["friction_residual"] <= 1e-10
 
 
-def test_a_bound_that_nothing_reaches_glues_the_flanks_as_well():
+def test_an_unreachable_bound_makes_open_rows_stick_as_well():
     """The other code's limit g → ∞ with all rows of the arc."""
-    _, _, found = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
+    _, _, values = solved("beam-ring/steps=1/relin=8/friction=tresca/bound=1e15/dual")
 
-    assert found["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
-    assert found["slip"] == 0
-    assert found["stick"] == found["active"]
-    assert found["sliding_without_contact"] > 0
-    assert found["open"] < found["contact_rows"] - found["active"]
+    assert values["tip"][1] == pytest.approx(-0.24493, abs=6e-6)
+    assert values["slip"] == 0
+    assert values["stick"] == values["active"]
+    assert values["sliding_without_contact"] > 0
+    assert values["open"] < values["contact_rows"] - values["active"]
 
 
 def test_shear_that_tresca_grants_without_contact_is_counted_apart():
     """Every row of the arc is open, sticks, slips, or slides without contact."""
-    case, s, found = solved("beam-ring/steps=1/friction=tresca/bound=1e6/dual")
-    friction, rows = case.mechanics.friction, found["contact_rows"]
+    case, s, values = solved("beam-ring/steps=1/friction=tresca/bound=1e6/dual")
+    friction, rows = case.mechanics.friction, values["contact_rows"]
     states = ("open", "stick", "slip", "sliding_without_contact")
-    assert sum(found[name] for name in states) == friction.bound.size
+    assert sum(values[name] for name in states) == friction.bound.size
 
-    z = case.mechanics.back(s).z
+    z = case.mechanics.to_primal(s).z
     shear, pressed = np.abs(z[rows:]), z[:rows] > 1e-6 * z[:rows].max()
     apart = ~pressed[friction.row] & (shear > 1e-6 * np.abs(z).max())
-    assert found["sliding_without_contact"] == apart.sum() > 0
+    assert values["sliding_without_contact"] == apart.sum() > 0
     share = shear[apart].sum() / shear.sum()
-    assert found["shear_without_contact"] == pytest.approx(share)
+    assert values["shear_without_contact"] == pytest.approx(share)
     assert 0 < share < 1
 
     (side,) = case.fields(s).contacts
     drawn = [name.replace("_", " ") for name in states]
     counts = [(side.friction == name).sum() for name in drawn]
-    assert counts == [found[name] for name in states]
+    assert counts == [values[name] for name in states]
 
 
 def test_coulomb_grants_no_shear_without_contact():
-    _, _, found = solved("beam-ring/steps=1/friction=coulomb/mu=0.3/dual")
-    assert found["sliding_without_contact"] == 0
-    assert found["shear_without_contact"] == 0
+    _, _, values = solved("beam-ring/steps=1/friction=coulomb/mu=0.3/dual")
+    assert values["sliding_without_contact"] == 0
+    assert values["shear_without_contact"] == 0
 
 
 @pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
 @pytest.mark.parametrize("law", ["tresca/bound=0", "coulomb/mu=0"])
-def test_a_bound_of_zero_is_no_friction(law, contact, form):
+def test_a_bound_of_zero_yields_the_frictionless_problem(law, contact, form):
     name = f"{SMALL}/contact={contact}"
     _, _, rough = solved(f"{name}/friction={law}/{form}")
     _, _, smooth = solved(f"{name}/{form}")
@@ -123,20 +123,22 @@ def test_every_form_is_the_same_problem(law, contact):
     }
     case, s, primal = forms["primal"]
 
-    for other, t, found in forms.values():
+    for other, t, values in forms.values():
         assert kkt_residuals(other.qp, t).worst < 1e-7
         energy = other.scale * other.qp.objective(t.x) + other.constant
-        assert energy == pytest.approx(found["energy"] + found["dissipation"], rel=1e-9)
+        assert energy == pytest.approx(
+            values["energy"] + values["dissipation"], rel=1e-9
+        )
         for key in ("energy", "tip", "dissipation", "stick", "slip", "open"):
-            assert found[key] == pytest.approx(primal[key], rel=1e-6)
+            assert values[key] == pytest.approx(primal[key], rel=1e-6)
         u, v = other.recover(t), case.recover(s)
         assert u == pytest.approx(v, abs=1e-8 * abs(v).max())
 
 
 @pytest.mark.parametrize("law", ["tresca/bound=5e7", "coulomb/mu=0.3"])
 def test_friction_opposes_the_slip_and_only_at_its_bound(law):
-    case, s, found = solved(f"{SMALL}/friction={law}/dual")
-    friction, back = case.mechanics.friction, case.mechanics.back(s)
+    case, s, values = solved(f"{SMALL}/friction={law}/dual")
+    friction, back = case.mechanics.friction, case.mechanics.to_primal(s)
     force = back.z[case.mechanics.primal.h.size :]
     slip = friction.T @ back.x - friction.start
     slips = abs(slip) > 1e-9 * abs(slip).max()
@@ -144,7 +146,7 @@ def test_friction_opposes_the_slip_and_only_at_its_bound(law):
     assert (abs(force) <= friction.bound * (1 + 1e-9)).all()
     assert force[slips] == pytest.approx(np.sign(slip)[slips] * friction.bound[slips])
     work = (friction.bound * abs(slip)).sum() * case.scale
-    assert abs(work) == pytest.approx(found["dissipation"], rel=1e-6)
+    assert abs(work) == pytest.approx(values["dissipation"], rel=1e-6)
 
 
 @pytest.mark.parametrize("basis", ["dual", "standard"])
@@ -161,7 +163,7 @@ def test_a_bound_is_the_traction_times_the_share_of_the_node(contact, basis):
 
 
 @pytest.mark.parametrize("contact", ["nts", "mortar"])
-def test_tangential_rows_are_blind_to_what_both_sides_do_together(contact):
+def test_tangential_rows_vanish_on_common_motions_of_both_sides(contact):
     bodies = model(PROBLEMS["contact-patch"].defaults)
     law = (FrictionLaw("tresca", bound=1.0),)
     rows = linearisation(bodies, contact, "dual", law)(np.zeros(bodies.mesh.dofs))
@@ -190,27 +192,29 @@ def test_a_block_on_an_incline_slips_at_its_limit():
     """NAFEMS CGS-4: F/G = (tan α + mu)/(1 − mu tan α), tan α = 0.1, mu = 0.3."""
     limit = 0.412371
     case = block_on_incline(limit - 4e-4, COULOMB)
-    found = case.quantities(reference_solution(case.qp))
-    across, onto = found["contact_force"]
+    values = case.quantities(reference_solution(case.qp))
+    across, onto = values["contact_force"]
 
-    assert found["stick"] > 0
+    assert values["stick"] > 0
     assert across / -onto == pytest.approx(0.3, abs=1e-3)
-    with pytest.raises(InputError, match="no equilibrium was found with the"):
+    with pytest.raises(InputError, match="no equilibrium was found with bound"):
         block_on_incline(limit + 4e-4, COULOMB)
 
 
 @pytest.mark.parametrize("share", [0.99, 1.01])
 def test_a_bound_of_tresca_below_the_load_along_the_side_is_refused(share):
-    """The block of length 1 m carries at most its bound times that, from the law."""
+    """A block of length 1 m carries at most the bound times 1 m."""
     across = (0.2 - 0.1) / np.hypot(1, 0.1) * WEIGHT
     law = FrictionLaw("tresca", bound=share * across)
     if share > 1:
-        found = block_on_incline(0.2, law)
-        got = found.quantities(reference_solution(found.qp))["contact_force"]
+        built = block_on_incline(0.2, law)
+        got = built.quantities(reference_solution(built.qp))["contact_force"]
         assert abs(got[0]) == pytest.approx(across, rel=1e-6)
         return
-    told = r"friction cannot hold the load; within .* nothing balances 0\.\d\d% of it"
-    with pytest.raises(InputError, match=told):
+    message = (
+        r"friction cannot hold the load; within .* nothing balances 0\.\d\d% of it"
+    )
+    with pytest.raises(InputError, match=message):
         block_on_incline(0.2, law)
 
 
@@ -222,7 +226,7 @@ def test_the_limit_of_coulomb_is_refused_in_the_same_words():
 
 
 def test_loads_are_balanced_where_friction_may_hold_them():
-    """As `bodies:` ask before they solve; without friction the block slides."""
+    """Check the balance as `bodies:` do; without friction the block slides."""
     bodies = incline(0.3)
     rows = linearisation(bodies, "nts", "dual", (COULOMB,))(np.zeros(bodies.mesh.dofs))
 
@@ -232,21 +236,21 @@ def test_loads_are_balanced_where_friction_may_hold_them():
 
 
 @pytest.mark.parametrize("push", [0.2, -0.1])
-def test_below_the_limit_it_stays_whatever_the_law_allows(push):
-    """Forces follow from the weight alone, not from the law."""
+def test_below_the_limit_forces_do_not_depend_on_the_law(push):
+    """Statics determines the forces, whatever the law."""
     normal = (1 + 0.1 * push) / np.hypot(1, 0.1) * WEIGHT
     for law in (COULOMB, FrictionLaw("tresca", bound=0.5 * WEIGHT)):
         case = block_on_incline(push, law)
-        found = case.quantities(reference_solution(case.qp))
+        values = case.quantities(reference_solution(case.qp))
 
-        assert found["multiplier_sum"] == pytest.approx(normal, rel=1e-9)
-        assert found["contact_force"][0] == pytest.approx(
+        assert values["multiplier_sum"] == pytest.approx(normal, rel=1e-9)
+        assert values["contact_force"][0] == pytest.approx(
             (push - 0.1) / np.hypot(1, 0.1) * WEIGHT, rel=1e-7
         )
 
 
 def test_quasi_static_slip_begins_where_the_step_before_ended():
-    """In proportion, two steps; the static problem knows nothing of the first one."""
+    """Two proportional steps; the static problem does not depend on the first."""
     name = f"{SMALL.replace('steps=1', 'steps=2')}/friction=tresca/bound=5e7"
     first, _, _ = solved(f"{name}/step=1/primal")
     path, s, _ = solved(f"{name}/primal")
@@ -261,7 +265,7 @@ def test_quasi_static_slip_begins_where_the_step_before_ended():
 
 
 def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
-    """Each has mu times the pressure of the one before as its bound."""
+    """The bound of each iterate is mu times the pressure of its predecessor."""
     name = f"{SMALL}/friction=coulomb/mu=0.3"
     _, _, first = solved(f"{name}/iterate=1/dual-bounds")
     _, _, smooth = solved(f"{SMALL}/dual-bounds")
@@ -269,14 +273,14 @@ def test_iterates_are_the_tresca_problems_that_lead_to_the_last_one():
     assert first["tip"] == pytest.approx(smooth["tip"], rel=1e-8)  # of no bound yet
     residuals = []
     for k in (1, 2, 3, 4):
-        case, s, found = solved(f"{name}/iterate={k}/dual-bounds")
+        case, s, values = solved(f"{name}/iterate={k}/dual-bounds")
         after, _, _ = solved(f"{name}/iterate={k + 1}/dual-bounds")
         m = case.mechanics.primal.h.size
         demanded = 0.3 * s.x[:m]
 
         assert after.qp.ub[m:] == pytest.approx(demanded, abs=1e-9)
         assert (after.qp.P == last.qp.P).all()
-        residuals.append(found["friction_residual"])
+        residuals.append(values["friction_residual"])
     assert residuals[1:] == sorted(residuals[1:], reverse=True)
 
 
@@ -299,12 +303,12 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "told"), REFUSED)
-def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, told):
+@pytest.mark.parametrize(("name", "message"), REFUSED)
+def test_keys_that_do_not_fit_the_law_are_refused_in_one_line(name, message):
     with pytest.raises(InputError) as e:
         parse(name, PROBLEMS)
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -329,13 +333,15 @@ def test_a_fixed_point_that_does_not_settle_is_given_up_with_its_last_residual(l
     first = np.zeros(1, dtype=np.int64)
     rows = ContactRows(B, np.zeros(1), T, first, np.ones(1), first)
     laws = (FrictionLaw("coulomb", mu=0.5),)
-    path = path_of(
-        bodies, lambda u: rows, lambda: clamped(bodies), reference_solution, 1,
-        laws=laws,
+    path = load_path(
+        bodies, lambda u: rows, lambda: factorise_clamped(bodies),
+        reference_solution, 1, laws=laws,
     )  # fmt: skip
 
-    told = r"step 1 does not settle: after 3. Tresca problems .* is [789]\.\de-01, and"
-    with pytest.raises(InputError, match=told):
+    message = (
+        r"converge in load step 1: after 3. Tresca problems, .* is [789]\.\de-01, and"
+    )
+    with pytest.raises(InputError, match=message):
         path.problem(1)
 
 

@@ -1,4 +1,4 @@
-"""Bodies from gmsh files: the paper's benchmark, described by a user, is the same."""
+"""Bodies from gmsh files, compared with the family of the paper's benchmark."""
 
 import re
 import shutil
@@ -12,11 +12,11 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.contact.bodies import assembled
+from mortarbench.problems.contact.bodies import assemble_stiffness
 from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
 from mortarbench.problems.models.beam_ring import model
-from mortarbench.problems.models.description import described_bodies
+from mortarbench.problems.models.description import read_bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
@@ -64,7 +64,7 @@ def edges(chain):
 
 
 def parts(flip=False):
-    """Cells under their names as gmsh has them: unordered, of any orientation."""
+    """Return cells by name as gmsh writes them: unordered, of any orientation."""
     sides, rng = RING.mesh.boundaries, np.random.default_rng(577215)
     curves = {name: edges(sides[name]) for name in ("left", "outer", "bottom", "top")}
     curves["feet"] = np.vstack([edges(sides["left_foot"]), edges(sides["right_foot"])])
@@ -81,7 +81,7 @@ def parts(flip=False):
 
 
 def msh41(points, quads, curves, spots):
-    """Write ASCII 4.1, one entity for each physical group, or for cells without one."""
+    """Write ASCII 4.1 with one entity per physical group, or per set of other cells."""
     groups, counts, entities, blocks, tag, cell_number = [], [], [], [], 0, 0
     for dimension, kind, named in ((0, 15, spots), (1, 1, curves), (2, 3, quads)):
         counts.append(len(named))
@@ -114,7 +114,7 @@ POINTS = np.column_stack([RING.mesh.points, np.zeros(len(RING.mesh.points))])
 
 @pytest.fixture
 def described(tmp_path, monkeypatch):
-    """Write mesh and TOML into the working directory; the name of the family's case."""
+    """Write mesh and TOML into the working directory; return the name of the case."""
     monkeypatch.chdir(tmp_path)
 
     def write(mesh=None, toml=TOML):
@@ -134,7 +134,7 @@ def build(text):
 @pytest.mark.parametrize("flip", [False, True])
 def test_the_paper_s_bodies_from_a_gmsh_file_are_the_paper_s(described, writer, flip):
     described(writer(POINTS, *parts(flip)))
-    ours = assembled(described_bodies(Path("a.toml"), "strain"))
+    ours = assemble_stiffness(read_bodies(Path("a.toml"), "strain"))
 
     assert ours.names == ("beam", "ring")
     np.testing.assert_array_equal(ours.mesh.points, RING.mesh.points)
@@ -156,8 +156,8 @@ def test_triangles_are_read_whatever_their_orientation(tmp_path, clockwise):
         name: halved(Mesh(RING.mesh.points, cells, {})).cells[:, :3]
         for name, cells in quads.items()
     }
-    given = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
-    (tmp_path / "m.msh").write_text(msh22(POINTS, given, curves, spots, quad_type=2))
+    elements = {name: t[:, ::-1] if clockwise else t for name, t in triangles.items()}
+    (tmp_path / "m.msh").write_text(msh22(POINTS, elements, curves, spots, quad_type=2))
     read = read_msh(tmp_path / "m.msh")
 
     for name, expected in triangles.items():
@@ -268,7 +268,7 @@ def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
     lengths = nodal_lengths(RING.mesh.points[top])
     for load, total in (("traction = [3e6, -5e6]", 2.0), ("force = [6e6, -1e7]", 2.0)):
         described(toml=TOML.replace(point, f'boundary = "top"\n{load}'))
-        bodies = described_bodies(Path("a.toml"), "strain")
+        bodies = read_bodies(Path("a.toml"), "strain")
         f = bodies.f.reshape(-1, 2) * 1e8
 
         assert lengths.sum() == pytest.approx(total)
@@ -278,7 +278,7 @@ def test_loads_on_a_boundary_are_spread_by_the_shape_functions(described):
 
 def test_without_units_the_extent_and_the_whole_load_are_the_scales(described):
     described(toml=TOML.replace("units = { length = 2.0, force = 1e8 }\n", ""))
-    bodies = described_bodies(Path("a.toml"), "strain")
+    bodies = read_bodies(Path("a.toml"), "strain")
 
     assert bodies.length == pytest.approx(2.0)
     assert bodies.force == 1e8
@@ -296,22 +296,114 @@ def test_bodies_that_only_contact_holds_have_their_first_qp_and_no_path(describe
         build(f"{text}/steps=1/dual-bounds")
 
 
+SHEARED = """\
+mesh = "two.msh"
+plane = "stress"
+units = { length = 4.0, force = 1e7 }
+friction = "coulomb"
+mu = 0.5
+[[bodies]]
+name = "lower"
+E = 1e9
+nu = 0
+[[bodies]]
+name = "upper"
+E = 2e9
+nu = 0
+[[supports]]
+boundary = "base"
+fix = ["x", "y"]
+[[loads]]
+boundary = "top"
+traction = [4e5, -1e6]
+[[loads]]
+boundary = "right"
+traction = [0, 4e5]
+[[loads]]
+boundary = "left"
+traction = [0, -4e5]
+[[contacts]]
+slave = "foot"
+master = "table"
+"""
+
+
+@pytest.fixture
+def sheared_blocks(described):
+    """Two squares of side 2 in a state of constant pressure and shear stress.
+
+    Their Poisson's ratio is zero, so that their common side stays straight: every load
+    step has the same contact rows. Friction alone holds the upper one sideways.
+    """
+    (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0))
+    sides = {
+        "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
+        "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
+        "left": [[0, 3], [3, 6], [9, 12], [12, 15]],
+        "right": [[2, 5], [5, 8], [11, 14], [14, 17]],
+    }  # fmt: skip
+    curves = {name: np.array(edges) for name, edges in sides.items()}
+    bodies = {"lower": cells, "upper": cells + 9}
+    mesh = msh22(np.vstack([lower, upper]), bodies, curves, {})
+    return lambda toml=SHEARED: described(mesh, toml)
+
+
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+@pytest.mark.parametrize("form", ["primal", "dual"])
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_a_block_that_friction_alone_holds_takes_its_load_in_steps(
+    sheared_blocks, contact, form, step
+):
+    """Each step has its share of the stress, and of the displacement (γy, −εy)."""
+    text = f"{sheared_blocks()}/contact={contact}/steps=3/step={step}/{form}"
+    case = build(text)
+    s = reference_solution(case.qp)
+    fields, share = case.fields(s), step / 3
+    points, u = fields.points, fields.displacement
+    shear, press = 4e5 / np.array([5e8, 1e9]), 1e6 / np.array([1e9, 2e9])
+    y, is_upper = points[:, 1], np.arange(len(points)) >= 9
+    low, high = np.where(is_upper, 2.0, y), np.where(is_upper, y - 2.0, 0.0)
+    expected = share * np.column_stack(
+        [low * shear[0] + high * shear[1], -low * press[0] - high * press[1]]
+    )
+
+    assert u == pytest.approx(expected, abs=1e-9 * abs(expected).max())
+    force = case.quantities(s)["contacts"]["upper on lower"]["force"]["upper"]
+    assert force == pytest.approx(share * np.array([-8e5, 2e6]), abs=1)
+
+
+def test_the_last_of_several_relinearisations_is_the_same_where_rows_stay(
+    sheared_blocks,
+):
+    once = build(f"{sheared_blocks()}/steps=1/dual")
+    again = build(f"{sheared_blocks()}/steps=1/relin=3/dual")
+
+    assert once.quantities(reference_solution(once.qp))["energy"] == pytest.approx(
+        again.quantities(reference_solution(again.qp))["energy"], rel=1e-9
+    )
+
+
+def test_more_shear_than_friction_bears_is_refused_in_every_step(sheared_blocks):
+    text = sheared_blocks(SHEARED.replace("4e5", "6e5"))
+    for step in (1, 2):
+        with pytest.raises(InputError, match="friction cannot hold the load"):
+            build(f"{text}/steps=2/step={step}/dual")
+
+
 @pytest.mark.parametrize(
-    ("load", "told"),
+    ("load", "message"),
     [
         ("force = [0, -1e8]", "body 'beam': nothing balances the moment of its load"),
         (f'{TOP}\n[[loads]]\nboundary = "left"\nforce = [-1e3, 0]', "beam"),
     ],
 )
 @pytest.mark.parametrize("form", ["primal", "dual"])
-def test_a_load_that_nothing_balances_is_named_before_solving(
-    described, load, told, form
-):
+def test_an_unbalanced_load_is_refused_before_solving(described, load, message, form):
     text = described(toml=FLOATING.replace("force = [0, -1e8]", load))
     with pytest.raises(InputError, match=r"a\.toml: body 'beam': nothing") as e:
         build(f"{text}/steps=1/{form}")
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -370,8 +462,8 @@ def test_a_contact_that_is_described_twice_is_refused(described):
         build(f"{described(toml=TOML + PAIR.format('outer', 'bottom'))}/step=1/primal")
 
 
-def test_a_body_that_can_slide_is_found_though_rounding_hides_it(tmp_path):
-    """Its top is on rollers; the factor of the singular K exists all the same."""
+def test_a_sliding_body_is_detected_although_rounding_hides_it(tmp_path):
+    """Its top is on rollers: K is singular, but rounding lets it be factorised."""
     there = ROOT / "suites" / "crossval"
     shutil.copy(there / "punch.msh", tmp_path)
     toml = (there / "punch.toml").read_text()
@@ -411,7 +503,7 @@ def test_nodes_of_no_cell_are_left_out(described):
     shift = {k: v + 1 for k, v in quads.items()}, {k: v + 1 for k, v in curves.items()}
     more = np.vstack([[[1.0, 0.0, 0.0]], POINTS])  # the centre of the ring
     described(msh22(more, *shift, {"corner": np.array([[CORNER + 1]])}))
-    bodies = described_bodies(Path("a.toml"), "strain")
+    bodies = read_bodies(Path("a.toml"), "strain")
 
     np.testing.assert_array_equal(bodies.mesh.points, RING.mesh.points)
     np.testing.assert_array_equal(bodies.f, RING.f)
@@ -444,7 +536,7 @@ def test_nodes_of_no_cell_are_left_out(described):
          "a.toml: loads[0]: point: unknown physical point 'tip'; known: corner"),
         ("force = [0, -1e8]", "force = [0]", "a.toml: loads[0]: force = [0]; expected"),
         ("force = [0, -1e8]", "force = [0, inf]", "a.toml: loads[0]: force = inf; "),
-        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: the loads sum up to"),
+        ("force = [0, -1e8]", "force = [0, 0.0]", "a.toml: units: all loads are zero"),
         ("force = [0, -1e8]", "", "a.toml: loads[0]: expected either force"),
         ("force = [0, -1e8]", "forces = [0, -1e8]",
          "a.toml: loads[0]: unknown key 'forces'; did you mean 'force'? known: "),
@@ -452,7 +544,8 @@ def test_nodes_of_no_cell_are_left_out(described):
          "a.toml: loads[0]: unknown key 'pint'; did you mean 'point'? known: "),
         ('boundary = "feet"', 'boundry = "feet"',
          "a.toml: supports[1]: unknown key 'boundry'; did you mean 'boundary'? known"),
-        ("force = [0, -1e8]", "traction = [0, -1e8]", "a.toml: loads[0]: a point"),
+        ("force = [0, -1e8]", "traction = [0, -1e8]",
+         "a.toml: loads[0]: traction acts on a point"),
         ('slave = "outer"', 'slave = "outre"',
          "a.toml: contacts[0]: slave: unknown physical curve 'outre'; did you mean 'o"),
         ('slave = "outer"', 'slave = "feet"',
@@ -479,7 +572,7 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
 
 
 @pytest.mark.parametrize(
-    ("load", "supports", "told"),
+    ("load", "supports", "message"),
     [
         ('boundary = "feet"\nforce = [0, -1e8]', "", "acts on 'feet' in y, which"),
         ('boundary = "feet"\ntraction = [1e6, 0]', "", "acts on 'feet' in x, which"),
@@ -490,14 +583,16 @@ POINT_LOAD = 'point = "corner"\nforce = [0, -1e8]'
          '[[supports]]\nboundary = "top"\nfix = ["x"]\n', "acts on 'top' in x, which"),
     ],
 )  # fmt: skip
-def test_a_load_that_its_supports_take_up_is_refused(described, load, supports, told):
-    """Every component of it is prescribed to be zero: no body feels it."""
+def test_a_load_that_its_supports_take_up_is_refused(
+    described, load, supports, message
+):
+    """All displacements at the load are prescribed as zero: it has no effect."""
     toml = TOML.replace(POINT_LOAD, load) + supports
     with pytest.raises(InputError) as e:
         build(f"{described(toml=toml)}/step=1/dual")
 
     assert str(e.value) == (
-        f"a.toml: loads[0] {told} fix holds there: it has no effect; load another "
+        f"a.toml: loads[0] {message} fix holds there: it has no effect; load another "
         "side, or hold other components"
     )
 
@@ -561,10 +656,10 @@ def bent(points):
     ],
 )  # fmt: skip
 def test_a_mesh_that_does_not_serve_is_refused(tmp_path, contents, message):
-    made = contents(*square())
-    kinds = {"quad_type": made[4]} if len(made) > 4 else {}
+    content = contents(*square())
+    kinds = {"quad_type": content[4]} if len(content) > 4 else {}
     with pytest.raises(InputError, match=r"m\.msh: ") as e:
-        read(tmp_path, *made[:4], **kinds)
+        read(tmp_path, *content[:4], **kinds)
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
@@ -588,7 +683,7 @@ SAVED = [msh41, lambda *contents: untagged(msh22(*contents))]
 
 @pytest.mark.parametrize("writer", SAVED)
 def test_all_entities_may_be_saved_if_every_body_has_a_name(tmp_path, writer):
-    """Curves and points without a name, as of Mesh.SaveAll = 1, change nothing."""
+    """Unnamed curves and points, written with Mesh.SaveAll = 1, change nothing."""
     quads, curves, spots = parts()
     more = curves | {"": curves["top"][:2]}, spots | {"": np.array([[0]])}
     read = []
@@ -619,7 +714,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
 
 
 def test_a_binary_file_of_all_entities_has_its_remedy(tmp_path):
-    """The entities of a text without the tag of its first curve, in binary."""
+    """Return a binary file whose first curve has no physical tag."""
     text = msh41(POINTS, *parts())
     (tmp_path / "a.msh").write_text(text)
     mesh = meshio.gmsh.read(tmp_path / "a.msh")
@@ -727,7 +822,7 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
 ):
     law = 'friction = "coulomb"\nmu = 0.3\n'
     same = "beam-ring/Nr=2/Nh=1/steps=1/friction=coulomb/mu=0.3/dual-bounds"
-    known = build(same).qp
+    expected_qp = build(same).qp
     for toml, keys in (
         (TOML, "/friction=coulomb/mu=0.3"),
         (law + TOML, ""),
@@ -737,11 +832,11 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
         qp = build(f"{described(toml=toml)}{keys}/steps=1/dual-bounds").qp
 
         assert qp.ub.size == 2 * (12 * NH + 1)
-        assert sorted(qp.ub) == pytest.approx(sorted(known.ub), abs=1e-9)
+        assert sorted(qp.ub) == pytest.approx(sorted(expected_qp.ub), abs=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("keys", "pair", "told"),
+    ("keys", "pair", "message"),
     [
         ("", 'friction = "tresca"', "contacts[0]: friction 'tresca' needs bound"),
         ("", 'friction = "tresca"\nbound = -1', "contacts[0]: bound = -1; expected a"),
@@ -754,12 +849,12 @@ def test_friction_is_that_of_the_benchmark_whether_key_top_of_file_or_pair_says_
     ],
 )
 def test_a_law_of_a_pair_that_does_not_fit_is_refused_in_one_line(
-    described, keys, pair, told
+    described, keys, pair, message
 ):
     with pytest.raises(InputError) as e:
         build(f"{described(toml=TOML + pair)}{keys}/dual")
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
@@ -783,24 +878,24 @@ def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described
         with pytest.raises(
             InputError, match=f"{what}; three dimensions are not supported yet"
         ):
-            described_bodies(Path("a.toml"), "strain")
+            read_bodies(Path("a.toml"), "strain")
 
 
-def test_contact_forces_of_several_pairs_are_told_pair_by_pair(tmp_path):
+def test_contact_forces_of_several_pairs_are_reported_pair_by_pair(tmp_path):
     """2 MN/m pass through a disc: each of its two contacts bears all of it."""
     case = build(f"bodies:{press.described(tmp_path)}/dual")
-    found = case.quantities(reference_solution(case.qp))
+    values = case.quantities(reference_solution(case.qp))
 
-    assert "contact_force" not in found
-    assert [pair["force"]["disc"][1] for pair in found["contacts"].values()] == (
+    assert "contact_force" not in values
+    assert [pair["force"]["disc"][1] for pair in values["contacts"].values()] == (
         pytest.approx([2e6, -2e6], rel=1e-6)
     )
 
 
 def test_the_contact_force_of_one_pair_is_its_force_on_the_master(described):
     case = build(described() + "/step=1/dual")
-    found = case.quantities(reference_solution(case.qp))
+    values = case.quantities(reference_solution(case.qp))
 
-    assert found["contact_force"] == pytest.approx(
-        found["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
+    assert values["contact_force"] == pytest.approx(
+        values["contacts"]["ring on beam"]["force"]["beam"], rel=1e-12
     )

@@ -25,8 +25,8 @@ PROTOTYPE = {
 
 
 @cache
-def solved(n, form="dual-bounds", tol=1e-10, **given):
-    case = FAMILY.build(form, FAMILY.complete({"n": n, **given}), reference_solution)
+def solved(n, form="dual-bounds", tol=1e-10, **keys):
+    case = FAMILY.build(form, FAMILY.complete({"n": n, **keys}), reference_solution)
     s = SMALBE().prepare(case.qp, tol)()
     assert kkt_residuals(case.qp, s).worst <= 10 * tol
     return case, s
@@ -59,9 +59,9 @@ def test_the_plate_sticks_from_30_mm_on_and_slips_towards_plus_x():
 
 
 def test_forces_are_in_equilibrium():
-    """Friction and the reactions of the right side carry the push, contact the rest."""
+    """Friction and reactions on the right balance the push, contact forces the rest."""
     case, s = solved(8)
-    got, reaction = case.quantities(s), case.mechanics.back(s).y * 5e7 * 0.04
+    got, reaction = case.quantities(s), case.mechanics.to_primal(s).y * 5e7 * 0.04
     fx, fy = got["contact_force"]
 
     assert 15e7 * 0.04 + fx - reaction[:9].sum() == pytest.approx(0, abs=1)
@@ -83,7 +83,7 @@ def test_every_form_has_the_same_answer():
 
 
 def test_the_fixed_point_begins_without_friction_and_contracts():
-    """Every one of its Tresca problems can be had by its number."""
+    """The key `iterate` selects each of its Tresca problems."""
     case, s = solved(8)
     count, residuals = case.quantities(s)["tresca_problems"], []
     for i in range(1, count + 1):
@@ -96,7 +96,7 @@ def test_the_fixed_point_begins_without_friction_and_contracts():
     assert (np.divide(residuals[2:9], residuals[1:8]) < 0.7).all()
 
 
-def test_without_friction_nothing_slips_back():
+def test_without_friction_there_is_no_tangential_force():
     got = solved(8, mu=0.0)[0].quantities(solved(8, mu=0.0)[1])
 
     assert got["tangential_sum"] == 0
@@ -104,16 +104,16 @@ def test_without_friction_nothing_slips_back():
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [("n=1", "greco: n=1 must be at least 2"),
      ("mu=-0.5", "greco: mu=-0.5; expected a coefficient of friction of 0 or more"),
      ("iterate=-1", "greco: iterate=-1 must be at least 0")],
 )  # fmt: skip
-def test_values_out_of_range_are_refused(name, told):
+def test_values_out_of_range_are_refused(name, message):
     with pytest.raises(InputError) as e:
         parse(f"greco/{name}/dual", PROBLEMS)
 
-    assert told in str(e.value)
+    assert message in str(e.value)
 
 
 def test_an_iterate_beyond_the_last_is_refused():

@@ -1,4 +1,4 @@
-"""Half planes without a mesh against Hertz, Cattaneo and Mindlin."""
+"""Half planes, compared with Hertz, Cattaneo and Mindlin."""
 
 from itertools import pairwise
 
@@ -26,8 +26,8 @@ FAMILY = HalfPlane()
 TOL = 1e-9
 
 
-def result(solver=None, **given):
-    case = FAMILY.build("dual", FAMILY.complete(given), reference_solution)
+def result(solver=None, **keys):
+    case = FAMILY.build("dual", FAMILY.complete(keys), reference_solution)
     s = (solver or SMALBE()).prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case.quantities(s)
@@ -119,16 +119,16 @@ def test_400_elements_have_the_shear_traction_of_cattaneo_and_mindlin(Q):
 
 
 @pytest.mark.parametrize(
-    ("given", "error"),
+    ("keys", "error"),
     [(dict(law="hertz"), "pressure_l2_error"),
      (dict(law="cattaneo", Q=0.3), "shear_l2_error"),
      (dict(law="cattaneo", Q=0.9), "shear_l2_error"),
      (dict(law="cattaneo", Q=0.2, peak=0.6), "shear_l2_error")],
     ids=str,
 )  # fmt: skip
-def test_tractions_converge_about_linearly_and_energies_quadratically(given, error):
-    """Over four halvings: at each, c and a fall differently between the elements."""
-    coarse, fine = (result(n=n, **given) for n in (50, 800))
+def test_tractions_converge_about_linearly_and_energies_quadratically(keys, error):
+    """Rates over four halvings: c and a lie differently in the elements at each."""
+    coarse, fine = (result(n=n, **keys) for n in (50, 800))
 
     assert np.log2(coarse[error] / fine[error]) / 4 > 0.8
     assert np.log2(abs(coarse["energy_error"] / fine["energy_error"])) / 4 > 1.5
@@ -154,7 +154,7 @@ def test_unloading_lets_slip_come_in_from_the_edge(Q, peak):
     assert got["dissipation"] > 0
 
 
-def test_friction_dissipates_what_the_force_did_less_what_is_stored():
+def test_dissipation_is_the_work_of_the_force_less_the_stored_energy():
     """∫Q dδ of the closed curve Q(δ) from −peak to peak and back: 2·dissipation."""
     Q = np.linspace(-0.8, 0.8, 201)
     unit = MU * EXACT.P * 2 * MU * EXACT.P / (np.pi * EXACT.E_star)
@@ -166,14 +166,14 @@ def test_friction_dissipates_what_the_force_did_less_what_is_stored():
 
 
 def test_an_interior_point_method_finds_the_same():
-    given = dict(n=40, law="cattaneo", Q=0.4, peak=0.7)
+    keys = dict(n=40, law="cattaneo", Q=0.4, peak=0.7)
 
-    ours, theirs = result(**given), result(Clarabel(), **given)
+    ours, theirs = result(**keys), result(Clarabel(), **keys)
     assert ours["shear_centre"] == pytest.approx(theirs["shear_centre"], rel=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "message"),
     [("Q=0.5", "Q=0.5 needs law=cattaneo"), ("peak=0.5", "peak=0.5 needs law=cattaneo"),
      ("law=cattaneo", "Q=0.0 must be between 0 and 1"),
      ("law=cattaneo/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
@@ -182,11 +182,11 @@ def test_an_interior_point_method_finds_the_same():
      ("law=coulomb", "law='coulomb' is unknown, expected 'hertz' or 'cattaneo'"),
      ("n=1", "n=1 must be at least 2"), ("n=90000000", "a full matrix of 90000000")],
 )  # fmt: skip
-def test_what_the_law_does_not_use_or_lacks_is_refused_in_one_line(name, told):
+def test_unused_and_missing_keys_of_the_law_are_refused_in_one_line(name, message):
     with pytest.raises(InputError, match="half-plane: ") as e:
         parse(f"half-plane/{name}/dual", PROBLEMS)
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 

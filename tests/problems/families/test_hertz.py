@@ -1,4 +1,4 @@
-"""Pressures between cylinders against Hertz."""
+"""Pressures between cylinders, compared with Hertz."""
 
 from dataclasses import replace
 from functools import cache
@@ -27,17 +27,17 @@ PAIRINGS = [("mortar", "dual"), ("mortar", "standard"), ("nts", "dual")]
 
 
 @cache
-def solved(family, form="dual", **given):
-    """The case and its verified solution."""
-    case = family.build(form, {**family.defaults, **given}, reference_solution)
+def solved(family, form="dual", **keys):
+    """Return the case and its verified solution."""
+    case = family.build(form, {**family.defaults, **keys}, reference_solution)
     s = SOLVERS[form].prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case, s
 
 
 @cache
-def result(family, form="dual", **given):
-    case, s = solved(family, form, **given)
+def result(family, form="dual", **keys):
+    case, s = solved(family, form, **keys)
     return case.quantities(s)
 
 
@@ -81,7 +81,7 @@ def test_the_peak_pressure_of_the_benchmark_in_pascal():
 
 @pytest.mark.parametrize("family", [PLANE, CYLINDER], ids=["plane", "cylinder"])
 def test_the_pressure_converges(family):
-    """Faster than with order one: it has an infinite slope at ±a."""
+    """The order is above one, although the slope is infinite at ±a."""
     errors = [
         result(family, n=n, **({"m": n} if family is CYLINDER else {}))[
             "pressure_l2_error"
@@ -123,10 +123,10 @@ def test_unequal_cylinders_are_in_hertz_contact(contact, basis):
 
 
 def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
-    """Equal ones press like one on a plane; a soft or small partner gives in more."""
+    """Equal cylinders press like one on a plane; a soft or small one yields more."""
     theory = [
-        two_cylinders({**CYLINDER.defaults, "load": 10.0, **given})[1]
-        for given in ({}, {"ratio": 1e9, "radius": 1e9}, {"radius": 3.0, "ratio": 0.5})
+        two_cylinders({**CYLINDER.defaults, "load": 10.0, **keys})[1]
+        for keys in ({}, {"ratio": 1e9, "radius": 1e9}, {"radius": 3.0, "ratio": 0.5})
     ]
 
     assert theory[0].a == pytest.approx(BENCHMARK.a)
@@ -135,7 +135,7 @@ def test_the_theory_of_two_cylinders_adds_curvatures_and_compliances():
 
 
 def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segment():
-    """On meshes that do not match; as in the patch test."""
+    """The meshes do not match, as in the patch test."""
     errors = {
         contact: [
             result(CYLINDER, n=n, m=m, contact=contact)["pressure_l2_error"]
@@ -149,7 +149,7 @@ def test_refinement_removes_the_pressure_error_of_mortar_but_not_of_node_to_segm
 
 
 def test_the_difference_from_hertz_falls_with_the_load():
-    """It is O(a²/R²), and a² is proportional to P; finite size adds a constant."""
+    """The error is O(a²/R²) with a² ∝ P, plus a constant of the finite bodies."""
     errors = np.array([
         result(CYLINDER, n=20, m=20, load=load)["half_width_error"]
         for load in (10.0, 1.0, 0.1)
@@ -159,7 +159,7 @@ def test_the_difference_from_hertz_falls_with_the_load():
 
 
 @pytest.mark.parametrize("n", [20, 40])
-def test_what_is_left_on_fine_meshes_is_finite_size(n):
+def test_errors_on_fine_meshes_are_those_of_finite_bodies(n):
     got = result(PLANE, n=n)
 
     assert got["pressure_l2_error"] <= 0.01
@@ -168,7 +168,7 @@ def test_what_is_left_on_fine_meshes_is_finite_size(n):
 
 
 @pytest.mark.parametrize(
-    ("family", "bad", "told"),
+    ("family", "bad", "message"),
     [
         (PLANE, {"n": 0}, "hertz-plane: n=0 must be at least 1"),
         (PLANE, {"load": -1.0}, "hertz-plane: load=-1.0 must be positive"),
@@ -177,20 +177,20 @@ def test_what_is_left_on_fine_meshes_is_finite_size(n):
         (CYLINDER, {"contact": "glue"}, "contact='glue' is unknown"),
     ],
 )
-def test_values_out_of_range_are_refused(family, bad, told):
+def test_values_out_of_range_are_refused(family, bad, message):
     with pytest.raises(InputError) as e:
         family.check({**family.defaults, **bad})
 
-    assert told in str(e.value)
+    assert message in str(e.value)
 
 
 COULOMB = dict(n=20, m=20, friction="coulomb", mu=0.3)
 
 
 @cache
-def sheared_result(form="dual", **given):
+def sheared_result(form="dual", **keys):
     case = CYLINDER.build(
-        form, CYLINDER.complete({**COULOMB, **given}), reference_solution
+        form, CYLINDER.complete({**COULOMB, **keys}), reference_solution
     )
     s = SOLVERS[form].prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
@@ -231,10 +231,10 @@ def test_unloading_lets_it_slip_back_from_the_edge(Q):
 
 
 def test_in_proportion_only_the_last_node_at_each_edge_slips():
-    """And as if Q had come last, where the load is static."""
-    given = dict(n=6, m=6, Q=0.5)
-    got = sheared_result(**given, steps=6, programme="proportional")
-    static = sheared_result(**given, loading="static")
+    """A single static load gives the tractions of Q applied last."""
+    keys = dict(n=6, m=6, Q=0.5)
+    got = sheared_result(**keys, steps=6, programme="proportional")
+    static = sheared_result(**keys, loading="static")
 
     assert (got["slip"], static["slip"]) == (2, pytest.approx(12 * 0.29, abs=1.1))
     assert abs(static["stick_half_width_error"]) < 0.03
@@ -259,9 +259,9 @@ def test_in_proportion_the_shear_traction_tends_to_that_part_of_the_pressure():
 
 
 def test_the_tangential_force_turns_no_body():
-    """Loads and their moments cancel on each body, so that supports carry nothing."""
-    given = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
-    params = CYLINDER.complete(given)
+    """Forces and moments of loads cancel on each body: there are no reactions."""
+    keys = dict(n=4, m=4, friction="coulomb", mu=0.5, Q=0.5)
+    params = CYLINDER.complete(keys)
     stated = problem(params)
     first, last = stated.stages[0].forces, stated.stages[-1].forces
     bodies = stated.bodies.assembled
@@ -279,11 +279,11 @@ def test_the_tangential_force_turns_no_body():
     assert abs(reference_solution(case.qp).x[:3]).max() < 1e-3  # turned contact normals
 
 
-@pytest.mark.parametrize("given", [dict(), dict(contact="nts"), dict(slave="lower")])
-def test_the_slip_begins_where_symmetry_puts_the_cylinders(given):
-    """Without friction they would roll on each other under P, however far."""
-    given |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
-    case = CYLINDER.build("dual", CYLINDER.complete(given), reference_solution)
+@pytest.mark.parametrize("keys", [dict(), dict(contact="nts"), dict(slave="lower")])
+def test_the_slip_begins_where_symmetry_puts_the_cylinders(keys):
+    """Without friction, the cylinders could roll on each other under P."""
+    keys |= dict(n=5, m=4, friction="coulomb", mu=0.4, Q=0.6)
+    case = CYLINDER.build("dual", CYLINDER.complete(keys), reference_solution)
     friction = case.mechanics.friction
     begins = friction.start[friction.bound > 0]
 
@@ -291,9 +291,9 @@ def test_the_slip_begins_where_symmetry_puts_the_cylinders(given):
 
 
 def test_friction_holds_equal_cylinders_together_without_a_force():
-    """None is needed: they deform alike, and the pressure is Hertz's."""
-    given = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)
-    got, smooth = result(CYLINDER, **given), result(CYLINDER, n=10, m=10, load=0.1)
+    """Both deform alike, so that there is no slip, and the pressure is Hertz's."""
+    keys = dict(n=10, m=10, load=0.1, friction="coulomb", mu=0.3)
+    got, smooth = result(CYLINDER, **keys), result(CYLINDER, n=10, m=10, load=0.1)
 
     assert got["p_max"] == pytest.approx(smooth["p_max"], rel=2e-3)
     assert got["dissipation"] < 1e-5 * abs(got["energy"])
@@ -311,7 +311,7 @@ def test_of_a_fixed_point_every_tresca_problem_can_be_had():
 
 
 @pytest.mark.parametrize(
-    ("keys", "told"),
+    ("keys", "message"),
     [("Q=0.5", "friction=none with a tangential force; expected friction=coulomb"),
      ("friction=tresca/bound=1e6/Q=0.5", "expected friction=coulomb, or no Q"),
      ("friction=coulomb/mu=0.3/Q=1", "Q=1.0 must be between 0 and 1, a part of μP"),
@@ -326,17 +326,17 @@ def test_of_a_fixed_point_every_tresca_problem_can_be_had():
       "peak=0.5 is not used by loading=static"),
      ("friction=coulomb/mu=0.3/Q=0.5/programme=both", "programme='both' is unknown")],
 )  # fmt: skip
-def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, told):
+def test_keys_of_friction_that_do_not_fit_are_refused_in_one_line(keys, message):
     with pytest.raises(InputError, match="hertz-cylinder: ") as e:
         parse(f"hertz-cylinder/{keys}/dual", PROBLEMS)
 
-    assert told in str(e.value)
+    assert message in str(e.value)
     assert "\n" not in str(e.value)
 
 
 @pytest.mark.parametrize("ratio", [1e-5, 1e-6, 1e-9, 1e-10, 1e-12])
 def test_cells_keep_their_area_where_the_contact_is_wider_than_the_cylinder(ratio):
-    """Even arcs must not wind around it: K would be indefinite."""
+    """The uniform part of the arc must fit the half disc, or K is indefinite."""
     params = parse(f"hertz-cylinder/n=3/m=2/ratio={ratio}/primal", PROBLEMS).params
     bodies, exact = two_cylinders(params)
     assert exact.a > 4 * 0.008

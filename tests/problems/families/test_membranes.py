@@ -11,7 +11,7 @@ from mortarbench.harness import InputError, Solution, Status, kkt_residuals
 from mortarbench.harness.files.matfile import read_mat, save_mat
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.fem.laplacian import grid_stiffness
-from mortarbench.problems.models.membranes import shares
+from mortarbench.problems.models.membranes import hat_integrals
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
 
@@ -44,16 +44,16 @@ def solution(case):
 def test_sizes_are_those_of_the_table(size):
     S, n = size
     case = built("dual", S=S, n=n)
-    told = case.quantities(Solution.without_point(case.qp, Status.FAILED))
+    values = case.quantities(Solution.without_point(case.qp, Status.FAILED))
     names = ("torn_dofs", "multipliers", "contact_rows", "subdomains")
 
-    assert tuple(told[name] for name in names) == TABLE[size]
-    assert (case.qp.lb == 0).sum() == told["contact_rows"]
-    assert told["kinds"] == 1
-    assert told["explicit_subdomains"] == told["subdomains"]
+    assert tuple(values[name] for name in names) == TABLE[size]
+    assert (case.qp.lb == 0).sum() == values["contact_rows"]
+    assert values["kinds"] == 1
+    assert values["explicit_subdomains"] == values["subdomains"]
 
 
-def test_the_stiffness_is_exact_for_what_the_elements_hold():
+def test_the_stiffness_is_exact_for_functions_of_the_element_space():
     """∫|∇u|² of u = 1, x, y and xy on the unit square: 0, 1, 1 and 2/3."""
     n = 5
     x = np.tile(np.linspace(0, 1, n + 1), n + 1)
@@ -67,9 +67,9 @@ def test_the_stiffness_is_exact_for_what_the_elements_hold():
 
 @pytest.mark.parametrize("n", [3, 4, 8])
 def test_the_load_integrates_polynomials_of_the_first_degree(n):
-    """Also where the edge of the strip is inside of a cell."""
+    """The edge of the loaded strip may be inside a cell."""
     y = np.linspace(0, 1, n + 1)
-    share = shares(n, 0.75, 1.0)
+    share = hat_integrals(n, 0.75, 1.0)
 
     assert share.sum() == pytest.approx(0.25)
     assert share @ y == pytest.approx((1 - 0.75**2) / 2)
@@ -88,16 +88,15 @@ def test_the_forms_have_one_solution_in_every_gluing(glue):
 
 
 def test_contact_holds_the_right_membrane_where_the_left_one_is_not_lower():
-    """Its load is ¼; contact is partial, and a bottom of both is free of the other."""
+    """The contact force is the load, ¼; contact covers part of the edge only."""
     case = built("dual", S=2, n=8)
     s = solution(case)
-    found = case.quantities(s)
+    values = case.quantities(s)
 
-    assert found["contact_force"] == pytest.approx(0.25, rel=1e-10)
-    assert 0 < found["active"] < found["contact_rows"]
-    assert kkt_residuals(built("primal", S=2, n=8).qp, case.mechanics.back(s)).worst < (
-        1e-9
-    )
+    assert values["contact_force"] == pytest.approx(0.25, rel=1e-10)
+    assert 0 < values["active"] < values["contact_rows"]
+    primal = built("primal", S=2, n=8).qp
+    assert kkt_residuals(primal, case.mechanics.to_primal(s)).worst < 1e-9
 
 
 @pytest.mark.parametrize("glue", ["orthonormal", "redundant"])
@@ -121,11 +120,11 @@ def test_products_stay_below_those_of_the_best_settings_of_permon(size, best):
 
 
 def test_energies_fall_to_a_limit_as_the_mesh_is_refined():
-    energies = [solution(built("primal", S=1, n=n)) for n in (4, 8, 16, 32)]
-    found = [built("primal", S=1, n=n).qp.objective(s.x)
-             for n, s in zip((4, 8, 16, 32), energies, strict=True)]  # fmt: skip
+    solutions = [solution(built("primal", S=1, n=n)) for n in (4, 8, 16, 32)]
+    energies = [built("primal", S=1, n=n).qp.objective(s.x)
+             for n, s in zip((4, 8, 16, 32), solutions, strict=True)]  # fmt: skip
 
-    steps = -np.diff(found)
+    steps = -np.diff(energies)
     assert (steps > 0).all()
     assert (steps[1:] < 0.5 * steps[:-1]).all()
 

@@ -6,7 +6,7 @@ import pytest
 from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.problems.families.obstacle import Obstacle
 from mortarbench.problems.models.obstacle import (
-    LIFT_OFF,
+    CONTACT_RADIUS,
     exact_energy,
     exact_height,
     obstacle_height,
@@ -83,7 +83,7 @@ def test_the_string_is_exact_at_the_nodes_if_one_is_where_it_lifts_off():
 
 @pytest.mark.parametrize("phase", [10, 20])
 def test_the_string_converges_with_second_order(phase):
-    """It lifts off ⅓ or ⅔ of a cell from a node, and four times finer it does again."""
+    """The string lifts off ⅓ or ⅔ of a cell from a node, also for h/4."""
     got = [result(1, n) for n in (4 * phase, 16 * phase, 64 * phase)]
 
     for error in ("max_error", "energy_error"):
@@ -127,7 +127,7 @@ def test_the_membrane_keeps_the_symmetry_of_the_square():
         assert image == pytest.approx(u, abs=1e-10)
 
 
-def test_the_boundary_is_held_at_the_exact_height():
+def test_the_boundary_has_the_exact_height():
     problem = obstacle_problem(2, 8)
     at_boundary = abs(problem.x).max(axis=1) == 1.5
     case, s = solved(SMALBE(), "primal", 2, 8)
@@ -147,10 +147,10 @@ def test_over_the_hemisphere_the_exact_height_is_harmonic_and_leaves_it_smoothly
     ) / h**2  # fmt: skip
     r = np.linalg.norm(x, axis=1)
     lift = exact_height(x, "hemisphere") - obstacle_height(x, "hemisphere")
-    near = abs(r - LIFT_OFF) < 0.02
+    near = abs(r - CONTACT_RADIUS) < 0.02
 
-    assert laplacian[r > LIFT_OFF + h] == pytest.approx(0, abs=1e-5)
-    assert (laplacian[r < LIFT_OFF - h] < -1).all()
+    assert laplacian[r > CONTACT_RADIUS + h] == pytest.approx(0, abs=1e-5)
+    assert (laplacian[r < CONTACT_RADIUS - h] < -1).all()
     assert (lift >= 0).all()
     assert lift[near].max() <= 3 * 0.02**2
     assert exact_height(np.array([[2.0, 0.0]]), "hemisphere") == pytest.approx(0)
@@ -190,15 +190,15 @@ def test_over_the_hemisphere_it_converges_with_second_order(form):
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "message"),
     [
         ({"dim": 3}, "dim=3 is unknown, expected 1 or 2"),
         ({"n": 1}, "n=1 must be at least 2"),
         ({"shape": "hemisphere", "dim": 1}, "shape=hemisphere needs dim=2"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
+def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
     with pytest.raises(InputError, match="obstacle: ") as e:
         FAMILY.check({**FAMILY.defaults, **bad})
 
-    assert told in str(e.value)
+    assert message in str(e.value)

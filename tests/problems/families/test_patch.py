@@ -1,4 +1,4 @@
-"""The contact patch test: exact linear states, and who fails to reproduce them."""
+"""Contact patch test: exact linear states, and methods that fail it."""
 
 import numpy as np
 import pytest
@@ -17,17 +17,17 @@ BASES = [("mortar", "dual"), ("mortar", "standard")]
 MESHES = [(6, 4), (7, 5), (24, 20)]
 
 
-def solved(form="dual", **given):
-    """The case, its verified solution, its quantities."""
+def solved(form="dual", **keys):
+    """Return the case, its verified solution and its quantities."""
     solver, tol = SOLVERS[form]
-    case = FAMILY.build(form, {**FAMILY.defaults, **given}, reference_solution)
+    case = FAMILY.build(form, {**FAMILY.defaults, **keys}, reference_solution)
     s = solver.prepare(case.qp, tol)()
     assert kkt_residuals(case.qp, s).worst <= 10 * tol
     return case, s, case.quantities(s)
 
 
-def error(**given):
-    return solved(**given)[2]["stress_error"]
+def error(**keys):
+    return solved(**keys)[2]["stress_error"]
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1e-3])
@@ -70,8 +70,8 @@ def test_node_to_segment_passes_on_matching_meshes():
     ("mesh", "slave", "percent"),
     [((6, 4), "upper", 27.8), ((6, 4), "lower", 8.9), ((24, 20), "upper", 9.8)],
 )
-def test_node_to_segment_fails_by_what_another_code_found(mesh, slave, percent):
-    """The numbers are those of a prototype with other supports."""
+def test_node_to_segment_has_the_errors_of_an_independent_code(mesh, slave, percent):
+    """The expected errors are those of a prototype with other supports."""
     lower, upper = mesh
     got = 100 * error(contact="nts", slave=slave, lower=lower, upper=upper)
 
@@ -91,9 +91,9 @@ def test_the_whole_pressure_passes_even_where_its_distribution_is_wrong(contact)
 @pytest.mark.parametrize("form", ["primal", "dual"])
 def test_the_displacement_is_the_exact_linear_one(form, plane):
     """ε_y = −p/E′, ε_x = ν′p/E′; in plane strain E′ = E/(1 − ν²), ν′ = ν/(1 − ν)."""
-    given = {"ratio": 0.25, "plane": plane}
-    case, s, _ = solved(form, **given)
-    bodies = model({**FAMILY.defaults, **given})
+    keys = {"ratio": 0.25, "plane": plane}
+    case, s, _ = solved(form, **keys)
+    bodies = model({**FAMILY.defaults, **keys})
     E, nu = (10e6 / 0.91, 0.3 / 0.7) if plane == "strain" else (10e6, 0.3)
     x, y = bodies.mesh.points.T
     lower = bodies.body_of_node == 0
@@ -116,7 +116,7 @@ def test_the_energy_is_minus_half_the_work_of_the_pressure(form):
 
 
 @pytest.mark.parametrize(
-    ("bad", "told"),
+    ("bad", "message"),
     [
         ({"lower": 0}, "lower=0 must be at least 1"),
         ({"ratio": 0.0}, "ratio=0.0 must be positive"),
@@ -124,8 +124,8 @@ def test_the_energy_is_minus_half_the_work_of_the_pressure(form):
         ({"basis": "cubic"}, "basis='cubic' is unknown, expected 'dual' or 'standard'"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_right_ones(bad, told):
+def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
     with pytest.raises(InputError, match="contact-patch: ") as e:
         FAMILY.check({**FAMILY.defaults, **bad})
 
-    assert told in str(e.value)
+    assert message in str(e.value)

@@ -1,4 +1,4 @@
-"""Every family in subdomains has the displacement that it has in one piece."""
+"""Families in subdomains: the displacement equals that of undivided bodies."""
 
 from functools import cache
 
@@ -38,7 +38,7 @@ def built(name):
 @cache
 def in_one_piece(name):
     whole = built(f"{name}/dual")
-    u = whole.mechanics.back(reference_solution(whole.qp)).x
+    u = whole.mechanics.to_primal(reference_solution(whole.qp)).x
     return u, whole.mechanics.primal.P
 
 
@@ -46,7 +46,7 @@ def check(name, cut, glue):
     u, K = in_one_piece(name)
     case = built(f"{name}/{cut}/glue={glue}/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
-    error = case.mechanics.back(s).x - u
+    error = case.mechanics.to_primal(s).x - u
     bound = certified(case, s)[0]["energy_bound"]
     relative = np.sqrt(max(error @ (K @ error), 0.0) / (u @ (K @ u)))
 
@@ -68,8 +68,8 @@ def test_the_first_step_makes_no_factor_of_the_whole(monkeypatch):
     def refused(*_: object) -> None:
         raise AssertionError("a factor of the whole")
 
-    monkeypatch.setattr(problem, "clamped", refused)
-    monkeypatch.setattr(problem, "floating", refused)
+    monkeypatch.setattr(problem, "factorise_clamped", refused)
+    monkeypatch.setattr(problem, "factorise_floating", refused)
     case = built("beam-ring/Nr=2/Nh=3/steps=2/step=1/feti=2/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
     assert certified(case, s)[0]["energy_bound"] <= 1e-5
@@ -96,7 +96,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
     """One with the form that eliminates them."""
     u, _ = in_one_piece(name)
     eliminated = built(f"{name}/dual-bounds")
-    exact = eliminated.mechanics.back(reference_solution(eliminated.qp)).x
+    exact = eliminated.mechanics.to_primal(reference_solution(eliminated.qp)).x
 
     assert u == pytest.approx(exact, abs=1e-12)
 
@@ -114,7 +114,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
         ),
     ],
 )
-def test_what_is_not_built_is_refused_by_name(press, name, message):
+def test_unsupported_combinations_are_refused_by_name(press, name, message):
     with pytest.raises(InputError, match=message):
         built(name)
 
@@ -139,7 +139,7 @@ def test_keys_that_do_not_fit_are_refused_before_anything_is_built(
 
 @pytest.mark.parametrize(("n", "most"), [(4, 45), (8, 60)])
 def test_subdomains_of_graded_meshes_are_compact(n, most):
-    """In blocks of 8 × 8 cells, 95 and 359 products were needed."""
+    """With blocks of 8 × 8 cells instead, 95 and 359 products were needed."""
     case = built(f"hertz-plane/n={n}/feti=8/dual")
     s = SOLVERS["smalbe"].prepare(case.qp, 1e-6)()
 

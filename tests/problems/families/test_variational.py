@@ -12,8 +12,8 @@ from mortarbench.solvers.smalbe.solver import SMALBE
 TOL = 1e-9
 
 
-def solved(family, solver=None, **given):
-    case = family.build("primal", family.complete(given), reference_solution)
+def solved(family, solver=None, **keys):
+    case = family.build("primal", family.complete(keys), reference_solution)
     s = (solver or SMALBE()).prepare(case.qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case, s
@@ -24,7 +24,7 @@ def solved(family, solver=None, **given):
     [(4, -0.22474), (10, -0.17896), (23, -0.18005), (32, -0.18030), (75, -0.18055)],
 )
 def test_the_journal_bearing_has_its_published_optimum(points, optimum):
-    """JNLBRNG1 of CUTEst, whose points per side count those at the boundary."""
+    """JNLBRNG1 of CUTEst, whose sizes include the boundary points."""
     case, s = solved(JournalBearing(), n=points - 2)
 
     assert case.quantities(s)["energy"] == pytest.approx(optimum, abs=6e-6)
@@ -72,7 +72,7 @@ def test_a_plastic_bar_is_a_roof(twist):
 
 
 def test_a_bar_twisted_back_is_its_mirror_image():
-    """Both bounds are used: −c gives −v."""
+    """With −c, the other bound is active and v changes its sign."""
     case, s = solved(Torsion(), n=20)
     qp = case.qp
     back = SMALBE().prepare(type(qp)(
@@ -83,7 +83,7 @@ def test_a_bar_twisted_back_is_its_mirror_image():
 
 
 def test_the_string_bends_by_its_load_or_lies_on_the_obstacle():
-    """Second differences are 30h² where it is free, smaller where it is held up."""
+    """Second differences are 30h² off the obstacle, and smaller on it."""
     n = 100
     case, s = solved(String(), n=n)
     bend = np.diff(s.x, 2) * (n - 1) ** 2
@@ -96,23 +96,23 @@ def test_the_string_bends_by_its_load_or_lies_on_the_obstacle():
 
 
 @pytest.mark.parametrize(
-    ("family", "given"),
+    ("family", "keys"),
     [
         (String(), {"n": 60}), (Torsion(), {"n": 14}),
         (JournalBearing(), {"n": 14, "eccentricity": 0.9}),
     ],
     ids=["string", "torsion", "journal bearing"],
 )  # fmt: skip
-def test_another_method_finds_the_same(family, given):
-    case, s = solved(family, **given)
-    _, other = solved(family, Clarabel(), **given)
+def test_another_method_finds_the_same(family, keys):
+    case, s = solved(family, **keys)
+    _, other = solved(family, Clarabel(), **keys)
 
     assert s.x == pytest.approx(other.x, abs=1e-5 * np.abs(other.x).max())
     assert case.qp.objective(s.x) == pytest.approx(case.qp.objective(other.x), rel=1e-7)
 
 
 @pytest.mark.parametrize(
-    ("family", "bad", "told"),
+    ("family", "bad", "message"),
     [
         (String(), {"n": 2}, "n=2 must be at least 3"),
         (Torsion(), {"twist": 0.0}, "twist=0.0 must be positive"),
@@ -120,8 +120,8 @@ def test_another_method_finds_the_same(family, given):
     ],
     ids=["string", "torsion", "journal bearing"],
 )
-def test_values_out_of_range_are_refused(family, bad, told):
+def test_values_out_of_range_are_refused(family, bad, message):
     with pytest.raises(InputError, match=f"{family.name}: ") as e:
         family.check({**family.defaults, **bad})
 
-    assert told in str(e.value)
+    assert message in str(e.value)

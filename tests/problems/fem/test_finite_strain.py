@@ -1,4 +1,4 @@
-"""Hyperelastic cells: known digits, derivatives, objectivity, the limit of small u."""
+"""Hyperelastic cells: published digits, derivatives, objectivity, small strains."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ from mortarbench.problems.fem.finite_strain import (
     assemble,
     cauchy_stress,
     cells_of,
-    clip,
-    convexified,
+    clip_eigenvalues,
+    convex_tangent,
     deformation_gradients,
     evaluate,
     strain_energy,
@@ -27,7 +27,7 @@ NEARLY = Material(E=1.0, nu=0.49)
 
 
 def stretched(material, lateral_free):
-    """The stretch λ₁ at which P₁₁ vanishes, with F, for a given λ₂."""
+    """Return the stretch λ₁ with P₁₁ = 0 for a stretch λ₂, and F."""
     free = brentq(
         lambda l: material.stress(np.diag([l, lateral_free]))[0, 0], 0.7, 1.6,
         xtol=1e-15,
@@ -42,7 +42,7 @@ def stretched(material, lateral_free):
         (0.6, 1.2144261693, -0.7146352056, -0.5884550446),
     ],
 )
-def test_neo_hooke_between_frictionless_plates_has_the_known_digits(
+def test_neo_hooke_between_frictionless_plates_has_published_digits(
     stretch, lateral, nominal, cauchy
 ):
     material = hyperelastic("neo-hooke", SOFT)
@@ -72,7 +72,7 @@ def test_st_venant_kirchhoff_in_uniaxial_stress_is_a_cubic(stretch):
 
 
 def mixed(nu):
-    """A distorted block of quadrilaterals below half a disc that has triangles, too."""
+    """A distorted block of quadrilaterals below a half disc with triangles."""
     block = rectangle((0.0, 0.0), (2.0, 1.0), (4, 3))
     disc = half_disc((0.0, 3.0), np.linspace(0, np.pi, 7), np.array([1.0, 0.5]))
     mesh, body = join((block, disc))
@@ -116,7 +116,7 @@ def test_forces_and_tangent_are_the_derivatives_of_the_energy(name, nu):
 @every_material
 @both_elements
 def test_cells_agree_with_the_sums_over_their_points(name, nu):
-    """The compiled loops against the formulae of the page, by numpy."""
+    """Compare the compiled loops with the formulas of the documentation in numpy."""
     c = cells(name, nu)
     u = random_state(c.mesh)
     F = deformation_gradients(c, u)
@@ -209,7 +209,7 @@ def test_the_tangent_without_strain_is_that_of_linear_elasticity(name):
 
 @every_material
 def test_in_homogeneous_states_both_elements_agree_with_the_material(name):
-    """The average of what is constant: P, and σ = PFᵀ/J with σ_z, of any cell."""
+    """For constant F, the mean dilatation changes neither P nor σ = PFᵀ/J and σ_z."""
     mesh, body, _ = mixed(0.3)
     F = np.array([[1.2, 0.3], [-0.1, 0.9]])
     u = (mesh.points @ (F - np.eye(2)).T).ravel()
@@ -220,13 +220,13 @@ def test_in_homogeneous_states_both_elements_agree_with_the_material(name):
 
     area = c.volumes.sum()
     assert evaluate(c, u).energy == pytest.approx(area * material.energy(F), rel=1e-13)
-    found = cauchy_stress(c, u)
-    assert np.allclose(found[:, 0], stress[0, 0], rtol=1e-11)
-    assert np.allclose(found[:, 1], stress[1, 1], rtol=1e-11)
-    assert np.allclose(found[:, 2], stress[0, 1], rtol=1e-11)
+    computed = cauchy_stress(c, u)
+    assert np.allclose(computed[:, 0], stress[0, 0], rtol=1e-11)
+    assert np.allclose(computed[:, 1], stress[1, 1], rtol=1e-11)
+    assert np.allclose(computed[:, 2], stress[0, 1], rtol=1e-11)
 
 
-def test_neo_hooke_out_of_the_plane_is_what_a_cube_needs_that_cannot_move():
+def test_neo_hooke_stress_out_of_the_plane_is_that_of_a_confined_cube():
     """σ_z = ΛlnJ/J: μ(B₃₃ − 1) vanishes as F₃₃ = 1."""
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     material = hyperelastic("neo-hooke", SOFT)
@@ -240,7 +240,7 @@ def test_neo_hooke_out_of_the_plane_is_what_a_cube_needs_that_cannot_move():
 
 
 def test_mean_dilatation_does_not_lock_where_four_points_do():
-    """A pure bending of one cell, which changes its area nowhere on the average."""
+    """Pure bending of one cell, which leaves its mean dilatation unchanged."""
     mesh = rectangle((-1.0, -1.0), (2.0, 2.0), (1, 1))
     bend = (np.prod(mesh.points, axis=1)[:, None] * [0.01, 0.0]).ravel()
     material = hyperelastic("neo-hooke", Material(1.0, 0.4999))
@@ -272,14 +272,16 @@ def test_clipping_leaves_convex_matrices_and_raises_negative_eigenvalues():
     ])  # fmt: skip
     symmetric = (Q * spectra[:, None, :]) @ np.swapaxes(Q, 1, 2)
 
-    clipped, changed = clip((symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    clipped, changed = clip_eigenvalues((symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
 
     assert changed == 2
-    found = np.linalg.eigvalsh(clipped)
-    assert np.allclose(found, np.sort(np.maximum(spectra, 0)), atol=1e-5)
-    assert found.min() > -1e-14
+    computed = np.linalg.eigvalsh(clipped)
+    assert np.allclose(computed, np.sort(np.maximum(spectra, 0)), atol=1e-5)
+    assert computed.min() > -1e-14
     assert (clipped == np.swapaxes(clipped, 1, 2)).all()
-    in_other_units, _ = clip(1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2)
+    in_other_units, _ = clip_eigenvalues(
+        1e6 * (symmetric + np.swapaxes(symmetric, 1, 2)) / 2
+    )
     assert np.abs(in_other_units / 1e6 - clipped).max() < 1e-13
 
 
@@ -289,9 +291,9 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     c = cells_of(
         mesh, [hyperelastic("neo-hooke", SOFT)], np.zeros(40, dtype=np.int64)
     )  # fmt: skip
-    held = np.unique(np.r_[2 * mesh.boundaries["left"], 2 * mesh.boundaries["right"]])
-    held = np.append(held, 1 + 2 * mesh.boundaries["left"])
-    free = np.setdiff1d(np.arange(mesh.dofs), held)
+    fixed = np.unique(np.r_[2 * mesh.boundaries["left"], 2 * mesh.boundaries["right"]])
+    fixed = np.append(fixed, 1 + 2 * mesh.boundaries["left"])
+    free = np.setdiff1d(np.arange(mesh.dofs), fixed)
 
     def positive(K):
         return np.linalg.eigvalsh(K.toarray()[np.ix_(free, free)])[0] > 0
@@ -300,7 +302,7 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     for stretch in (0.9, 1.1):
         u = (mesh.points * [stretch - 1, 0]).ravel()
         tangents = evaluate(c, u).tangents
-        K, changed[stretch] = convexified(c, tangents, positive)
+        K, changed[stretch] = convex_tangent(c, tangents, positive)
         exact[stretch] = abs(K - assemble(c, tangents)).max() == 0
         assert positive(K)
 
@@ -308,22 +310,22 @@ def test_only_a_tangent_that_is_not_convex_is_changed():
     assert changed == {0.9: 40, 1.1: 0}
 
 
-def test_convex_cells_stay_what_they_are_triangles_too():
-    """Without strain no cell is changed, asked for or not."""
+def test_convex_cells_are_unchanged_also_triangles():
+    """Without strain, no cell is changed, even if K_t counts as indefinite."""
     c = cells("neo-hooke", 0.3)
     tangents = evaluate(c, np.zeros(c.mesh.dofs)).tangents
     asked = iter([False, True])
 
-    K, changed = convexified(c, tangents, lambda K: next(asked))
+    K, changed = convex_tangent(c, tangents, lambda K: next(asked))
 
     assert changed == 0
     assert abs(K - assemble(c, tangents)).max() < 1e-14
 
 
-def test_a_body_that_nothing_holds_is_refused():
+def test_a_floating_body_is_refused():
     mesh = rectangle((0.0, 0.0), (1.0, 1.0), (2, 2))
     c = cells_of(mesh, [hyperelastic("svk", SOFT)], np.zeros(4, dtype=np.int64))
     tangents = evaluate(c, np.zeros(mesh.dofs)).tangents
 
     with pytest.raises(ArithmeticError, match="expected supports that hold every body"):
-        convexified(c, tangents, lambda K: False)
+        convex_tangent(c, tangents, lambda K: False)

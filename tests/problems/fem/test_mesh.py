@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.problems.fem.gmsh_mesh import halved, read_msh
+from mortarbench.problems.fem.gmsh_mesh import read_msh, refine
 from mortarbench.problems.fem.mesh import (
     half_disc,
     half_ring,
@@ -132,7 +132,7 @@ def named(request):
 
 
 def test_halved_cells_fill_each_body_and_meet_at_whole_edges(named):
-    fine = halved(named)
+    fine = refine(named)
 
     assert signed_areas(fine).min() > 0
     for name, cells in named.surfaces.items():
@@ -154,7 +154,7 @@ def edges(mesh):
 
 
 def test_halved_sides_are_the_same_polygons_with_the_body_on_their_left(named):
-    fine = halved(named)
+    fine = refine(named)
 
     for name, side in named.curves.items():
         ends, halves = named.points[side], fine.points[fine.curves[name]]
@@ -166,7 +166,7 @@ def test_halved_sides_are_the_same_polygons_with_the_body_on_their_left(named):
 
 
 def test_triangles_are_halved_into_similar_ones(named):
-    """Ratios of side to area stay, so that no angle degenerates."""
+    """Ratios of sides to area are preserved, so that no angle degenerates."""
 
     def shapes(mesh):
         cells = mesh.cells[mesh.cells[:, 2] == mesh.cells[:, 3]][:, :3]
@@ -174,6 +174,6 @@ def test_triangles_are_halved_into_similar_ones(named):
         sides = np.linalg.norm(x - np.roll(x, 1, axis=1), axis=-1)
         return np.sort(sides / sides.max(axis=1, keepdims=True), axis=1)
 
-    before, after = shapes(named), shapes(halved(named))
+    before, after = shapes(named), shapes(refine(named))
     assert np.allclose(np.sort(np.repeat(before, 4, axis=0), axis=0),
                        np.sort(after, axis=0), atol=1e-12)  # fmt: skip

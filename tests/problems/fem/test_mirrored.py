@@ -1,4 +1,4 @@
-"""The generator on the same bodies, seen in a mirror or measured in other units."""
+"""Invariance of cases under reflection and change of units."""
 
 from functools import cache
 
@@ -7,11 +7,16 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.sparse import diags_array
 
-from mortarbench.problems.contact.bodies import ContactPair, assemble, clamped, floating
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    assemble,
+    factorise_clamped,
+    factorise_floating,
+)
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import quantities
 from mortarbench.problems.duality.case_forms import contact_case
-from mortarbench.problems.duality.undivided import path_of as whole_path
+from mortarbench.problems.duality.monolithic import load_path as monolithic_path
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
@@ -24,7 +29,7 @@ every_method = pytest.mark.parametrize(("contact", "basis"), METHODS)
 
 
 def again(bodies, *, units=None, mesh=None, pairs=None, load=None):
-    """Assemble the same bodies anew, but for what is given."""
+    """Assemble the same bodies with some arguments replaced."""
     return assemble(
         mesh or bodies.mesh, bodies.body, names=bodies.names,
         materials=bodies.materials, plane=bodies.plane,
@@ -55,32 +60,36 @@ def sign(bodies):
 
 
 @cache
-def path_of(bodies, contact, basis, relin=1):
-    return whole_path(
-        bodies, linearisation(bodies, contact, basis), lambda: clamped(bodies),
-        reference_solution, STEPS, relin,
+def load_path(bodies, contact, basis, relin=1):
+    return monolithic_path(
+        bodies, linearisation(bodies, contact, basis),
+        lambda: factorise_clamped(bodies), reference_solution, STEPS, relin,
     )  # fmt: skip
 
 
 @cache
 def results(bodies, contact, basis, form):
-    """Solve the QP of the last step in `form`: u in m, and what it means in SI."""
-    primal = path_of(bodies, contact, basis).primal(STEPS)
+    """Solve the QP of the last step in `form`; return u, m, and SI quantities."""
+    primal = load_path(bodies, contact, basis).primal(STEPS)
     case = contact_case(
-        bodies, primal, form, floating=lambda: floating(bodies),
-        clamped=lambda: clamped(bodies), supported=lambda: clamped(bodies),
+        bodies, primal, form, floating=lambda: factorise_floating(bodies),
+        clamped=lambda: factorise_clamped(bodies),
+        supported=lambda: factorise_clamped(bodies),
         quantities=lambda s: quantities(bodies, primal, s),
     )  # fmt: skip
     s = SMALBE().prepare(case.qp, 1e-12)()
-    found = dict(case.quantities(s))
-    (push, found["up"]), stress = found.pop("contact_force"), found.pop("max_von_mises")
-    (pair,) = found.pop("contacts").values()
-    found |= stress | {
+    values = dict(case.quantities(s))
+    (push, values["up"]), stress = (
+        values.pop("contact_force"),
+        values.pop("max_von_mises"),
+    )
+    (pair,) = values.pop("contacts").values()
+    values |= stress | {
         "pressure": pair["largest_pressure"],
         "sideways": abs(push),
         "objective": case.scale * case.qp.objective(s.x) + case.constant,
     }
-    return case.recover(s), found
+    return case.recover(s), values
 
 
 @pytest.fixture(scope="module", params=["strain", "stress"])
@@ -97,7 +106,7 @@ def test_stiffness_and_load_are_mirrored(bodies):
 
 
 def kinked(bodies):
-    """Bend the beam to a V, whose tip is what several nodes of the ring are next to."""
+    """Bend the beam to a V, whose tip is the closest point of several nodes."""
     u = np.zeros((len(bodies.mesh.points), 2))
     beam = bodies.body_of_node == 0
     u[beam, 1] = 2 * abs(bodies.mesh.points[beam, 0] - 1.0625)
@@ -108,9 +117,9 @@ def kinked(bodies):
 @pytest.mark.parametrize("about", [1.0, -3.7])
 @pytest.mark.parametrize("state", ["loaded", "kinked"])
 def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
-    """Where nodes have slid along segments, and at a corner; in the other order."""
+    """Contact inside segments after sliding, and at a corner, with chains reversed."""
     there, flip = mirrored(bodies, about), sign(bodies)
-    loaded = path_of(bodies, contact, basis).solution(1) * bodies.length
+    loaded = load_path(bodies, contact, basis).solution(1) * bodies.length
     u = loaded if state == "loaded" else kinked(bodies)
     here, other = (
         linearisation(b, contact, basis)(v) for b, v in ((bodies, u), (there, flip * u))
@@ -125,7 +134,7 @@ def test_contact_rows_are_mirrored(bodies, contact, basis, about, state):
 @pytest.mark.parametrize("relin", [1, 2])
 def test_the_mirrored_path_is_the_mirror_of_the_path(bodies, contact, basis, relin):
     there = mirrored(bodies, 1.0)
-    here, other = (path_of(b, contact, basis, relin) for b in (bodies, there))
+    here, other = (load_path(b, contact, basis, relin) for b in (bodies, there))
 
     for k in range(1, STEPS + 1):
         u, v = here.solution(k), other.solution(k)
@@ -151,7 +160,7 @@ UNITS = [(1.0, 1.0), (1e-3, 1e3), (1.0, 1e9), (0.0254, 4.4482216 / 0.0254)]
 
 @cache
 def measured(units=None):
-    """The same bodies, with other units in their QPs if asked for."""
+    """Return the same bodies, optionally with other units of their QPs."""
     return again(measured(), units=units) if units else model(4, 3, 4, "strain")
 
 

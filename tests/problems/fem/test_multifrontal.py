@@ -26,12 +26,12 @@ MESHES = {
 
 
 def definite(mesh):
-    """A stiffness on an elastic foundation."""
+    """Return a stiffness matrix on an elastic foundation."""
     return csc_array(stiffness(mesh, D) + 7.0 * eye_array(mesh.dofs))
 
 
 def dense(factor):
-    """The whole Lᵀ."""
+    """Return the whole Lᵀ."""
     f, U = factor.fronts, np.zeros((factor.order.size, factor.order.size))
     for s in range(len(f.children)):
         own = np.arange(f.start[s], f.start[s + 1])
@@ -81,7 +81,7 @@ def test_right_hand_sides_give_planted_solutions_alone_and_together(name, choice
     assert np.array_equal(factor.solve(K_oo @ x[:, 1]), solved[:, 1])
 
 
-def test_one_unknown_per_node_is_factorised_too():
+def test_matrices_with_one_unknown_per_node_are_factorised():
     mesh = MESHES["ring"]
     K = csc_array(definite(mesh)[::2][:, ::2])  # x components alone
     x = np.random.default_rng(173205).standard_normal(K.shape[0])

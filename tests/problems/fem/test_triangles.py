@@ -1,4 +1,4 @@
-"""Linear triangles, as cells of which two corners are one: against exact elasticity."""
+"""Linear triangles, as degenerate quadrilaterals, compared with exact elasticity."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from skfem import Basis, ElementTriP1, ElementVector, MeshTri
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.elasticity import (
     Material,
@@ -20,8 +20,8 @@ from mortarbench.problems.fem.mesh import (
     boundary_facets,
     dofs_of,
     half_ring,
+    is_triangle,
     rectangle,
-    triangular,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover
 from mortarbench.problems.models.patch import PRESSURE, model
@@ -42,7 +42,7 @@ def test_the_stiffness_is_that_of_linear_triangles_of_another_code(quads):
     expected = linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(other)
     K = stiffness(mesh, elasticity_matrix(STEEL, "strain"))
 
-    assert triangular(mesh.cells).all()
+    assert is_triangle(mesh.cells).all()
     assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
     assert abs(K @ rigid_modes(mesh.points)).max() <= 1e-12 * abs(K).max()
 
@@ -87,9 +87,9 @@ def bending(n):
     K = stiffness(mesh, D)
     x, y = mesh.points.T
     u = np.column_stack([x * y, -(x**2 + 0.3 * y**2) / 2]).ravel()
-    held = dofs_of(np.unique(boundary_facets(mesh.cells, mesh.dim)), 2)
-    free = np.setdiff1d(np.arange(mesh.dofs), held)
-    u[free] = spsolve(K[free][:, free], -K[free][:, held] @ u[held])
+    fixed = dofs_of(np.unique(boundary_facets(mesh.cells, mesh.dim)), 2)
+    free = np.setdiff1d(np.arange(mesh.dofs), fixed)
+    u[free] = spsolve(K[free][:, free], -K[free][:, fixed] @ u[fixed])
     exact = np.column_stack([y, 0 * y, 0 * y])
     stress = recover(mesh, centre_stress(mesh, D, u))
     return 0.5 * u @ K @ u, np.sqrt(np.mean((stress - exact) ** 2))
@@ -105,9 +105,9 @@ def test_energies_converge_with_the_square_of_the_size_and_stresses_with_the_siz
     assert [s1 / s2, s2 / s4] == pytest.approx([2, 2], rel=0.1)
 
 
-def pressed(which, **given):
-    """Solve the contact patch test, bodies of `which` made of triangles."""
-    p = {**ContactPatch().defaults, "lower": 7, "upper": 5, **given}
+def pressed(which, **keys):
+    """Solve the contact patch test with triangles in the bodies `which`."""
+    p = {**ContactPatch().defaults, "lower": 7, "upper": 5, **keys}
     bodies = of_triangles(model(p), np.array(which))
     rows = linearisation(bodies, p["contact"], p["basis"])(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)

@@ -13,91 +13,95 @@ from mortarbench.harness.distributed import factor
 from mortarbench.harness.distributed.factor import touched_rows
 from mortarbench.problems.feti import distributed as over_ranks
 from mortarbench.problems.feti.distributed import (
-    AFTER_FACTOR,
-    Forming,
+    BLOCK_SHARE,
+    Assignment,
     Halo,
-    balanced,
-    forming,
-    halo,
-    meanwhile,
-    owners,
+    assign_factorisations,
+    assign_owners,
+    balanced_partition,
+    blocks_before_exchange,
+    build_halo,
+    local_share,
     partition,
-    shared,
 )
+from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator
-from mortarbench.problems.feti.stored import dual_operator
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.membranes import Membranes
+from tests.support.decomposed_bodies import torn_pair
 from tests.support.threads import on_threads, without_lock
-from tests.support.torn_bodies import torn_pair
 
 
 def loads(work):
-    """Say what each rank does, if all do what `forming` says."""
+    """Say what each rank does, if all do what `assign_factorisations` says."""
     done = np.zeros(len(work))
-    for name, task in forming(work).items():
-        size = work[task.factor][name]
-        done[task.factor] += (1 - AFTER_FACTOR) * size
-        done[task.blocks] += AFTER_FACTOR * size
+    for name, task in assign_factorisations(work).items():
+        size = work[task.factor_rank][name]
+        done[task.factor_rank] += (1 - BLOCK_SHARE) * size
+        done[task.block_rank] += BLOCK_SHARE * size
     return done
 
 
 def test_of_an_odd_number_of_equal_kinds_two_ranks_do_half_each():
-    kinds = dict.fromkeys("abcdefghi", 4)
+    classes = dict.fromkeys("abcdefghi", 4)
 
-    assert loads([kinds, kinds]).tolist() == [18, 18]
-    factors = [task.factor for task in forming([kinds, kinds]).values()]
+    assert loads([classes, classes]).tolist() == [18, 18]
+    factors = [
+        task.factor_rank for task in assign_factorisations([classes, classes]).values()
+    ]
     assert sorted(np.bincount(factors)) == [4, 5]
 
 
 def test_blocks_fill_the_time_until_factors_are_given_away():
-    tasks = forming([dict.fromkeys("abcdefghi", 4)] * 2)
-    factors = np.bincount([task.factor for task in tasks.values()])
+    tasks = assign_factorisations([dict.fromkeys("abcdefghi", 4)] * 2)
+    factors = np.bincount([task.factor_rank for task in tasks.values()])
     more, less = factors.argmax(), factors.argmin()
 
-    assert meanwhile(tasks, more) == 0
-    assert meanwhile(tasks, less) == 3  # blocks take a third of a factor
+    assert blocks_before_exchange(tasks, more) == 0
+    assert blocks_before_exchange(tasks, less) == 3  # blocks take a third of a factor
 
 
 def test_a_kind_of_one_rank_alone_takes_its_factor_meanwhile_too():
     tasks = {
-        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "b": Forming(4, [1], factor=1, blocks=1),
-        "c": Forming(4, [1], factor=1, blocks=1),
-        "d": Forming(40, [0], factor=0, blocks=0),  # which nobody waits for
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "b": Assignment(4, [1], factor_rank=1, block_rank=1),
+        "c": Assignment(4, [1], factor_rank=1, block_rank=1),
+        "d": Assignment(40, [0], factor_rank=0, block_rank=0),  # which nobody waits for
     }
 
-    assert meanwhile(tasks, 1) == 1
-    assert meanwhile(tasks, 0) == 0
+    assert blocks_before_exchange(tasks, 1) == 1
+    assert blocks_before_exchange(tasks, 0) == 0
 
 
 def test_blocks_fill_the_time_until_the_last_factor_is_given_away():
     tasks = {
-        "a": Forming(8, [0, 1], factor=0, blocks=1),  # whose factor takes 6
-        "e": Forming(16, [1, 2], factor=2, blocks=1),  # whose factor takes 12
-        **{name: Forming(4, [1], factor=1, blocks=1) for name in "bcd"},
+        "a": Assignment(8, [0, 1], factor_rank=0, block_rank=1),  # whose factor takes 6
+        "e": Assignment(
+            16, [1, 2], factor_rank=2, block_rank=1
+        ),  # whose factor takes 12
+        **{name: Assignment(4, [1], factor_rank=1, block_rank=1) for name in "bcd"},
     }
-    assert meanwhile(tasks, 1) == 3
+    assert blocks_before_exchange(tasks, 1) == 3
     less = {name: task for name, task in tasks.items() if name != "e"}
-    assert meanwhile(less, 1) == 1
-    alone = {"a": less["a"], "b": Forming(11, [1], factor=1, blocks=1)}
-    assert meanwhile(alone, 1) == 1  # more than half of it fits in
+    assert blocks_before_exchange(less, 1) == 1
+    alone = {"a": less["a"], "b": Assignment(11, [1], factor_rank=1, block_rank=1)}
+    assert blocks_before_exchange(alone, 1) == 1  # more than half of it fits in
     smaller = {n: t._replace(work=3) if n in "bcd" else t for n, t in less.items()}
-    assert meanwhile(smaller, 1) == 2
+    assert blocks_before_exchange(smaller, 1) == 2
 
 
 def test_the_largest_kinds_are_shared_out_first():
-    kinds = {"a": 4, "b": 4, "c": 8}
-    assert loads([kinds, kinds]).tolist() == [8, 8]
+    classes = {"a": 4, "b": 4, "c": 8}
+    assert loads([classes, classes]).tolist() == [8, 8]
 
 
 def test_only_ranks_that_have_a_kind_do_anything_for_it():
-    tasks = forming([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
+    tasks = assign_factorisations([{"a": 8, "b": 8}, {"b": 8}, {"c": 40}])
 
     assert tasks["a"] == (8, [0], 0, 0)
     assert tasks["b"] == (8, [0, 1], 1, 1)
     assert tasks["c"] == (40, [2], 2, 2)
-    assert [meanwhile(tasks, rank) for rank in range(3)] == [1, 1, 1]
+    assert [blocks_before_exchange(tasks, rank) for rank in range(3)] == [1, 1, 1]
 
 
 def test_one_rank_does_all():
@@ -113,11 +117,11 @@ def test_nobody_gets_more_to_do_than_who_gives_it_away():
             {str(k): int(size[k]) for k in names[: rng.integers(1, 13)]}
             for _ in range(rng.integers(1, 5))
         ]
-        tasks = forming(work)
+        tasks = assign_factorisations(work)
         whole = np.zeros(len(work))
         for name, task in tasks.items():
-            assert {task.factor, task.blocks} <= set(task.have)
-            whole[task.factor] += work[task.factor][name]
+            assert {task.factor_rank, task.block_rank} <= set(task.ranks)
+            whole[task.factor_rank] += work[task.factor_rank][name]
         assert set(tasks) == set().union(*work)
         assert loads(work).max() <= whole.max()
 
@@ -130,11 +134,15 @@ def test_what_several_neighbours_return_for_one_row_is_added_up():
             clocked=lambda name: nullcontext(),
             exchange=lambda *what: lambda: arriving,
         ),
-        rows=np.arange(3), own=np.arange(3), lent=np.array([0, 2, 0, 1]),
-        borrowed=np.zeros(0, dtype=np.int64), lends=np.array([0, 2, 2]),
-        borrows=np.zeros(3, dtype=np.int64),
+        rows=np.arange(3), owned=np.arange(3), exported=np.array([0, 2, 0, 1]),
+        ghosts=np.zeros(0, dtype=np.int64), export_counts=np.array([0, 2, 2]),
+        ghost_counts=np.zeros(3, dtype=np.int64),
     )  # fmt: skip
-    assert at.added(np.array([0.5, 0.25, 0.125])).tolist() == [101.5, 1000.25, 10.125]
+    assert at.accumulate(np.array([0.5, 0.25, 0.125])).tolist() == [
+        101.5,
+        1000.25,
+        10.125,
+    ]
 
 
 @pytest.fixture(autouse=True)
@@ -145,7 +153,7 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
 @pytest.fixture(
     scope="module",
     params=[
-        lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).torn_bodies,
+        lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).decomposed,
         lambda: torn_pair("chain", most=4)[2],
         lambda: torn_pair("orthonormal", most=4)[2],
     ],
@@ -184,9 +192,9 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
     known["onto rows"] = B @ np.linalg.lstsq(B, x, rcond=None)[0]
 
     def work(ranks):
-        share = shared(qp, F, ranks)
+        share = local_share(qp, F, ranks)
         part, P = share.qp, share.qp.P
-        own = P.halo.rows[P.halo.own]
+        own = P.halo.rows[P.halo.owned]
         found = {"F": P(x[own]), "diagonal": P.diagonal()}
         assert (np.asarray(P @ x[own]) == found["F"]).all()
         found |= {p: P.preconditioner(*p)(x[own]) for p in PRECONDITIONERS}
@@ -215,18 +223,18 @@ def test_shares_of_ranks_are_slices_of_the_whole(torn, size):
     for _, at, _ in found:
         assert (at.is_shared == (touching[at.rows] > 1)).all()
         assert (np.diff(at.rows) > 0).all()
-        assert at.borrowed.size == at.rows.size - at.own.size
+        assert at.ghosts.size == at.rows.size - at.owned.size
 
 
 @pytest.mark.parametrize("fill", [0, 10**6])
 def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkeypatch):
     """Either way the sum of the ranks' parts of B W Bᵀ is inverted."""
-    monkeypatch.setattr(factor, "FILL", fill)
+    monkeypatch.setattr(factor, "MAX_FILL", fill)
     F, qp = dual_of(torn)
     x = np.random.default_rng(6).standard_normal(qp.q.size)
     known = F.preconditioner("dirichlet", "stiffness")(x)
     ways = []
-    for name in ("_rank_by_rank", "_alike"):
+    for name in ("_distributed_inverse", "_replicated_inverse"):
         way = getattr(over_ranks, name)
 
         def noted(*args, name=name, way=way):
@@ -236,21 +244,21 @@ def test_contact_rows_are_solved_for_by_ranks_or_by_all_alike(torn, fill, monkey
         monkeypatch.setattr(over_ranks, name, noted)
 
     def work(ranks):
-        P = shared(qp, F, ranks).qp.P
-        own = P.halo.rows[P.halo.own]
+        P = local_share(qp, F, ranks).qp.P
+        own = P.halo.rows[P.halo.owned]
         found = np.asarray(P.preconditioner("dirichlet", "stiffness")(x[own]))
         assert_allclose(found, known[own], atol=1e-7 * np.abs(known).max())
 
     on_threads(3, work)
-    assert ("_rank_by_rank" in ways) == (fill > 0)
+    assert ("_distributed_inverse" in ways) == (fill > 0)
     if not fill:
-        assert "_alike" in ways
+        assert "_replicated_inverse" in ways
 
 
 def test_owners_of_rows_are_those_that_touch_them_in_turn():
     reach = csr_array(np.array([[1, 0, 1], [0, 1, 0], [1, 1, 1], [1, 1, 1], [1, 0, 1]]))
     rows = np.array([4, 5, 6, 7, 9])
-    assert owners(rows, reach).tolist() == [0, 1, 0, 1, 2]
+    assert assign_owners(rows, reach).tolist() == [0, 1, 0, 1, 2]
 
 
 def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn):
@@ -258,7 +266,7 @@ def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn)
     parts = partition(torn.B, domains, 3)
     for row in range(len(B)):
         subdomains = [
-            s for s in range(domains.kind.size)
+            s for s in range(domains.class_of.size)
             if B[row, domains.start[s] : domains.start[s + 1]].any()
         ]  # fmt: skip
         ranks = sorted(set(parts.rank[subdomains].tolist()))
@@ -275,9 +283,9 @@ def test_subdomains_are_weighed_by_dense_blocks_and_joined_by_rows(torn, monkeyp
         seen.update(graph=graph.toarray(), work=work, size=size)
         return np.arange(size.size) % ranks
 
-    monkeypatch.setattr(over_ranks, "balanced", noted)
+    monkeypatch.setattr(over_ranks, "balanced_partition", noted)
     partition(torn.B, torn.domains, 2)
-    B, start, kind = torn.B.toarray() != 0, torn.domains.start, torn.domains.kind
+    B, start, kind = torn.B.toarray() != 0, torn.domains.start, torn.domains.class_of
     touches = np.add.reduceat(B, start[:-1], axis=1, dtype=int) > 0
     assert (seen["graph"] == touches.T.astype(int) @ touches).all()
     assert (seen["size"] == np.diff(start)).all()
@@ -295,7 +303,7 @@ def chain(size):
 
 def test_subdomains_in_a_row_are_cut_into_equal_halves():
     ones = np.ones(12, dtype=np.int64)
-    rank = balanced(chain(12), 7 * ones, ones, 2)
+    rank = balanced_partition(chain(12), 7 * ones, ones, 2)
     assert (np.diff(rank) != 0).sum() == 1
     assert np.bincount(rank).tolist() == [6, 6]
 
@@ -303,14 +311,16 @@ def test_subdomains_in_a_row_are_cut_into_equal_halves():
 def test_one_rank_has_all_without_metis(monkeypatch):
     monkeypatch.delattr(over_ranks, "_partitioned")
     ones = np.ones(5, dtype=np.int64)
-    assert balanced(chain(5), ones, ones, 1).tolist() == [0] * 5
+    assert balanced_partition(chain(5), ones, ones, 1).tolist() == [0] * 5
 
 
 def test_each_of_as_many_ranks_has_one_subdomain():
     ones = np.ones(5, dtype=np.int64)
-    assert sorted(balanced(chain(5), ones, ones, 5).tolist()) == list(range(5))
+    assert sorted(balanced_partition(chain(5), ones, ones, 5).tolist()) == list(
+        range(5)
+    )
     with pytest.raises(InputError, match="6 ranks for 5 subdomains; expected at most"):
-        balanced(chain(5), ones, ones, 6)
+        balanced_partition(chain(5), ones, ones, 6)
 
 
 #: of eight subdomains of equal work, of which the first four are four times as large
@@ -346,7 +356,7 @@ def test_of_partitions_of_even_work_that_of_the_most_even_sizes_is_taken(
 
     monkeypatch.setattr(over_ranks, "_partitioned", answer)
     work, size = np.full(8, 10), np.repeat([4, 1], 4)
-    assert balanced(chain(8), work, size, 2).tolist() == taken
+    assert balanced_partition(chain(8), work, size, 2).tolist() == taken
     assert len(asks) == asked
     assert asks[0] == (None, [1] * 8)
     if asked == 37:
@@ -363,7 +373,7 @@ def test_sizes_are_weighed_beside_work_with_a_quarter_a_half_and_whole(monkeypat
 
     monkeypatch.setattr(over_ranks, "_partitioned", answer)
     size = np.array([1000, 1, 1, 1, 1, 1, 1, 1])
-    balanced(chain(8), np.full(8, 10), size, 2)
+    balanced_partition(chain(8), np.full(8, 10), size, 2)
     assert seen == {(first, 1, 1, 1, 1, 1, 1, 1) for first in (1, 2, 4, 8)}
 
 
@@ -376,7 +386,9 @@ def test_work_is_weighed_in_units_of_the_least(unit, monkeypatch):
         return np.array([0, 0, 1, 1])
 
     monkeypatch.setattr(over_ranks, "_partitioned", answer)
-    balanced(chain(4), unit * np.array([3, 1, 2, 2]), np.ones(4, dtype=np.int64), 2)
+    balanced_partition(
+        chain(4), unit * np.array([3, 1, 2, 2]), np.ones(4, dtype=np.int64), 2
+    )
     assert weights == [[3, 1, 2, 2]]
 
 
@@ -387,7 +399,7 @@ def test_ranks_that_metis_leaves_idle_get_a_subdomain_of_the_largest(monkeypatch
         pymetis, "part_graph", lambda *args, **how: (0, [0, 0, 2, 2, 2, 0, 2])
     )
     ones = np.ones(7, dtype=np.int64)
-    found = balanced(chain(7), ones, 10**6 * ones, 4)
+    found = balanced_partition(chain(7), ones, 10**6 * ones, 4)
     assert found.tolist() == [0, 0, 2, 2, 2, 3, 1]
 
 
@@ -395,14 +407,14 @@ def test_all_ranks_that_have_a_kind_get_its_blocks(torn):
     F, qp = dual_of(torn)
 
     def work(ranks):
-        local = shared(qp, F, ranks).qp.P.local
+        local = local_share(qp, F, ranks).qp.P.local
         groups = local.packed.groups
         return dict(local.condense(groups)), groups
 
     for blocks, groups in on_threads(3, work):
         assert sorted(blocks) == list(range(len(groups)))
         for i, group in enumerate(groups):
-            whole = group.kind.condensed(group.touched)
+            whole = group.template.condense(group.touched)
             for got, known in zip(blocks[i], whole, strict=True):
                 assert_allclose(got, known, atol=1e-9 * np.abs(known).max())
 
@@ -411,7 +423,7 @@ def halo_of(ranks, here):
     """Rows of which `here` (ranks, m) tells who touches them, owned in turn."""
     rows = np.flatnonzero(here[ranks.rank])
     reach = csr_array(here[:, rows].T.astype(int))
-    return halo(ranks, rows, reach, owners(rows, reach))
+    return build_halo(ranks, rows, reach, assign_owners(rows, reach))
 
 
 def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
@@ -434,7 +446,7 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
     def work(ranks):
         at = halo_of(ranks, here)
         part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        diagonal = at.added(part.diagonal())
+        diagonal = at.accumulate(part.diagonal())
         return over_ranks._coupled(part, at, diagonal, at.rows != 8)
 
     assert set(np.concatenate(on_threads(2, work)).tolist()) == {1, 2, 3, 9}
@@ -464,10 +476,10 @@ def test_the_sum_of_parts_is_inverted_rank_by_rank():
         at = halo_of(ranks, here)
         rows = touched_rows(at.rows, ranks)
         part = csc_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
-        owned, inverse = over_ranks._rank_by_rank(
-            part, rows, at, at.added(part.diagonal())
+        owned, inverse = over_ranks._distributed_inverse(
+            part, rows, at, at.accumulate(part.diagonal())
         )
-        own = at.rows[at.own]
+        own = at.rows[at.owned]
         assert owned.tolist() == list(range(own.size))
         assert length[own] * inverse(x[own]) == pytest.approx(known[own], rel=1e-5)
         return True
@@ -483,7 +495,9 @@ def test_equal_contact_rows_are_inverted_to_rounding():
     def work(ranks):
         at = halo_of(ranks, here)
         rows = touched_rows(at.rows, ranks)
-        _, inverse = over_ranks._rank_by_rank(csc_array(A), rows, at, np.diag(A).copy())
+        _, inverse = over_ranks._distributed_inverse(
+            csc_array(A), rows, at, np.diag(A).copy()
+        )
         return A @ inverse(np.array([1.0, 1, 1]))
 
     assert on_threads(1, work)[0] == pytest.approx([1, 1, 1], abs=1e-6)
@@ -503,10 +517,10 @@ def test_the_sum_of_parts_on_some_rows_is_inverted_by_all_alike():
         at = halo_of(ranks, here)
         part = csr_array(parts[ranks.rank][np.ix_(at.rows, at.rows)])
         first_of = here[:, at.rows].argmax(axis=0) == ranks.rank  # no other knows
-        owned, inverse = over_ranks._alike(
+        owned, inverse = over_ranks._replicated_inverse(
             part, np.isin(at.rows, some) & first_of, at, first
         )
-        own = at.rows[at.own]
+        own = at.rows[at.owned]
         assert own[owned].tolist() == np.intersect1d(own, some).tolist()
         assert inverse(x[own[owned]]) == pytest.approx(known[own[owned]], rel=1e-5)
         return True

@@ -13,14 +13,17 @@ from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import Preconditioned
 from mortarbench.problems import OPERATORS
 from mortarbench.problems.contact.linearise import linearisation
-from mortarbench.problems.duality.undivided import primal_qp
-from mortarbench.problems.feti.operators import inverted_blocks
-from mortarbench.problems.feti.stored import dual_operator, made
+from mortarbench.problems.duality.monolithic import primal_qp
+from mortarbench.problems.feti.operator_arrays import (
+    dual_operator,
+    dual_operator_from_arrays,
+)
+from mortarbench.problems.feti.operators import block_pseudoinverse
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled_subdivision, torn_by
 
 pytestmark = pytest.mark.together
 
@@ -36,11 +39,11 @@ def beam_and_ring(rows="orthonormal"):
     )
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
-    return torn_by(bodies, labelled(bodies, label), primal, rows=rows)
+    return torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)
 
 
 def membranes(rows="orthonormal"):
-    return on_one_process(Membranes(2, 4).in_subdomains(rows)).torn_bodies
+    return on_one_process(Membranes(2, 4).in_subdomains(rows)).decomposed
 
 
 @pytest.fixture(
@@ -59,7 +62,7 @@ def operator_of(pair):
 
 def dense(pair):
     """K as a whole, with B and R."""
-    K = block_diag(*(pair.kinds[k].K.toarray() for k in pair.kind))
+    K = block_diag(*(pair.classes[k].K.toarray() for k in pair.class_of))
     return K, pair.B.toarray(), pair.domains.kernel.toarray()
 
 
@@ -100,22 +103,26 @@ def test_a_product_with_a_matrix_is_that_with_each_column(pair):
 
 def test_a_block_that_is_not_formed_gives_the_same_product(pair):
     arrays = operator_of(pair).arrays
-    implicit = made({**arrays, "explicit": np.zeros_like(arrays["explicit"])})
+    implicit = dual_operator_from_arrays(
+        {**arrays, "explicit": np.zeros_like(arrays["explicit"])}
+    )
     x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
-    Fx = made(arrays)(x)
+    Fx = dual_operator_from_arrays(arrays)(x)
 
     assert arrays["explicit"].all()
     assert_allclose(implicit(x), Fx, atol=1e-11 * abs(Fx).max())
     assert_allclose(implicit(x[:, 0]), Fx[:, 0], atol=1e-11 * abs(Fx).max())
     for kind in KINDS:
-        Mx = made(arrays).preconditioner(kind, "stiffness")(x)
+        Mx = dual_operator_from_arrays(arrays).preconditioner(kind, "stiffness")(x)
         found = implicit.preconditioner(kind, "stiffness")(x)
         assert_allclose(found, Mx, atol=1e-9 * abs(Mx).max())
 
 
 def test_the_diagonal_is_that_of_the_matrix(pair):
     P = operator_of(pair)
-    implicit = made({**P.arrays, "explicit": np.zeros_like(P.arrays["explicit"])})
+    implicit = dual_operator_from_arrays(
+        {**P.arrays, "explicit": np.zeros_like(P.arrays["explicit"])}
+    )
     diagonal = np.diag(P @ np.eye(P.shape[0]))
 
     assert_allclose(P.diagonal(), diagonal, rtol=1e-10)
@@ -128,12 +135,12 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
     sizes = [
         np.unique(np.concatenate([
             pair.B[:, pair.start[s] : pair.start[s + 1]].indices
-            for s in np.flatnonzero(pair.kind == k)
-        ])).size for k in range(len(pair.kinds))
+            for s in np.flatnonzero(pair.class_of == k)
+        ])).size for k in range(len(pair.classes))
     ]  # fmt: skip
     assert len(set(sizes)) > 1
     room = 16 * (np.square(sizes).sum() - 1) / 2**20
-    monkeypatch.setattr("mortarbench.problems.feti.operators.EXPLICIT_MIB", room)
+    monkeypatch.setattr("mortarbench.problems.feti.operators.MAX_EXPLICIT_MIB", room)
 
     explicit = operator_of(pair).arrays["explicit"]
 
@@ -144,9 +151,9 @@ def test_the_largest_blocks_are_not_formed_where_memory_says_so(monkeypatch):
 
 def test_a_subdomain_alone_has_one_triangle_of_its_blocks():
     """Each of two membranes in one square, of the same kind or of two."""
-    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).torn_bodies
-    (kind,) = pair.kinds
-    other = replace(pair, kinds=(kind, replace(kind)), kind=np.array([0, 1]))
+    pair = on_one_process(Membranes(1, 4).in_subdomains("orthonormal")).decomposed
+    (kind,) = pair.classes
+    other = replace(pair, classes=(kind, replace(kind)), class_of=np.array([0, 1]))
     F, apart = operator_of(pair), operator_of(other)
     x = np.random.default_rng(3).standard_normal((pair.c.size, 2))
 
@@ -162,8 +169,8 @@ def definition(pair, kind, scaling):
     _, B, _ = dense(pair)
     touched = np.abs(B).sum(axis=0) > 0
     D, softness = [], []
-    for s, k in enumerate(pair.kind):
-        own, part = pair.kinds[k], touched[pair.start[s] : pair.start[s + 1]]
+    for s, k in enumerate(pair.class_of):
+        own, part = pair.classes[k], touched[pair.start[s] : pair.start[s + 1]]
         S = own.K.toarray().copy()
         edge = np.zeros(len(S), dtype=bool)
         edge[own.boundary] = True
@@ -212,7 +219,7 @@ def test_small_blocks_are_inverted_as_moore_and_penrose_do():
     turn = rng.permutation(len(M))
     M = M[turn][:, turn]
 
-    found = inverted_blocks(csr_array(M)).toarray()
+    found = block_pseudoinverse(csr_array(M)).toarray()
     assert_allclose(found, np.linalg.pinv(M), atol=1e-14)
 
 
@@ -232,7 +239,7 @@ def test_contact_rows_do_not_weigh_the_equations(kind):
 
 def test_preconditioners_bring_the_spectrum_together():
     """As the field has it: none, lumped, Dirichlet."""
-    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).torn_bodies
+    pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
     F = operator_of(pair)
     _, B, R = dense(pair)
     G = R.T @ B.T
@@ -279,7 +286,7 @@ def test_a_written_operator_is_read_as_the_same(tmp_path):
 def test_equal_subdomains_share_one_stiffness_in_what_is_written():
     few, many = (
         operator_of(
-            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).torn_bodies
+            on_one_process(Membranes(S, 4).in_subdomains("orthonormal")).decomposed
         ).arrays
         for S in (1, 3)
     )
@@ -289,7 +296,7 @@ def test_equal_subdomains_share_one_stiffness_in_what_is_written():
 
 def test_a_kind_without_kernel_has_its_inverse():
     """Where supports are eliminated, as in FETI-1."""
-    (kind,) = membranes().kinds
+    (kind,) = membranes().classes
     n = kind.K.shape[0]
     K = csc_array(kind.K + eye_array(n))
     nothing = np.zeros(0, dtype=np.int64)

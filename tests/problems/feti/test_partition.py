@@ -47,14 +47,14 @@ def test_cells_are_neighbours_where_they_share_an_edge():
 def test_a_piece_apart_goes_to_the_part_that_it_touches_most():
     strip = rectangle((0.0, 0.0), (6.0, 1.0), (6, 1))
     graph = neighbours(strip.points, strip.cells)
-    label = partition._connected(graph, np.array([0, 0, 1, 1, 1, 0]))
+    label = partition._reconnect(graph, np.array([0, 0, 1, 1, 1, 0]))
 
     assert label.tolist() == [0, 0, 1, 1, 1, 1]
 
 
 def test_cells_that_hang_together_in_a_node_are_no_body():
     cells = np.array([[0, 1, 4, 3], [4, 5, 8, 7], [9, 10, 12, 11], [11, 12, 14, 13]])
-    with pytest.raises(InputError, match="do not all hang together by edges"):
+    with pytest.raises(InputError, match="are not all connected by edges"):
         graph_partition(np.eye(15)[:, :2], cells, np.array([0, 0, 1, 1]), 2)
 
 

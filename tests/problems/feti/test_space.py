@@ -6,12 +6,16 @@ from numpy.testing import assert_allclose
 from scipy.sparse import csr_array
 
 from mortarbench.problems.contact.stepping import Forces, load_steps
-from mortarbench.problems.duality.divided import described, longitudinal_share
+from mortarbench.problems.duality.decomposed import decompose, longitudinal_share
 from mortarbench.problems.duality.problem import ElasticBodies, Meshed
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import Mesh, dofs_of
-from mortarbench.problems.feti.own_bodies import own_bodies, unheld_bodies
-from mortarbench.problems.feti.subdomains import Contact, OwnSubdomains, on_one_process
+from mortarbench.problems.feti.local_bodies import floating_bodies, local_bodies
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    LocalSubdomains,
+    on_one_process,
+)
 from tests.support.hexahedra import bricks
 
 STEEL = Material(E=2e11, nu=0.3)
@@ -25,7 +29,7 @@ def box() -> Mesh:
     return Mesh((mesh.points + bump[:, None]) @ shear, mesh.cells, {})
 
 
-def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> OwnSubdomains:
+def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> LocalSubdomains:
     """Cut a body by METIS, under gravity."""
     down = dofs_of(np.arange(len(mesh.points)), 3, 2)
     forces = Forces(down, np.full(down.size, -1.0))
@@ -37,14 +41,14 @@ def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> OwnSubdomains:
     (stage,) = load_steps(1, 1, forces, fixed)
     none = Contact(csr_array((0, mesh.dofs)), np.zeros(0), np.zeros(0))
     layout = of.shape.layout(parts)
-    return on_one_process(described(of, layout, "orthonormal", stage, none))
+    return on_one_process(decompose(of, layout, "orthonormal", stage, none))
 
 
-def stored(own: OwnSubdomains) -> csr_array:
+def stored(own: LocalSubdomains) -> csr_array:
     """TᵀK_T T."""
     T, domains = own.spread, own.domains
-    blocks = [domains.kinds[k].K @ T[a:b] for k, a, b in zip(
-        domains.kind, domains.start[:-1], domains.start[1:], strict=True
+    blocks = [domains.classes[k].K @ T[a:b] for k, a, b in zip(
+        domains.class_of, domains.start[:-1], domains.start[1:], strict=True
     )]  # fmt: skip
     ends = zip(domains.start[:-1], domains.start[1:], blocks, strict=True)
     return csr_array(sum(T[a:b].T @ block for a, b, block in ends))
@@ -59,20 +63,20 @@ def test_subdomains_have_the_stiffness_and_the_load_of_the_body():
     assert own.components.size == mesh.dofs
     assert_allclose(stored(own).toarray(), whole.toarray(), atol=1e-13)
     assert_allclose(own.spread.T @ own.f, np.tile([0.0, 0.0, -1.0], len(mesh.points)))
-    free = np.setdiff1d(np.arange(mesh.dofs), own.problem.held)
+    free = np.setdiff1d(np.arange(mesh.dofs), own.problem.fixed)
     jumps = own.rows.B @ own.spread[:, free]
     assert abs(jumps).max() <= 1e-15  # none where copies are one
 
 
 def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
     own = torn(box(), np.zeros(0, dtype=np.int64))
-    unheld = own_bodies(own).unheld
-    R = unheld.motions.toarray()
+    floating = local_bodies(own).floating
+    R = floating.motions.toarray()
 
-    assert unheld_bodies(own.problem)
+    assert floating_bodies(own.problem)
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
     assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
-    assert_allclose(unheld.left, np.eye(6))
+    assert_allclose(floating.combinations, np.eye(6))
 
 
 #: motions that a face across x leaves that is held along some axes
@@ -85,13 +89,13 @@ def test_a_face_that_is_held_along_axes_leaves_the_other_motions(axes):
     face = np.flatnonzero(mesh.points[:, 0] == 0)
     fixed = np.unique([dofs_of(face, 3, "xyz".index(axis)) for axis in axes])
     own = torn(mesh, fixed)
-    unheld = own_bodies(own).unheld
+    floating = local_bodies(own).floating
     left = LEFT[axes]
 
-    assert (not unheld_bodies(own.problem)) == (left == 0)
-    assert unheld.left.shape[1] == left
+    assert (not floating_bodies(own.problem)) == (left == 0)
+    assert floating.combinations.shape[1] == left
     if left:
-        R = unheld.motions @ unheld.left
+        R = floating.motions @ floating.combinations
         assert_allclose(R.T @ R, np.eye(left), atol=1e-14)
         assert abs(R[fixed]).max() <= 1e-15
         assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mortarbench.problems.duality.divided import longitudinal_share
+from mortarbench.problems.duality.decomposed import longitudinal_share
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
 from mortarbench.problems.fem.mesh import half_ring_grid, join, rectangle_grid
 from mortarbench.problems.feti.structured import Layout, shape_factors, spacings
@@ -83,7 +83,7 @@ def test_the_factor_is_a_mean_where_interfaces_cross_and_one_without_any():
 
 def test_spacings_are_those_of_the_cells_around(torn):
     layout, _ = torn
-    nodes = layout.torn_nodes(np.arange(layout.count))
+    nodes = layout.subdomain_nodes(np.arange(layout.count))
     of_blocks = layout.spacings(np.arange(layout.count))
     whole = [
         spacings(grid.mesh().points.reshape(grid.rows.size, -1, 2)) for grid in GRIDS

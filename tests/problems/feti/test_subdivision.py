@@ -6,11 +6,14 @@ from numpy.testing import assert_array_equal
 
 from mortarbench.problems.fem.mesh import HalfDisc, half_ring_grid, join, rectangle_grid
 from mortarbench.problems.feti.structured import Layout
-from mortarbench.problems.feti.subdivision import half_discs_in_blocks, mesh_in_parts
+from mortarbench.problems.feti.subdivision import (
+    half_discs_in_blocks,
+    mesh_in_subdomains,
+)
 from mortarbench.problems.feti.subdomains import subdomains_of
-from mortarbench.problems.feti.tearing import compact_blocks, labelled
+from mortarbench.problems.feti.tearing import compact_blocks, label_blocks
+from tests.support.decomposed_bodies import parts_of
 from tests.support.glued import decompose, structured_bodies
-from tests.support.torn_bodies import parts_of
 
 pytestmark = pytest.mark.together
 
@@ -40,7 +43,7 @@ def discs(most):
     blocks = [compact_blocks(disc.lengths(), most) for disc in DISCS]
     labels = [np.zeros(0, dtype=np.int64)]
     for own in blocks:
-        labels.append(labelled(own) + labels[-1].max(initial=-1) + 1)
+        labels.append(label_blocks(own) + labels[-1].max(initial=-1) + 1)
     return half_discs_in_blocks(DISCS, blocks), *torn(DISCS, np.concatenate(labels))
 
 
@@ -48,7 +51,12 @@ def mesh(most):
     """The same grids as a mesh of which every node is asked for."""
     _, whole, body, parts = grids(most)
     label = structured_bodies([grid.divisions for grid in GRIDS], most)
-    return mesh_in_parts(whole, label, body, np.arange(parts.nodes)), whole, body, parts
+    return (
+        mesh_in_subdomains(whole, label, body, np.arange(parts.nodes)),
+        whole,
+        body,
+        parts,
+    )
 
 
 @pytest.fixture(
@@ -63,7 +71,7 @@ def known(request):
 
 def test_torn_nodes_are_numbered_as_in_the_torn_mesh(known):
     of, _, _, whole = known
-    nodes = of.torn_nodes(np.arange(of.count))
+    nodes = of.subdomain_nodes(np.arange(of.count))
 
     assert of.nodes == whole.nodes
     assert_array_equal(nodes.number, whole.node)
@@ -80,37 +88,41 @@ def test_nodes_of_subdomains_are_counted_before_they_are_listed(known):
 def test_some_subdomains_have_the_nodes_that_they_have_among_all(known):
     of, _, _, whole = known
     some = np.arange(of.count)[1::2]
-    nodes, all_ = of.torn_nodes(some), of.torn_nodes(np.arange(of.count))
+    nodes, all_ = of.subdomain_nodes(some), of.subdomain_nodes(np.arange(of.count))
     kept = np.isin(whole.subdomain, some)
 
     assert_array_equal(some[nodes.subdomain], whole.subdomain[kept])
-    for name in ("number", "times", "copy"):
+    for name in ("number", "multiplicity", "copy"):
         assert_array_equal(getattr(nodes, name), getattr(all_, name)[kept])
 
 
 def test_copies_of_a_node_are_counted_in_the_order_of_their_subdomains(known):
     of, _, _, whole = known
-    nodes = of.torn_nodes(np.arange(of.count))
-    times = np.bincount(whole.node)
-    shared = np.flatnonzero(nodes.times > 1)
+    nodes = of.subdomain_nodes(np.arange(of.count))
+    multiplicity = np.bincount(whole.node)
+    shared = np.flatnonzero(nodes.multiplicity > 1)
 
-    assert_array_equal(nodes.times, times[whole.node])
+    assert_array_equal(nodes.multiplicity, multiplicity[whole.node])
     assert_array_equal(
         of.holder(nodes.number[shared], nodes.copy[shared]), nodes.subdomain[shared]
     )
-    for n in np.flatnonzero(times > 1):
-        assert nodes.copy[whole.node == n].tolist() == list(range(times[n]))
+    for n in np.flatnonzero(multiplicity > 1):
+        assert nodes.copy[whole.node == n].tolist() == list(range(multiplicity[n]))
 
 
 def test_nodes_with_as_many_copies_are_counted_from_the_first(known):
     of, _, _, whole = known
-    times = np.bincount(whole.node)
-    several = {int(m): int((times == m).sum()) for m in np.unique(times) if m > 1}
+    multiplicity = np.bincount(whole.node)
+    several = {
+        int(m): int((multiplicity == m).sum()) for m in np.unique(multiplicity) if m > 1
+    }
 
-    assert dict(of.having) == several
+    assert dict(of.nodes_by_multiplicity) == several
     for m in several:
-        having = np.flatnonzero(times == m)
-        assert of.before(having).tolist() == list(range(having.size))
+        nodes_by_multiplicity = np.flatnonzero(multiplicity == m)
+        assert of.before(nodes_by_multiplicity).tolist() == list(
+            range(nodes_by_multiplicity.size)
+        )
 
 
 def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
@@ -136,10 +148,10 @@ def test_subdomains_have_the_points_cells_and_bodies_of_the_whole(known):
 
 def test_sides_of_bodies_and_interfaces_have_holders_and_points(known):
     of, mesh, _, whole = known
-    times = np.bincount(whole.node)
-    for chain in (*mesh.boundaries.values(), np.flatnonzero(times > 1)):
+    multiplicity = np.bincount(whole.node)
+    for chain in (*mesh.boundaries.values(), np.flatnonzero(multiplicity > 1)):
         assert_array_equal(of.position(chain), mesh.points[chain])
-        assert_array_equal(of.times(chain), times[chain])
+        assert_array_equal(of.multiplicity(chain), multiplicity[chain])
         first = np.searchsorted(np.sort(whole.node), chain)
         by_node = whole.subdomain[np.argsort(whole.node, kind="stable")]
         assert_array_equal(of.holder(chain), by_node[first])
@@ -149,7 +161,7 @@ def test_neighbours_are_those_with_common_nodes(known):
     of, _, _, whole = known
     own = [set(part) for part in np.split(whole.node, whole.start[1:-1])]
     common = {(t, s): len(own[s] & own[t]) for s in range(len(own)) for t in range(s)}
-    one, other, nodes = of.sharing()
+    one, other, nodes = of.shared_node_counts()
 
     found = dict(zip(zip(one, other, strict=True), nodes, strict=True))
     assert found == {pair: n for pair, n in common.items() if pair in found}

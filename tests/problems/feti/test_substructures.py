@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
 from mortarbench.problems.feti.substructures import LocalProblems
-from tests.support.torn_bodies import torn_pair
+from tests.support.decomposed_bodies import torn_pair
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,7 @@ def parts() -> LocalProblems:
 
 def dense(parts: LocalProblems) -> np.ndarray:
     torn = parts.torn
-    return np.asarray(block_diag(*(torn.kinds[k].K.toarray() for k in torn.kind)))
+    return np.asarray(block_diag(*(torn.classes[k].K.toarray() for k in torn.class_of)))
 
 
 def test_a_solve_takes_the_rigid_part_from_forces_and_from_motions(

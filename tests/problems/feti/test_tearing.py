@@ -9,14 +9,18 @@ from numpy.testing import assert_allclose
 from scipy.sparse import block_diag, csr_array, eye_array
 
 from mortarbench.problems.contact.stepping import Forces
-from mortarbench.problems.duality.divided import elastic_kind, looked_up
+from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
 from mortarbench.problems.fem.mesh import rectangle
-from mortarbench.problems.feti.subdivision import mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
-from mortarbench.problems.feti.tearing import blocks, compact_blocks, labelled
+from mortarbench.problems.feti.subdivision import mesh_in_subdomains
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    DecomposedProblem,
+    on_one_process,
+)
+from mortarbench.problems.feti.tearing import blocks, compact_blocks, label_blocks
+from tests.support.decomposed_bodies import torn_pair
 from tests.support.glued import decompose, glue, structured_bodies
-from tests.support.torn_bodies import torn_pair
 
 GLUING = ("orthonormal", "chain", "redundant")
 
@@ -42,7 +46,9 @@ def test_blocks_of_several_bodies_are_numbered_one_body_after_another() -> None:
 
 
 def test_compact_blocks_of_squares_are_squares() -> None:
-    found = labelled(compact_blocks(sides(np.full(16, 2 / 16), np.full(8, 1 / 8)), 4))
+    found = label_blocks(
+        compact_blocks(sides(np.full(16, 2 / 16), np.full(8, 1 / 8)), 4)
+    )
     pairs = set(zip(found.tolist(), blocks((16, 8), 4).tolist(), strict=True))
 
     assert len(pairs) == found.max() + 1 == 8
@@ -51,7 +57,9 @@ def test_compact_blocks_of_squares_are_squares() -> None:
 def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> None:
     """Of cells that are 8 times as long as wide, 2 × 16 are a square."""
     mesh = rectangle((0.0, 0.0), (8.0, 1.0), (16, 16))
-    label = labelled(compact_blocks(sides(np.full(16, 1 / 2), np.full(16, 1 / 16)), 6))
+    label = label_blocks(
+        compact_blocks(sides(np.full(16, 1 / 2), np.full(16, 1 / 16)), 6)
+    )
 
     assert np.bincount(label).tolist() == [32] * 8
     for block in range(8):
@@ -62,7 +70,7 @@ def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> 
 
 def test_compact_blocks_of_a_graded_mesh_halve_lengths_not_numbers_of_cells() -> None:
     wide = np.array([1, 1, 1, 1, 1, 1, 6, 1.0])
-    label = labelled(compact_blocks(sides(wide, np.full(2, 0.5)), 3))
+    label = label_blocks(compact_blocks(sides(wide, np.full(2, 0.5)), 3))
 
     assert label.tolist() == 2 * [0, 0, 0, 1, 1, 1, 2, 2]
 
@@ -104,12 +112,12 @@ def test_rounding_of_points_makes_no_kinds_but_another_shape_does() -> None:
     mesh = rectangle((0.3, 0.1), (2.1, 0.7), (6, 2))
     cells, of_one = mesh.cells, np.zeros(12, dtype=np.int64)
     label = blocks((6, 2), 2)
-    assert decompose(mesh.points, cells, label, of_one).kind.tolist() == [0, 0, 0]
+    assert decompose(mesh.points, cells, label, of_one).class_of.tolist() == [0, 0, 0]
     moved = mesh.points.copy()
     moved[6] += 1e-7  # the upper right corner of the last one, in the first row
-    assert decompose(moved, cells, label, of_one).kind.tolist() == [0, 0, 1]
+    assert decompose(moved, cells, label, of_one).class_of.tolist() == [0, 0, 1]
     of_two = np.where(label == 1, 1, 0)
-    assert decompose(mesh.points, cells, label, of_two).kind.tolist() == [0, 1, 0]
+    assert decompose(mesh.points, cells, label, of_two).class_of.tolist() == [0, 1, 0]
 
 
 def test_a_mirror_image_is_of_another_kind() -> None:
@@ -118,24 +126,24 @@ def test_a_mirror_image_is_of_another_kind() -> None:
     cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
     of_one = np.zeros(2, dtype=np.int64)
     both = decompose(np.vstack([points, mirrored]), cells, np.arange(2), of_one)
-    assert both.kind.tolist() == [0, 1]
+    assert both.class_of.tolist() == [0, 1]
 
 
 def test_rectangles_are_of_one_kind_and_each_layer_of_the_ring_is_of_one() -> None:
     _, _, pair = torn_pair()
-    assert len(pair.kinds) == 1 + 3
-    assert pair.kind.size == 16 * 2 + 18 * 3
+    assert len(pair.classes) == 1 + 3
+    assert pair.class_of.size == 16 * 2 + 18 * 3
 
 
 def test_the_torn_stiffness_of_all_subdomains_is_that_of_the_whole() -> None:
     bodies, _, pair = torn_pair()
-    K = block_diag([pair.kinds[k].K for k in pair.kind])
+    K = block_diag([pair.classes[k].K for k in pair.class_of])
     assembled = pair.spread.T @ K @ pair.spread
     assert abs(assembled - bodies.K).max() < 1e-12 * abs(bodies.K).max()
 
 
 def test_motions_of_the_kernel_are_orthonormal_and_cost_no_energy() -> None:
-    for kind in torn_pair()[2].kinds:
+    for kind in torn_pair()[2].classes:
         assert_allclose(kind.R.T @ kind.R, np.eye(3), atol=1e-14)
         assert abs(kind.K @ kind.R).max() < 1e-13 * abs(kind.K).max()
 
@@ -178,10 +186,10 @@ def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
 
 def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
     _, _, pair = torn_pair(most=4)
-    beam = pair.kinds[0]  # 4 × 4 cells
+    beam = pair.classes[0]  # 4 × 4 cells
     assert beam.boundary.size == 2 * 16
     assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
-    assert np.unique(np.concatenate([k.stiffness for k in pair.kinds])).size == 2
+    assert np.unique(np.concatenate([k.stiffness for k in pair.classes])).size == 2
 
 
 @pytest.mark.parametrize("rows", GLUING)
@@ -192,7 +200,7 @@ def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> Non
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
     D, E = bodies.elasticity * (bodies.length / bodies.force), bodies.moduli
     expected = glue(
-        parts, tuple(elastic_kind(part, D, E) for part in parts.parts),
+        parts, tuple(elastic_class(part, D, E) for part in parts.parts),
         load=bodies.f, supports=csr_array(primal.A), supported=primal.b,
         contact=csr_array(primal.G), c=primal.h, E=E[bodies.body_of_node], rows=rows,
     )  # fmt: skip
@@ -203,7 +211,7 @@ def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> Non
     assert abs(found.spread - expected.spread).max() <= 1e-14
     for name in ("c", "f", "scale"):
         assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-14)
-    assert np.array_equal(found.kind, expected.kind)
+    assert np.array_equal(found.class_of, expected.class_of)
 
 
 def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
@@ -212,20 +220,20 @@ def test_a_subdomain_on_rollers_keeps_the_motion_that_they_allow() -> None:
     D, E = elasticity_matrix(Material(1.0, 0.3), "strain")[None], np.ones(1)
     held = 2 * mesh.boundaries["left"]
     load = np.arange(1.0, n + 1)
-    layout = mesh_in_parts(mesh, label, np.zeros_like(label), np.arange(n // 2))
-    problem = ProblemInParts(
+    layout = mesh_in_subdomains(mesh, label, np.zeros_like(label), np.arange(n // 2))
+    problem = DecomposedProblem(
         layout=layout, components=2, material=np.zeros(2, dtype=np.int64),
-        kind=partial(elastic_kind, D=D, E=E), E=E, names=("plate",),
-        load=looked_up(Forces(np.arange(n), load)), held=held, glue="orthonormal",
+        assemble_class=partial(elastic_class, D=D, E=E), E=E, names=("plate",),
+        load=force_lookup(Forces(np.arange(n), load)), fixed=held, glue="orthonormal",
         contact=Contact(
             csr_array(eye_array(n, format="csr")[held[:1]]), np.ones(1), np.zeros(0)
         ),
     )  # fmt: skip
     pair, found = (
-        on_one_process(one).torn_bodies
+        on_one_process(one).decomposed
         for one in (problem, replace(problem, eliminated=True))
     )
-    first, second = (found.kinds[k] for k in found.kind)
+    first, second = (found.classes[k] for k in found.class_of)
     assert [first.R.shape, second.R.shape] == [(15, 1), (18, 3)]
     assert abs(first.K @ first.R).max() < 1e-13
     assert_allclose(first.R.T @ first.R, [[1.0]])

@@ -309,7 +309,7 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
     [
         ("r4                 3.0", "r9 3.0", "line 16: row 'r9' is not among ROWS"),
         ("    c1        c2  ", "    c1 c9 ", "line 31: column 'c9' is not among COL"),
-        ("20.0", "2O.0", "line 25: '2O.0' is no number"),
+        ("20.0", "2O.0", "line 25: '2O.0' is not a number"),
         (" UP bnd", " UQ bnd", "line 25: unknown bound type 'UQ'; known: FR, FX, LO"),
         (" UP bnd", " BV bnd", "line 25: bound BV makes the variable discrete"),
         ("RANGES", "RANGE", "line 21: unknown section 'RANGE'; did you mean 'RANGES'?"),
@@ -399,7 +399,7 @@ def test_the_older_names_of_p_and_q_are_known(written):
         ({"l": np.full(5, 2.0), "u": np.ones(5)}, "the limits of row 0 (from 0) cross"),
         ({"l": np.full(5, 1e21), "u": np.full(5, 1e21)}, "the limits of row 0"),
         ({"q": np.full(4, np.nan)}, "q holds NaN"),
-        ({"q": "text"}, "q is no matrix of numbers"),
+        ({"q": "text"}, "q is not a matrix of numbers"),
         ({"q": np.eye(4)}, "q is of shape (4, 4); expected one row or column"),
         ({"m": 7}, "m is not 5"),
         ({"u": np.ones(4)}, "u has shape (4,), expected (5,)"),

@@ -162,7 +162,7 @@ def test_cells_that_resolve_nothing_are_counted_apart(changed):
     times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
     before = [record(case=k, repeat=i) for k in times for i in range(2)]
     after = [
-        r.but(total_seconds=r.total_seconds * times[r.params["n"]][r.repeat])
+        r.replace(total_seconds=r.total_seconds * times[r.params["n"]][r.repeat])
         for r in before
     ]
     said = "\n".join(verdict_lines(changed(before, after)))
@@ -209,7 +209,7 @@ def test_all_repeats_of_both_count_since_nothing_pairs_two_sessions(changed):
 
 def test_an_unverified_answer_has_no_time_to_compare(changed):
     before = [record(repeat=i) for i in range(3)]
-    after = [r.but(verdict=Verdict.WRONG, total_seconds=1e-6) for r in before]
+    after = [r.replace(verdict=Verdict.WRONG, total_seconds=1e-6) for r in before]
     c = changed(before, after)
 
     assert only(c).ratio is None
@@ -266,7 +266,7 @@ def folders(tmp_path):
             digest = environment["digest"]
             with Journal(out, "j") as journal:
                 for r in records or suite(1, cases=4, repeats=3):
-                    journal.append(r.but(environment=digest))
+                    journal.append(r.replace(environment=digest))
             (out / "environment.json").write_text(json.dumps(environment))
         return tmp_path / "a", tmp_path / "b"
 
@@ -321,7 +321,7 @@ def test_equal_environments_are_called_so_and_their_machine_named_once(folders):
 
 def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
     before = [record(repeat=i) for i in range(3)]
-    other = changed(before, [r.but(environment="e2") for r in before])
+    other = changed(before, [r.replace(environment="e2") for r in before])
 
     assert only(changed(before, before)).ratio is not None
     assert only(other).ratio is None
@@ -331,7 +331,7 @@ def test_environments_that_nobody_knows_are_not_taken_for_equal(changed):
 def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
     """Half of the cells moved to a slower node: they alone have no ratio."""
     after = [
-        r.but(environment="n2", total_seconds=9.0) if r.params["n"] >= 2 else r
+        r.replace(environment="n2", total_seconds=9.0) if r.params["n"] >= 2 else r
         for r in suite(2, cases=4, repeats=3)
     ]
     a, b = folders(HERE, HERE)
@@ -351,7 +351,7 @@ def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
 
 def test_options_that_differ_under_one_label_are_listed(changed):
     before = [record(repeat=i) for i in range(3)]
-    after = [r.but(options={"max_iter": 200}) for r in before]
+    after = [r.replace(options={"max_iter": 200}) for r in before]
     page = markdown(compose(changed(before, after)))
 
     assert re.search(r"\| one\.max\\_iter \| 100 \| 200 \|", page)
@@ -359,15 +359,19 @@ def test_options_that_differ_under_one_label_are_listed(changed):
 
 def test_another_qp_under_the_same_name_is_flagged(changed):
     before = [record(repeat=i) for i in range(3)]
-    bits = changed(before, [r.but(qp="xyz") for r in before])
-    sizes = changed(before, [r.but(qp="xyz", sizes={"variables": 99}) for r in before])
+    bits = changed(before, [r.replace(qp="xyz") for r in before])
+    sizes = changed(
+        before, [r.replace(qp="xyz", sizes={"variables": 99}) for r in before]
+    )
 
     for c in (bits, sizes):
         assert "1 cell had another QP" in markdown(compose(c))
     assert only(bits).ratio is not None
     assert only(sizes).ratio is None
     assert "another QP" not in markdown(compose(changed(before, before)))
-    old = [r.but(qp=None) for r in before]  # a journal from before there were digests
+    old = [
+        r.replace(qp=None) for r in before
+    ]  # a journal from before there were digests
     assert only(changed(old, before)).same_qp
 
 
@@ -377,7 +381,7 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
 def test_lost_verdicts_are_worse_and_named_first(changed):
     before = suite(1, cases=2, repeats=3)
     after = [
-        r.but(verdict=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
+        r.replace(verdict=Verdict.INACCURATE) if r.run_id == "two-1-2" else r
         for r in suite(2, cases=2, repeats=3, three=3.0)
     ]
     c = changed(before, after)
@@ -423,9 +427,9 @@ def test_verified_answers_that_differ_are_named(changed, energy, status, other):
 
 def test_objectives_stand_in_where_there_is_no_energy(changed):
     one = record(quantities={}, objective=-0.5)
-    assert only(changed([one], [one.but(objective=-0.6)])).other_answer
-    zero = one.but(objective=1e-25)
-    assert not only(changed([zero], [zero.but(objective=3e-25)])).other_answer
+    assert only(changed([one], [one.replace(objective=-0.6)])).other_answer
+    zero = one.replace(objective=1e-25)
+    assert not only(changed([zero], [zero.replace(objective=3e-25)])).other_answer
 
 
 def test_cells_in_one_folder_only_are_listed_not_compared(changed):
@@ -532,7 +536,7 @@ def test_folders_with_and_without_a_plug_in_merge_into_one_comparison(
 ):
     with_it = HERE | {"digest": "e2", "plugins": {"admm.py": "aaa"}}
     before = suite(1, cases=2, repeats=3)
-    after = [r.but(session="s2") for r in suite(2, cases=2, repeats=3)]
+    after = [r.replace(session="s2") for r in suite(2, cases=2, repeats=3)]
     a, b = folders(HERE | {"plugins": {}}, with_it, before=before, after=after)
     merge([a, b], tmp_path / "both")
     found = read_evidence(tmp_path / "both")
@@ -550,7 +554,7 @@ def from_file(path, **changes):
     return record(
         case=0, family="file", params={"path": path}, form="primal",
         run_id=f"{path}-{changes.get('repeat', 0)}", qp="d1g35t", **changes,
-    ).but(case=f"file:{path}")  # fmt: skip
+    ).replace(case=f"file:{path}")  # fmt: skip
 
 
 def test_a_qp_in_two_files_is_one_case(folders, changed):
@@ -561,14 +565,14 @@ def test_a_qp_in_two_files_is_one_case(folders, changed):
     (outcome,) = read_evidence(a).flat
     assert outcome.case == "file:a/x.npz"
     assert len(outcome.records) == 2
-    other = changed([from_file("a/x.npz")], [from_file("b/y.npz").but(qp="0th3r")])
+    other = changed([from_file("a/x.npz")], [from_file("b/y.npz").replace(qp="0th3r")])
     assert other.pairs == ()
 
 
 def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
     slow = HERE | {"digest": "e2", "machine": {"cpu": "slow"}}
     worse = [
-        r.but(verdict=Verdict.WRONG) if r.solver == "two" else r
+        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r
         for r in suite(2, cases=4, repeats=3)
     ]
     a, b = folders(HERE, slow, after=worse)
@@ -582,7 +586,9 @@ def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
 def test_a_gate_without_verified_answers_of_a_solver_names_it(folders):
     """Of the two solvers of the suite, one is wrong everywhere in the later folder."""
     pair = [r for r in suite(2, cases=4, repeats=3) if r.solver in ("one", "two")]
-    spoilt = [r.but(verdict=Verdict.WRONG) if r.solver == "two" else r for r in pair]
+    spoilt = [
+        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r for r in pair
+    ]
     a, b = folders(HERE, HERE, before=pair, after=spoilt)
     with pytest.raises(InputError) as refused:
         report(a, b, formats=["csv"], fail_on=["slower"])

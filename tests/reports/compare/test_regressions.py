@@ -160,14 +160,15 @@ def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
         return found.why_not
 
     def elsewhere(made):
-        return [r.but(environment="f") for r in made]
+        return [r.replace(environment="f") for r in made]
 
     assert why(solvers=("one",)).endswith("add one that does not change")
 
     def wrong(*solvers):
         def spoil(made):
             return [
-                r.but(verdict=Verdict.WRONG) if r.solver in solvers else r for r in made
+                r.replace(verdict=Verdict.WRONG) if r.solver in solvers else r
+                for r in made
             ]
 
         return spoil
@@ -190,7 +191,9 @@ def test_a_solver_without_a_verified_answer_is_named_beside_what_is_judged(
 ):
     rng = np.random.default_rng(141421)
     before, after = (session(rng, name, draw=normal) for name in "ab")
-    spoilt = [r.but(verdict=Verdict.WRONG) if r.solver == "two" else r for r in after]
+    spoilt = [
+        r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r for r in after
+    ]
     found = regressions(c := changed(before, spoilt))
     named = f"two has no verified answer in {tmp_path / 'b'}: nothing to compare"
 

@@ -493,7 +493,7 @@ def test_steps_of_each_kind_have_exponents_of_their_own(record, evidence):
 
 def test_one_mesh_torn_more_or_less_finely_has_a_table_of_its_own(record, evidence):
     records = [
-        record("s", cells, 1.0, counts={"P_products": 10 + cells}).but(
+        record("s", cells, 1.0, counts={"P_products": 10 + cells}).replace(
             case=f"toy/Nr=3/feti={cells}/dual", params={"Nr": 3, "feti": cells},
             quantities={"dofs": 100, "subdomains": 64 // cells},
         )
@@ -532,7 +532,7 @@ def test_claims_and_verdicts_are_counted_beside_each_other(record, evidence):
 
 def test_one_refuted_repeat_refutes_the_claim(record, evidence):
     records = [record("a", 0, repeat=i) for i in range(3)]
-    records[1] = records[1].but(verdict=Verdict.INACCURATE)
+    records[1] = records[1].replace(verdict=Verdict.INACCURATE)
     (table,) = section(compose(evidence(records)), "tally").tables
     assert [c.value for c in rows(table)["a"].values()][1:] == [0, 1, 0, 0, 0.0]
 
@@ -588,7 +588,7 @@ def test_a_lone_surrogate_in_a_name_is_no_obstacle(record, evidence):
 
 def test_the_sheet_of_contests_holds_what_profiles_are_drawn_from(record, evidence):
     records = some_records(record, 2)
-    records[0] = records[0].but(verdict=Verdict.WRONG)
+    records[0] = records[0].replace(verdict=Verdict.WRONG)
     sheet = csv_tables(evidence(records))["contests"]
     by_cell = sheet.set_index(["case", "solver"])
     assert set(by_cell["ratio"]) == {1.0, 2.0, np.inf}

@@ -103,7 +103,7 @@ def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
 
 def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
     slow = [
-        r.but(solve_seconds=10 * r.solve_seconds) if r.ranks == 4 else r
+        r.replace(solve_seconds=10 * r.solve_seconds) if r.ranks == 4 else r
         for r in rank_records(sizes=[DOFS])
     ]
     (series,) = strong_series(evidence(slow, cpus=2))
@@ -115,7 +115,7 @@ def test_ranks_that_took_turns_on_a_cpu_are_no_basis_of_the_model():
 
 
 def test_records_that_do_not_say_what_was_sent_have_no_model():
-    silent = (r.but(rank_counts={}) for r in rank_records(sizes=[DOFS]))
+    silent = (r.replace(rank_counts={}) for r in rank_records(sizes=[DOFS]))
     (series,) = strong_series(evidence(silent))
     assert series.model is None
 
@@ -130,7 +130,7 @@ def test_records_that_do_not_say_what_was_sent_have_no_model():
     ],
 )
 def test_records_with_other_entries_have_no_model_either(change):
-    records = [r.but(**change) for r in rank_records(sizes=[DOFS])]
+    records = [r.replace(**change) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
     assert series.model is None
     assert ranks(Analysis(evidence(records))).name == "ranks"
@@ -138,7 +138,9 @@ def test_records_with_other_entries_have_no_model_either(change):
 
 def test_a_network_may_be_told_of_more_than_the_model_takes():
     records = [
-        r.but(rank_network={**r.rank_network, "hops": (1.0, 1.0)}) if r.ranks > 1 else r
+        r.replace(rank_network={**r.rank_network, "hops": (1.0, 1.0)})
+        if r.ranks > 1
+        else r
         for r in rank_records(sizes=[DOFS])
     ]
     (series,) = strong_series(evidence(records))
@@ -147,7 +149,7 @@ def test_a_network_may_be_told_of_more_than_the_model_takes():
 
 def test_memory_that_is_no_number_is_not_known():
     words = {"rank_peak_mib_mean": "much", "rank_peak_mib_largest": "more"}
-    records = [r.but(reported=words) for r in rank_records(sizes=[DOFS])]
+    records = [r.replace(reported=words) for r in rank_records(sizes=[DOFS])]
     (series,) = strong_series(evidence(records))
     assert rank_memory(series.answers[2]) is None
 
@@ -174,7 +176,7 @@ def test_cases_of_other_sizes_are_no_weak_scaling():
 
 def test_answers_that_were_not_verified_are_left_out():
     wrong = (
-        r.but(verdict=Verdict.WRONG) if r.ranks == 2 and not r.role else r
+        r.replace(verdict=Verdict.WRONG) if r.ranks == 2 and not r.role else r
         for r in rank_records(sizes=[DOFS])
     )
     (series,) = strong_series(evidence(wrong))
@@ -219,7 +221,9 @@ def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
 
 def test_a_model_that_does_not_fit_is_not_asked_about_more_ranks():
     worse = (  # slower on two ranks than the model can be on any
-        r.but(solve_seconds=9 * r.solve_seconds) if r.ranks == 2 and not r.role else r
+        r.replace(solve_seconds=9 * r.solve_seconds)
+        if r.ranks == 2 and not r.role
+        else r
         for r in rank_records(sizes=[DOFS], ranks=[1, 2])
     )
     (series,) = strong_series(evidence(worse))

@@ -175,7 +175,9 @@ def test_few_problems_are_compared_within_blocks(record, evidence):
 def test_where_each_way_has_its_problem_the_first_sentence_says_which(record, evidence):
     def measured(k, **ways):
         return [
-            r.but(case=f"box/n={k}/{r.form}", params={"n": k}, run_id=f"{r.run_id} {k}")
+            r.replace(
+                case=f"box/n={k}/{r.form}", params={"n": k}, run_id=f"{r.run_id} {k}"
+            )
             for r in problems(record, 1, 4, **ways)
         ]
 
@@ -202,7 +204,9 @@ def test_single_repeats_of_few_problems_name_nobody_but_compare_all_forms(
 
 def test_a_form_that_nobody_solves_everywhere_is_named(record, evidence):
     records = [
-        r.but(verdict=Verdict.WRONG) if r.form == "primal" and r.params["n"] == 3 else r
+        r.replace(verdict=Verdict.WRONG)
+        if r.form == "primal" and r.params["n"] == 3
+        else r
         for r in four_ways(record)
     ]
     claim = first_sentence(evidence(records))
@@ -214,14 +218,14 @@ def test_problems_without_seconds_of_dualising_are_left_out_and_counted(
 ):
     """As in folders of older versions."""
     known = four_ways(record, count=9)
-    old = [r.but(dualise_seconds=None) if r.params["n"] == 0 else r for r in known]
+    old = [r.replace(dualise_seconds=None) if r.params["n"] == 0 else r for r in known]
     page = compose(evidence(old))
     assert "over 8 problems" in page.sections[0].statements[0].claims[0]
     assert page.sections[0].prose == (
         "Forms are not compared on 1 problem: the records do not hold the time of "
         "dualising.",
     )
-    oldest = [r.but(dualise_seconds=None) for r in known]
+    oldest = [r.replace(dualise_seconds=None) for r in known]
     page = compose(evidence(oldest))
     assert [s.subject for s in page.sections[0].statements] == ["dual", "primal"]
     assert "not compared on 9 problems" in page.sections[0].prose[0]
@@ -246,7 +250,7 @@ def test_a_single_way_is_compared_with_nothing(record, evidence):
 
 def test_tolerances_are_compared_apart_the_tightest_first(record, evidence):
     loose = [
-        r.but(tol=1e-3, run_id=f"{r.run_id} loose")
+        r.replace(tol=1e-3, run_id=f"{r.run_id} loose")
         for r in problems(record, a_dual=4e-3, b_dual=3e-3, b_primal=1e-3, a_primal=9.0)
     ]
     (statement,) = compose(evidence(four_ways(record) + loose)).sections[0].statements

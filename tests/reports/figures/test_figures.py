@@ -71,7 +71,7 @@ def swept():
     """Every solver once per tolerance, with residual and certified error 2·tol."""
     first = {r.solver: r for r in reversed([*records(SOLVERS, 1, 1)])}
     return [
-        r.but(
+        r.replace(
             run_id=f"{solver} {tol}", tol=tol, accuracy=1e-3, energy_bound=2 * tol,
             primal=2 * tol, dual=0.0, complementarity=0.0, gap=0.0,
             verdict=Verdict.VERIFIED, claimed="solved",
@@ -104,7 +104,7 @@ def test_verified_marks_are_filled_and_the_others_hollow(campaign):
 
 def test_times_and_iterations_over_size_name_the_measurements_of_their_size(campaign):
     grown = [
-        r.but(run_id=f"{solver} {n} {i}", solver=solver, case=f"box/n={n}/dual",
+        r.replace(run_id=f"{solver} {n} {i}", solver=solver, case=f"box/n={n}/dual",
               family="box", form="dual", params={"n": n}, iterations=n,
               sizes={"variables": n}, quantities={"dofs": n}, total_seconds=1e-6 * n,
               verdict=Verdict.VERIFIED)
@@ -130,7 +130,7 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
 def test_guides_leave_the_axes_their_room_however_little_times_differ(spread):
     """Sizes of 1 to 100: a guide of slope 3/2 rises by seven."""
     grown = [
-        r.but(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
+        r.replace(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
               form="dual", params={"n": n}, sizes={"variables": n},
               quantities={"dofs": n}, total_seconds=1e-3 * spread**i,
               verdict=Verdict.VERIFIED)
@@ -167,7 +167,7 @@ def test_a_remark_beside_the_axes_takes_no_room(place):
 
 def test_answers_out_of_all_bounds_have_their_place_in_the_figure_of_accuracy():
     answers = [
-        r.but(primal=worst, dual=0.0, complementarity=0.0, gap=0.0)
+        r.replace(primal=worst, dual=0.0, complementarity=0.0, gap=0.0)
         for worst, r in zip((0.0, 1e-9, 1e290), records(1, 3, 1), strict=True)
     ]
     figure = accuracy_figure(evidence(answers))
@@ -198,7 +198,7 @@ def test_points_of_a_sweep_name_the_measurement_at_their_tolerance(certified):
 
 def test_ratios_name_the_measurements_after():
     before = [*records(2, 8, 3)]
-    after = [r.but(run_id=f"after {r.run_id}") for r in before]
+    after = [r.replace(run_id=f"after {r.run_id}") for r in before]
     made = compare(evidence(before), evidence(after))
     runs = [i for ids in told(ratios_figure(made)).values() for i in ids]
 

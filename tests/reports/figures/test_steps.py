@@ -76,7 +76,7 @@ def test_a_fit_is_a_curve_through_what_it_is_fitted_to(figure):
 
 def test_counts_against_cells_of_a_subdomain_have_their_values_as_ticks():
     torn = [
-        r.but(
+        r.replace(
             case=f"plate/feti={h}/dual", params={"feti": h},
             quantities={"dofs": 1000, "equality_rows": 10, "contact_rows": 0},
         )
@@ -91,6 +91,8 @@ def test_counts_against_cells_of_a_subdomain_have_their_values_as_ticks():
 
 
 def test_a_solver_that_counts_nothing_has_no_figure():
-    bare = (r.but(counts={}, quantities={"dofs": r.params["Sx"]}) for r in records())
+    bare = (
+        r.replace(counts={}, quantities={"dofs": r.params["Sx"]}) for r in records()
+    )
     (series,) = size_series(evidence(bare))
     assert steps_figure(series, "smalbe") is None

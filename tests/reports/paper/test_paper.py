@@ -24,7 +24,7 @@ from mortarbench.problems.experiments.analysis import WAYS, analyse
 from mortarbench.problems.experiments.clock import Rounds, Stopwatch, race, whole
 from mortarbench.problems.experiments.physics import stepping
 from mortarbench.problems.fem.elasticity import elasticity_matrix, stiffness
-from mortarbench.problems.fem.inverse import Factorised
+from mortarbench.problems.fem.inverse import CholeskyInverse
 from mortarbench.problems.fem.mesh import half_ring
 from mortarbench.problems.fem.triplets import stiffness_by_triplets
 from mortarbench.problems.models.beam_ring import BEAM
@@ -278,9 +278,9 @@ def test_both_ways_through_the_load_steps_end_in_the_same_displacement():
 
 @pytest.mark.parametrize(("way", "solves"), [("per-row", 3), ("condensed", 0)])
 def test_only_the_papers_way_solves_for_all_rows_in_each_step(way, solves, monkeypatch):
-    calls, congruence = [], Factorised.congruence
+    calls, congruence = [], CholeskyInverse.congruence
     monkeypatch.setattr(
-        Factorised, "congruence", lambda s, B: calls.append(B) or congruence(s, B)
+        CholeskyInverse, "congruence", lambda s, B: calls.append(B) or congruence(s, B)
     )
     done = analyse(1, 1, solve=solve, condense=WAYS[way], steps=3)
 

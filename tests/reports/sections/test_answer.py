@@ -164,7 +164,7 @@ def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
     record, opened, make
 ):
     lies = dict(verdict=Verdict.WRONG, claimed="solved", dual=0.03)
-    liar = [r.but(**lies) for r in make(record, liar=0.01)]
+    liar = [r.replace(**lies) for r in make(record, liar=0.01)]
     statement = opened(make(record, honest=1.0, slow=2.0) + liar)["dual"]
     (claim,) = statement.claims
     assert claim.startswith("honest was the fastest")
@@ -177,7 +177,7 @@ def test_a_fast_liar_does_not_win_and_is_named_with_what_refutes_it(
 
 def test_one_refuted_repeat_is_enough_not_to_compete(record, opened):
     records = one_case(record, fast=0.1, honest=1.0, slow=2.0)
-    records[3] = records[3].but(verdict=Verdict.INACCURATE, dual=1e-3)
+    records[3] = records[3].replace(verdict=Verdict.INACCURATE, dual=1e-3)
     statement = opened(records)["dual"]
     assert statement.claims[0].startswith("honest was the fastest")
     assert "fast claimed solved but inaccurate on 1 of 1 case" in statement.remarks[0]
@@ -187,7 +187,7 @@ def test_a_solver_that_fails_half_of_the_cases_is_not_the_fastest_of_all(
     record, opened
 ):
     half = [
-        r.but(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
+        r.replace(verdict=Verdict.ITERATION_LIMIT, claimed="iteration_limit")
         if r.params["n"] % 2 else r
         for r in many_cases(record, half=1e-4)
     ]  # fmt: skip
@@ -200,7 +200,7 @@ def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
     record, opened
 ):
     almost = many_cases(record, almost=0.5)
-    almost[0] = almost[0].but(verdict=Verdict.CRASHED)
+    almost[0] = almost[0].replace(verdict=Verdict.CRASHED)
     statement = opened(many_cases(record, sure=1.0, slow=2.0) + almost)["dual"]
     assert statement.claims[0].startswith("sure was the fastest over 8 cases")
     faster = statement.remarks[0]
@@ -212,9 +212,9 @@ def test_who_is_faster_but_not_verified_everywhere_is_told_beside_the_fastest(
 
 def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
     a, b = many_cases(record, a=1.0), many_cases(record, b=2.0)
-    a[0] = a[0].but(verdict=Verdict.TIME_LIMIT)
-    b[5] = b[5].but(verdict=Verdict.CRASHED, message="signal 11")
-    b[6] = b[6].but(verdict=Verdict.CRASHED, message="signal 11")
+    a[0] = a[0].replace(verdict=Verdict.TIME_LIMIT)
+    b[5] = b[5].replace(verdict=Verdict.CRASHED, message="signal 11")
+    b[6] = b[6].replace(verdict=Verdict.CRASHED, message="signal 11")
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "Nobody is named over 8 cases at tol 1e-6: no solver was verified on all of "
@@ -225,7 +225,7 @@ def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
 
 def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, opened):
     records = [
-        r.but(verdict=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
+        r.replace(verdict=Verdict.TIME_LIMIT) if r.params["n"] == 7 else r
         for r in many_cases(record, fast=1.0, slow=3.0)
     ]
     statement = opened(records)["dual"]
@@ -240,7 +240,7 @@ def test_a_single_solver_has_nobody_to_be_faster_than(record, opened):
 
 
 def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
-    failed = [r.but(verdict=Verdict.FAILED, message="gave up")
+    failed = [r.replace(verdict=Verdict.FAILED, message="gave up")
               for r in one_case(record, other=0.5)]  # fmt: skip
     (claim,) = opened(one_case(record, lonely=1.0) + failed)["dual"].claims
     assert "Nobody is named" in claim
@@ -249,7 +249,8 @@ def test_a_solver_that_alone_is_verified_wins_no_race(record, opened):
 
 def test_a_form_without_a_verified_answer_says_so(record, opened):
     records = [
-        r.but(verdict=Verdict.ITERATION_LIMIT) for r in one_case(record, a=1.0, b=2.0)
+        r.replace(verdict=Verdict.ITERATION_LIMIT)
+        for r in one_case(record, a=1.0, b=2.0)
     ]
     assert opened(records)["dual"].claims == ("No answer was verified at tol 1e-6.",)
 
@@ -295,7 +296,7 @@ def test_where_each_has_its_case_nobody_is_fastest(record, opened):
 def test_forms_and_tolerances_have_answers_of_their_own(record, opened):
     def measured(form, tol, **factors):
         return [
-            r.but(form=form, tol=tol, case=f"box/n=0/{form}",
+            r.replace(form=form, tol=tol, case=f"box/n=0/{form}",
                   run_id=f"{r.run_id}-{form}-{tol}")
             for r in one_case(record, **factors)
         ]  # fmt: skip
@@ -315,7 +316,7 @@ def test_forms_and_tolerances_have_answers_of_their_own(record, opened):
 def test_many_tolerances_are_no_wall_of_text(record, opened):
     tols = [10.0**-k for k in range(2, 10)]
     records = [
-        r.but(tol=tol, run_id=f"{r.run_id}-{tol}")
+        r.replace(tol=tol, run_id=f"{r.run_id}-{tol}")
         for tol in tols for r in one_case(record, a=1.0, b=2.0)
     ]  # fmt: skip
     statement = opened(records)["dual"]
@@ -327,9 +328,9 @@ def test_many_tolerances_are_no_wall_of_text(record, opened):
 
 def test_a_null_arm_is_nobodys_rival(record, opened):
     records = one_case(record, a=1.0, b=2.0)
-    null = [r.but(solver="a (null)", role="null", run_id=f"{r.run_id}-null")
+    null = [r.replace(solver="a (null)", role="null", run_id=f"{r.run_id}-null")
             for r in one_case(record, seed=2, a=1.0)]  # fmt: skip
-    null[0] = null[0].but(verdict=Verdict.CRASHED)
+    null[0] = null[0].replace(verdict=Verdict.CRASHED)
     statement = opened(records + null)["dual"]
     assert statement.claims[0].startswith("a was the fastest")
     assert not any("null" in line for line in statement.lines)
@@ -338,7 +339,7 @@ def test_a_null_arm_is_nobodys_rival(record, opened):
 def test_sequences_are_compared_with_sequences(record, opened):
     cold = one_case(record, a=1.0, b=2.0)
     warm = [
-        r.but(mode="sequence", solver=f"{r.solver} (sequence)",
+        r.replace(mode="sequence", solver=f"{r.solver} (sequence)",
               run_id=f"{r.run_id}-warm", total_seconds=r.total_seconds / 100)
         for r in one_case(record, a=2.0, b=1.0)
     ]  # fmt: skip
@@ -386,13 +387,14 @@ def test_equal_certified_errors_are_compared_where_there_are_any(record, opened)
 
 def test_times_of_different_environments_name_nobody(record, opened):
     records = [
-        r.but(environment="other" if r.solver == "new" else "abc")
+        r.replace(environment="other" if r.solver == "new" else "abc")
         for r in one_case(record, old=1.0, new=0.5)
     ]
     (claim,) = opened(records)["dual"].claims
     assert "different environments, whose times are not comparable" in claim
     nodes = [
-        r.but(environment=f"node{r.repeat % 2}") for r in one_case(record, a=1.0, b=2.0)
+        r.replace(environment=f"node{r.repeat % 2}")
+        for r in one_case(record, a=1.0, b=2.0)
     ]
     assert opened(nodes)["dual"].claims[0].startswith("a was the fastest")
 
@@ -408,7 +410,7 @@ def test_who_declined_is_told_apart_from_who_failed(record, opened):
 
 def test_many_failures_are_counted_not_listed(record, opened):
     lost = [
-        r.but(verdict=Verdict.FAILED, message="no")
+        r.replace(verdict=Verdict.FAILED, message="no")
         for k in range(30) for r in one_case(record, blocks=2, **{f"s{k:02d}": 1.0})
     ]  # fmt: skip
     statement = opened([*one_case(record, a=1.0, b=2.0), *lost])["dual"]
@@ -504,7 +506,7 @@ def test_every_point_of_the_figure_shows_its_measurements(record, evidence):
 
 
 def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence):
-    lost = [r.but(verdict=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
+    lost = [r.replace(verdict=Verdict.TIME_LIMIT) for r in one_case(record, lost=0.1)]
     made = evidence(one_case(record, a=1.0, b=2.0) + lost)
     (panel,) = fastest_figure(found(made), made.solvers).panels
     assert panel.y.ticks == ((0.0, "a"), (-1.0, "b"), (-2.0, "lost"))
@@ -515,7 +517,9 @@ def test_what_was_not_verified_is_at_the_edge_with_its_verdict(record, evidence)
 
 
 def test_without_answers_there_is_no_figure(record, evidence):
-    lost = [r.but(verdict=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)]
+    lost = [
+        r.replace(verdict=Verdict.TIME_LIMIT) for r in one_case(record, a=1.0, b=1.0)
+    ]
     made = evidence(lost)
     assert fastest_figure(found(made), made.solvers) is None
     assert compose(made).sections[0].pictures == ()

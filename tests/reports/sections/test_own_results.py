@@ -64,7 +64,7 @@ def test_the_first_figure_shows_iterations_from_zero_on(record, page):
 
 def test_condition_numbers_have_a_range_of_their_own(record, page):
     records = [
-        r.but(quantities={**r.quantities, "kappa": 3.0 + k, "kappa_lumped": 2.0})
+        r.replace(quantities={**r.quantities, "kappa": 3.0 + k, "kappa_lumped": 2.0})
         for k, r in enumerate(sized(record, [9, 9, 9, 9]))
     ]
     (statement,) = page(records).sections[0].statements
@@ -75,7 +75,7 @@ def test_condition_numbers_have_a_range_of_their_own(record, page):
 
 def test_failures_of_the_only_solver_are_told_beside_its_result(record, page):
     records = sized(record, [9, 9, 9, 9, 9])
-    records[2] = records[2].but(verdict=Verdict.WRONG, dual=0.03)
+    records[2] = records[2].replace(verdict=Verdict.WRONG, dual=0.03)
     own, dual = page(records).sections[0].statements
     assert own.subject == "a"
     assert "a claimed solved but wrong on 1 of 5 cases" in dual.remarks[0]

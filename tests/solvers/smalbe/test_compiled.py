@@ -178,7 +178,7 @@ def test_other_rows_and_preconditioners_take_the_steps_that_are_written(
     A = no_rows(n) if rows == "none" else rng.standard_normal((min(n, 3), n))
     inside = np.clip(rng.standard_normal(n), qp.lb, qp.ub)
     if rows == "sparse":
-        monkeypatch.setattr(rows_module, "MOST_DENSE", 0)
+        monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
         A = csr_array(A)
     options = replace(
         SOLVERS["smalbe"], preconditioner=preconditioner, max_steps=20, recycle=False,

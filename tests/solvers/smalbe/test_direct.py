@@ -6,7 +6,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.smalbe.direct import LARGEST
+from mortarbench.solvers.smalbe.direct import MAX_UNKNOWNS
 from mortarbench.solvers.smalbe.faces import Faces
 
 DIRECT = SOLVERS["smalbe-direct"]
@@ -148,13 +148,13 @@ def test_it_stops_after_the_solves_that_it_may_make():
 
 
 def test_it_says_what_it_declines():
-    n = LARGEST + 1
+    n = MAX_UNKNOWNS + 1
     large = box_qp(csr_array((n, n)).toarray(), np.zeros(n), 0)
     rows = QP(
         P=np.eye(1), q=np.zeros(1), A=no_rows(1), b=np.zeros(0),
         G=csr_array([[1.0]]), h=np.ones(1), lb=np.zeros(1), ub=np.ones(1),
     )  # fmt: skip
 
-    assert str(LARGEST) in DIRECT.declines(large)
+    assert str(MAX_UNKNOWNS) in DIRECT.declines(large)
     assert "no inequality rows" in DIRECT.declines(rows)
     assert DIRECT.declines(box_qp(np.eye(2), [1, 1], 0)) is None

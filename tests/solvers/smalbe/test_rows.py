@@ -44,7 +44,7 @@ ALL, THIRD = np.ones(40, dtype=bool), np.arange(40) % 3 == 0
 def pair(G, e, request, monkeypatch):
     """The rows, sparse and dense; what may be held decides how faces are factorised."""
     if "refactorised" in request.param:
-        monkeypatch.setattr(module, "MOST_BORDER", 0)
+        monkeypatch.setattr(module, "MAX_BORDER", 0)
     bounded = THIRD if request.param == "held" else ALL
     return sparse_rows(G, e, bounded), orthonormal_rows(G, e)
 
@@ -112,7 +112,7 @@ def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch
     )  # fmt: skip
     found = []
     for most in (0, 10_000):
-        monkeypatch.setattr(module, "MOST_DENSE", most)
+        monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", most)
         problem = projected_problem(qp, partial(by_lanczos, steps=3))
         solver = outer_loop(problem, qp, SMALBE()).solver
         found.append(columns(lambda v, s=solver: s.precondition(face, v, rho), 40))
@@ -131,7 +131,7 @@ def test_a_model_of_the_penalty_preconditions_alike(G, e, face, rho, monkeypatch
 
 
 def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
-    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     twice = csr_array(np.vstack([G.toarray(), G.toarray()[3:4]]))
 
     assert isinstance(equality_rows(G, e, ALL), SparseRows)
@@ -141,7 +141,7 @@ def test_rows_that_depend_on_each_other_are_taken_as_dense(G, e, monkeypatch):
 
 
 def test_of_dependent_rows_that_are_too_many_some_stand_for_all(G, e, monkeypatch):
-    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     monkeypatch.setattr(module, "too_large", lambda n, copies: "too large")
     dependent = np.vstack(
         [G.toarray(), G.toarray()[1] - 2 * G.toarray()[3], np.zeros(40)]
@@ -170,7 +170,7 @@ def test_a_motion_that_held_components_alone_feel_leaves_a_factor(
     rounding of G_H G_Hᵀ. A right-hand side G_F v has a solution whatever the shift.
     """
     if not border:
-        monkeypatch.setattr(module, "MOST_BORDER", 0)
+        monkeypatch.setattr(module, "MAX_BORDER", 0)
     rng = np.random.default_rng(7)
     free = rng.integers(-3, 4, size=(12, 40)).astype(float)
     free[11] = free[0] + free[5]
@@ -202,7 +202,7 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
         preconditioner=preconditioner, eliminate="never", lanczos_steps=1, energy=0
     )
     dense = solver.prepare(qp, 1e-8)()
-    monkeypatch.setattr(module, "MOST_DENSE", 0)
+    monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
     sparse = solver.prepare(qp, 1e-8)()
 
     assert dense.status is sparse.status is Status.SOLVED

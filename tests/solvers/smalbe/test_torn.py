@@ -82,7 +82,7 @@ def test_a_sequence_is_warm():
 @pytest.mark.parametrize("parts", [4, 20])
 def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
     """As on ranks, with sparse rows: G_F G_Fᵀ has an eigenvalue that is rounding."""
-    monkeypatch.setattr(rows_module, "MOST_DENSE", 0)
+    monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
     qp = torn_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
     assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
     s = SMALBE().prepare(qp, 1e-8)()

@@ -15,12 +15,12 @@ from importlib.machinery import PathFinder
 
 #: module and name of what fails; of a class, its method
 STAGES = {
-    "emission": ("mortarbench.problems.feti.emission", "emitted"),
+    "emission": ("mortarbench.problems.feti.distributed_dual", "distributed_qp"),
     "prepare": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
     "solve": ("mortarbench.solvers.smalbe.solver", "SMALBE.prepare"),
     "residuals": ("mortarbench.harness.verify.verdicts", "_values_by_ranks"),
     "certificate": ("mortarbench.harness.verify.verdicts", "certify_over_ranks"),
-    "quantities": ("mortarbench.problems.duality.divided", "_largest_von_mises"),
+    "quantities": ("mortarbench.problems.duality.decomposed", "_largest_von_mises"),
 }
 KIND, STAGE = os.environ.get("FAULT_KIND"), os.environ.get("FAULT_STAGE")
 

@@ -12,7 +12,11 @@ from scipy.sparse import issparse
 from mortarbench.harness import QP, Vector
 from mortarbench.solvers.smalbe.driver import History, recovered
 from mortarbench.solvers.smalbe.options import Options
-from mortarbench.solvers.smalbe.preconditioner import Preconditioner, chosen, structural
+from mortarbench.solvers.smalbe.preconditioner import (
+    Preconditioner,
+    resolved_preconditioner,
+    structural_preconditioner,
+)
 from mortarbench.solvers.smalbe.projected import Iterate
 from mortarbench.solvers.smalbe.rows import Mask
 from tests.support.textbook import kernels
@@ -66,7 +70,7 @@ def outer_loop(
         rules=rules,
         model=problem.model if options.expansion == "model" else plain,
         precondition=face_preconditioner(
-            problem, qp, chosen(qp, options.preconditioner)
+            problem, qp, resolved_preconditioner(qp, options.preconditioner)
         ),
         watch=None if history is None else partial(_watched, history, problem),
     )
@@ -86,7 +90,7 @@ def face_preconditioner(
         return lambda rho: None
     if kind == "model":
         return lambda rho: problem.model(rho).inverse_in
-    M = structural(qp, kind)
+    M = structural_preconditioner(qp, kind)
     assert M is not None
 
     def in_face(free: Mask, rho: float) -> Operator:

@@ -44,7 +44,7 @@ CIRCLES = (
     "beam-ring/Nr=1/Nh=3/radial=6/steps=2/relin=2/feti=7/glue=chain/contact=mortar/"
     "friction=coulomb/mu=0.3/loading=static/dual"
 )
-ROUNDING = 1e-14
+COUPLING_ROUNDING = 1e-14
 SOLVED = 1e-10  #: what two references may leave of another point to linearise at
 
 
@@ -101,7 +101,7 @@ def test_ranks_assemble_their_parts_of_a_mesh_that_all_read(found, described, wh
     of = found[described[what]]
     assert of["sizes"][0] == of["sizes"][1]
     assert of["entries"][0] == of["entries"][1]
-    assert max(*of["errors"].values(), *of["bounds"]) < ROUNDING
+    assert max(*of["errors"].values(), *of["bounds"]) < COUPLING_ROUNDING
     assert set(of["owners"]) == {1}
     assert of["torn"] == 0
 
@@ -111,8 +111,8 @@ def test_shares_are_the_qp_of_one_process_row_by_row(found, case):
     of = found[case]
     assert of["sizes"][0] == of["sizes"][1]
     assert of["entries"][0] == of["entries"][1]
-    assert max(of["errors"].values()) < ROUNDING, of["errors"]
-    assert max(of["bounds"]) < ROUNDING
+    assert max(of["errors"].values()) < COUPLING_ROUNDING, of["errors"]
+    assert max(of["bounds"]) < COUPLING_ROUNDING
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -151,7 +151,7 @@ def test_no_choice_of_keys_is_emitted_as_another_qp(seed):
         2 + seed % 2, generated(np.random.default_rng(seed))
     ).items():
         assert of["sizes"][0] == of["sizes"][1], case
-        assert max(*of["errors"].values(), *of["bounds"]) < ROUNDING, case
+        assert max(*of["errors"].values(), *of["bounds"]) < COUPLING_ROUNDING, case
         assert set(of["owners"]) == {1}, case
         assert of["torn"] == 0, case
 

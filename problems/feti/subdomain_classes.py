@@ -1,13 +1,15 @@
-"""Bodies torn into subdomains: what every part of Total FETI works on.
+"""Classes of congruent subdomains, and bodies decomposed into them (Total FETI).
 
-Dostál, Horák and Kučera 2006: every subdomain floats; supports, gluing and contact are
-rows of one matrix B, so that the kernel of every stiffness is known beforehand.
+In Total FETI (Dostál, Horák and Kučera 2006, Commun. Numer. Methods Eng. 22) every
+subdomain floats; supports, gluing and contact are rows of one matrix B. So the kernel
+of every stiffness matrix is known in advance: the rigid motions.
 
-Torn unknowns v (N,) are numbered subdomain after subdomain, and within one node by
-node, each component in the frame of its subdomain. Subdomains that differ by a rigid
-motion only, as those in one layer of a ring, are of one kind then: they share one
-stiffness, one factor and one explicit operator, and B holds the rotations. A
-displacement u (n,) of the whole is v = T u, one d×d block per torn node.
+Torn unknowns v (N,), which count every copy of a node, are numbered subdomain by
+subdomain and node by node, with components in the frame of the subdomain. Subdomains
+that differ only by a rigid motion, such as those in one layer of a ring, are congruent:
+they share one stiffness matrix, one factor and one explicit operator, and B contains
+the rotations. A displacement u (n,) of the undivided bodies gives v = T u, with one d×d
+block per copy of a node.
 """
 
 from __future__ import annotations
@@ -29,29 +31,31 @@ from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
 
 Dense = NDArray[np.float64]
-_STRIP = 256  #: right-hand sides that are solved for at once
+_STRIP = 256  #: right-hand sides per solve, which bounds the memory for their images
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Kind:
-    """A subdomain, up to its place: what all subdomains of one kind share.
+class SubdomainClass:
+    """Data shared by all congruent subdomains of a class.
 
     K⁺ = K_ρ⁻¹ with K_ρ = K + ρR*R*ᵀ, where R* has the rows of R at the fixing
     components, orthonormalised, and zeros elsewhere (see `problems.fem.inverse`). All
-    subdomains of a kind are solved for at once, as columns of one right-hand side.
+    subdomains of a class are solved for together, as columns of one right-hand side.
     """
 
     K: csc_array  #: (n_k, n_k) stiffness in the frame of the subdomain
     R: NDArray[np.float64]  #: (n_k, r) orthonormal basis of ker K
-    fixing: Nodes  #: components of few nodes that no motion of R leaves at rest
-    #: components of all nodes on the boundary of the subdomain, ascending: those that
-    #: Dirichlet preconditioners condense onto, glued or free
+    fixing: Nodes  #: components of a few nodes that exclude every motion of R
+    #: components of all nodes on the boundary of the subdomain, ascending, glued or
+    #: free: Dirichlet preconditioners condense onto these
     boundary: Nodes
-    stiffness: Vector  #: (n_k,) modulus of the cells around each component, as K has it
+    stiffness: (
+        Vector  #: (n_k,) mean modulus of the cells around each component, in units of K
+    )
 
     @cached_property
     def name(self) -> str:
-        """A digest of its numbers: the same on all ranks that have it, there only."""
+        """Digest of the numbers; equal on all ranks that assemble this class."""
         K = self.K
         return hex_digest(
             map(
@@ -61,11 +65,11 @@ class Kind:
             32,
         )
 
-    def without_factor(self, name: str = "") -> Kind:
-        """Return the same to be factorised anew, under its name or another one."""
-        found = replace(self)
-        vars(found)["name"] = name or self.name
-        return found
+    def without_factor(self, name: str = "") -> SubdomainClass:
+        """Return a copy without cached factors, under this name or another one."""
+        copy = replace(self)
+        vars(copy)["name"] = name or self.name
+        return copy
 
     def inverse(self, b: Dense) -> Dense:
         """Apply K⁺ to columns (n_k, k)."""
@@ -75,15 +79,16 @@ class Kind:
         """Return K_bb."""
         return csr_array(self.K[b][:, b])
 
-    def condensed(self, b: Nodes) -> Condensed:
-        """Condense onto components b: what is inside is eliminated once for both.
+    def condense(self, b: Nodes) -> Condensed:
+        """Return both local blocks on components b, by one elimination of the interior.
 
         ::
 
             (K⁺)_bb = (S_ρ⁻¹)_bb,    S_ρ = S_h + ρR*R*ᵀ,   S_h = K_hh − K_hi K_ii⁻¹K_ih
 
-        where h are the boundary, b and the fixing components, and i all others. With h
-        last, S_ρ = LLᵀ is the last block of the Cholesky factor of K_ρ.
+        where h is the union of the boundary, b and the fixing components, and i are all
+        others. With h ordered last, the trailing block L of the Cholesky factor of K_ρ
+        satisfies S_ρ = LLᵀ.
         """
         return self.blocks(b, self.border_factor(b))
 
@@ -92,10 +97,12 @@ class Kind:
         return np.union1d(np.union1d(self.boundary, b), self.fixing)
 
     def border_factor(self, b: Nodes) -> Dense:
-        """Return L (h, h) of S_ρ = LLᵀ, the greater part of the work of `condensed`."""
+        """Return L (h, h) with S_ρ = LLᵀ: the larger part of the work of `condense`."""
         h = self.border(b)
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
-        if i.size:
+        if (
+            i.size
+        ):  # reduce fill inside; h stays last, so that its block is a trailing one
             i = i[analyze(with_int32(self.K[i][:, i]), use_long=False).P()]
         order = np.concatenate([i, h])
         K_rho = with_int32(self._fixed[order][:, order])
@@ -104,20 +111,20 @@ class Kind:
         return np.asarray(factor.L()[i.size :, i.size :].toarray())
 
     def blocks(self, b: Nodes, L: Dense) -> Condensed:
-        """Do what is left of `condensed`, with L of `border_factor`."""
+        """Return both blocks of `condense`, from the L of `border_factor`."""
         g, h = np.union1d(self.boundary, b), self.border(b)
-        at, fixed = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
-        C = cho_solve((L, True), np.eye(h.size)[:, at])[at]
-        S = L @ L.T
-        S[np.ix_(fixed, fixed)] -= self._held
-        S_bb, inner = S[np.ix_(at, at)], ~np.isin(h, g)
-        if inner.any():
-            S_ib = S[inner][:, at]
+        places_b, places_fixing = np.searchsorted(h, b), np.searchsorted(h, self.fixing)
+        C = cho_solve((L, True), np.eye(h.size)[:, places_b])[places_b]
+        S = L @ L.T  # S_ρ; without ρR*R*ᵀ it is the Schur complement S_h of K itself
+        S[np.ix_(places_fixing, places_fixing)] -= self._fixing_term
+        S_bb, inner = S[np.ix_(places_b, places_b)], ~np.isin(h, g)
+        if inner.any():  # fixing components inside are not part of S_bb: eliminate them
+            S_ib = S[inner][:, places_b]
             S_bb -= S_ib.T @ np.linalg.solve(S[inner][:, inner], S_ib)
         return Condensed(_symmetric(C), _symmetric(S_bb))
 
     def elimination(self, h: Nodes) -> Elimination:
-        """Eliminate all components but h; S on these multiplies columns."""
+        """Eliminate all components but h; the result multiplies columns by S."""
         i = np.setdiff1d(np.arange(self.K.shape[0]), h)
         order = np.concatenate([h, i])
         K = csc_array(csc_array(self.K[:, order])[order])
@@ -126,14 +133,14 @@ class Kind:
         return Elimination(K_hh, K_ih, factor)
 
     @cached_property
-    def _held(self) -> Dense:
+    def _fixing_term(self) -> Dense:
         """ρR*R*ᵀ at the fixing components, (p, p)."""
         star = np.linalg.qr(self.R[self.fixing])[0]
         return np.asarray(self.K.diagonal().max() * (star @ star.T))
 
     @cached_property
     def _factor(self) -> Factor:
-        """Factorise K_ρ, where it is first needed."""
+        """Factor of K_ρ, computed on first use."""
         return cholesky(csc_matrix(self._fixed))
 
     @property
@@ -141,12 +148,12 @@ class Kind:
         """K_ρ, (n_k, n_k)."""
         p = self.fixing.size
         where = np.repeat(self.fixing, p), np.tile(self.fixing, p)
-        held = csc_array((self._held.ravel(), where), shape=self.K.shape)
-        return csc_array(self.K + held)
+        added = csc_array((self._fixing_term.ravel(), where), shape=self.K.shape)
+        return csc_array(self.K + added)
 
 
 class Condensed(NamedTuple):
-    """Blocks of one kind on components b."""
+    """Local blocks of one class on components b."""
 
     compliance: Dense  #: (K⁺)_bb
     schur: Dense  #: S_bb of S condensed onto the boundary and b
@@ -157,7 +164,7 @@ class Elimination(NamedTuple):
 
     K_hh: csr_array
     K_ih: csr_array
-    factor: Factor | None  #: of K_ii, where there is any i
+    factor: Factor | None  #: of K_ii; None when i is empty
 
     def __matmul__(self, X: Dense) -> Dense:
         SX = np.asarray(self.K_hh @ X)
@@ -170,30 +177,30 @@ class Elimination(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Subdomains:
-    """S subdomains, each of one of few kinds, that nothing holds together yet."""
+    """S subdomains before gluing, each of one of few classes."""
 
-    kinds: tuple[Kind, ...]
-    kind: NDArray[np.int64]  #: (S,) of each subdomain
+    classes: tuple[SubdomainClass, ...]
+    class_of: NDArray[np.int64]  #: (S,) class of each subdomain
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
         """First torn unknown of each subdomain, and N: (S + 1,)."""
-        sizes = np.array([kind.R.shape[0] for kind in self.kinds])[self.kind]
+        sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
     @cached_property
     def members(self) -> tuple[NDArray[np.int64], ...]:
-        """Subdomains of each kind."""
-        order = np.argsort(self.kind, kind="stable")
-        ends = np.cumsum(np.bincount(self.kind, minlength=len(self.kinds)))
+        """Subdomains of each class."""
+        order = np.argsort(self.class_of, kind="stable")
+        ends = np.cumsum(np.bincount(self.class_of, minlength=len(self.classes)))
         return tuple(np.split(order, ends[:-1]))
 
     @cached_property
     def kernel(self) -> csr_array:
         """R = diag(R_1 … R_S), (N, Σr)."""
-        modes = np.array([kind.R.shape[1] for kind in self.kinds])[self.kind]
+        modes = np.array([kind.R.shape[1] for kind in self.classes])[self.class_of]
         sizes = np.diff(self.start)
-        entries = np.concatenate([self.kinds[k].R.ravel() for k in self.kind])
+        entries = np.concatenate([self.classes[k].R.ravel() for k in self.class_of])
         per_row = np.repeat(modes, sizes)
         ends = np.concatenate([[0], np.cumsum(per_row)])
         along = np.arange(entries.size) - np.repeat(ends[:-1], per_row)
@@ -201,52 +208,52 @@ class Subdomains:
         return csr_array((entries, columns, ends), shape=(sizes.sum(), modes.sum()))
 
     def places(self) -> Iterator[NDArray[np.int64]]:
-        """Give the torn unknowns of each kind, (n_k, S_k): a column per subdomain."""
-        for kind, members in zip(self.kinds, self.members, strict=True):
-            yield self.start[members] + np.arange(kind.R.shape[0])[:, None]
+        """Yield the torn unknowns of each class, (n_k, S_k), a column per subdomain."""
+        for template, members in zip(self.classes, self.members, strict=True):
+            yield self.start[members] + np.arange(template.R.shape[0])[:, None]
 
-    def without(self, free: NDArray[np.bool_]) -> Subdomains:
-        """Return the subdomains without all but their free torn unknowns (N,)."""
-        kinds, kind = list[Kind](), np.empty_like(self.kind)
-        known = dict[tuple[int, bytes], int]()
-        for s, k in enumerate(self.kind):
-            mine = free[self.start[s] : self.start[s + 1]]
-            found = known.setdefault((int(k), mine.tobytes()), len(kinds))
-            if found == len(kinds):
-                kinds.append(_held(self.kinds[k], mine))
-            kind[s] = found
-        return Subdomains(tuple(kinds), kind)
+    def restrict(self, free: NDArray[np.bool_]) -> Subdomains:
+        """Return the subdomains restricted to the free torn unknowns, a mask (N,)."""
+        classes, class_of = list[SubdomainClass](), np.empty_like(self.class_of)
+        numbers = dict[tuple[int, bytes], int]()
+        for s, k in enumerate(self.class_of):
+            mask = free[self.start[s] : self.start[s + 1]]
+            number = numbers.setdefault((int(k), mask.tobytes()), len(classes))
+            if number == len(classes):
+                classes.append(_restricted(self.classes[k], mask))
+            class_of[s] = number
+        return Subdomains(tuple(classes), class_of)
 
     def inverse(self, b: Vector) -> Vector:
         """Apply K⁺ to a torn vector (N,)."""
         v = np.empty_like(b)
-        for kind, place in zip(self.kinds, self.places(), strict=True):
-            own = b[place]
-            v[place] = kind.inverse(own) if own.any() else 0.0
+        for template, places in zip(self.classes, self.places(), strict=True):
+            columns = b[places]
+            v[places] = template.inverse(columns) if columns.any() else 0.0
         return v
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Torn:
-    """A contact problem on torn bodies, without dimensions.
+class DecomposedBodies:
+    """A contact problem on decomposed bodies, in nondimensional form.
 
     ::
 
         min ½vᵀKv − fᵀv   subject to   B_E v = c_E,  B_I v ≤ c_I,   K = diag(K_1 … K_S)
 
     Rows of B are those of supports and gluing (E), then of contact (normals, then
-    tangents). Those of contact are multiplied with `scale`, so that λ of the rows as
-    they were is scale·λ.
+    tangents). Contact rows are multiplied by `scale`: the multipliers of the unscaled
+    rows are scale·λ.
     """
 
-    kinds: tuple[Kind, ...]
-    kind: NDArray[np.int64]  #: (S,) of each subdomain
+    classes: tuple[SubdomainClass, ...]
+    class_of: NDArray[np.int64]  #: (S,) class of each subdomain
     spread: csr_array  #: T (N, n)
     B: csr_array  #: (m, N), scaled
     c: Vector  #: (m,), scaled
-    scale: Vector  #: positive, of the rows of contact, the last ones
-    f: Vector  #: (N,) Tᵀf is the load of the whole
-    equalities: int  #: rows of B that are equations, the first ones
+    scale: Vector  #: positive factors of the contact rows, which come last
+    f: Vector  #: (N,) Tᵀf is the load of the undivided bodies
+    equalities: int  #: number of rows of supports and gluing, which come first
 
     @property
     def start(self) -> NDArray[np.int64]:
@@ -255,22 +262,25 @@ class Torn:
 
     @cached_property
     def domains(self) -> Subdomains:
-        """The subdomains on their own, with what is factorised once."""
-        return Subdomains(self.kinds, self.kind)
+        """The subdomains without B; factors are cached here."""
+        return Subdomains(self.classes, self.class_of)
 
 
 def _symmetric(M: Dense) -> Dense:
     return np.asarray((M + M.T) / 2)
 
 
-def _held(kind: Kind, free: NDArray[np.bool_]) -> Kind:
-    """Return a subdomain without all but its free components (n_k,)."""
+def _restricted(kind: SubdomainClass, free: NDArray[np.bool_]) -> SubdomainClass:
+    """Return a class restricted to its free components, a mask (n_k,).
+
+    The kernel keeps the motions of R that vanish at the fixed components.
+    """
     if free.all():
         return kind
     R = kind.R @ null_space(kind.R[~free])
     R = np.linalg.qr(R[free])[0]
     number = np.cumsum(free) - 1
-    return Kind(
+    return SubdomainClass(
         K=csc_array(kind.K[free][:, free]), R=R,
         fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
         boundary=number[kind.boundary[free[kind.boundary]]],

@@ -14,22 +14,26 @@ from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import Bodies
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.stepping import load_steps
-from mortarbench.problems.duality.divided import described
-from mortarbench.problems.duality.problem import chosen, stated
-from mortarbench.problems.duality.undivided import primal_qp, whole_path
+from mortarbench.problems.duality.decomposed import decompose
+from mortarbench.problems.duality.monolithic import monolithic_path, primal_qp
+from mortarbench.problems.duality.problem import elastic_bodies_of, qp_choice
 from mortarbench.problems.families.declared import ContactFamily
-from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_parts
-from mortarbench.problems.feti.subdomains import Contact, ProblemInParts, on_one_process
-from mortarbench.problems.feti.torn import Torn
+from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
+from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
+from mortarbench.problems.feti.subdomains import (
+    Contact,
+    DecomposedProblem,
+    on_one_process,
+)
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 
 
-def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
+def labelled_subdivision(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
     """Know the bodies by the labels (E,) of their cells; all nodes are listed."""
     every = np.arange(len(bodies.mesh.points))
-    return mesh_in_parts(bodies.mesh, label, bodies.body, every)
+    return mesh_in_subdomains(bodies.mesh, label, bodies.body, every)
 
 
 def torn_by(
@@ -38,9 +42,9 @@ def torn_by(
     primal: QP,
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
-) -> Torn:
+) -> DecomposedBodies:
     """Tear bodies with a QP of theirs, with friction."""
-    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).torn_bodies
+    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).decomposed
 
 
 def parts_by(
@@ -49,35 +53,44 @@ def parts_by(
     primal: QP,
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
-) -> ProblemInParts:
+) -> DecomposedProblem:
     """Pose a QP of the bodies, with friction, on their subdomains."""
-    of = stated(replace(bodies, f=-primal.q))
+    of = elastic_bodies_of(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
     contact = Contact(*contact_rows(primal, friction), friction.bound)
-    return described(of, layout, rows, stage, contact)
+    return decompose(of, layout, rows, stage, contact)
 
 
-def parts_of(name: str) -> ProblemInParts:
+def parts_of(name: str) -> DecomposedProblem:
     """Describe the dual of a case; what comes before it is solved."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
-        problem, choice = case.family.stated(case.params), chosen("dual", case.params)
-        path = whole_path(problem, reference_solution)
+        problem, choice = (
+            case.family.stated(case.params),
+            qp_choice("dual", case.params),
+        )
+        path = monolithic_path(problem, reference_solution)
         whole, friction, _ = path.problem(choice.step, choice.iterate)
         of, stage = problem.bodies, problem.stages[path.last_of(choice.step)]
         contact = Contact(*contact_rows(whole.primal, friction), friction.bound)
         layout = of.shape.layout(choice.size)
-        return described(of, layout, choice.glue, stage, contact)
+        return decompose(of, layout, choice.glue, stage, contact)
     models = import_module(f"mortarbench.problems.models.{case.family.name}")
-    found: ProblemInParts = models.in_subdomains(case.params)
+    found: DecomposedProblem = models.in_subdomains(case.params)
     return found
 
 
-def torn_pair(rows: str = "orthonormal", most: int = 2) -> tuple[Bodies, Any, Torn]:
+def torn_pair(
+    rows: str = "orthonormal", most: int = 2
+) -> tuple[Bodies, Any, DecomposedBodies]:
     """Bodies of 32 × 4 and 36 × 6 cells, their QP, and both in subdomains."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
     label = of_beam_ring(*geometry).shape.layout(most).label
-    return bodies, primal, torn_by(bodies, labelled(bodies, label), primal, rows=rows)
+    return (
+        bodies,
+        primal,
+        torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows),
+    )

@@ -7,16 +7,16 @@ import pytest
 
 from mortarbench.harness import kkt_residuals
 from mortarbench.harness.mechanics import NO_FRICTION
-from mortarbench.problems.contact.bodies import floating
+from mortarbench.problems.contact.bodies import factorise_floating
 from mortarbench.problems.contact.friction import FrictionLaw, friction_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.duality.dualisation import dualise
-from mortarbench.problems.duality.torn_dual import torn_dual
-from mortarbench.problems.duality.undivided import primal_qp
+from mortarbench.problems.duality.feti_dual import feti_dual
+from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.torn_bodies import labelled, torn_by
+from tests.support.decomposed_bodies import labelled_subdivision, torn_by
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")
@@ -35,8 +35,8 @@ def posed(law):
 def dual_of(primal, friction, rows):
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 2))
-    pair = torn_by(BODIES, labelled(BODIES, label), primal, friction, rows)
-    return pair, torn_dual(pair, primal, friction)
+    pair = torn_by(BODIES, labelled_subdivision(BODIES, label), primal, friction, rows)
+    return pair, feti_dual(pair, primal, friction)
 
 
 def assembled(qp):
@@ -48,7 +48,7 @@ def assembled(qp):
 def test_the_solution_is_that_of_the_whole(rows, law):
     primal, friction = posed(law)
     _, torn_apart = dual_of(primal, friction, rows)
-    whole = dualise(primal, floating(BODIES), friction=friction)
+    whole = dualise(primal, factorise_floating(BODIES), friction=friction)
     s = reference_solution(assembled(torn_apart.qp))
     found, expected = (
         torn_apart.recover(s), whole.recover(reference_solution(whole.qp)),
@@ -57,7 +57,7 @@ def test_the_solution_is_that_of_the_whole(rows, law):
     assert found.x == pytest.approx(expected.x, abs=1e-10 * abs(expected.x).max())
     assert found.y == pytest.approx(expected.y, abs=1e-9 * abs(expected.y).max())
     assert found.z == pytest.approx(expected.z, abs=1e-9 * abs(expected.z).max())
-    assert torn_apart.touched(s) == pytest.approx(found.x)
+    assert torn_apart.interface_displacement(s) == pytest.approx(found.x)
     if not law:
         assert kkt_residuals(primal, found).worst < 1e-9
     else:

@@ -1,0 +1,231 @@
+"""Load steps of undivided bodies in contact, with one factor of K for all QPs.
+
+Contact rows are linearised at displacements of the contact sides, which follow from the
+dual solution of a step by one small product. Displacements elsewhere are recovered on
+demand, by one solve with the factor of K each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache, lru_cache
+
+import numpy as np
+
+from mortarbench.harness import QP, Friction, Reference, Solution, Vector, kkt_residuals
+from mortarbench.problems.contact.balance import check_friction
+from mortarbench.problems.contact.bodies import Bodies, factorise_floating, support_rows
+from mortarbench.problems.contact.friction import (
+    FrictionLaw,
+    forces_at_nodes,
+    friction_of,
+)
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.stepping import (
+    LoadPath,
+    Stage,
+    State,
+    forces_of,
+    load_steps,
+)
+from mortarbench.problems.duality.dualisation import (
+    Transformed,
+    dual_bounds,
+    dualise,
+    with_friction_bound,
+)
+from mortarbench.problems.duality.problem import ContactProblem, Linearise
+from mortarbench.problems.fem.inverse import GeneralisedInverse
+from mortarbench.problems.fem.mesh import Nodes
+
+Transform = Callable[[QP, GeneralisedInverse, Vector, Friction], Transformed]
+
+#: largest KKT residual of a reference solve; the next step is linearised there
+MAX_REFERENCE_RESIDUAL = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class MonolithicLinearisation:
+    """A linearised contact problem of undivided bodies; see `LinearisedProblem`."""
+
+    bodies: Bodies  #: with the load and the supports of the stage
+    primal: QP  #: (1) of the paper
+    friction: Friction
+    place: Nodes  #: (m,) slave node of each contact row, see `ContactRows`
+    dual: Callable[
+        [], Transformed
+    ]  #: the dual for these rows; friction bounds are replaced later
+    reference: Reference
+    part: float  #: load factor
+
+    def solve(self, friction: Friction, start: Solution | None = None) -> Solution:
+        """Solve the dual with the given friction bounds.
+
+        Raises
+        ------
+        ArithmeticError
+            If the residual exceeds `MAX_REFERENCE_RESIDUAL`.
+
+        """
+        qp = with_friction_bound(self.dual().qp, friction)
+        s = self.reference(qp)
+        if not (worst := kkt_residuals(qp, s).worst) <= MAX_REFERENCE_RESIDUAL:
+            raise ArithmeticError(
+                f"the reference solve at load factor {self.part:g} left a residual "
+                f"of {worst:.1e}, more than {MAX_REFERENCE_RESIDUAL:g}"
+            )
+        return s
+
+    def normal_multipliers(self, s: Solution) -> Vector:
+        """Return the multipliers λ_n (m,) of the contact rows."""
+        m, k = self.place.size, self.friction.bound.size
+        return s.x[-m - k :][:m]
+
+    def end_state(self, s: Solution) -> tuple[Vector, Vector]:
+        """Return u (n,), valid on the contact sides, and the normal nodal forces."""
+        places = sum(pair.slave.size for pair in self.bodies.pairs)
+        forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
+        return self.dual().interface_displacement(s), forces
+
+
+@dataclass(frozen=True, eq=False)
+class MonolithicPath(LoadPath[MonolithicLinearisation]):
+    """The load steps of undivided bodies."""
+
+    _answers: dict[int, Solution] = field(default_factory=dict, init=False)
+
+    def primal(self, k: int) -> QP:
+        """Return the QP of step k ≥ 1 in its last linearisation, without friction."""
+        return self.problem(k).problem.primal
+
+    def answer(self, k: int) -> Solution:
+        """Return the solution of the primal problem of step k ≥ 1."""
+        if k not in self._answers:
+            last = self.problem(k)
+            self._answers[k] = last.problem.dual().recover(last.solution())
+        return self._answers[k]
+
+    def solution(self, k: int) -> Vector:
+        """Return the nondimensional displacement (n,) after step k; zero for k = 0."""
+        return self.answer(k).x if k else self.initial.u
+
+
+def load_path(
+    bodies: Bodies,
+    linearise: Linearise,
+    factorise: Callable[[], GeneralisedInverse],
+    reference: Reference,
+    steps: int,
+    relin: int = 1,
+    *,
+    transform: Transform = dual_bounds,
+    laws: tuple[FrictionLaw, ...] = (),
+    quasi_static: bool = True,
+    initial_force: float = 0.0,
+) -> MonolithicPath:
+    """Return the load path of assembled bodies for a given linearisation of contact.
+
+    Parameters
+    ----------
+    factorise : returns the K⁺ for `transform`; called before the first solve
+    laws : one per contact pair; empty without friction
+    initial_force : normal force per slave node, the start of Coulomb's fixed point
+
+    """
+    stages = load_steps(
+        steps, relin, forces_of(bodies.f), bodies.B_D.indices, laws,
+        quasi_static=quasi_static,
+    )  # fmt: skip
+    return _path(
+        bodies,
+        stages,
+        lambda _: linearise,
+        factorise,
+        reference,
+        transform,
+        initial_force,
+    )
+
+
+@lru_cache(maxsize=4)
+def monolithic_path(problem: ContactProblem, reference: Reference) -> MonolithicPath:
+    """Return the load path of a contact problem on undivided bodies.
+
+    If supports exclude all rigid motions, only the contact rows are dualised.
+    """
+    elastic, stages = problem.bodies, problem.stages
+    fixed = np.unique(np.concatenate([stage.fixed for stage in stages]))
+    bodies = elastic.assembled
+
+    def factor() -> GeneralisedInverse:
+        if fixed.size == elastic.fixed.size:
+            return elastic.floating
+        return factorise_floating(replace(bodies, B_D=support_rows(bodies.mesh, fixed)))
+
+    is_supported = elastic.is_supported and all(
+        stage.fixed is elastic.fixed for stage in stages
+    )
+    return _path(
+        bodies, stages, lambda laws: problem.linearise(bodies, laws),
+        (lambda: elastic.clamped) if is_supported else factor, reference,
+        dual_bounds if is_supported else dualise, problem.initial_force,
+    )  # fmt: skip
+
+
+def _path(
+    bodies: Bodies,
+    stages: Sequence[Stage],
+    linearise: Callable[[tuple[FrictionLaw, ...]], Linearise],
+    factorise: Callable[[], GeneralisedInverse],
+    reference: Reference,
+    transform: Transform,
+    initial_force: float,
+) -> MonolithicPath:
+    inverse = cache(factorise)
+    # loads and supports recur in several stages; K⁺f is stored for the full load
+    bodies_by_stage, free = dict[tuple[int, int], Bodies](), dict[int, Vector]()
+
+    def bodies_of(stage: Stage) -> Bodies:
+        names = id(stage.forces), id(stage.fixed)
+        if names not in bodies_by_stage:
+            f = np.zeros(bodies.mesh.dofs)
+            f[stage.forces.component] = stage.forces.value
+            held = support_rows(bodies.mesh, stage.fixed)
+            bodies_by_stage[names] = replace(bodies, f=f, B_D=held)
+        return bodies_by_stage[names]
+
+    def pose(stage: Stage, at: State) -> MonolithicLinearisation:
+        rows = linearise(stage.laws)(at.u * bodies.length)
+        loaded, load = bodies_of(stage), id(stage.forces)
+        primal = primal_qp(loaded, rows, stage.part)
+        first = friction_of(loaded, rows, stage.laws, at.slip_origin, at.normal_forces)
+        if first.bound.size and not any(law.mu for law in stage.laws):
+            check_friction(loaded, rows.B, first, stage.step, stage.part)
+
+        @cache
+        def dual() -> Transformed:
+            if load not in free:
+                free[load] = inverse()(loaded.f)
+            return transform(primal, inverse(), free[load] * stage.part, first)
+
+        return MonolithicLinearisation(
+            loaded, primal, first, rows.place, dual, reference, stage.part
+        )
+
+    places = sum(pair.slave.size for pair in bodies.pairs)
+    nothing = np.zeros(bodies.mesh.dofs)
+    return MonolithicPath(
+        stages, pose, State(nothing, nothing, np.full(places, initial_force))
+    )
+
+
+def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP:
+    """Return the nondimensional QP (1),  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M."""
+    n = bodies.mesh.dofs
+    return QP(
+        P=bodies.K, q=-load_factor * bodies.f,
+        A=bodies.B_D, b=np.zeros(bodies.B_D.shape[0]),
+        G=rows.B, h=rows.c / bodies.length,
+        lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
+    )  # fmt: skip

@@ -1,0 +1,292 @@
+"""The dual of decomposed bodies, assembled in distributed form by all ranks.
+
+Each rank assembles the rows that it owns from its local subdomains
+(`problems.feti.subdomains`). Contact rows are linearised from the contact sides alone.
+
+Messages between ranks: the points of one subdomain of each class that may occur on
+several ranks, so that congruent subdomains have the same frame everywhere; the
+contributions to rows of q and RᵀBᵀ that other ranks own; and the parts of Rᵀf.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, partial
+from itertools import chain, pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csc_array, csr_array
+
+from mortarbench.harness import QP, InputError, Vector, no_rows
+from mortarbench.harness.digest import hex_digest
+from mortarbench.harness.distributed.vectors import (
+    DISTRIBUTED_DIGEST,
+    DistributedColumns,
+    DistributedQP,
+    DistributedVector,
+    Ranks,
+    Share,
+    distributed,
+)
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.distributed import (
+    Halo,
+    RankOperator,
+    assign_owners,
+    build_halo,
+    condense_over_ranks,
+    gather_on_rank_0,
+)
+from mortarbench.problems.feti.local_bodies import Results, evaluation
+from mortarbench.problems.feti.operators import (
+    DualOperator,
+    block_bytes,
+    explicit_classes,
+    touched_components,
+)
+from mortarbench.problems.feti.subdomain_classes import Subdomains
+from mortarbench.problems.feti.subdomains import (
+    DecomposedProblem,
+    LocalSubdomains,
+    subdomains_of,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalDual:
+    """The rows of a dual that a rank owns; all ranks evaluate members together."""
+
+    subdomains: LocalSubdomains
+
+    @cached_property
+    def halo(self) -> Halo:
+        """Owned rows and ghosts of this rank."""
+        rows = self.subdomains.rows
+        owner = assign_owners(rows.number, rows.reach)
+        return build_halo(self.subdomains.ranks, rows.number, rows.reach, owner)
+
+    @cached_property
+    def explicit(self) -> NDArray[np.bool_]:
+        """Flags of the classes with explicit blocks."""
+        return explicit_classes(self.subdomains.rows.B, self.subdomains.domains)
+
+    @cached_property
+    def q(self) -> Vector:
+        """The linear term −d = c − BK⁺f (o,) at owned rows."""
+        local = self.subdomains
+        return np.asarray(
+            local.rows.c[self.halo.owned]
+            - self.halo.accumulate(local.rows.B @ local.domains.inverse(local.f))
+        )
+
+    @cached_property
+    def G(self) -> csr_array:
+        """Columns of RᵀBᵀ (r, o) for owned rows."""
+        return _coarse_rows(self.subdomains, self.halo.rows[self.halo.owned])
+
+    @cached_property
+    def b(self) -> Vector:
+        """Right-hand side Rᵀf (r,), on every rank."""
+        return _resultants(self.subdomains)
+
+    def share(self) -> Share:
+        """Return the share of this rank in the dual QP; nothing is factorised yet."""
+        rows, domains, ranks = (
+            self.subdomains.rows,
+            self.subdomains.domains,
+            self.subdomains.ranks,
+        )
+        classes = tuple(kind.without_factor() for kind in domains.classes)
+        unfactored = Subdomains(classes, domains.class_of)
+        local = DualOperator(
+            rows.B, unfactored, self.explicit, rows.equalities,
+            partial(condense_over_ranks, ranks=ranks),
+        )  # fmt: skip
+        lower, upper = self.bounds(self.subdomains.problem.contact.bound)
+        qp = QP(
+            P=RankOperator(local, self.halo), q=distributed(self.q, ranks),
+            lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
+            A=DistributedColumns(self.G, ranks), b=self.b,
+        )  # fmt: skip
+        return Share(qp, gather_on_rank_0(self.halo, rows.total))
+
+    def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
+        """Return bounds of the multipliers of owned rows, with friction bounds (k,)."""
+        ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
+        scale = self.subdomains.problem.contact_scale
+        pressing = scale.size - bound.size
+        bound = bound / scale[pressing:]
+        below = np.concatenate([np.zeros(pressing), -bound])
+        above = np.concatenate([np.full(pressing, np.inf), bound])
+        number = self.halo.rows[self.halo.owned]
+        touching = number >= E
+        lower, upper = (np.full(number.size, x) for x in (-np.inf, np.inf))
+        lower[touching] = below[number[touching] - E]
+        upper[touching] = above[number[touching] - E]
+        return distributed(lower, ranks), distributed(upper, ranks)
+
+    def with_bound(self, bound: Vector) -> LocalDual:
+        """Return a copy with another friction bound (k,); cached results are kept."""
+        copy = LocalDual(self.subdomains.with_bound(bound))
+        vars(copy).update({**vars(self), "subdomains": copy.subdomains})
+        return copy
+
+
+def dual_on(problem: DecomposedProblem, ranks: Ranks) -> LocalDual:
+    """Distribute the subdomains of a problem over ranks; called by all of them.
+
+    Raises
+    ------
+    InputError
+        If there are fewer subdomains than ranks, or ranks have cut the bodies
+        differently.
+
+    """
+    return LocalDual(
+        LocalSubdomains(problem, ranks, _replicated_partition(problem, ranks))
+    )
+
+
+def distributed_qp(
+    dual: LocalDual,
+    results: Results | None,
+    first: LocalDual | None = None,
+    others: int = 0,
+) -> DistributedQP:
+    """Return the dual QP as distributed over ranks; called by all of them.
+
+    If solutions of previous problems enter the QP, they depend on the number of ranks
+    by rounding. The digest is then that of the first of these problems, with their
+    number, so that it does not depend on the ranks.
+
+    Parameters
+    ----------
+    results : physical results of an answer; None if they need the undivided bodies
+    first, others : first of the previous problems, and their number
+
+    """
+    local = dual.subdomains
+    for part in ("explicit", "q", "G", "b"):
+        getattr(
+            dual, part
+        )  # computed here, so that it is not part of the time of `prepare`
+
+    def digest() -> str:
+        names = others * [_digest(first.subdomains)] if first else [_digest(local)]
+        return DISTRIBUTED_DIGEST + hex_digest(map(str.encode, names), 16)
+
+    bounds = dual.bounds(local.problem.contact.bound)
+    return DistributedQP(
+        variables=local.rows.total, equality_rows=local.coarse_size,
+        bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
+        share=dual.share, digest=digest,
+        answer=evaluation(
+            local, dual.halo, _decomposition(local, dual.explicit), results
+        ),
+    )  # fmt: skip
+
+
+def _decomposition(
+    local: LocalSubdomains, explicit: NDArray[np.bool_]
+) -> dict[str, Any]:
+    """Return the quantities of `decomposition_quantities`, on all ranks.
+
+    explicit_mib: memory for blocks on all ranks together; a block of a class that
+    occurs on several ranks is stored on each of them.
+    """
+    domains, rows, ranks = local.domains, local.rows, local.ranks
+    sizes = np.array([part.size for part in touched_components(rows.B, domains)])
+    taken = block_bytes(sizes, domains)[explicit].sum() / 2**20
+    counts = [local.f.size, explicit[domains.class_of].sum(), taken]
+    dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
+    classes = ranks.comm.allgather({kind.name for kind in domains.classes})
+    return {
+        "subdomains": local.rank.size, "kinds": len(set().union(*classes)),
+        "torn_dofs": int(dofs), "multipliers": rows.total,
+        "explicit_subdomains": int(formed), "explicit_mib": mib,
+    }  # fmt: skip
+
+
+def _digest(local: LocalSubdomains) -> str:
+    """Return a digest of the QP that does not depend on the distribution over ranks.
+
+    It combines the digests of all subdomains in order (class, load and columns of B)
+    and the contact data, which are replicated.
+    """
+    domains, rows, contact = local.domains, local.rows, local.problem.contact
+    names = [kind.name.encode() for kind in domains.classes]
+    B = csc_array(rows.B)
+    B.sort_indices()
+    digests = []
+    for s, (begin, end) in enumerate(pairwise(domains.start)):
+        ends = B.indptr[begin : end + 1]
+        entries = slice(ends[0], ends[-1])
+        parts = rows.number[B.indices[entries]], B.data[entries], ends - ends[0]
+        numbers = (*map(np.ndarray.tobytes, parts), local.f[begin:end].tobytes())
+        name = hex_digest((names[domains.class_of[s]], *numbers))
+        digests.append((int(local.number[s]), name))
+    every = sorted(chain.from_iterable(local.ranks.comm.allgather(digests)))
+    shared = contact.rows.data, contact.c, contact.bound
+    content = (*(name.encode() for _, name in every), *(v.tobytes() for v in shared))
+    return hex_digest(content, 64)
+
+
+def _replicated_partition(
+    problem: DecomposedProblem, ranks: Ranks
+) -> NDArray[np.int64]:
+    """Return the rank of each subdomain (S,), the same on all ranks.
+
+    Every rank partitions the graph with its own library, and different versions may
+    give different results.
+
+    Raises
+    ------
+    InputError
+        If they do, or if there are fewer subdomains than ranks.
+
+    """
+    ranks_of = subdomains_of(problem, ranks.size)
+    digest = hex_digest(
+        x.tobytes() for x in (ranks_of, *problem.layout.shared_node_counts())
+    )
+    if len(set(ranks.comm.allgather(digest))) > 1:
+        raise InputError(
+            "ranks have cut the bodies into different subdomains; expected the same "
+            "version of METIS on all nodes"
+        )
+    return ranks_of
+
+
+def _coarse_rows(local: LocalSubdomains, mine: Nodes) -> csr_array:
+    """Return the columns (r, o) of RᵀBᵀ for the owned rows, numbered `mine`."""
+    ranks, rows = local.ranks, local.rows
+    B, t = rows.B, rows.number.size
+    unknown, place = np.unique(B.indices, return_inverse=True)
+    R = local.resultants(unknown, np.ones(unknown.size))
+    touched = csr_array((B.data, place, B.indptr), shape=(t, unknown.size))
+    part = csr_array(touched @ R)
+    owner = assign_owners(rows.number, rows.reach)
+    messages: list[tuple[NDArray[Any], ...]] = [()] * ranks.size
+    for one in set(range(ranks.size)) - {ranks.rank}:
+        foreign = np.flatnonzero(owner == one)
+        entries = coo_array(part[foreign])
+        messages[one] = rows.number[foreign][entries.row], entries.col, entries.data
+    G = csr_array(part[np.flatnonzero(owner == ranks.rank)])
+    for row, column, data in filter(None, ranks.comm.alltoall(messages)):
+        places = np.searchsorted(mine, row), column
+        G += csr_array((data, places), shape=G.shape)
+    return csr_array(G.T)
+
+
+def _resultants(local: LocalSubdomains) -> Vector:
+    """Return Rᵀf (r,) of all subdomains, on every rank."""
+    loaded = np.flatnonzero(local.f)
+    resultants = local.resultants(loaded, local.f[loaded])
+    total = np.zeros(local.coarse_size)
+    for number, part in local.ranks.comm.allgather(
+        (resultants.indices, resultants.data)
+    ):
+        np.add.at(total, number, part)
+    return total

@@ -1,0 +1,290 @@
+"""Local bodies and solutions of a rank, for certificates and physical results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, null_space
+from scipy.sparse import csc_array, csr_array, hstack
+
+from mortarbench.harness import Solution, Vector
+from mortarbench.harness.distributed.vectors import Evaluation
+from mortarbench.harness.verify.certificate import Certificate
+from mortarbench.harness.verify.over_ranks import (
+    Contact,
+    FloatingBodies,
+    LocalBodies,
+    certify_over_ranks,
+)
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.distributed import Halo
+from mortarbench.problems.feti.subdivision import Points
+from mortarbench.problems.feti.subdomains import (
+    DecomposedProblem,
+    LocalSubdomains,
+)
+from mortarbench.problems.feti.substructures import LocalProblems
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LocalSolution:
+    """Local part of a displacement, and the contact forces, replicated on all ranks.
+
+    Its methods are called by all ranks together and return the same values on each.
+    """
+
+    subdomains: LocalSubdomains
+    bodies: LocalBodies
+    u: Vector  #: (n,) at `bodies.components`; equal on all ranks that share a component
+    z: Vector  #: (m,) multipliers of all rows of contact and friction
+
+    def at(self, component: Nodes) -> Vector:
+        """Return the displacement at global components (w,)."""
+        return np.asarray(self.bodies.reduction.values_at(self.u, component))
+
+    def diagonal(self, component: Nodes) -> Vector:
+        """Return the diagonal of K at global components (w,)."""
+        reduction = self.bodies.reduction
+        places, here = reduction.places(component)
+        local = np.unique(places[here])
+        values = np.zeros(self.u.size)
+        values[local] = self.bodies.parts.diagonal(local)
+        return np.asarray(reduction.values_at(reduction.completed(values), component))
+
+    @cached_property
+    def energy(self) -> float:
+        """½uᵀKu − fᵀu, summed over all ranks."""
+        v = self.bodies.parts.spread @ self.u
+        work = v @ self.bodies.parts.product(v) / 2 - v @ self.bodies.f
+        return self.bodies.reduction.total(float(work))[0]
+
+
+#: solution → physical results in SI units, the same on all ranks
+Results = Callable[[LocalSolution], Mapping[str, Any]]
+
+
+def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolution:
+    """Recover the local displacement from the multipliers of the dual.
+
+    As in `problems.duality.feti_dual`, v = K⁺(f − Bᵀλ) − Rα is averaged over the copies
+    of each node on all ranks; α are the multipliers of RᵀBᵀλ = Rᵀf. Components that
+    supports eliminate are zero.
+    """
+    bodies, multiplicity = _local_bodies(local.floating)
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_motions]
+    multipliers = halo.gather(np.asarray(s.x))
+    v = np.zeros(T.shape[0])
+    v[local.free] = local.domains.inverse(local.f - local.rows.B.T @ multipliers)
+    v[local.free] -= local.domains.kernel @ alpha
+    u = bodies.reduction.completed(T.T @ v) / multiplicity
+    z = contact_multipliers(local, halo, s)
+    return LocalSolution(subdomains=local, bodies=bodies, u=u, z=z)
+
+
+def contact_multipliers(local: LocalSubdomains, halo: Halo, s: Solution) -> Vector:
+    """Return the multipliers (m,) of all unscaled contact and friction rows."""
+    rows, scale = local.rows, local.problem.contact_scale
+    owned = rows.number[halo.owned]
+    is_contact = owned >= rows.equalities
+    z = np.zeros(scale.size)
+    z[owned[is_contact] - rows.equalities] = np.asarray(s.x)[is_contact]
+    return np.asarray(scale * local.ranks.total(z))
+
+
+def evaluation(
+    local: LocalSubdomains,
+    halo: Halo,
+    decomposition: Mapping[str, Any],
+    reported: Results | None,
+) -> Callable[[Solution], Evaluation]:
+    """Return a function that evaluates physical results for the local subdomains.
+
+    Parameters
+    ----------
+    decomposition : its quantities, see `decomposition_quantities`
+    reported : physical results of a solution; None if they need the undivided bodies
+
+    """
+    problem = local.problem
+
+    def answer(s: Solution) -> Evaluation:
+        solution, results = local_solution(local, halo, s), None
+        if reported is not None:
+
+            def results() -> Mapping[str, Any]:
+                return {**reported(solution), **decomposition}
+
+        return Evaluation(
+            (solution.bodies, solution.u, solution.z[_force_rows(problem)]), results
+        )
+
+    return answer
+
+
+def certifier(
+    local: LocalSubdomains, K: csc_array
+) -> Callable[[Vector, Vector], Certificate]:
+    """Return a function that bounds the error of a displacement with multipliers.
+
+    K : (n, n) stiffness matrix of the undivided bodies, stored on this one process
+    """
+    bodies = cache(lambda: replace(local_bodies(local), stored=csr_array(K)))
+    return lambda u, multipliers: certify_over_ranks(bodies(), u, multipliers)
+
+
+def local_bodies(local: LocalSubdomains) -> LocalBodies:
+    """Return the local data of certificates; supports are rows."""
+    return _local_bodies(local.floating)[0]
+
+
+def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
+    """Return the local data of certificates, and the multiplicities (n,).
+
+    local : subdomains that all float
+    """
+    problem, components, place = local.problem, local.components, local.place
+    contact, active = problem.contact, _force_rows(problem)
+    multiplicity = np.empty(components.size)
+    multiplicity[place] = local.multiplicity
+    parts = LocalProblems(local.decomposed, problem.components)
+    return LocalBodies(
+        ranks=local.ranks, parts=parts, components=components,
+        shared=np.bincount(place, minlength=multiplicity.size) < multiplicity,
+        coarse=local.local_motions,
+        motions=local.coarse_size, f=local.f,
+        fixed=np.flatnonzero(np.isin(components, problem.fixed)),
+        contact=Contact(
+            rows=csr_array(contact.rows[active]), c=contact.c[active],
+            bound=contact.bound[contact.bound > 0],
+        ),
+        floating=_floating_bodies(local),
+    ), multiplicity  # fmt: skip
+
+
+def _force_rows(problem: DecomposedProblem) -> Nodes:
+    """Return the rows of contact, and of friction with a positive bound."""
+    m, bound = problem.contact.rows.shape[0], problem.contact.bound
+    return np.flatnonzero(np.append(np.ones(m - bound.size), bound) > 0)
+
+
+def floating_bodies(problem: DecomposedProblem) -> list[int]:
+    """Return the numbers of the bodies that supports leave a rigid motion."""
+    layout, d = problem.layout, problem.components
+    node, axis = np.divmod(problem.fixed, d)
+    body = layout.body[layout.holder(node)]
+
+    def is_supported(b: int) -> bool:
+        fixed = body == b
+        if not fixed.any():
+            return False
+        points = layout.position(node[fixed])
+        size = np.ptp(points, axis=0).max() or 1.0
+        motions = _motions((points - points[0]) / size, axis[fixed], d)
+        return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
+
+    return [b for b in range(problem.E.size) if not is_supported(b)]
+
+
+def _motions(points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+    """Return the rigid motions (k, r) at components of points, r = d (d + 1) / 2.
+
+    The modes are those of `problems.fem.elasticity.rigid_motions`, about the origin.
+
+    axis : (k,) axis of each component, 0 … d − 1
+    """
+    columns = [np.where(axis == k, 1.0, 0.0) for k in range(d)]
+    for k, l in combinations(range(d), 2):
+        column = np.where(axis == l, points[:, k], 0.0)
+        columns.append(np.where(axis == k, -points[:, l], column))
+    return np.stack(columns, axis=1)
+
+
+class _Extent(NamedTuple):
+    """Centre and size of a body with N nodes."""
+
+    centre: Vector  #: (dim,)
+    radius: float  #: root mean square distance of the nodes from the centre
+    size: float  #: √N
+    #: (k, k) combinations of the rotations that are orthonormal; None for at most one
+    turn: NDArray[np.float64] | None
+
+    def motions(self, points: Points, axis: Nodes, d: int) -> NDArray[np.float64]:
+        """Return the rigid motions at some points, orthonormal over all nodes."""
+        motions = _motions((points - self.centre) / self.radius, axis, d)
+        if self.turn is not None:
+            motions[:, d:] = motions[:, d:] @ self.turn
+        return motions / self.size
+
+
+def _floating_bodies(local: LocalSubdomains) -> FloatingBodies:
+    """Return the rigid motions of all floating bodies at the local components."""
+    #: one copy of each local node among the local torn nodes
+    copy = np.unique(local.nodes.number, return_index=True)[1]
+    problem, layout, d = local.problem, local.problem.layout, local.problem.components
+    components = d * copy.size
+    motions, remaining, names = [csr_array((components, 0))], list[Any](), list[str]()
+    if not (numbers := floating_bodies(problem)):
+        return FloatingBodies(
+            motions=motions[0], combinations=np.zeros((0, 0)), names=()
+        )
+    points = np.concatenate([*layout.points(local.number)])
+    body = layout.body[local.number][local.nodes.subdomain]
+    fixed, axis = np.divmod(problem.fixed, d)
+    body_fixed = layout.body[layout.holder(fixed)]
+    for b in numbers:
+        extent = _extent(
+            local, points, np.where(body == b, 1 / local.nodes.multiplicity, 0.0)
+        )
+        of_body = body_fixed == b
+        at_fixed = extent.motions(layout.position(fixed[of_body]), axis[of_body], d)
+        remaining.append(
+            null_space(at_fixed) if of_body.any() else np.eye(at_fixed.shape[1])
+        )
+        nodes = np.flatnonzero(body[copy] == b)
+        at = np.repeat(points[copy[nodes]], d, axis=0)
+        modes = extent.motions(at, np.tile(np.arange(d), nodes.size), d)
+        rows = (d * nodes[:, None] + np.arange(d)).ravel()
+        embedding = csr_array(
+            (np.ones(rows.size), (rows, np.arange(rows.size))),
+            shape=(components, rows.size),
+        )
+        motions.append(embedding @ csr_array(modes))
+        names.append(problem.names[b])
+    return FloatingBodies(
+        motions=csr_array(hstack(motions)),
+        combinations=block_diag(*remaining),
+        names=tuple(names),
+    )
+
+
+def _extent(local: LocalSubdomains, points: Points, share: Vector) -> _Extent:
+    """Return the extent of a body that is distributed over ranks; called by all.
+
+    Parameters
+    ----------
+    points : (M, dim) of the local torn nodes
+    share : (M,) weights; those of all copies of a node of the body add up to one
+
+    """
+    total = local.ranks.total
+    count, *moments = total(np.append(share.sum(), share @ points))
+    centre = np.array(moments) / count
+    spread = total(np.array([share @ ((points - centre) ** 2).sum(axis=1)]))[0]
+    radius, d, rotations = (
+        float(np.sqrt(spread / count)),
+        local.problem.components,
+        None,
+    )
+    if d > 2:
+        scaled = np.repeat((points - centre) / radius, d, axis=0)
+        modes = _motions(scaled, np.tile(np.arange(d), len(points)), d)[:, d:]
+        gram = total(modes.T @ (np.repeat(share, d)[:, None] * modes) / count)
+        sizes, axes = np.linalg.eigh(gram)
+        rotations = axes / np.sqrt(sizes)
+    return _Extent(centre, radius, float(np.sqrt(count)), rotations)

@@ -1,0 +1,78 @@
+"""Protocol for a preconditioner and a step rule of one's own in SMALBE.
+
+A subclass of `solvers.smalbe.solver.SMALBE` overrides `preconditioner_for`,
+`step_rule_for`, or both. Each is called once per QP, while that is prepared, and
+returns a function for this QP, or None to keep the built-in choice. Fields of the
+subclass are options like those of SMALBE.
+
+Neither function can make SMALBE return a wrong answer: a preconditioner changes the
+directions of conjugate gradients alone, and a trial point of a step rule is projected
+onto the bounds and accepted only if the cost falls enough (`Step`). The KKT residuals
+are measured by the harness in any case.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from mortarbench.harness import Vector
+
+#: v (n,) → Mv (n,) with a symmetric positive definite M that approximates P⁻¹
+Operator: TypeAlias = Callable[[Vector], Vector]
+
+
+class Step(NamedTuple):
+    """State of MPRGP where the CG step x − αp would leave the box.
+
+    Costs, gradients and lengths are those of the augmented Lagrangian
+    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span those
+    of the equality constraints; without these, of the QP itself.
+    """
+
+    x: Vector  #: (n,) iterate, within the bounds
+    g: Vector  #: (n,) gradient at x
+    p: Vector  #: (n,) direction of conjugate gradients, zero on active bounds; gᵀp > 0
+    lb: Vector  #: (n,) lower bounds
+    ub: Vector  #: (n,) upper bounds
+    alpha_cg: float  #: length that minimises the cost along x − αp; may be inf
+    alpha_f: float  #: largest length for which x − αp stays within the bounds
+    alpha_bar: float  #: length of a step of gradient projection, 1.9/‖H‖ by default
+
+
+#: Step → trial point (n,). It is projected onto the bounds, and accepted if the cost
+#: falls by at least φ̃ᵀφ/(2‖H‖), the decrease that the rate of MPRGP rests on (Dostál
+#: and Schöberl 2005); else the standard expansion is taken instead.
+StepRule: TypeAlias = Callable[[Step], Vector]
+
+
+def checked(M: Operator) -> Operator:
+    """Return M with a test of each product: vᵀMv must be positive.
+
+    Along a direction for which it is not, conjugate gradients would climb.
+
+    Raises
+    ------
+    ValueError
+        By the function that is returned: where Mv has not the shape of v, or vᵀMv is
+        not a positive number.
+
+    """
+
+    def product(v: Vector) -> Vector:
+        Mv = M(v)
+        if np.shape(Mv) != np.shape(v):
+            raise ValueError(
+                f"preconditioner returned shape {np.shape(Mv)}; expected {np.shape(v)}"
+            )
+        energy = float(v @ Mv)
+        if not 0 < energy < np.inf and v.any():
+            raise ValueError(
+                f"preconditioner has vᵀMv = {energy:.3g}; expected a positive number "
+                "(M must be symmetric positive definite)"
+            )
+        return Mv
+
+    return product

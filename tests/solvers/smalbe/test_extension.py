@@ -1,0 +1,216 @@
+"""A preconditioner and a step rule of a subclass: used, safe, refused in one line."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from mortarbench.harness import QP, Status, kkt_residuals, no_rows
+from mortarbench.harness.registry import options_of
+from mortarbench.solvers.smalbe.solver import SMALBE
+
+
+def bounded(P, q, lb, ub=None, rows=None):
+    """½xᵀPx + qᵀx with bounds and, perhaps, rows with the right-hand side 0."""
+    n = len(q)
+    rows = no_rows(n) if rows is None else rows
+    return QP(
+        P=P, q=q, A=rows, b=np.zeros(rows.shape[0]), G=no_rows(n), h=np.zeros(0),
+        lb=lb, ub=np.full(n, np.inf) if ub is None else ub,
+    )  # fmt: skip
+
+
+def spd(n, seed, condition=1e3):
+    rng = np.random.default_rng(seed)
+    V = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    return (V * np.geomspace(1, condition, n)) @ V.T
+
+
+def qp_with_solution(n, seed):
+    """A QP with a row sum x = 0, boxes, and its solution by construction."""
+    rng = np.random.default_rng(seed)
+    P, x = spd(n, seed), rng.standard_normal(n)
+    x -= x.mean()
+    side = rng.integers(-1, 2, n)  # −1 at the lower bound, 1 at the upper one
+    lb = np.where(side < 0, x, x - rng.uniform(0.1, 1, n))
+    ub = np.where(side > 0, x, x + rng.uniform(0.1, 1, n))
+    z = side * rng.uniform(0.1, 1, n)
+    return bounded(P, -P @ x - z - 0.3, lb, ub, np.ones((1, n))), x
+
+
+@dataclass(frozen=True)
+class WithM(SMALBE):
+    """SMALBE with a preconditioner of the QP and v."""
+
+    inverse: object = None
+
+    def preconditioner_for(self, qp):
+        return lambda v: self.inverse(qp, v)
+
+
+@dataclass(frozen=True)
+class WithRule(SMALBE):
+    """SMALBE with a step rule."""
+
+    rule: object = None
+
+    def step_rule_for(self, qp):
+        return self.rule
+
+
+PLAIN = dict(expansion="std", proportioning="cg", recycle=False, eliminate="never")
+
+
+def test_the_inverse_as_preconditioner_needs_one_cg_step():
+    """P⁻¹ takes CG to the unconstrained minimum in one step, for any condition."""
+    n = 40
+    P, q = spd(n, 1, 1e6), np.linspace(1, 2, n)
+    qp = bounded(P, q, np.full(n, -1e9))
+    plain = SMALBE(preconditioner="none", **PLAIN).prepare(qp, 1e-8)()
+    s = WithM(inverse=lambda qp, v: np.linalg.solve(qp.P, v), **PLAIN).prepare(
+        qp, 1e-8
+    )()
+
+    assert s.status is Status.SOLVED
+    assert s.counts["cg"] <= 2  # the second, where rounding left something
+    assert plain.counts["cg"] > 10
+
+
+def test_one_like_a_built_in_one_takes_the_same_steps():
+    qp, _ = qp_with_solution(30, 2)
+    ours = SMALBE(preconditioner="diagonal", **PLAIN).prepare(qp, 1e-8)()
+    own = WithM(inverse=lambda qp, v: 1 / qp.P.diagonal() * v, **PLAIN).prepare(
+        qp, 1e-8
+    )()
+
+    assert own.counts == ours.counts
+    assert (own.x == ours.x).all()
+
+
+def test_a_rule_sees_the_problem_in_its_own_units():
+    """g = Px + q, both lengths by definition, and p points where the cost grows."""
+    n, seen = 12, []
+    P, q = 1e7 * spd(n, 3), np.linspace(-1e8, 2e8, n)
+    qp = bounded(P, q, np.full(n, -1e-2), np.full(n, 2e-2))
+
+    def rule(step):
+        seen.append(step)
+        return step.x - step.alpha_f * step.p
+
+    WithRule(rule=rule, proportioning="cg").prepare(qp, 1e-6)()
+
+    assert seen
+    for x, g, p, lb, ub, cg, feasible, bar in seen:
+        assert g == pytest.approx(P @ x + q, rel=1e-6, abs=1e-6 * abs(q).max())
+        assert cg == pytest.approx(g @ p / (p @ P @ p), rel=1e-6)
+        room = np.where(p > 0, x - lb, ub - x)[p != 0] / abs(p[p != 0])
+        assert feasible == pytest.approx(room.min(), rel=1e-9)
+        assert feasible < cg
+        assert g @ p > 0
+        assert 1 / np.linalg.norm(P, 2) < bar <= 2 / np.linalg.norm(P, 2)
+        assert (lb == qp.lb).all()
+        assert (ub == qp.ub).all()
+
+
+def test_a_trial_point_outside_is_projected():
+    """For P = I the projected unconstrained minimum is the solution: one step."""
+    n = 20
+    q = np.linspace(-1, 1, n)
+    qp = bounded(np.eye(n), q, np.full(n, -0.3), np.full(n, 0.4))
+    s = WithRule(rule=lambda step: step.x - step.g, proportioning="cg").prepare(
+        qp, 1e-10
+    )()
+
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx(np.clip(-q, -0.3, 0.4), abs=1e-12)
+    assert s.counts["expansion"] == 1
+    assert "fallback" not in s.counts
+
+
+RULES = {
+    "stays": lambda step: step.x,
+    "climbs": lambda step: step.x + step.alpha_bar * step.g,
+    "far": lambda step: step.x - 1e12 * step.g,
+    "corner": lambda step: np.where(np.isfinite(step.lb), step.lb, step.ub),
+    "creeps": lambda step: step.x - 1e-9 * step.alpha_f * step.p,
+    "random": lambda step: np.random.default_rng(0).normal(size=step.x.size),
+    "projected cg": lambda step: step.x - step.alpha_cg * step.p,
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_no_rule_spoils_an_answer_or_lets_the_cost_rise(name):
+    """Bad rules cost products; the planted solutions are found, going downhill."""
+    for seed in range(20):
+        qp, x = qp_with_solution(25, seed)
+        solver = WithRule(rule=RULES[name], preconditioner="none", history=True)
+        s = solver.prepare(qp, 1e-8)()
+
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(qp, s).worst <= 5e-8
+        assert np.linalg.norm(s.x - x) <= 1e-5 * np.linalg.norm(x)
+        cost, outer = s.history["cost"], s.history["outer"]
+        fall = np.diff(cost)[np.diff(outer) == 0]
+        assert (fall <= 1e-9 * abs(cost).max()).all()
+
+
+def test_rules_that_only_waste_a_product_are_replaced_by_the_standard_expansion():
+    qp, _ = qp_with_solution(25, 4)
+    std = SMALBE(preconditioner="none", **PLAIN).prepare(qp, 1e-8)()
+    options = {**PLAIN, "preconditioner": "none"}
+    own = WithRule(rule=RULES["stays"], **options).prepare(qp, 1e-8)()
+
+    assert own.counts["fallback"] == std.counts["expansion"]
+    assert own.counts["P_products"] == std.counts["P_products"] + own.counts["fallback"]
+    assert (own.x == std.x).all()
+
+
+@pytest.mark.parametrize(
+    ("M", "message"),
+    [
+        (lambda qp, v: -v, "vᵀMv = -.*; expected a positive number"),
+        (lambda qp, v: v * np.nan, "vᵀMv = nan; expected a positive number"),
+        (lambda qp, v: v[:-1], r"returned shape \(24,\); expected \(25,\)"),
+    ],
+)
+def test_a_preconditioner_that_cannot_be_one_is_refused(M, message):
+    qp, _ = qp_with_solution(25, 5)
+    with pytest.raises(ValueError, match=message):
+        WithM(inverse=M).prepare(qp, 1e-8)()
+
+
+@pytest.mark.parametrize(
+    ("rule", "message"),
+    [
+        (lambda step: step.x * np.inf, "a point that is not finite"),
+        (lambda step: step.x[1:], "trial point .* has 24 components; expected 25"),
+    ],
+)
+def test_a_rule_that_returns_no_point_is_refused(rule, message):
+    qp, _ = qp_with_solution(25, 5)
+    with pytest.raises(ValueError, match=message):
+        WithRule(rule=rule).prepare(qp, 1e-8)()
+
+
+def test_in_a_sequence_the_functions_meet_every_variable():
+    """Without them, free variables are eliminated from the second QP on."""
+    n, sizes = 30, []
+    lb = np.where(np.arange(n) < 10, -np.inf, 0.0)
+    qps = [bounded(spd(n, 6), np.linspace(-1, k, n), lb) for k in (1, 2, 3)]
+
+    def M(qp, v):
+        sizes.append(v.size)
+        return v / qp.P.diagonal()
+
+    prepare = WithM(inverse=M).chain(1e-8)
+    answers = [prepare(qp)() for qp in qps]
+
+    assert set(sizes) == {n}
+    assert all(
+        kkt_residuals(qp, s).worst <= 5e-8 for qp, s in zip(qps, answers, strict=True)
+    )
+
+
+def test_fields_of_a_subclass_are_options():
+    assert options_of(WithM())["inverse"] is None
+    assert options_of(WithM())["expansion"] == "model"
