@@ -52,9 +52,8 @@ bench: setup  ## time our own kernels (pytest-benchmark)
 	$(BIN)/pytest benchmarks --benchmark-warmup=on \
 	    --benchmark-sort=name --benchmark-columns=min,median,iqr,rounds
 
-docs: setup  ## write docs/solvers.md and mortarbench/catalogue.json anew from the adapters
+docs: setup  ## write docs/solvers*.md and mortarbench/catalogue.json from the adapters
 	@$(BIN)/python tools/catalogue.py
-	@$(BIN)/mortarbench list solvers --markdown > docs/solvers.md
 
 weaknesses: setup  ## measure docs/weaknesses.md anew (minutes)
 	@$(BIN)/mortarbench test-solver '*' $(BACKENDS) --markdown > docs/weaknesses.md

@@ -1,7 +1,7 @@
-"""Races: several ways to do one thing, timed in turn in one process.
+"""Fixtures for races: functions timed alternately in one process.
 
-Interleaving makes a drift of the machine hit all alike; what is printed at the end are
-medians, their spread, and ratios to the first.
+Through alternation, a drift of the machine affects all of them equally. At the end
+medians, quartiles and ratios to the first function are printed.
 """
 
 from statistics import median, quantiles
@@ -20,17 +20,17 @@ def pytest_configure(config):
 
 @pytest.fixture
 def note(request):
-    """``note(text)``: a line for the summary."""
+    """Return ``note(text)``, which adds a line to the summary."""
     return request.config.stash[NOTES].append
 
 
 @pytest.fixture
 def race(request):
-    """``race(first=f, second=g, rounds=9)``: call each in turn, return the medians."""
+    """Return ``race(first=f, second=g, rounds=9)``, which returns medians, s."""
 
     def run(*, rounds=9, **contestants):
         for function in contestants.values():
-            function()  # warm: compilation and caches are not what is compared
+            function()  # warm-up: imports and caches are not compared
         seconds = {name: [] for name in contestants}
         for _ in range(rounds):
             for name, function in contestants.items():

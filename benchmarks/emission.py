@@ -1,12 +1,12 @@
-"""What ranks hold and take when each emits its own share of a QP, and one process.
+"""Memory and time of a QP assembled on MPI ranks, compared with one process.
 
     mpiexec -n 2 .venv/bin/python -m mpi4py benchmarks/emission.py [CASE]
     .venv/bin/python benchmarks/emission.py whole [CASE]
 
-Prints, after each stage, the peak of the resident memory of a rank beyond its imports,
-the largest and the mean of all ranks, and the seconds of the slowest. `whole` builds
-the case in one process, with everything that certifies and draws an answer. Nothing is
-asserted: machines differ.
+Each rank assembles its share. Printed after each stage are the peaks of resident memory
+without imports, largest and mean of all ranks, and the seconds of the slowest rank.
+`whole` builds the case in one process, including the data for certificates and
+pictures. Nothing is asserted: machines differ.
 """
 
 import sys
@@ -23,11 +23,9 @@ TOL = 1e-6
 def whole(name: str = CASE) -> None:
     """Build the case in this process."""
     import mortarbench as mb
-    from mortarbench.problems.models import (
-        beam_ring,  # its imports are none of the case's memory
-    )
+    from mortarbench.problems.models import beam_ring
 
-    del beam_ring
+    del beam_ring  # imported before the memory is measured
     before, start = memory_mib("VmHWM"), time.perf_counter()
     qp = mb.build(name).qp
     seconds, peak = time.perf_counter() - start, memory_mib("VmHWM") - before
@@ -35,8 +33,8 @@ def whole(name: str = CASE) -> None:
     print(f"  build    {seconds:7.2f} s   peak {peak:7.1f} MiB")
 
 
-def emitted(name: str = CASE) -> None:
-    """Emit, prepare and solve on all ranks."""
+def distributed(name: str = CASE) -> None:
+    """Assemble, prepare and solve on all ranks."""
     from mpi4py import MPI
 
     from mortarbench.harness.distributed.vectors import Ranks
@@ -49,9 +47,9 @@ def emitted(name: str = CASE) -> None:
     ranks, case = Ranks(MPI.COMM_WORLD), parse(name, PROBLEMS)
     before = memory_mib("VmHWM")
 
-    def told(stage, start):
-        mine = time.perf_counter() - start, memory_mib("VmHWM") - before
-        times, peaks = zip(*ranks.comm.allgather(mine), strict=True)
+    def print_stage(stage, start):
+        local = time.perf_counter() - start, memory_mib("VmHWM") - before
+        times, peaks = zip(*ranks.comm.allgather(local), strict=True)
         if ranks.rank == 0:
             mean = sum(peaks) / len(peaks)
             print(
@@ -64,20 +62,20 @@ def emitted(name: str = CASE) -> None:
     emit = case.family.emission(case.form, case.params)
     if emit is None:
         raise SystemExit(f"{name}: ranks cannot emit it")
-    made = emit(ranks, reference_over_ranks)
+    share_source = emit(ranks, reference_over_ranks)
     if ranks.rank == 0:
-        print(f"{name}: {made.variables} multipliers, {ranks.size} ranks")
-    told("emit", start)
+        print(f"{name}: {share_source.variables} multipliers, {ranks.size} ranks")
+    print_stage("emit", start)
     start = time.perf_counter()
-    run = SMALBE().prepare(made.share().qp, TOL)
-    told("prepare", start)
+    run = SMALBE().prepare(share_source.share().qp, TOL)
+    print_stage("prepare", start)
     start = time.perf_counter()
     run()
-    told("solve", start)
+    print_stage("solve", start)
 
 
 if __name__ == "__main__":
     if sys.argv[1:2] == ["whole"]:
         whole(*sys.argv[2:])
     else:
-        emitted(*sys.argv[1:])
+        distributed(*sys.argv[1:])

@@ -2,15 +2,17 @@
 
     python benchmarks/feti_scaling.py [--cells H/h] [--ways feti,whole] [Nr ...]
 
-The beam on its half ring in one load step, Nh = Nr/2. `feti` tears it into subdomains,
-`whole` is the dual of the whole; both go from the mesh to an answer with a certified
-error below 1e-6, for which their tolerances differ. Each runs in a process of its own,
-so that peaks are its own; `cpu` is what a busy machine can compare.
+The beam on its half ring in one load step, Nh = Nr/2. `feti` decomposes it into
+subdomains, `whole` is the dual of undivided bodies; both go from the mesh to an answer
+with a certified error below 1e-6, which needs different tolerances. Each runs in a
+separate process, so that its peak memory is measured. `cpu` is processor time, for
+comparisons on a busy machine.
 
-Of `feti`, what theory speaks of is measured apart from the search for the active set:
+For `feti` the quantities of the theory are measured without the search for the active
+set:
 
     kappa      condition number of PFP on supports and gluing, no contact, by Lanczos
-    face       CG steps with the active rows known as equations, to a reduction of 1e-6
+    face       CG steps with the active rows as equations, to a reduction of 1e-6
     face none  the same without a preconditioner
 
 Prints a table, and the exponents of c·n^p with 95 % intervals.
@@ -45,15 +47,15 @@ from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.smalbe.solver import SMALBE
 
-TOL = {"feti": 1e-7, "whole": 1e-8}  #: with which errors are certified to 1e-6
+TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for a certified error below 1e-6
 REDUCTION = 1e-6
 STAGES = ("mesh", "dual", "prepare", "solve", "recover", "certify")
 
 
 def one(way, Nr, cells):
-    """Measure one size in this process; compiled loops are loaded before."""
-    model(1, 1, 2, "strain")
-    begun, marks = process_time(), [perf_counter()]
+    """Measure one size in this process."""
+    model(1, 1, 2, "strain")  # loads compiled modules, which is not measured
+    cpu_start, marks = process_time(), [perf_counter()]
 
     def lap():
         marks.append(perf_counter())
@@ -82,33 +84,34 @@ def one(way, Nr, cells):
     back = dual.recover(s)
     lap()
     mechanics = Mechanics(
-        primal=primal, back=dual.recover, factorise=lambda: factorise_clamped(bodies),
+        primal=primal, to_primal=dual.recover,
+        factorise=lambda: factorise_clamped(bodies),
         certify_by_subdomains=certify_by_subdomains,
         mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
     )  # fmt: skip
     bound = certify(mechanics, back).bound
     lap()
-    cpu = process_time() - begun
+    cpu = process_time() - cpu_start
     status = Path("/proc/self/status").read_text().splitlines()
     peak_kib = next(line.split()[1] for line in status if line.startswith("VmHWM"))
-    found = {
+    results = {
         "way": way, "n": bodies.mesh.dofs, "m": dual.qp.q.size, "status": s.status,
         "bound": bound, **dict(zip(STAGES, np.diff(marks).tolist(), strict=True)),
         "total": marks[-1] - marks[0], "cpu": cpu, "peak_mib": int(peak_kib) / 1024,
         **s.counts,
     }  # fmt: skip
     if parts is None:
-        return found
+        return results
     empty = Contact(no_rows(bodies.mesh.dofs), np.zeros(0), np.zeros(0))
-    bare = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
-    return found | known_face(pieces, bare, dual.qp, s)
+    unbounded = LocalDual(on_one_process(replace(parts, contact=empty))).share().qp
+    return results | final_face(pieces, unbounded, dual.qp, s)
 
 
-def known_face(pieces, bare, qp, s):
-    """Measure κ without contact, and CG steps with the final active rows known."""
+def final_face(pieces, unbounded, qp, s):
+    """Return κ without contact, and CG steps on the face of the solution."""
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    (alone,) = spectra_over_ranks(bare.P, bare.A, tol=1e-3)
+    (spectrum,) = spectra_over_ranks(unbounded.P, unbounded.A, tol=1e-3)
     m = int(active.sum())
     F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
     face = replace(
@@ -121,7 +124,7 @@ def known_face(pieces, bare, qp, s):
         .counts["steps_to_tol"]
         for name, kind in (("face", "dirichlet"), ("face none", "none"))
     }
-    return {"kappa": alone.condition, **steps}
+    return {"kappa": spectrum.condition, **steps}
 
 
 def exponent(n, values):
@@ -136,30 +139,30 @@ def main():
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--ways", default="feti,whole")
     parser.add_argument("--one", action="store_true", help="in this process, as JSON")
-    given = parser.parse_args()
-    if given.one:
-        print(json.dumps(one(given.ways, given.Nr[0], given.cells)))
+    args = parser.parse_args()
+    if args.one:
+        print(json.dumps(one(args.ways, args.Nr[0], args.cells)))
         return
     rows = []
-    for Nr in given.Nr:
-        for way in given.ways.split(","):
-            options = ["--one", "--ways", way, "--cells", str(given.cells), str(Nr)]
+    for Nr in args.Nr:
+        for way in args.ways.split(","):
+            options = ["--one", "--ways", way, "--cells", str(args.cells), str(Nr)]
             child = [sys.executable, __file__, *options]
             rows.append(json.loads(subprocess.check_output(child, text=True)))
             print("  ".join(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}"
                             for k, v in rows[-1].items()), flush=True)  # fmt: skip
-    for way in given.ways.split(","):
-        own = [row for row in rows if row["way"] == way]
-        for what in own[0]:
-            values = [row.get(what) for row in own]
+    for way in args.ways.split(","):
+        way_rows = [row for row in rows if row["way"] == way]
+        for name in way_rows[0]:
+            values = [row.get(name) for row in way_rows]
             if (
-                what == "n"
-                or len(own) < 3
+                name == "n"
+                or len(way_rows) < 3
                 or not all(isinstance(v, int | float) and v > 0 for v in values)
             ):
                 continue
-            p, half = exponent([row["n"] for row in own], values)
-            print(f"{way} {what:>22} ~ n^{p:.3f} ± {half:.3f}")
+            p, half = exponent([row["n"] for row in way_rows], values)
+            print(f"{way} {name:>22} ~ n^{p:.3f} ± {half:.3f}")
 
 
 if __name__ == "__main__":

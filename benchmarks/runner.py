@@ -1,12 +1,12 @@
-"""What the runner itself costs, and what its clock can tell apart.
+"""Overhead of the runner, and the ratios of times that its clock can resolve.
 
     .venv/bin/python benchmarks/runner.py overhead [N]   ms per tiny measurement
     .venv/bin/python benchmarks/runner.py growth [N]     memory, descriptors over N
     .venv/bin/python benchmarks/runner.py null [TRIALS]  A/A: intervals of a ratio of 1
     .venv/bin/python benchmarks/runner.py neighbours [N] times beside careless solvers
 
-Overhead is the time from one record to the next, less what the worker spent in the
-solver and what the disk took to sync.
+Overhead is the time from one record to the next, minus the time of the worker in the
+solver and the time of fsync.
 """
 
 import os
@@ -23,7 +23,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.pairs import paired_ratio
 from mortarbench.harness.running.run import run
-from mortarbench.harness.suite.suite import NULL, Suite
+from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
 from mortarbench.harness.verify.measure import SAMPLE_SECONDS, memory_mib
 
 PLUGIN = Path(__file__).parents[1] / "tests/support/adversaries.py"
@@ -31,18 +31,18 @@ ACCIDENTS = PLUGIN.with_name("accidents.py")
 
 
 class Watch:
-    """A progress that notes when records come, and how large this process is."""
+    """Progress that records the times of records and the size of this process."""
 
     def __init__(self):
         self.records, self.at, self.synced, self.sizes = [], [], [], []
-        self.solving = []  # s: one timing more than `inner` where there were several
-        self._fsync, self._waited = os.fsync, 0.0
-        os.fsync = self._timed
+        self.solving = []  # s; with several inner loops one more solve is made
+        self._fsync, self._fsync_seconds = os.fsync, 0.0
+        os.fsync = self._timed_fsync
 
-    def _timed(self, fd):
+    def _timed_fsync(self, fd):
         start = perf_counter()
         self._fsync(fd)
-        self._waited += perf_counter() - start
+        self._fsync_seconds += perf_counter() - start
 
     def start(self, total):
         pass
@@ -59,24 +59,25 @@ class Watch:
             record.total_seconds * (record.inner_loops + (record.inner_loops > 1))
         )
         self.at.append(perf_counter())
-        self.synced.append(self._waited)
+        self.synced.append(self._fsync_seconds)
         self.sizes.append((memory_mib("VmRSS"), len(os.listdir("/proc/self/fd"))))
 
     def overheads(self):
-        """Seconds between records that were neither the solver's nor the disk's."""
-        found = []
+        """Return seconds between records without those of the solver and of fsync."""
+        seconds = []
         for i in range(1, len(self.at)):
             gap = self.at[i] - self.at[i - 1]
-            found.append(gap - self.solving[i] - (self.synced[i] - self.synced[i - 1]))
-        return found
+            fsync = self.synced[i] - self.synced[i - 1]
+            seconds.append(gap - self.solving[i] - fsync)
+        return seconds
 
 
 def measure(out, *solvers, repeats, plugin=PLUGIN):
-    """Run solvers of a plug-in on its tiny QP; returns who watched."""
+    """Run solvers of a plug-in on its tiny QP; return the `Watch`."""
     start = [sys.executable, "-P", str(plugin)]
     plugin = load_plugin(plugin)
     specs = [SolverSpec(name=s, label=s) for s in solvers]
-    specs += [replace(specs[0], label=f"{solvers[0]}{NULL}", role="null")]
+    specs += [replace(specs[0], label=f"{solvers[0]}{NULL_SUFFIX}", role="null")]
     tiny = plugin.problems["tiny"]
     suite = Suite(
         name="runner", tolerances=(1e-6,), repeats=repeats, time_limit=60.0,
@@ -107,7 +108,7 @@ def overhead(n=500):
 
 
 def growth(n=10_000):
-    """Print memory and descriptors of the run early on and at its end."""
+    """Print memory and descriptors of the run after a tenth, a half and at the end."""
     with tempfile.TemporaryDirectory() as out:
         watch = measure(Path(out), "honest", repeats=n // 2)
         lines = len(read_journal(Path(out)))
@@ -117,7 +118,7 @@ def growth(n=10_000):
 
 
 def null(trials=40, blocks=10):
-    """Print how often the 95 % interval of A/A contains 1, and how wide it is."""
+    """Print how often the 95 % interval of A/A contains 1, and its median width."""
     hits, widths = 0, []
     for _ in range(trials):
         with tempfile.TemporaryDirectory() as out:
@@ -135,7 +136,7 @@ def null(trials=40, blocks=10):
 
 
 def beside(n=20):
-    """Print a solver's times after honest and after careless neighbours, in turns."""
+    """Print times of a solver beside honest and careless neighbours, alternately."""
     calm, careless = ("honest",), ("daemon", "executeddaemon", "burns", "pools")
     os.environ["WATCHED"] = "benchmark"
     times = {calm: [], careless: []}
@@ -145,10 +146,10 @@ def beside(n=20):
                 watch = measure(
                     Path(out), "computes", *neighbours, repeats=5, plugin=ACCIDENTS
                 )
-            found = [t for solver, _, t in watch.records if solver == "computes"]
-            times[neighbours].append(median(found))
-    for neighbours, found in times.items():
-        low, middle, high = quantiles(found, n=4)
+            seconds = [t for solver, _, t in watch.records if solver == "computes"]
+            times[neighbours].append(median(seconds))
+    for neighbours, medians in times.items():
+        low, middle, high = quantiles(medians, n=4)
         print(
             f"beside {', '.join(neighbours)}: {1e3 * middle:.3f} ms "
             f"[{1e3 * low:.3f}, {1e3 * high:.3f}]"
@@ -159,8 +160,8 @@ def beside(n=20):
 
 
 if __name__ == "__main__":
-    what, *numbers = sys.argv[1:] or ["overhead"]
-    what_it_does = {
+    name, *numbers = sys.argv[1:] or ["overhead"]
+    functions = {
         "overhead": overhead, "growth": growth, "null": null, "neighbours": beside,
     }  # fmt: skip
-    what_it_does[what](*map(int, numbers))
+    functions[name](*map(int, numbers))

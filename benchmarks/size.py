@@ -2,8 +2,9 @@
 
     make size        or   .venv/bin/python benchmarks/size.py [FORM] [Nr ...]
 
-Nh = Nr/2. Each size runs in a process of its own, so that peaks are its own; prints a
-table and the exponents of c·n^p, least squares on logarithms with 95 % intervals.
+Nh = Nr/2. Each size runs in a separate process, so that its peak memory is measured.
+Prints a table and the exponents of c·n^p, by least squares on logarithms with 95 %
+intervals.
 """
 
 import json
@@ -29,8 +30,8 @@ WAYS = {
 
 
 def one(form, Nr):
-    """Measure one size in this process; compiled loops are loaded before."""
-    model(1, 1, 2, "strain")
+    """Measure one size in this process."""
+    model(1, 1, 2, "strain")  # loads compiled modules, which is not measured
     factorise, transform = WAYS[form]
     marks = [perf_counter()]
 

@@ -1,21 +1,21 @@
-"""What a solve of SMALBE costs beside its products: tables of docs/performance.md.
+"""Costs of SMALBE besides its products: tables of docs/performance-smalbe.md.
 
     python -m benchmarks.smalbe_costs dense|sparse|incomplete|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
-* dense: preparing and solving duals, in units of their products with F. The bound of a
-  solve is 1.5 times its products, by `smalbe` or by BLAS' `dsymv`, whichever is
-  faster, and 100 µs.
-* sparse: a product with all work shared out, in units of one product and five passes
-  w += v over vectors.
+* dense: preparing and solving duals, in units of products with F. A solve is compared
+  with a bound: 1.5 times the time of its products (by `smalbe` or `dsymv` of BLAS,
+  whichever is faster) plus 100 µs.
+* sparse: time of a solve per product, in units of one product and five passes w += v
+  over vectors.
 * incomplete: sparse problems with and without incomplete factors.
-* kept: the same solves with and without keeping directions of CG.
-* race: solvers on a case, preparing and solving; answers are verified.
+* kept: the same solves with and without recycling of CG directions.
+* race: preparing and solving a case by several solvers; answers are verified.
 
-All that is compared runs in turn in one process, in seconds of its own processor time
-(those of other processes are not in it; set OMP_NUM_THREADS=1, or threads add up). Each
-is given by the median of the runs, and by the median of their fastest tenth, which
-others on the same processor change less.
+Everything compared runs alternately in one process and is measured in processor time of
+that process (set OMP_NUM_THREADS=1, as the times of threads add up). Printed are the
+median of the runs and the median of their fastest tenth, on which other programs have
+less influence.
 """
 
 from __future__ import annotations
@@ -60,13 +60,13 @@ INCOMPLETE = {
     "torsion": [{"n": 30}, {"n": 100}, {"n": 200}],
 }  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
-REPEATS = 20  #: of a product, which is too short to be timed alone
+REPEATS = 20  #: repeats of a product, which is too short to be timed alone
 
 Times = dict[str, tuple[float, float]]  #: median, and median of the fastest tenth
 
 
 def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
-    """Time calls, which say the seconds that they took."""
+    """Return the times of calls that run alternately and return their seconds."""
     spent: dict[str, list[float]] = {name: [] for name in calls}
     for _ in range(rounds):
         for name, call in calls.items():
@@ -81,7 +81,7 @@ def in_turn(rounds: int, **calls: Callable[[], float]) -> Times:
 
 
 def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
-    """Make a call that says the seconds of another, on average over `repeats`."""
+    """Return a call that runs `call` and returns its mean seconds over `repeats`."""
 
     def run() -> float:
         start = process_time()
@@ -93,14 +93,14 @@ def timed(call: Callable[[], object], repeats: int = 1) -> Callable[[], float]:
 
 
 def beam_ring(form: str, Nr: int, Nh: int, step: int) -> QP:
-    """Build a dual of the paper's beam."""
+    """Return a QP of the paper's beam on its ring."""
     family = PROBLEMS["beam-ring"]
     params = family.complete({"Nr": Nr, "Nh": Nh, "step": step})
     return family.build(form, params, reference_solution).qp
 
 
 def dense(tol: float = 1e-6) -> None:
-    """Prepare and solve duals."""
+    """Print times of preparing and solving duals."""
     print("form m | products of the solve, of preparing | a product | prepare | solve")
     for form, sizes in DUALS.items():
         for size in sizes:
@@ -113,7 +113,7 @@ def _dense(form: str, qp: QP, tol: float) -> None:
     ready: list[Callable[[], Solution]] = []
     before = _products_of_preparing(qp, tol)
     spent = solver.prepare(qp, tol)().counts["P_products"] - before
-    told = in_turn(
+    times = in_turn(
         150 if n > 600 else 600,
         ours=timed(lambda: P(v), REPEATS),
         dsymv=timed(lambda: dsymv(1.0, blas, v, lower=1), REPEATS),
@@ -122,8 +122,8 @@ def _dense(form: str, qp: QP, tol: float) -> None:
     )
     cells = []
     for k in (0, 1):
-        product = min(told["ours"][k], told["dsymv"][k])
-        prepare, solve = told["prepare"][k], told["solve"][k]
+        product = min(times["ours"][k], times["dsymv"][k])
+        prepare, solve = times["prepare"][k], times["solve"][k]
         cells.append(
             f"{1e6 * product:.1f} µs, {1e6 * prepare:.0f} µs, {1e6 * solve:.0f} µs, "
             f"solve/bound {solve / (1.5 * spent * product + 100e-6):.2f}, "
@@ -139,12 +139,14 @@ def _products_of_preparing(qp: QP, tol: float) -> int:
 
 
 def sparse(tol: float = 1e-6) -> None:
-    """Solve large sparse problems; a product with its step in units of a bare one."""
+    """Print times of large sparse problems per product, in units of a bare product."""
     solver = SOLVERS["smalbe"]
     for name, params in LARGE.items():
         family = PROBLEMS[name]
-        form, given = family.forms[0], family.complete(params)
-        _sparse(name, family.build(form, given, reference_solution).qp, solver, tol)
+        case = family.build(
+            family.forms[0], family.complete(params), reference_solution
+        )
+        _sparse(name, case.qp, solver, tol)
 
 
 def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
@@ -156,7 +158,7 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
             np.add(v, w, out=w)
 
     spent = solver.prepare(qp, tol)().counts["P_products"]
-    told = in_turn(
+    times = in_turn(
         15 if n > 20_000 else 60,
         cold_product=timed(lambda: P(v)),
         cold_passes=timed(passes),
@@ -166,7 +168,7 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
         whole=timed(lambda: solver.prepare(qp, tol)()),
     )
     for k, which in enumerate(("medians", "fastest tenth")):
-        us = {name: 1e6 * seconds[k] for name, seconds in told.items()}
+        us = {name: 1e6 * seconds[k] for name, seconds in times.items()}
         step = us["whole"] / spent
         unit = us["product"] + us["passes"]
         cold = us["cold_product"] + us["cold_passes"]
@@ -207,13 +209,13 @@ def _incomplete(name: str, qp: QP, tol: float) -> None:
         "without": replace(SOLVERS["smalbe"], preconditioner="model"),
     }
     counts = {name: s.prepare(qp, tol)().counts for name, s in solvers.items()}
-    told = in_turn(
+    times = in_turn(
         5 if qp.q.size > 20_000 else 30,
         **{
             name: timed(lambda s=s: s.prepare(qp, tol)()) for name, s in solvers.items()
         },
     )
-    (ms, _), (before, _) = told["factors"], told["without"]
+    (ms, _), (before, _) = times["factors"], times["without"]
     with_factors, without = counts["factors"], counts["without"]
     print(
         f"{name} | {with_factors['P_products']}, {with_factors['factorisations']}, "
@@ -224,7 +226,7 @@ def _incomplete(name: str, qp: QP, tol: float) -> None:
 
 
 def kept() -> None:
-    """Solve duals with and without keeping directions."""
+    """Print times of duals with and without recycling of CG directions."""
     for form, *size in KEPT:
         for tol in (1e-6, 1e-8):
             _kept(form, beam_ring(form, *size), tol)
@@ -238,14 +240,14 @@ def _kept(form: str, qp: QP, tol: float) -> None:
     products = {
         name: s.prepare(qp, tol)().counts["P_products"] for name, s in solvers.items()
     }
-    told = in_turn(
+    times = in_turn(
         60 if qp.q.size > 600 else 400,
         **{
             name: lambda s=s: timed(s.prepare(qp, tol))() for name, s in solvers.items()
         },
     )
     for k, which in enumerate(("medians", "fastest tenth")):
-        ms = {name: 1e3 * seconds[k] for name, seconds in told.items()}
+        ms = {name: 1e3 * seconds[k] for name, seconds in times.items()}
         print(
             f"{form} m={qp.q.size} {tol:.0e} {which}: kept {ms['kept']:.3f} ms "
             f"({products['kept']}), forgotten {ms['forgotten']:.3f} ms "
@@ -255,7 +257,7 @@ def _kept(form: str, qp: QP, tol: float) -> None:
 
 
 def positive(text: str) -> float:
-    """Read a positive number."""
+    """Return a positive number from its text."""
     try:
         value = float(text)
     except ValueError:
@@ -266,12 +268,12 @@ def positive(text: str) -> float:
 
 
 def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
-    """Solve a case by several solvers in turn, to each tolerance.
+    """Print times of several solvers on a case, at each tolerance.
 
     Raises
     ------
     InputError
-        When a name, the rounds or a tolerance is none.
+        If there is no such solver or case, or `rounds` or a tolerance is not positive.
 
     """
     names = solvers.split(",")
@@ -282,14 +284,14 @@ def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
         raise InputError(f"{rounds} rounds; expected at least one")
     qp = mb.build(case).qp
     for tol in map(positive, tolerances.split(",")):
-        told = in_turn(
+        times = in_turn(
             rounds,
             **{
                 name: timed(lambda name=name, tol=tol: SOLVERS[name].prepare(qp, tol)())
                 for name in names
             },
         )
-        for name, (typical, fast) in told.items():
+        for name, (typical, fast) in times.items():
             s = SOLVERS[name].prepare(qp, tol)()
             verified = kkt_residuals(qp, s).worst <= VERIFIED_FACTOR * tol
             print(
@@ -301,23 +303,23 @@ def race(case: str, solvers: str, rounds: int, tolerances: str) -> None:
 
 
 def main() -> None:
-    """Read the command line, and do what it says."""
+    """Parse the command line and print the table."""
     parser = ArgumentParser(description="What a solve of SMALBE costs.")
     tables = parser.add_subparsers(dest="table", required=True)
     for name in ("dense", "sparse", "incomplete", "kept"):
         tables.add_parser(name)
-    of_race = tables.add_parser("race", help="solve a case by several solvers in turn")
-    of_race.add_argument("case")
-    of_race.add_argument("solvers", help="names, separated by commas")
-    of_race.add_argument("rounds", type=int)
-    of_race.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
-    given = vars(parser.parse_args())
-    chosen = {
+    race_parser = tables.add_parser("race", help="compare several solvers on a case")
+    race_parser.add_argument("case")
+    race_parser.add_argument("solvers", help="names, separated by commas")
+    race_parser.add_argument("rounds", type=int)
+    race_parser.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
+    arguments = vars(parser.parse_args())
+    functions = {
         "dense": dense, "sparse": sparse, "incomplete": incomplete, "kept": kept,
         "race": race,
     }  # fmt: skip
     try:
-        chosen[given.pop("table")](**given)
+        functions[arguments.pop("table")](**arguments)
     except InputError as e:
         parser.error(str(e))
 

@@ -1,10 +1,10 @@
-"""Time and peak memory of reading a journal and of its report, by their sizes.
+"""Time and peak memory of reading a journal and writing its report, against size.
 
     make synthetic   or   .venv/bin/python benchmarks/synthetic_results.py [CASES ...]
 
-20 solvers, 5 repeats, all formats. Each size runs in a process of its own, so that
-peaks are its own. With chromium and playwright (make browser) also the page's first
-paint and the time until it is loaded and all of its plots are drawn.
+20 solvers, 5 repeats, all formats. Each size runs in a separate process, so that its
+peak memory is measured. With chromium and playwright (make browser) the first paint of
+the page and the time until all of its plots are drawn are measured as well.
 """
 
 import os
@@ -26,7 +26,7 @@ TIMES = """() => new Promise((done) =>
 
 
 def read(folder):
-    """Read the journal of a folder in this process."""
+    """Measure the reading of the journal of a folder, in this process."""
     from mortarbench.harness.results.journal import read_journal
 
     start = process_time()
@@ -36,7 +36,7 @@ def read(folder):
 
 
 def measure(folder):
-    """Write the report of a folder in this process."""
+    """Measure the writing of the report on a folder, in this process."""
     from mortarbench.reports import write_report
 
     start = process_time()
@@ -74,18 +74,12 @@ def main(cases):
     )
     for count in cases:
         with TemporaryDirectory() as folder:
-            make = [
-                maker,
-                folder,
-                SOLVERS,
-                count,
-                REPEATS,
-            ]
+            make = [maker, folder, SOLVERS, count, REPEATS]
             subprocess.run([sys.executable, *map(str, make)], check=True)
             for part in ("--read", "--measure"):
-                again = [sys.executable, __file__, part, folder]
-                done = subprocess.run(again, check=True, capture_output=True, text=True)
-                print(done.stdout, end="", flush=True)
+                command = [sys.executable, __file__, part, folder]
+                output = subprocess.check_output(command, text=True)
+                print(output, end="", flush=True)
             times = paint(Path(folder))
             print("" if times is None else "".join(f"{t / 1e3:12.2f}" for t in times))
 

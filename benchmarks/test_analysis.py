@@ -1,4 +1,4 @@
-"""The whole analysis of the paper's Table 1: mesh to recovered u, ten load steps.
+"""Whole analysis of the paper's Table 1: mesh to recovered u, ten load steps.
 
 The paper took 29.99 s (assembly 0.087, Cholesky 0.078, mortar 2.064, dualisation
 26.686, QPs 1.074) in MATLAB on a Ryzen 5 3600. Here each step's QP is solved by SMALBE
@@ -66,7 +66,7 @@ def analysis(form, Nr=30, Nh=15, steps=10):
 
 
 def plain(bodies):
-    """Return what factorises K_ff once, ordering included."""
+    """Return a function that factorises K_ff, ordering included."""
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)
     K_ff = csc_matrix(bodies.K[free][:, free])
     return lambda: cholesky(K_ff, mode="simplicial", ordering_method="amd")

@@ -1,6 +1,6 @@
 """Stiffness assembly against a library and against triplets, on general quadrilaterals.
 
-No two cells are congruent: the mesh is distorted smoothly. Compilation is done before.
+The mesh is distorted smoothly, so that no two cells are congruent.
 """
 
 import numpy as np

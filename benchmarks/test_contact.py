@@ -1,4 +1,4 @@
-"""Contact linearisation at the paper's size, and what the search costs per segment."""
+"""Contact linearisation at the paper's size, and the cost of search per segment."""
 
 from functools import partial
 
@@ -27,15 +27,15 @@ def test_ten_linearisations(benchmark, method):
 
 @pytest.mark.parametrize("segments", [100, 1000, 10_000])
 def test_search(benchmark, segments):
-    """As many nodes on a half ring as segments on a bent beam, far on the flanks."""
+    """Nodes on a half ring, as many as segments on a bent beam; flanks are far off."""
     theta = np.pi * np.arange(segments) / (segments - 1)
     ring = 0.49 * np.column_stack([np.cos(theta), np.sin(theta)]) + [1.0, 0.0]
     x = 2 * np.arange(segments + 1) / segments
     beam = np.column_stack([x, 0.5 - 0.025 * x**2])
 
-    found = benchmark(lambda: nearest(ring, surface(beam, "master")))
+    projection = benchmark(lambda: nearest(ring, surface(beam, "master")))
 
-    assert len(found.segment) == segments
+    assert len(projection.segment) == segments
 
 
 @pytest.mark.parametrize("method", [node_to_segment, mortar])

@@ -1,4 +1,4 @@
-"""F and d of all ten load steps: condensed, and by solves for the rows of each step."""
+"""F and d of ten load steps: by condensation, and by solves for each step."""
 
 import numpy as np
 import pytest
@@ -13,10 +13,8 @@ from mortarbench.solvers.reference.solve import reference_solution
 @pytest.fixture(scope="module")
 def steps():
     family = BeamRing()
-    given = [{"Nr": 30, "Nh": 15, "step": k} for k in range(1, 11)]
-    return [
-        family.build("primal", family.complete(g), reference_solution).qp for g in given
-    ]
+    params = [family.complete({"Nr": 30, "Nh": 15, "step": k}) for k in range(1, 11)]
+    return [family.build("primal", p, reference_solution).qp for p in params]
 
 
 def test_dualisation_of_ten_steps(race, steps):

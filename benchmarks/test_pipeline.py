@@ -1,4 +1,4 @@
-"""Where the time of an analysis goes, at the size of the paper's Table 1 and below."""
+"""Times of the stages of an analysis, at the size of the paper's Table 1 and below."""
 
 import numpy as np
 import pytest

@@ -15,7 +15,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.compiled import Product
 from tests.support.generated_bodies import generated_case
 
-#: all products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8
+#: products with F of PERMON 3.18 at its best setting, to 1e-6 and 1e-8, by Nr, Nh, step
 PERMON = {
     (4, 3, 1): (92, 112), (4, 3, 10): (109, 146),
     (12, 6, 5): (119, 169), (12, 6, 10): (144, 206),
@@ -55,7 +55,7 @@ def products(s):
 
 @pytest.mark.parametrize("name", [n for n in SOLVERS if n.startswith("smalbe")])
 def test_products_with_F(note, name):
-    """Everything counted: norm, homogenisation, start, checks, factorised columns."""
+    """All products count: norm, homogenisation, start, checks, factorised columns."""
     for (Nr, Nh, step), best in PERMON.items():
         cells = []
         for form in ("dual", "dual-bounds"):
@@ -72,7 +72,7 @@ def test_products_with_F(note, name):
 
 @pytest.mark.parametrize("tol", TOLERANCES)
 def test_products_on_generated_bodies(note, tol):
-    """Of 300; products over those of the better of PERMON's and ESPRESO's rules."""
+    """Products on 300 bodies relative to the better of PERMON's and ESPRESO's rules."""
     ratios = []
     for seed in range(300):
         qp = generated_case(seed).qp
@@ -92,7 +92,7 @@ def test_products_on_generated_bodies(note, tol):
 
 @pytest.mark.parametrize("preconditioner", ["diagonal", "lumped", "dirichlet"])
 def test_products_with_other_preconditioners(note, preconditioner):
-    """In place of the inverse of the model; applies are counted apart."""
+    """Preconditioners other than the inverse of the model, with their applies."""
     solver = replace(SOLVERS["smalbe"], preconditioner=preconditioner)
     for Nr, Nh, step in PERMON:
         cells = []
@@ -124,7 +124,7 @@ def test_products_of_a_load_path(note, form, Nr, Nh):
 )
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
 def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
-    """Prepare and solve, tolerance 1e-6, all that verify; the slow ones only once."""
+    """Prepare and solve at 1e-6, by all solvers whose answers are verified."""
     qp, tol = dual(Nr, Nh, 10, form), 1e-6
     least = {
         name: min(seconds(solver, qp, tol) for _ in range(3))
@@ -154,8 +154,10 @@ def test_time_to_a_verified_answer(race, note, form, Nr, Nh):
     ("Nr", "Nh"), [(12, 6), (12, 7), (30, 15), (60, 30), (130, 65)]
 )
 @pytest.mark.parametrize("form", ["dual", "dual-bounds"])
-def test_a_solve_costs_its_products_and_little_more(race, note, form, Nr, Nh):
-    """Prepare, and solve less 1.5 times its products, in units of a product."""
+def test_the_time_of_a_solve_is_that_of_its_products_and_little_more(
+    race, note, form, Nr, Nh
+):
+    """Times of preparing and solving, against 1.5 times the products of the solve."""
     qp, tol, solver = dual(Nr, Nh, 5, form), 1e-6, SOLVERS["smalbe"]
     v, P, blas = np.ones(qp.q.size), Product(qp.P, qp.q.size), np.asarray(qp.P).T
     ready = []
@@ -229,8 +231,8 @@ def test_large_sparse_problems(race, note, name):
     }
     unit = medians["product"] + medians["passes"]
     step = medians["smalbe"] / spent["smalbe"] / unit
-    told = ", ".join(
+    times = ", ".join(
         f"{f} {medians[f]:.2f} s" + (f" ({spent[f]})" if f in spent else "")
         for f in fleet
     )
-    note(f"{name} n={n}: {told}; a product with its step × {step:.2f}")
+    note(f"{name} n={n}: {times}; a product with its step × {step:.2f}")

@@ -1,4 +1,4 @@
-"""Compare QP solvers on elastic contact problems: what users may rely on.
+"""Benchmark of QP solvers on elastic contact problems: the promised interface.
 
 >>> import mortarbench as mb
 >>> case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/dual")
@@ -6,10 +6,10 @@
 >>> str(answer.verdict)
 'verified'
 
-Plug-ins import from here, too: `QP`, `Solution`, `Status`, `Case` and `Family`.
+Plug-ins import `QP`, `Solution`, `Status`, `Case` and `Family` from here.
 
-Nothing prints unless asked. Bad input raises `InputError`, whose text is one line. The
-command line is a thin caller of these functions.
+Functions print only if asked to. Wrong input raises `InputError` with a message of one
+line. The command line calls these functions.
 """
 
 from importlib import import_module
@@ -33,7 +33,7 @@ def __getattr__(name: str) -> Any:
 
 
 class _Listed(ModuleType):
-    """A package that, called, lists its contents: `solvers()`, `problems()`."""
+    """Package that can be called to list its contents: `solvers()`, `problems()`."""
 
     def __call__(self, **options: Any) -> Any:
         """Return the `Listing` of the same name in `mortarbench.listing`."""

@@ -1,4 +1,4 @@
-"""The program: ``mortarbench`` and ``python -m mortarbench``."""
+"""Program entry point: ``mortarbench`` and ``python -m mortarbench``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 
 def main() -> None:
     """Run the command line, with one thread in every library."""
-    # first of all: libraries read these when they load, and once
+    # before any other import: libraries read these variables once, when they load
     from mortarbench.harness.limits import ONE_THREAD
 
     os.environ.update(ONE_THREAD)

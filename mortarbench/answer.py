@@ -1,4 +1,4 @@
-"""One answer to one case: of a solver, measured in a process, or from elsewhere."""
+"""Answers to single cases: computed and judged (`solve`), or only judged (`verify`)."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ import numpy as np
 from mortarbench.arguments import (
     GRIDS,
     PICTURES,
-    drawn_scale,
+    check_output_file,
+    check_scale,
     solver_options,
     tolerance,
-    writable,
 )
-from mortarbench.case import Case, as_case, built_case
+from mortarbench.case import Case, as_case, build_case
 from mortarbench.harness import QP, Fields, Record, Residuals, Solution, Solver, Verdict
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.names import assemble, is_shared
 from mortarbench.harness.processes.measurement import (
-    measured_once,
+    measure_once,
     scratch_folder,
     single_worker,
 )
@@ -54,57 +54,58 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.crossval.discretisation import Discretisation
 
-LOOSE = 0.01  #: certified relative error above which a verified answer has a remark
-#: sum of the contact forces, relative to that of the loads, up to which there is no
-#: contact: interior points end at 1e-8 or so of their scale, a closed contact far above
-UNFELT_FORCE = 1e-6
+#: certified relative error above which a verified answer has a remark
+MAX_CERTIFIED_ERROR = 0.01
+#: largest sum of contact forces, relative to the sum of loads, without contact:
+#: interior-point methods leave forces of about 1e-8, closed contacts have far more
+MAX_OPEN_FORCE = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Answer:
-    """What a solver answered, and what we make of it."""
+    """Answer of a solver to a case, with our verdict."""
 
     case: Case
-    record: Record  #: the measurement, as a line of a journal
-    solution: Solution | None  #: point and claim; None where the process ended
+    record: Record  #: the measurement, as in a line of a journal
+    solution: Solution | None  #: point and claim; None if the process ended early
     spec: SolverSpec
-    solver: str | Solver  #: as given to `solve`: a name or an object
-    defaults: Mapping[str, Any]  #: options that the solver has if none are given
-    remarks: tuple[str, ...] = ()  #: reasons to doubt what is verified, a line each
+    solver: str | Solver  #: name or object, as passed to `solve`
+    defaults: Mapping[str, Any]  #: default options of the solver
+    remarks: tuple[str, ...] = ()  #: reasons to doubt a verified answer, a line each
 
     @property
     def verdict(self) -> Verdict:
-        """Our judgement, whatever the solver claimed."""
+        """Verdict of the harness, independent of the solver's claim."""
         return self.record.verdict
 
     @property
     def residuals(self) -> Residuals | None:
-        """Relative KKT residuals, evaluated by us; None where there is no point."""
-        found: list[Any] = [getattr(self.record, name) for name in Residuals._fields]
-        return None if None in found else Residuals(*found)
+        """Relative KKT residuals, evaluated by the harness; None without a point."""
+        values: list[Any] = [getattr(self.record, name) for name in Residuals._fields]
+        return None if None in values else Residuals(*values)
 
     @property
     def energy_bound(self) -> float | None:
-        """Certified bound of the error, relative, in the energy norm; None: unknown."""
+        """Certified bound of the relative error in the energy norm; None: unknown."""
         return self.record.energy_bound
 
     @property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results, SI."""
+        """Physical results, in SI units."""
         return self.record.quantities
 
     @property
     def history(self) -> History:
-        """What the solver told of its iterations: columns, a row per iteration."""
+        """Iterations as the solver reports them: columns with one row per iteration."""
         return {} if self.solution is None else self.solution.history
 
     @property
     def has_point(self) -> bool:
-        """Whether there is a point to look at."""
+        """True if the solver returned a finite point."""
         return self.solution is not None and has_point(self.solution)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON: the record, the history of the iterations, remarks."""
+        """Return record, history of the iterations and remarks as plain data."""
         history = finite(plain(self.history))
         return {
             **json.loads(self.record.to_json()),
@@ -113,27 +114,27 @@ class Answer:
         }
 
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
-        """Estimate the error of the mesh, to which that of the solver adds.
+        """Estimate the discretisation error, which adds to the error of the solver.
 
-        Solves the case on finer meshes by the reference, not by the solver.
+        The case is solved on finer meshes, by the reference solve.
 
-        budget : s; a mesh that would take longer than what is left is not begun
+        budget : seconds; meshes that would exceed it are not solved
         """
         from mortarbench.harness.crossval.discretisation import discretisation_errors
 
         with TemporaryDirectory() as folder:
-            (found,) = discretisation_errors(
+            (error,) = discretisation_errors(
                 [self.case.id], self.case.registries.reference, Path(folder), budget
             )
-        return found
+        return error
 
     def fields(self) -> Fields:
-        """Give the deformed bodies.
+        """Return the deformed bodies with their stresses and contact forces.
 
         Raises
         ------
         InputError
-            When the case has no bodies, or the answer no point.
+            If the case has no bodies, or the answer has no point.
 
         """
         if self.solution is None or not self.has_point:
@@ -145,16 +146,25 @@ class Answer:
     ) -> Figure:
         """Draw the deformed bodies with their stresses, and each contact enlarged.
 
-        Of half planes, which have no ends, the tractions between them.
+        For half planes, which are unbounded, draw the tractions between them.
 
-        path : of a file to write, too: .png, .pdf or .svg
-        scale : of the displacement, as drawn; None: 1 where that can be seen, else a
-            round factor that the title states
+        Parameters
+        ----------
+        path : file to which the picture is also written: .png, .pdf or .svg
+        scale : factor of the displacements; None: 1 if they are visible, else a round
+            factor that the title states
 
         Raises
         ------
         InputError
-            As `fields`; when the file cannot be written, or the scale is no number.
+            If the case has no bodies, the answer has no point, the file cannot be
+            written, or `scale` is not a finite number.
+
+        Examples
+        --------
+        >>> import mortarbench as mb
+        >>> answer = mb.solve("contact-patch/dual", "smalbe")
+        >>> figure = answer.plot()
 
         """
         from mortarbench.reports.figures.deformed import deformed_figure
@@ -162,7 +172,7 @@ class Answer:
         from mortarbench.reports.render.saving import draw, save
 
         fields = self.fields()
-        drawn = None if scale is None else drawn_scale(scale)
+        drawn = None if scale is None else check_scale(scale)
         figure = (
             deformed_figure(fields, drawn)
             if len(fields.cells) else traction_figure(fields)
@@ -170,22 +180,24 @@ class Answer:
         if figure is None:
             raise InputError("no bodies and no tractions: there is no picture")
         if path is not None:
-            save(figure, writable(path, PICTURES))
+            save(figure, check_output_file(path, PICTURES))
         return draw(figure)
 
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
 
+        For a .pvd the earlier load steps are solved by the same solver.
+
         Raises
         ------
         InputError
-            As `fields`; when the file cannot be written, or an earlier load step has
-            no point.
+            If the case has no bodies, the answer or an earlier load step has no point,
+            or the file cannot be written.
 
         """
         from mortarbench.reports.export.vtu import write_series, write_vtu
 
-        path, fields = writable(path, GRIDS), self.fields()
+        path, fields = check_output_file(path, GRIDS), self.fields()
         if not len(fields.cells):
             raise InputError(f"{path}: {self.case.name} has no bodies to write")
         if path.suffix == ".vtu":
@@ -196,7 +208,7 @@ class Answer:
             params = {**self.case.params, "step": step}
             case_id = assemble(self.case.id.family, params, self.case.form)
             earlier = solve(
-                built_case(case_id, self.case.registries),
+                build_case(case_id, self.case.registries),
                 self.solver,
                 self.record.tol,
                 options=self.spec.options,
@@ -224,73 +236,74 @@ class Answer:
 
 
 def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str, ...]:
-    """Return the reasons why a person may doubt a verified answer, a line each.
+    """Return reasons to doubt a verified answer, a line each.
 
-    The QP is solved; its certificate may bound little, and the QP may not be what was
-    meant: no contact, or displacements that linear kinematics does not describe.
+    The QP is solved, but the certified bound may be weak or the model inadequate: no
+    contact, or displacements too large for linear kinematics.
     """
     if record.verdict is not Verdict.VERIFIED or solution is None:
         return ()
-    found = []
+    reasons = []
     bound = record.energy_bound
     if bound is not None and bound == np.inf:
-        found.append(
+        reasons.append(
             "the certificate does not bound the solver's error: the displacements may "
             "be as small as rounding, or a load may act on supports"
         )
-    elif bound is not None and bound > LOOSE:
-        found.append(
-            f"the solver's error is certified to be at most {100 * bound:.2g} % only; "
-            "a smaller tolerance may bound it better"
+    elif bound is not None and bound > MAX_CERTIFIED_ERROR:
+        reasons.append(
+            f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
+            "a smaller tolerance may give a better bound"
         )
-    # on ranks nothing is built here; a plug-in's code may fail
+    # a remark must not fail a solve: recovery may be code of a plug-in, and on ranks
+    # there is no case in this process
     with suppress(Exception), one_thread():
         if _is_open(case, record, solution):
-            found.append(
+            reasons.append(
                 "no node is in contact: the sides stay apart, and the answer is that "
-                "of bodies without contact; see the direction of the load, and the gap"
+                "of bodies without contact; check the direction of the load and the gap"
             )
     with suppress(Exception), one_thread():
-        found += _large_displacements(case, solution)
-    return tuple(found)
+        reasons += _large_displacements(case, solution)
+    return tuple(reasons)
 
 
 def _is_open(case: Case, record: Record, solution: Solution) -> bool:
-    """Return True if no contact row presses, but for forces of rounding size."""
+    """Return True if all contact forces are zero up to rounding."""
     if not record.quantities.get("contact_rows"):
         return False
     if record.quantities.get("active") == 0:
         return True
-    mechanics = case.made.mechanics if "made" in vars(case) else None
+    mechanics = case.family_case.mechanics if "family_case" in vars(case) else None
     if mechanics is None:
         return False
     normal = mechanics.to_primal(solution).z[: mechanics.primal.h.size]
     load = np.abs(mechanics.primal.q).sum()
-    return bool(np.abs(normal).sum() <= UNFELT_FORCE * load)
+    return bool(np.abs(normal).sum() <= MAX_OPEN_FORCE * load)
 
 
 def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
     """Yield a remark if a body moves by more than its size, with linear kinematics."""
-    if "made" not in vars(case) or case.params.get("kinematics") == "finite":
+    if "family_case" not in vars(case) or case.params.get("kinematics") == "finite":
         return
-    mechanics = case.made.mechanics
+    mechanics = case.family_case.mechanics
     if mechanics is None or mechanics.grid is None:
         return
-    grid, u = mechanics.grid, case.made.recover(solution)
+    grid, u = mechanics.grid, case.family_case.recover(solution)
     if u.size != grid.points.size:
-        return  # a height, as of membranes, is not a motion along the mesh
-    moved = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
+        return  # the height of a membrane is not a displacement of its mesh
+    lengths = np.linalg.norm(u.reshape(grid.points.shape), axis=1)
     worst, text = 1.0, ""
     for body in np.unique(grid.bodies):
         nodes = np.unique(grid.cells[grid.bodies == body])
         size = float(np.ptp(grid.points[nodes], axis=0).max())
-        if moved[nodes].max() > worst * size:
-            worst = float(moved[nodes].max()) / size
+        if lengths[nodes].max() > worst * size:
+            worst = float(lengths[nodes].max()) / size
             name = repr(mechanics.names[body]) if mechanics.names else str(body)
             text = (
-                f"body {name} moves by up to {moved[nodes].max():.3g} m and is "
-                f"{size:.3g} m large; linear kinematics describes small displacements: "
-                "see the moduli, the loads and the supports"
+                f"body {name} moves by up to {lengths[nodes].max():.3g} m and is "
+                f"{size:.3g} m large; linear kinematics is for small displacements: "
+                "check the moduli, the loads and the supports"
             )
     if text:
         yield text
@@ -308,28 +321,37 @@ def solve(
     ranks: int = 1,
     **more: Any,
 ) -> Answer:
-    """Run one solver on one case, once, in a process of its own, and judge its answer.
+    """Run one solver on one case in a separate process, and verify its answer.
 
-    A solver that is an object is copied into that process by cloudpickle. Its class may
-    stand in a notebook, a script or a module; what it refers to must allow pickling: no
-    open files, locks or handles of a C library in its attributes.
+    A solver object is copied into that process by cloudpickle. Its class may be defined
+    in a notebook, a script or a module. Its attributes must be picklable: no open
+    files, locks or handles of C libraries.
 
     Parameters
     ----------
     case : a case of `build`, its name, or a QP
     solver : a name of `solvers`, or an object with the methods `declines` and `prepare`
-    tol : relative KKT accuracy asked for
-    options : of the solver, where they differ from its defaults. A solver that records
-        its iterations does, unless they contain ``history = False``
+    tol : requested relative KKT accuracy
+    options : options of the solver that differ from its defaults. A solver with an
+        option ``history`` records its iterations unless ``history = False``
     plugins : Python files with more solvers or families
-    ranks : processes of MPI that solve it together
+    ranks : number of MPI processes that solve the case together
     more : further options of the solver
 
     Raises
     ------
     InputError
-        When there is no such case, solver or option, the case cannot be built, or the
-        solver cannot be copied; when ranks are asked for and there is no MPI.
+        If there is no such case, solver or option, the case cannot be built, the
+        solver cannot be copied, or `ranks` needs an MPI that is not installed.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> answer = mb.solve("beam-ring/Nr=4/Nh=3/steps=1/dual", "osqp", tol=1e-6)
+    >>> str(answer.verdict), max(answer.residuals) <= 1e-5
+    ('verified', True)
+    >>> str(mb.solve(answer.case, "osqp", max_iter=25).verdict)
+    'iteration_limit'
 
     """
     tol = tolerance(tol)
@@ -337,12 +359,12 @@ def solve(
     check_solver(solver)
     problem = as_case(case, plugins)
     ranks_asked(ranks, "ranks")
-    with answers_of(solver, problem.registries, options, ranks=ranks) as answer:
+    with solver_session(solver, problem.registries, options, ranks=ranks) as answer:
         return answer(problem, tol)
 
 
 @contextmanager
-def answers_of(
+def solver_session(
     solver: str | Solver,
     registries: Registries,
     options: Mapping[str, Any] | None = None,
@@ -350,32 +372,31 @@ def answers_of(
     forks: bool = False,
     ranks: int = 1,
 ) -> Iterator[Callable[[Case, float], Answer]]:
-    """Give what has a solver solve a case to a tolerance, in a process of its own.
+    """Start a process for a solver; yield the call that solves a case to a tolerance.
 
-    solver, options : as of `solve`
-    ranks : as of `solve`
-    forks : whether that process may be a fork of this one, made now, if that is safe;
-        see `harness.processes.forking`
+    solver, options, ranks : see `solve`
+    forks : the process may be a fork of this one, if that is safe; see
+        `harness.processes.forking`
 
     Raises
     ------
     InputError
-        When there is no such solver or option.
+        If there is no such solver or option.
 
     """
-    given = solver_options(options)
+    requested = solver_options(options)
     if isinstance(solver, str):
         name, solvers = solver, registries.solvers
     else:
         name = type(solver).__name__
         solvers = {name: solver}
-    spec = SolverSpec(name=name, label=name, options=given).on(ranks)
+    spec = SolverSpec(name=name, label=name, options=requested).on(ranks)
     configured = resolve(spec, solvers)
     defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
-    if options_of(configured).get("history") is False and "history" not in given:
-        # what telling costs is not at stake where nothing is compared
+    if options_of(configured).get("history") is False and "history" not in requested:
+        # recording costs time, but the time of a single solve is compared with nothing
         defaults = {**defaults, "history": True}
-        spec = replace(spec, options={**given, "history": True})
+        spec = replace(spec, options={**requested, "history": True})
         configured = resolve(spec, solvers)
     environment = digest(registries.environment())
 
@@ -390,11 +411,12 @@ def answers_of(
         )
         source = Source.FILE
         if ranks > 1 and is_shared(case.id):
-            ours = registries.hold_own_code_only()
+            ours = registries.hold_only_builtins()
             source = Source.RANKS if ours else Source.SHARES
-        with one_thread(), redirect_stdout(stderr):  # whatever the family prints
-            record, solution = measured_once(
-                worker, lambda: case.made, record, registries.reference,
+        # a family may print; standard output is for the answer
+        with one_thread(), redirect_stdout(stderr):
+            record, solution = measure_once(
+                worker, lambda: case.family_case, record, registries.reference,
                 source=source,
             )  # fmt: skip
         return Answer(
@@ -404,7 +426,7 @@ def answers_of(
 
     work = None
     if forks and ranks == 1:
-        from mortarbench.harness.processes.worker import serve  # late: few need it here
+        from mortarbench.harness.processes.worker import serve  # needed for forks only
 
         work = partial(serve, configured)
     with scratch_folder() as scratch:
@@ -416,7 +438,7 @@ def answers_of(
 
 
 class Multipliers(NamedTuple):
-    """Multipliers in the sign convention of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
+    """Multipliers with the signs of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
 
     y: Vector  #: (m,) of A x = b
     z: Vector  #: (p,) of G x ≤ h
@@ -425,22 +447,22 @@ class Multipliers(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Verification:
-    """A judgement on a point from elsewhere."""
+    """Verdict on a point that `verify` was called with."""
 
-    verdict: Verdict  #: `verified`, or `inaccurate` or `wrong` where it is refuted
+    verdict: Verdict  #: `verified`, or if refuted `inaccurate` or `wrong`
     residuals: Residuals  #: relative KKT residuals
-    multipliers: Multipliers  #: as given; where left out, the best ones
+    multipliers: Multipliers  #: those passed to `verify`; computed ones for the others
     objective: float  #: ½xᵀPx + qᵀx
-    optimum_error: float | None  #: against a proven optimum, where that decided
-    tol: float  #: verified means every residual ≤ 10·tol, or as a proven optimum says
+    optimum_error: float | None  #: distance from a proven optimum if that decided
+    tol: float  #: verified: every residual ≤ 10·tol, or decided by a proven optimum
 
     def __repr__(self) -> str:
         if self.optimum_error is not None:
-            found = f"off the proven optimum by {self.optimum_error:.2g}"
+            error = f"off the proven optimum by {self.optimum_error:.2g}"
         else:
             values = self.residuals._asdict().items()
-            found = ", ".join(f"{name} {value:.2g}" for name, value in values)
-        return f"<{self.verdict}: {found}; allowed {allowed(self.tol):.2g}>"
+            error = ", ".join(f"{name} {value:.2g}" for name, value in values)
+        return f"<{self.verdict}: {error}; allowed {allowed(self.tol):.2g}>"
 
 
 def verify(
@@ -451,39 +473,46 @@ def verify(
     z_box: ArrayLike | None = None,
     tol: float = 1e-8,
 ) -> Verification:
-    """Judge a point from elsewhere by its KKT residuals, as answers of solvers are.
+    """Verify a point by its KKT residuals, in the same way as answers of solvers.
 
     Multipliers that are left out are computed by nonnegative least squares on the
-    active rows and bounds, see `harness.verify.multipliers`. Residuals that they leave
-    show that the point is not optimal to that accuracy.
+    active rows and bounds, see `harness.verify.multipliers`. Residuals that remain show
+    that the point is not optimal to that accuracy.
 
     Parameters
     ----------
     qp : a QP, a case of `build`, or its name
-    x : (n,) the point
-    y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, where known
-    tol : relative KKT accuracy; verified means that every residual is within 10·tol,
-        or for small QPs the error against a proven optimum
+    x : (n,) point
+    y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
+    tol : relative KKT accuracy; verified means that every residual is within 10·tol, or
+        for small QPs that the error against a proven optimum is
 
     Raises
     ------
     InputError
-        When a vector does not fit the QP, or there are too many multipliers to compute.
+        If a vector does not fit the QP, or too many multipliers would be computed.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> qp = mb.QP.from_arrays([[2.0, 0.0], [0.0, 2.0]], [-2.0, 2.0], lb=[0.0, 0.0])
+    >>> str(mb.verify(qp, [1.0, 0.0]).verdict), str(mb.verify(qp, [0.9, 0.0]).verdict)
+    ('verified', 'wrong')
 
     """
     tol = tolerance(tol)
     case = as_case(qp)
-    problem = case.made.qp
+    problem = case.family_case.qp
     sizes = {"x": problem.q, "y": problem.b, "z": problem.h, "z_box": problem.q}
-    given = {"x": x, "y": y, "z": z, "z_box": z_box}
-    known = {
+    arguments = {"x": x, "y": y, "z": z, "z_box": z_box}
+    vectors = {
         name: numeric_vector(name, v, sizes[name].size)
-        for name, v in given.items()
+        for name, v in arguments.items()
         if v is not None or name == "x"
     }
     with one_thread():
-        s = with_multipliers(problem, **known)
-        with np.errstate(all="ignore"):  # a point may hold NaN or 1e300
+        s = with_multipliers(problem, **vectors)
+        with np.errstate(all="ignore"):  # x may contain NaN or 1e300
             residuals, objective = kkt_residuals(problem, s), problem.objective(s.x)
         error = decided(problem, s, residuals, tol, proves(case.registries.reference))
     return Verification(

@@ -1,4 +1,4 @@
-"""Checks of what a user asks for, before any work is done or any library loads."""
+"""Checks of arguments, made before any work is done and any library is imported."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from typing import Any
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 
-EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: files that a QP is written to
+EXPORTS = (".npz", ".mat", ".parquet", ".qps")  #: suffixes of exported QPs
 PICTURES = (".png", ".pdf", ".svg")
-FORMATS = ("html", "md", "tex", "csv", "parquet")  #: of a report
-GATES = ("worse", "slower")  #: what a comparison may fail on
-MOST_SCALE = 1e9  #: of displacements in pictures
+FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
+GATES = ("worse", "slower")  #: conditions on which a comparison may fail
+MAX_SCALE = 1e9  #: largest factor of displacements in pictures
 GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
 
 
-def writable(path: str | Path, suffixes: tuple[str, ...]) -> Path:
-    """Refuse a file that could not be written.
+def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """Return the path of a file that can be written.
 
     Raises
     ------
     InputError
-        When its ending is none of `suffixes`, it is a folder, or its folder is missing.
+        If its suffix is none of `suffixes`, it is a folder, or its folder is missing.
 
     """
     path = checked.path("path", path)
@@ -40,13 +40,13 @@ def writable(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     return path
 
 
-def existing(folder: Path) -> Path:
-    """Refuse what is no folder.
+def check_result_folder(folder: Path) -> Path:
+    """Return a folder that exists.
 
     Raises
     ------
     InputError
-        With what it is instead.
+        If there is no such folder, or it is a file.
 
     """
     if not os.path.isdir(folder):
@@ -56,12 +56,12 @@ def existing(folder: Path) -> Path:
 
 
 def tolerance(tol: float, where: str = "tol") -> float:
-    """Take a relative accuracy, between 0 and 1.
+    """Return a relative accuracy.
 
     Raises
     ------
     InputError
-        For any other number.
+        Unless it is a number between 0 and 1, both excluded.
 
     """
     if not isinstance(tol, Real) or isinstance(tol, bool) or not 0 < tol < 1:
@@ -70,13 +70,13 @@ def tolerance(tol: float, where: str = "tol") -> float:
 
 
 def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, Any]:
-    """Join the options of a solver with those that are given as keywords.
+    """Return the options of a solver, from a mapping and from keyword arguments.
 
     Raises
     ------
     InputError
-        Unless they are a mapping from names to values, or None; and when one is among
-        the keywords, too.
+        If `options` is neither None nor a mapping from names to values, or a name is
+        in both.
 
     """
     options = {} if options is None else options
@@ -91,49 +91,49 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
     return {**options, **more}
 
 
-def drawn_scale(scale: float, where: str = "scale") -> float:
-    """Take a factor of displacements in pictures.
+def check_scale(scale: float, where: str = "scale") -> float:
+    """Return a factor of displacements in pictures.
 
     Raises
     ------
     InputError
-        When it is no finite number of a usual size.
+        If it is not a number of size at most 1e9.
 
     """
-    if not abs(scale) <= MOST_SCALE:  # a NaN, too
+    if not abs(scale) <= MAX_SCALE:  # `not ≤` is true for NaN as well
         raise InputError(
-            f"{where} = {scale:g}; expected a number, at most {MOST_SCALE:g}"
+            f"{where} = {scale:g}; expected a number, at most {MAX_SCALE:g}"
         )
     return scale
 
 
 def budget(seconds: float, where: str = "budget") -> float:
-    """Take a number of seconds, 0 or more.
+    """Return a number of seconds.
 
     Raises
     ------
     InputError
-        For any other number.
+        Unless it is a number ≥ 0.
 
     """
-    if not checked.is_number(seconds) or not seconds >= 0:  # a NaN, too
+    if not checked.is_number(seconds) or not seconds >= 0:  # true for NaN as well
         raise InputError(
             f"{where} = {shown(seconds)}; expected a number of seconds ≥ 0"
         )
     return seconds
 
 
-def check_known(
-    kind: str, names: Sequence[str], known: Sequence[str], where: str
+def check_names(
+    kind: str, names: Sequence[str], allowed: Sequence[str], where: str
 ) -> None:
-    """Refuse names that are not known, such as of a format.
+    """Raise unless all names, such as those of formats, are allowed.
 
     Raises
     ------
     InputError
-        With what would be right.
+        With the nearest allowed name, or all of them.
 
     """
     for name in names:
-        if name not in known:
-            raise unknown(kind, name, known, where=where)
+        if name not in allowed:
+            raise unknown(kind, name, allowed, where=where)

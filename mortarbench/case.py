@@ -1,4 +1,4 @@
-"""A case by name, or a bare QP: its QP, and the way back to the physical problem."""
+"""Cases by name, and bare QPs: the QP with its recovery of physical results."""
 
 from __future__ import annotations
 
@@ -11,32 +11,38 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.sparse import csc_array, csc_matrix
 
-from mortarbench.arguments import EXPORTS, writable
+from mortarbench.arguments import EXPORTS, check_output_file
 from mortarbench.harness import QP, Fields, Matrix, Solution, plugin
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.names import CaseId, parse, unbuilt
 from mortarbench.harness.verify.verdicts import plain
-from mortarbench.registries import TURN, Plugins, Registries, known, one_thread
+from mortarbench.registries import (
+    TURN,
+    Plugins,
+    Registries,
+    load_registries,
+    one_thread,
+)
 
 if TYPE_CHECKING:
     from mortarbench.harness import Mechanics, Vector
 
 
 class Case(plugin.Case):
-    """One QP of one problem, under its canonical name, built when first used."""
+    """One QP of one problem, built at its first use."""
 
     def __init__(self, *, id: CaseId, registries: Registries) -> None:  # noqa: A002
-        self.id = id  #: its name, in parts
-        self.registries = registries  #: those that it is built with
+        self.id = id  #: family, parameters and form
+        self.registries = registries  #: families and reference solve for building it
 
     @cached_property
-    def made(self) -> plugin.Case:
-        """What the family makes, once it is asked for.
+    def family_case(self) -> plugin.Case:
+        """Case as its family builds it, at the first access.
 
         Raises
         ------
         InputError
-            As `build`.
+            If it cannot be built.
 
         """
         origin = self.registries.origins.get(self.id.family.name)
@@ -53,98 +59,98 @@ class Case(plugin.Case):
 
     @property
     def name(self) -> str:
-        """FAMILY/key=value/…/FORM, without keys that others imply."""
+        """Canonical name FAMILY/key=value/…/FORM, without keys that others imply."""
         return self.id.name
 
     @cached_property
     def qp(self) -> QP:
-        """The QP, non-dimensional: energy in SI = scale·objective + constant.
+        """Non-dimensional QP: energy in SI units = scale·objective + constant.
 
-        Its matrices are of the types that other libraries take: ``scipy.sparse``
+        Its matrices have types that other libraries accept: ``scipy.sparse``
         ``csc_matrix`` with 32-bit indices, or dense arrays. P of a decomposed problem
         is an operator, whose matrix is ``P @ numpy.eye(n)``.
         """
-        return self.made.qp.with_matrices(_exported)
+        return self.family_case.qp.with_matrices(_exported)
 
     @property
     def scale(self) -> float:
-        """Factor from the objective of the QP to an energy in SI."""
-        return self.made.scale
+        """Factor from the objective of the QP to an energy in SI units."""
+        return self.family_case.scale
 
     @property
     def constant(self) -> float:
-        """Energy in SI where the objective of the QP is zero."""
-        return self.made.constant
+        """Energy in SI units at which the objective of the QP is zero."""
+        return self.family_case.constant
 
     @property
     def matrices(self) -> Mapping[str, Any]:
         """Matrices of a dual form in the notation of the paper."""
-        return self.made.matrices
+        return self.family_case.matrices
 
     @property
     def dualise_seconds(self) -> float | None:
         """Time to assemble a dual form, factorisation included; None for a primal."""
-        return self.made.dualise_seconds
+        return self.family_case.dualise_seconds
 
     @property
     def mechanics(self) -> Mechanics | None:
-        """Mechanical problem that certificates use, or None."""
-        return self.made.mechanics
+        """Mechanical problem for certificates, or None."""
+        return self.family_case.mechanics
 
     @property
     def unsettled(self) -> float:
         """Relative distance of the QP from the fixed point that it approximates."""
-        return self.made.unsettled
+        return self.family_case.unsettled
 
     def recover(self, solution: Solution) -> Vector:
-        """Compute the physical unknown of a point, SI."""
-        return self.made.recover(solution)
+        """Return the physical unknown of a point (displacements, …) in SI units."""
+        return self.family_case.recover(solution)
 
     @property
     def params(self) -> Mapping[str, plugin.Value]:
-        """Every key of the name with its value, defaults included."""
+        """Values of all keys of the family, defaults included."""
         return self.id.params
 
     @property
     def form(self) -> str:
-        """Which of the equivalent QPs of the problem this is: primal, dual, …."""
+        """Form of the QP among equivalent ones of the problem: primal, dual, …."""
         return self.id.form
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """What may be wrong with the input, a line each: moduli of odd sizes."""
-        return self.made.remarks
+        """Possible mistakes in the input, a line each, such as unusual moduli."""
+        return self.family_case.remarks
 
     @TURN
     def quantities(self, solution: Solution) -> dict[str, Any]:
-        """Evaluate the physical results of a point, SI: energy, tip, pressures, …."""
-        return dict(plain(self.made.quantities(solution)))
+        """Return physical results of a point in SI units: energy, tip, pressures, …."""
+        return dict(plain(self.family_case.quantities(solution)))
 
     @TURN
     def fields(self, solution: Solution) -> Fields:
-        """Give the deformed bodies of a point, with stresses and contact forces, SI.
+        """Return the deformed bodies of a point with stresses and contact forces, SI.
 
         Raises
         ------
         InputError
-            When the case has no bodies.
+            If the case has no bodies.
 
         """
-        if self.made.fields is None:
+        if self.family_case.fields is None:
             raise InputError(f"{self.name} has no bodies to draw")
-        return self.made.fields(solution)
+        return self.family_case.fields(solution)
 
     def save(self, path: str | Path) -> Path:
-        """Write the QP for other people's solvers: .npz, .mat, .parquet or .qps.
+        """Write the QP to a file for other programs: .npz, .mat, .parquet or .qps.
 
         Raises
         ------
         InputError
-            When the ending is none of these, the format has no place for the numbers,
-            or the file cannot be written.
+            If the suffix is none of these, the format cannot store the QP, or the file
+            cannot be written.
 
         """
-        path = writable(path, EXPORTS)
+        path = check_output_file(path, EXPORTS)
         meta = plain(
             {
                 "name": self.name,
@@ -152,15 +158,15 @@ class Case(plugin.Case):
                 "params": self.params,
                 "form": self.form,
                 "units": "non-dimensional; energy in SI = scale * objective + constant",
-                "scale": self.made.scale,
-                "constant": self.made.constant,
+                "scale": self.family_case.scale,
+                "constant": self.family_case.constant,
             }
         )
         match path.suffix:
             case ".mat":
                 from mortarbench.harness.files.matfile import save_mat
 
-                save_mat(path, self.qp, meta, self.made.matrices)
+                save_mat(path, self.qp, meta, self.family_case.matrices)
             case ".parquet":
                 from mortarbench.harness.files.parquetfile import save_parquet
 
@@ -176,9 +182,11 @@ class Case(plugin.Case):
         return path
 
     def __repr__(self) -> str:
-        if "made" not in vars(self):
+        if "family_case" not in vars(self):
             return f"<Case {self.name}, not built>"
-        sizes = ", ".join(f"{n} {what}" for what, n in self.made.qp.sizes.items())
+        sizes = ", ".join(
+            f"{n} {what}" for what, n in self.family_case.qp.sizes.items()
+        )
         return f"<Case {self.name}: {sizes}>"
 
 
@@ -192,8 +200,8 @@ def _exported(M: Matrix) -> Matrix:
     return M
 
 
-class GivenQP(plugin.Family):
-    """A QP from a script, as a family of one problem."""
+class BareQP(plugin.Family):
+    """Family of a single problem, a QP without physical results."""
 
     name = "qp"
     defaults: Mapping[str, plugin.Value] = MappingProxyType({})
@@ -213,15 +221,15 @@ class GivenQP(plugin.Family):
 
 
 def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
-    """Return the case of a name, not built yet, or of a QP; a case as it is.
+    """Return the case for a name or a QP, not built yet; a case is returned as it is.
 
     plugins : Python files with more families or solvers
 
     Raises
     ------
     InputError
-        When the problem is of another type, there is no such case, or a plug-in cannot
-        be loaded.
+        If `problem` is of another type, there is no such case, or a plug-in cannot be
+        loaded.
 
     """
     match problem:
@@ -231,16 +239,16 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
                 return problem
             registries = problem.registries.with_files(files)
             extended = Case(id=problem.id, registries=registries)
-            if "made" in vars(problem):
-                extended.__dict__["made"] = problem.made
+            if "family_case" in vars(problem):
+                extended.__dict__["family_case"] = problem.family_case
             return extended
         case QP():
-            # our own code multiplies sparse arrays, not matrices, which differ in `*`
-            family = GivenQP(problem.with_matrices(csc_array))
+            # our code expects sparse arrays; `*` of sparse matrices differs
+            family = BareQP(problem.with_matrices(csc_array))
             name = CaseId(family=family, name="qp", params={}, form="qp")
-            return Case(id=name, registries=known(plugins))
+            return Case(id=name, registries=load_registries(plugins))
         case str():
-            registries = known(plugins)
+            registries = load_registries(plugins)
             return Case(id=parse(problem, registries.families), registries=registries)
     hint = f"; a file is 'file:{problem}'" if isinstance(problem, Path) else ""
     raise InputError(
@@ -250,19 +258,25 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
 
 
 def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
-    """Write a QP for other people's solvers: .npz, .mat, .parquet or .qps.
+    """Write a QP to a file for other programs: .npz, .mat, .parquet or .qps.
 
     Parameters
     ----------
     case : a name, a case of `build`, or a QP
-    path : of the file; its ending names the format
+    path : file to write; its suffix determines the format
     plugins : Python files with more families
 
     Raises
     ------
     InputError
-        When there is no such case, it cannot be built, the ending is none of these, the
-        format has no place for the numbers, or the file cannot be written.
+        If there is no such case, it cannot be built, the suffix is none of these, the
+        format cannot store the QP, or the file cannot be written.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> mb.export("contact-patch/dual", "patch.npz").name
+    'patch.npz'
 
     """
     return as_case(case, plugins).save(path)
@@ -277,22 +291,30 @@ def build(name: str, *, plugins: Plugins = ()) -> Case:
     Raises
     ------
     InputError
-        When there is no such case, or it cannot be built.
+        If there is no such case, or it cannot be built.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> case = mb.build("beam-ring/Nr=4/Nh=3/steps=1/dual")
+    >>> case.form, case.params["Nr"], case.qp.P.shape == (case.qp.q.size,) * 2
+    ('dual', 4, True)
 
     """
-    registries = known(plugins)
-    return built_case(parse(name, registries.families), registries)
+    registries = load_registries(plugins)
+    return build_case(parse(name, registries.families), registries)
 
 
-def built_case(case: CaseId, registries: Registries) -> Case:
-    """Build a case; what a plug-in or too little memory prevents is no fault of ours.
+def build_case(case: CaseId, registries: Registries) -> Case:
+    """Build a case.
 
     Raises
     ------
     InputError
-        For both, and what the family itself refuses.
+        If the family refuses the parameters, the code of a plug-in fails, or the memory
+        is too small.
 
     """
-    found = Case(id=case, registries=registries)
-    _ = found.made
-    return found
+    new_case = Case(id=case, registries=registries)
+    _ = new_case.family_case
+    return new_case

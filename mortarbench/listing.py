@@ -1,4 +1,4 @@
-"""What there is: solvers, families of problems, suites."""
+"""Lists of the available solvers, families of problems and suites."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.harness.names import completed
 from mortarbench.harness.plugin import About, Solver
 from mortarbench.harness.registry import options_of
-from mortarbench.registries import Plugins, Registries, known
+from mortarbench.registries import Plugins, Registries, load_registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.text import first_comment, first_sentence, listing
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: what `list solvers` says of our solvers, so that it need not import all of them;
-#: written by `make docs`, and a test compares it with the solvers
+#: data of our solvers for `list solvers`, so that it need not import all of them;
+#: written by `make docs`, and compared with the solvers by a test
 CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
 class Listing(tuple[Mapping[str, Any], ...]):
-    """Rows of plain data; a table where it is shown."""
+    """Rows of plain data, shown as a table."""
 
     __slots__ = ()
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The name of each row."""
+        """Names of all rows."""
         return tuple(row["name"] for row in self)
 
     @property
     def df(self) -> DataFrame:
-        """The same as a table of pandas."""
+        """The rows as a pandas table."""
         from pandas import DataFrame
 
         return DataFrame(list(self))
@@ -58,22 +58,28 @@ class Listing(tuple[Mapping[str, Any], ...]):
 def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
     """List the solvers: name, description, options with their defaults.
 
-    plugins : Python files with more of them
+    plugins : Python files with more solvers
 
     Raises
     ------
     InputError
-        When a plug-in cannot be loaded.
+        If a plug-in cannot be loaded.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> [row["options"] for row in mb.solvers() if row["name"] == "qoco"]
+    [{'max_iter': 200}]
 
     """
-    registries = known(plugins, registries)
+    registries = load_registries(plugins, registries)
     entries = getattr(registries.solvers, "entries", {})
     return Listing(
         _row(
             name,
             catalogue()[name]
             if name in SOLVERS and entries.get(name) is SOLVERS.entries[name]
-            else described(registries.solvers[name]),
+            else describe(registries.solvers[name]),
         )
         for name in registries.solvers
     )
@@ -82,15 +88,21 @@ def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> L
 def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
     """List the families: name, description, keys with their defaults, forms.
 
-    plugins : Python files with more of them
+    plugins : Python files with more families
 
     Raises
     ------
     InputError
-        When a plug-in cannot be loaded.
+        If a plug-in cannot be loaded.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> [row["forms"] for row in mb.problems() if row["name"] == "obstacle"]
+    [('primal', 'dual', 'dual-bounds')]
 
     """
-    registries = known(plugins, registries)
+    registries = load_registries(plugins, registries)
     return Listing(
         {
             "name": name,
@@ -103,16 +115,26 @@ def problems(*, plugins: Plugins = (), registries: Registries | None = None) -> 
 
 
 def suites(*, registries: Registries | None = None) -> Listing:
-    """List the suites that come with us: name, description, path."""
-    folder = known((), Registries() if registries is None else registries).suites
+    """List the suites of the package: name, description, path.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> "demo" in mb.suites().names
+    True
+
+    """
+    folder = load_registries(
+        (), Registries() if registries is None else registries
+    ).suites
     return Listing(
         {"name": path.stem, "description": first_comment(path), "path": str(path)}
         for path in sorted(folder.glob("*.toml"), key=attrgetter("stem"))
     )
 
 
-def described(solver: Solver) -> dict[str, Any]:
-    """Give what a list says of a solver, as plain data."""
+def describe(solver: Solver) -> dict[str, Any]:
+    """Return the entry of a solver in the catalogue, as plain data."""
     facts = about(solver)
     return {
         "about": None
@@ -124,7 +146,7 @@ def described(solver: Solver) -> dict[str, Any]:
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Say what a solver is, in a line, and what it lacks to be used here."""
+    """Return a row for a solver; its description names a library that is missing."""
     line = entry["sentence"]
     if entry["about"] is not None:
         facts = About(**entry["about"])
@@ -135,12 +157,12 @@ def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def catalogue() -> dict[str, Any]:
-    """Read what is known of our own solvers without importing them."""
-    found: dict[str, Any] = json.loads(CATALOGUE.read_text("utf-8"))
-    return found
+    """Read the catalogue of our own solvers, which are not imported."""
+    entries: dict[str, Any] = json.loads(CATALOGUE.read_text("utf-8"))
+    return entries
 
 
 def about(solver: Solver) -> About | None:
-    """Give the facts that a solver tells of itself, if it does."""
+    """Return the `About` of a solver, or None if it has none."""
     facts = getattr(solver, "about", None)
     return facts if isinstance(facts, About) else None

@@ -1,4 +1,4 @@
-"""The processes that runs start: a worker per solver, and one that builds cases."""
+"""Entry points of the processes of a run: workers of solvers, ranks, case workers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mortarbench.registries import Registries
 
 
 def worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Be the worker that `Registries.worker_command` starts."""
+    """Run as the worker that `Registries.worker_command` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     stand_for_harness()
@@ -37,10 +37,10 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 
         family = registries.families[case["family"]]
-        made = family.emission(case["form"], case["params"])
-        if made is None:
+        emission = family.emission(case["form"], case["params"])
+        if emission is None:
             raise InputError(f"{family.name}: ranks cannot emit this case")
-        return made(ranks, reference_over_ranks)
+        return emission(ranks, reference_over_ranks)
 
     serve(
         solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,
@@ -50,13 +50,13 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
 
 
 def ranks(registries: Registries, arguments: Sequence[str]) -> int:
-    """Start the ranks of a worker, as `Registries.worker_command` asks for."""
+    """Start the ranks of the worker that `Registries.worker_command` starts."""
     count = json.loads(arguments[0])["ranks"]
     return launch(count, [*registries.start, "worker", *arguments])
 
 
 def case_worker(registries: Registries, arguments: Sequence[str]) -> int:
-    """Be the case worker that `Registries.commands` starts."""
+    """Run as the case worker that `Registries.commands` starts."""
     text, request_fd, reply_fd = arguments
     request = json.loads(text)
     stand_for_harness()

@@ -1,8 +1,8 @@
-"""How a run goes: told to a function, or shown as a bar or as lines.
+"""Displays of the progress of a run: a bar, lines, or calls of a function.
 
-A run tells a `Progress` (see `harness.running.progress`) what it does. Here are those
-that show it: a bar on a terminal, a bar in a notebook, a line per measurement where
-there is neither, and events for a function of the user.
+A run reports to a `Progress` (see `harness.running.progress`). The classes here show
+it: a bar on a terminal, a bar in a notebook, a line per measurement elsewhere, or
+events for a function of the user.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from mortarbench.harness.errors import shown as repeated
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
-_REASON = 120  #: characters of why a solver declined
-_WIDE = 60  #: columns of a terminal that has room for a bar beside its numbers
-_BETWEEN = 0.2  #: s, between two pictures of a bar in a notebook
+_REASON_LENGTH = 120  #: characters shown of a reason to decline
+_BAR_WIDTH = 60  #: columns of a terminal that is wide enough for a bar and numbers
+_UPDATE_SECONDS = 0.2  #: between two updates of a bar in a notebook
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """What a run tells at one moment."""
+    """State of a run at one moment, passed to the function `progress` of `run`."""
 
-    done: int  #: measurements, those of an earlier run included
+    done: int  #: measurements so far, those of earlier runs included
     total: int
-    now: str = ""  #: what happens now
-    warning: str = ""  #: what went wrong, if something did
-    record: Record | None = None  #: the measurement that was just made, if one was
+    now: str = ""  #: current activity
+    warning: str = ""  #: message if something went wrong, else empty
+    record: Record | None = None  #: measurement that was just completed, if any
 
 
 Callback = Callable[[Event], object]
 
 
-class _State:
-    """Counts what a run has done, for those who show it."""
+class _Display:
+    """Counters of a run; subclasses show them."""
 
     def __init__(self) -> None:
-        self.done = self.total = self.measured = 0  # the last: by this run alone
+        self.done = self.total = 0
+        self.measured = 0  # by this run; `done` includes earlier runs
         self.began = monotonic()
         self.now = ""
 
@@ -56,19 +57,19 @@ class _State:
         self.changed()
 
     def warn(self, text: str) -> None:
-        """Show what went wrong, in a line that stays."""
+        """Show a warning in a line that is not overwritten."""
 
     def advance(self, record: Record | None) -> None:
         self.count(record)
         self.changed()
 
     def count(self, record: Record | None) -> None:
-        """Count what was done, and apart what was measured for it."""
+        """Count a unit as done, and as measured if there is a record."""
         self.done += 1
         self.measured += record is not None
 
     def left(self) -> str:
-        """Say how long the rest may take; empty before the first measurement."""
+        """Return the estimated remaining time; empty before the first measurement."""
         seconds = monotonic() - self.began
         return remaining(self.measured, self.total - self.done, seconds)
 
@@ -76,12 +77,12 @@ class _State:
         """Show the new state."""
 
 
-class _Silent(_State):
-    """Shows nothing."""
+class _Silent(_Display):
+    """Display that shows nothing."""
 
 
-class _Told(_State):
-    """Hands every change to a function."""
+class _EventDisplay(_Display):
+    """Display that calls a function with every change."""
 
     def __init__(self, callback: Callback) -> None:
         super().__init__()
@@ -103,20 +104,21 @@ class _Told(_State):
         self._tell(record=record)
 
 
-class _Warnings(_State):
-    """Writes what went wrong, and nothing else."""
+class _Warnings(_Display):
+    """Display that writes warnings only."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
         self._stream = stream
 
     def warn(self, text: str) -> None:
-        with suppress(BrokenPipeError):  # nobody listens: no reason to stop measuring
+        # a closed reader of the output must not end the run
+        with suppress(BrokenPipeError):
             print(text, file=self._stream, flush=True)
 
 
 class _Lines(_Warnings):
-    """Writes a line per measurement."""
+    """Display that writes a line per measurement."""
 
     def start(self, total: int) -> None:
         super().start(total)
@@ -125,25 +127,25 @@ class _Lines(_Warnings):
     def advance(self, record: Record | None) -> None:
         super().advance(record)
         if record is not None:
-            self.warn(f"{self.done}/{self.total} {in_words(record)}")
+            self.warn(f"{self.done}/{self.total} {measurement_line(record)}")
 
 
-def in_words(record: Record) -> str:
-    """Say in a line what came of a measurement."""
+def measurement_line(record: Record) -> str:
+    """Return the result of a measurement in a line."""
     seconds = record.total_seconds
-    took = "" if seconds is None else f" in {seconds:.3g} s"
+    detail = "" if seconds is None else f" in {seconds:.3g} s"
     if record.verdict is Verdict.DECLINED and record.message:
-        took = f": {record.message[:_REASON]}"
-    return f"{record.solver} on {record.case}: {record.verdict.words}{took}"
+        detail = f": {record.message[:_REASON_LENGTH]}"
+    return f"{record.solver} on {record.case}: {record.verdict.words}{detail}"
 
 
-def stands_out(record: Record) -> bool:
-    """Whether a measurement is worth a line above a bar: it was not verified."""
+def is_notable(record: Record) -> bool:
+    """Return True if a measurement is neither verified nor declined."""
     return not record.verdict.is_verified and record.verdict is not Verdict.DECLINED
 
 
-class _Bar(_State):
-    """A bar of `rich`, above it what was not verified."""
+class _Bar(_Display):
+    """Bar of `rich`, with a line above it for each answer that is not verified."""
 
     def __init__(self, bar: Any) -> None:
         super().__init__()
@@ -167,19 +169,19 @@ class _Bar(_State):
     def advance(self, record: Record | None) -> None:
         super().advance(record)
         self._bar.advance(self._task)
-        if record is not None and stands_out(record):
-            self.warn(in_words(record))
+        if record is not None and is_notable(record):
+            self.warn(measurement_line(record))
 
 
-class _Notebook(_State):
-    """A bar in a notebook, above it what was not verified."""
+class _Notebook(_Display):
+    """Bar in a notebook, with a line above it for each answer that is not verified."""
 
     def __init__(self) -> None:
         super().__init__()
         from IPython.display import display
 
         self._lines: list[str] = []
-        self._shown = -_BETWEEN
+        self._updated = -_UPDATE_SECONDS
         self._handle = display(_Html(""), display_id=True)
 
     def warn(self, text: str) -> None:
@@ -187,14 +189,14 @@ class _Notebook(_State):
         self.changed()
 
     def advance(self, record: Record | None) -> None:
-        if record is not None and stands_out(record):
-            self._lines.append(in_words(record))
+        if record is not None and is_notable(record):
+            self._lines.append(measurement_line(record))
         super().advance(record)
 
     def changed(self) -> None:
-        if monotonic() - self._shown < _BETWEEN and self.done < self.total:
+        if monotonic() - self._updated < _UPDATE_SECONDS and self.done < self.total:
             return
-        self._shown = monotonic()
+        self._updated = monotonic()
         above = "".join(f"<div>{html_escape(line)}</div>" for line in self._lines)
         self._handle.update(
             _Html(
@@ -214,10 +216,10 @@ class _Html:
 
 
 def remaining(measured: int, to_do: int, seconds: float) -> str:
-    """Say how long what is to do takes if it goes on as before; empty if unknown.
+    """Return the time left at the present rate, "H:MM:SS left"; empty if unknown.
 
-    measured : how many measurements took the `seconds`; those of an earlier run, which
-        took none, do not count
+    measured : number of measurements that took the `seconds`; those of earlier runs,
+        which took no time now, do not count
     """
     if measured <= 0 or to_do <= 0:
         return ""
@@ -227,13 +229,13 @@ def remaining(measured: int, to_do: int, seconds: float) -> str:
 
 
 def in_notebook() -> bool:
-    """Whether this Python is the kernel of a notebook."""
+    """Return True if this Python is the kernel of a notebook."""
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     return shell is not None and "IPKernelApp" in getattr(shell, "config", {})
 
 
 @contextmanager
-def shown_on(stream: TextIO) -> Iterator[Progress]:
+def display_on(stream: TextIO) -> Iterator[Progress]:
     """Show a run on a stream: a bar on a terminal, else a line per measurement."""
     if not stream.isatty():
         yield _Lines(stream)
@@ -251,7 +253,10 @@ def shown_on(stream: TextIO) -> Iterator[Progress]:
     from rich.text import Text
 
     class TimeLeft(ProgressColumn):
-        """rich's own looks back half a minute: a long measurement leaves it nothing."""
+        """Remaining time over all measurements.
+
+        The column of rich uses the last half minute, in which there may be none.
+        """
 
         def render(self, task: Task) -> Text:
             return Text(task.fields["left"](), style="progress.remaining")
@@ -263,33 +268,33 @@ def shown_on(stream: TextIO) -> Iterator[Progress]:
         TextColumn("{task.description}", table_column=now),
     ]
     console = Console(file=stream)
-    if console.width >= _WIDE:
+    if console.width >= _BAR_WIDTH:
         columns.insert(0, BarColumn(bar_width=20))
     with Bars(*columns, console=console, expand=True) as bar:
         yield _Bar(bar)
 
 
 @contextmanager
-def quiet_on(stream: TextIO) -> Iterator[Progress]:
-    """Show on a stream what goes wrong in a run, and nothing else."""
+def warnings_on(stream: TextIO) -> Iterator[Progress]:
+    """Show only the warnings of a run, on a stream."""
     yield _Warnings(stream)
 
 
 @contextmanager
 def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
-    """Show a run as the user asks: see `mortarbench.run`."""
+    """Show a run according to the argument `progress` of `mortarbench.run`."""
     if progress is None and in_notebook():
         yield _Notebook()
     elif progress is True:
         if in_notebook():
             yield _Notebook()
         else:
-            with shown_on(sys.stderr) as bar:
+            with display_on(sys.stderr) as bar:
                 yield bar
     elif isinstance(progress, Progress):
         yield progress
     elif callable(progress):
-        yield _Told(progress)
+        yield _EventDisplay(progress)
     elif progress in (None, False):
         yield _Silent()
     else:
@@ -299,4 +304,4 @@ def shown(progress: bool | Callback | Progress | None) -> Iterator[Progress]:
 
 
 def ignore(text: str) -> None:
-    """Take no notice."""
+    """Discard a message."""

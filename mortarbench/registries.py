@@ -1,4 +1,4 @@
-"""What can be measured: families, solvers and suites, with those of plug-ins."""
+"""Registries of families, solvers and suites, including those of plug-ins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.plugin import Family, Reference, Solver, as_family
-from mortarbench.harness.processes.turns import Turn
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.registry import (
     COPIES,
     Plugin,
@@ -36,16 +36,16 @@ if TYPE_CHECKING:
     from mortarbench.harness.results.work_unit import Commands
     from mortarbench.harness.solution import Solution
 
-#: of the thread that loads plug-ins, builds, solves, runs or validates: these set
-#: numbers of threads, standard output and modules of the whole process
-TURN = Turn()
+#: lock of the thread that loads plug-ins, builds, solves, runs or validates: these
+#: operations set numbers of threads, standard output and modules of the whole process
+TURN = ForkSafeLock()
 
-#: Python files that define SOLVERS or PROBLEMS; a text may be LABEL=FILE.py
+#: Python files that define SOLVERS or PROBLEMS; a string may be LABEL=FILE.py
 Plugins = Sequence[str | Path | PluginFile]
 
 
 class Reporter(Protocol):
-    """Writes the report on a result folder, and returns the files."""
+    """Function that writes the report on a result folder and returns its files."""
 
     def __call__(
         self,
@@ -55,11 +55,14 @@ class Reporter(Protocol):
         factor: float = ...,
         pool_forms: bool = ...,
     ) -> list[Path]:
-        """Report; verdicts are those at factor·tol, forms are compared together."""
+        """Write the report, with verdicts at factor·tol.
+
+        pool_forms : compare solvers over the cases of all forms together
+        """
 
 
 def _plugin_files(files: Plugins) -> list[PluginFile]:
-    """Parse a list of plug-ins; a lone text or path is a likely slip, and refused."""
+    """Return a list of plug-ins; a single string or path is refused as a mistake."""
     if isinstance(files, str | Path) or not isinstance(files, Iterable):
         raise InputError(
             f"plugins = {shown(files)}; expected a list of Python files, such as "
@@ -73,19 +76,19 @@ def _plugin_files(files: Plugins) -> list[PluginFile]:
 
 
 def suites_folder() -> Path:
-    """Say where the suites lie: in the package, or beside it in a checkout."""
+    """Return the folder of the suites: in the package, or beside it in a checkout."""
     inside = Path(__file__).parent / "suites"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "suites"
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Keep every library to one thread, as the processes of a run do.
+    """Limit every library to one thread, as the processes of a run do.
 
-    Sums in another order would make another QP of the same case, in its last digits.
-    Another thread of ours that wants the same waits until this one is done.
+    With several threads the order of sums differs, and with it the last digits of the
+    QP of a case. Another thread that enters this context waits until this one leaves.
     """
-    from scipy import linalg  # libraries that are loaded, and only they, can be told
+    from scipy import linalg  # threadpoolctl limits only libraries that are loaded
     from sksparse import cholmod
     from threadpoolctl import threadpool_limits
 
@@ -95,10 +98,10 @@ def one_thread() -> Iterator[None]:
 
 
 def defer_parts_of_numpy() -> None:
-    """Execute modules of numpy that scipy imports only when their names are used.
+    """Defer the execution of numpy's modules f2py and testing to their first use.
 
-    Nothing here uses them, and they take a quarter of the time in which a process that
-    solves starts: `scipy._lib.array_api_compat.numpy` asks for every name of numpy.
+    Nothing here uses them, but `scipy._lib.array_api_compat.numpy` accesses every name
+    of numpy, and importing them takes a quarter of the start-up time of a worker.
     """
     import numpy
 
@@ -109,11 +112,11 @@ def defer_parts_of_numpy() -> None:
         spec.loader = LazyLoader(spec.loader)
         module = sys.modules[spec.name] = module_from_spec(spec)
         spec.loader.exec_module(module)
-        setattr(numpy, part, module)  # or numpy would ask for it again
+        setattr(numpy, part, module)  # otherwise numpy.__getattr__ imports it again
 
 
 def reference(qp: QP) -> Solution:
-    """Solve to the last digits, by a method that is none of the solvers compared."""
+    """Solve to about rounding, without any of the solvers under test."""
     from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)
@@ -147,8 +150,8 @@ def _validation_page(
     return write_validation(folder, data, meshes)
 
 
-class _WithCopies(Mapping[str, Family]):
-    """Families that take the copies of files which a result folder holds."""
+class _FamiliesWithCopies(Mapping[str, Family]):
+    """Families that read files from their copies in a result folder."""
 
     def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
         self._families = families
@@ -170,34 +173,33 @@ class _WithCopies(Mapping[str, Family]):
 
 @dataclass(frozen=True, kw_only=True)
 class Registries:
-    """What can be measured, and how the processes are started that measure it."""
+    """Families, solvers and operators, and the commands that start processes."""
 
     families: Mapping[str, Family] = field(default_factory=lambda: PROBLEMS)
     solvers: Mapping[str, Solver] = field(default_factory=lambda: SOLVERS)
     reference: Reference = reference
     report: Reporter = report_folder
     validation_page: ValidationPage = _validation_page
-    #: what puts an operator P together, see `harness.operators`
+    #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
-    #: those of them that did not come in a file
+    #: those among them that are not from plug-in files
     own_operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     suites: Path = field(default_factory=suites_folder)
-    files: tuple[
-        PluginFile, ...
-    ] = ()  #: plug-ins that the processes of a run load, too
-    #: which plug-in a family came in, for those that did
+    #: plug-in files, which the processes of a run load as well
+    files: tuple[PluginFile, ...] = ()
+    #: plug-in of each family that is from a plug-in
     origins: Mapping[str, str] = field(default_factory=dict)
-    #: starts the command line, less the name of a process that runs need. -P: what lies
-    #: in the working directory must not pass for a library
+    #: command line without the name of the process. -P: a file in the working directory
+    #: must not be imported in place of a library
     start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
 
     def extended(self, plugin: Plugin) -> Registries:
-        """Add the solvers, problems and operators of a plug-in.
+        """Return registries with the solvers, problems and operators of a plug-in.
 
         Raises
         ------
         InputError
-            When one of its names exists.
+            If one of its names exists already.
 
         """
         return replace(
@@ -210,12 +212,12 @@ class Registries:
 
     @TURN
     def with_files(self, files: Plugins) -> Registries:
-        """Add the plug-ins in `files`.
+        """Return registries with the plug-ins in `files`.
 
         Raises
         ------
         InputError
-            When one cannot be loaded, or a name of it exists.
+            If one cannot be loaded, or one of its names exists already.
 
         """
         extended = self
@@ -229,19 +231,19 @@ class Registries:
         return extended
 
     def missing(self, files: Plugins) -> list[PluginFile]:
-        """List the plug-ins of `files` that are not loaded yet.
+        """Return the plug-ins of `files` that are not loaded yet.
 
         Raises
         ------
         InputError
-            When they are not a list of files.
+            If `files` is not a list of files.
 
         """
         loaded = {file.resolved() for file in self.files}
         return [f for f in _plugin_files(files) if f.resolved() not in loaded]
 
-    def hold_own_code_only(self) -> bool:
-        """Whether nothing of a plug-in has been loaded."""
+    def hold_only_builtins(self) -> bool:
+        """Return True if no plug-in has been loaded."""
         return (
             self.families is PROBLEMS
             and self.solvers is SOLVERS
@@ -250,15 +252,15 @@ class Registries:
         )
 
     def worker_command(self, spec: SolverSpec, copy: Path | None = None) -> list[str]:
-        """Return the command that starts the worker of a solver, less its two pipes.
+        """Return the command that starts the worker of a solver, without its two pipes.
 
-        copy : file that holds the configured solver, if it is an object; see
+        copy : file of the configured solver, if it is an object; see
             `harness.processes.solver_file`
 
         Raises
         ------
         InputError
-            When an option is no plain data.
+            If an option cannot be written as JSON.
 
         """
         request: dict[str, Any] = {
@@ -280,18 +282,18 @@ class Registries:
             ) from None
 
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
-        """Return the families, which take copies of files from a result folder.
+        """Return the families, which read files from the copies in a result folder.
 
-        folder : which `refuse_links` has let pass; None: there are no copies
+        folder : result folder, checked by `refuse_links`; None: there are no copies
         """
-        return _WithCopies(self.families, folder)
+        return _FamiliesWithCopies(self.families, folder)
 
     def commands(
         self, specs: Iterable[SolverSpec], folder: Path | None = None
     ) -> Commands:
         """Return the commands that start the processes of a run.
 
-        folder : the result folder, whose copies of files cases may be built from
+        folder : result folder, with copies of files from which cases may be built
         """
         from mortarbench.harness.results.work_unit import Commands
 
@@ -301,13 +303,14 @@ class Registries:
         return Commands(
             solvers={s.label: self.worker_command(s) for s in specs},
             case_worker=[*self.start, "generator", json.dumps(request)],
-            own_code_only=self.hold_own_code_only(),
+            own_code_only=self.hold_only_builtins(),
         )
 
     def environment(self) -> dict[str, Any]:
-        """Describe what the processes of a run measure in; see `capture`.
+        """Return the environment of the processes of a run; see `capture`.
 
-        In a process that is not ours, other libraries and more threads are at work.
+        It is captured in a new process unless this one is limited to one thread as
+        well: other programs, such as a notebook, load other libraries and use threads.
         """
         from mortarbench.harness.environment.environment import capture, capture_in
         from mortarbench.solvers.common.libraries import PACKAGES
@@ -315,56 +318,58 @@ class Registries:
         if ONE_THREAD.items() <= os.environ.items():
             here = capture(self.files, PACKAGES)
             if all(pool["threads"] == 1 for pool in here["threads"]["pools"]):
-                return here  # or they were set when libraries were loaded already
+                return here  # else the limits were set after libraries had been loaded
         return capture_in(ONE_THREAD, self.files, PACKAGES)
 
     def _absolute_files(self) -> list[str]:
         return [str(file.resolved()) for file in self.files]
 
     def suite_path(self, text: str | Path) -> Path:
-        """Find a suite by path, or by its bare name among those that come with us.
+        """Return the path of a suite, for a path or for the name of one of `suites`.
 
         Raises
         ------
         InputError
-            When there is neither.
+            If there is neither.
 
         """
         path = checked.path("suite", text)
         if path.is_file():
             return path
-        known = {p.stem: p for p in self.suites.glob("*.toml")}
-        if str(text) in known:
-            return known[str(text)]
+        suites = {p.stem: p for p in self.suites.glob("*.toml")}
+        if str(text) in suites:
+            return suites[str(text)]
         if path.exists():
-            return path  # what it is instead of a file, says who reads it
+            return path  # not a file: reading it raises the fitting error
         if len(path.parts) > 1 or path.suffix:
             raise InputError(f"{text}: no such file; expected a suite in TOML")
-        raise unknown("suite", str(text), known)
+        raise unknown("suite", str(text), suites)
 
 
 def installed(registries: Registries) -> Registries:
-    """Add what installed packages offer as entry points.
+    """Return registries with the plug-ins of installed packages (entry points).
 
     Raises
     ------
     InputError
-        When one fails to import, or one of its names exists.
+        If one fails to import, or one of its names exists already.
 
     """
     return registries.extended(entry_point_plugins())
 
 
 @TURN
-def known(plugins: Plugins = (), registries: Registries | None = None) -> Registries:
-    """Give all that is known: ours, installed plug-ins, and those in files.
+def load_registries(
+    plugins: Plugins = (), registries: Registries | None = None
+) -> Registries:
+    """Return our registries with those of installed plug-ins and of plug-in files.
 
-    registries : what is known instead, where it is given
+    registries : returned instead, unless None
 
     Raises
     ------
     InputError
-        When a plug-in cannot be loaded, or one of its names exists.
+        If a plug-in cannot be loaded, or one of its names exists already.
 
     """
     if registries is None:

@@ -1,4 +1,4 @@
-"""One stored measurement against the same made anew: what is the same, what is not."""
+"""Replay of a stored measurement, and comparison of the two."""
 
 from __future__ import annotations
 
@@ -29,36 +29,36 @@ from mortarbench.harness.results.stored_run import (
     open_stored_run,
     work_unit_of,
 )
-from mortarbench.harness.results.work_unit import Result, Unbuilt, Unmade
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.results.work_unit import BuildFailure, MeasurementFault, Result
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.solution import Status
-from mortarbench.registries import TURN, Plugins, Registries, known
-from mortarbench.text import aligned
+from mortarbench.registries import TURN, Plugins, Registries, load_registries
+from mortarbench.text import align
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
-_SHOWN = 48  #: characters of a value of an environment
+_VALUE_LENGTH = 48  #: characters shown of a value of an environment
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Replay:
-    """A stored measurement (`then`) and its repetition (`now`)."""
+    """Stored measurement (`then`) and its repetition (`now`)."""
 
     then: Record
     now: Record
-    same_qp: bool | None  #: None where the record is too old to tell
-    same_options: bool  #: with all defaults resolved
-    same_counts: bool  #: iterations too
+    same_qp: bool | None  #: None if the old record has no digest of its QP
+    same_options: bool  #: compared with all defaults filled in
+    same_counts: bool  #: iterations and all counts
     distance: float | None  #: ‖x_now − x_then‖∞ / ‖x_then‖∞; None without two points
     ratios: Mapping[str, tuple[float, float, float] | None]
-    """Of times: now over the median of the stored repeats; and those repeats' least
-    and greatest over that median. None where one was not measured."""
+    """Ratios of times: the new one, the smallest and the largest stored repeat, each
+    relative to the median of the stored repeats. None if a time was not measured."""
     stored: Mapping[str, tuple[float, ...]]  #: times of the stored repeats, s
-    environment: list[tuple[str, Any, Any]]  #: dotted key, then, now
+    environment: list[tuple[str, Any, Any]]  #: differences: dotted key, then, now
 
     @property
     def reproduced(self) -> bool:
-        """Whether the same QP got the same verdict."""
+        """True if the same QP has the same verdict."""
         return self.same_qp is not False and self.then.verdict is self.now.verdict
 
     def __repr__(self) -> str:
@@ -68,7 +68,7 @@ class Replay:
         return f"<pre>{escape(repr(self))}</pre>"
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON."""
+        """Return plain data for JSON."""
         lines = {"then": self.then.to_dict(), "now": self.now.to_dict()}
         data: dict[str, Any] = finite(
             {**asdict(self), **lines, "reproduced": self.reproduced}
@@ -88,23 +88,31 @@ def replay(
     plugins: Plugins = (),
     registries: Registries | None = None,
 ) -> Replay:
-    """Make one stored measurement again, and compare.
+    """Repeat one stored measurement, and compare it with the old one.
 
     Parameters
     ----------
-    run_id : of a line of the journal, or its first digits
+    folder : result folder, as `run` writes it
+    run_id : `run_id` of a line of the journal, or its first digits
     plugins : Python files with more solvers or families
-    registries : what is known, instead of ours, what is installed and `plugins`
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        When there is no such measurement, or its case or solver is not known.
+        If there is no such measurement, or its case or solver is unknown.
     FaultError
-        When something else than the solver prevented it.
+        If something other than the solver prevents the measurement.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> results = mb.run("smoke", out="out/smoke", cases=["*/dual"], solvers=["pdas"])
+    >>> mb.replay("out/smoke", results.df.run_id[0]).reproduced
+    True
 
     """
-    registries = known(plugins, registries)
+    registries = load_registries(plugins, registries)
     path, solvers = checked.path("folder", folder), registries.solvers
     families = registries.families_with_copies(path)
     stored = open_stored_run(path, text("run_id", run_id), families, solvers)
@@ -113,7 +121,7 @@ def replay(
     commands = registries.commands([stored.spec], path)
     with (
         TemporaryDirectory(prefix="mortarbench-") as scratch,
-        one_by_one(
+        local_engine(
             commands,
             Path(scratch),
             Path(scratch) / "cases",
@@ -121,20 +129,20 @@ def replay(
         ) as execute,
     ):
         *_, result = execute(iter([unit]))
-    if isinstance(result, Unbuilt):
+    if isinstance(result, BuildFailure):
         raise InputError(f"{stored.record.run_id}: {result.reason}")
-    if isinstance(result, Unmade):
+    if isinstance(result, MeasurementFault):
         raise FaultError(f"{stored.record.run_id}: {result.reason}")
-    return compared(path, stored, result, environment)
+    return compare(path, stored, result, environment)
 
 
-def compared(
+def compare(
     folder: Path,
     run: StoredRun,
     result: Result,
     environment: Mapping[str, Any],
 ) -> Replay:
-    """Compare a new measurement and its point with what `folder` holds."""
+    """Compare a new measurement and its point with those stored in `folder`."""
     then, now = run.record, result.record
     stored = {
         name: tuple(s for r in run.repeats if (s := getattr(r, name)) is not None)
@@ -149,19 +157,23 @@ def compared(
         distance=_distance(folder, then, result.point),
         ratios={name: _ratio(stored[name], getattr(now, name)) for name in _SECONDS},
         stored=stored,
-        environment=list(differences(_keyed(run.environment), _keyed(environment))),
+        environment=list(
+            differences(
+                _pools_by_library(run.environment), _pools_by_library(environment)
+            )
+        ),
     )
 
 
 def render(c: Replay) -> str:
-    """Lay out a comparison: then, now, and what is the same."""
+    """Return a comparison as a table: then, now, and whether they are equal."""
     rows = [["", "then", "now", ""], *_verdicts(c), *_numbers(c), *_times(c)]
     lines = [f"{c.now.run_id}  {c.now.solver} on {c.now.case}, tolerance {c.now.tol:g}"]
-    lines += ["", aligned(rows), ""]
+    lines += ["", align(rows), ""]
     if c.environment:
         lines.append("The environment differs:")
         shown = [[f"  {k}", _short(a), f"→ {_short(b)}"] for k, a, b in c.environment]
-        lines += [aligned(shown), ""]
+        lines += [align(shown), ""]
     else:
         lines += ["The environment is the same.", ""]
     if c.reproduced:
@@ -222,7 +234,7 @@ def _times(c: Replay) -> Iterable[list[str]]:
 
 
 def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> str:
-    """Say what a new time is divided by: `then` is but one of several repeats."""
+    """Return a ratio of times with its reference, the median of the stored repeats."""
     now, least, greatest = ratio
     if len(stored) == 1:
         return f"{now:.2f} of the only stored repeat"
@@ -237,9 +249,9 @@ def _distance(folder: Path, then: Record, point: Arrays | None) -> float | None:
         return None
     try:
         solution = load_solution(folder, then.vectors, Status.SOLVED)
-    except InputError:  # the vectors may have been thrown away: records suffice
+    except InputError:  # vectors may be deleted; the journal alone is valid
         return None
-    if digest_of(point_arrays(solution)) != then.vectors:  # not what was stored
+    if digest_of(point_arrays(solution)) != then.vectors:  # the file was changed
         return None
     stored = solution.x
     if stored.shape != point["x"].shape:
@@ -256,16 +268,19 @@ def _ratio(
     return new / middle, min(stored) / middle, max(stored) / middle
 
 
-def _keyed(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Name each thread pool by its library, so that one that differs is named."""
+def _pools_by_library(environment: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the environment with thread pools by the names of their libraries.
+
+    Differences are then reported by library, not by the position in a list.
+    """
     threads = environment.get("threads")
     if not isinstance(threads, Mapping):
         return dict(environment)
-    found = threads.get("pools")
-    if not isinstance(found, list) or not all(isinstance(p, Mapping) for p in found):
+    pools = threads.get("pools")
+    if not isinstance(pools, list) or not all(isinstance(p, Mapping) for p in pools):
         return dict(environment)
-    pools = {f"{p.get('library')} of {p.get('owner')}": p for p in found}
-    return {**environment, "threads": {**threads, "pools": pools}}
+    by_library = {f"{p.get('library')} of {p.get('owner')}": p for p in pools}
+    return {**environment, "threads": {**threads, "pools": by_library}}
 
 
 def _same(yes: bool) -> str:
@@ -278,4 +293,4 @@ def _text(value: Any, digits: str = "") -> str:
 
 def _short(value: Any) -> str:
     text = _text(value) if isinstance(value, str | None) else str(value)
-    return text if len(text) <= _SHOWN else text[: _SHOWN - 1] + "…"
+    return text if len(text) <= _VALUE_LENGTH else text[: _VALUE_LENGTH - 1] + "…"

@@ -1,4 +1,4 @@
-"""The report on a result folder, or on what changed between several."""
+"""Reports on a result folder, and on the changes between several."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mortarbench.arguments import FORMATS, GATES, check_known
+from mortarbench.arguments import FORMATS, GATES, check_names
 from mortarbench.harness import checked
 from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.durable import report_full_disk
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.registries import Registries, known, report_folder
+from mortarbench.registries import Registries, load_registries, report_folder
 
 if TYPE_CHECKING:
     from mortarbench.harness.running.pairs import Ratio
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Report:
-    """The files of a report."""
+    """Files of a report, with its main statements."""
 
     files: tuple[Path, ...]
-    said: tuple[str, ...] = ()  #: the answer in a few lines
-    #: what changed from the first folder to each of the others, as plain data
+    said: tuple[str, ...] = ()  #: main statements, a line each
+    #: changes from the first folder to each of the others, as plain data
     changes: tuple[dict[str, Any], ...] = ()
-    failed_on: tuple[str, ...] = ()  #: of what was asked to fail on, what happened
+    failed_on: tuple[str, ...] = ()  #: conditions of `fail_on` that are met
 
     @property
     def page(self) -> Path | None:
-        """The HTML page, if it was asked for."""
+        """HTML page, or None if it was not requested."""
         return next((file for file in self.files if file.suffix == ".html"), None)
 
     def to_dict(self) -> dict[str, Any]:
-        """Give all of it as plain data, as ``report --json`` prints it."""
+        """Return the report as plain data, as ``report --json`` prints it."""
         return {
             "said": [*self.said],
             "changes": [*self.changes],
@@ -66,32 +66,43 @@ def report(
     pool_forms: bool = False,
     registries: Registries | None = None,
 ) -> Report:
-    """Write DIR/report, or what changed from `folder` to each other into the latter.
+    """Write the report on a result folder, or on the changes from it to other folders.
 
     Parameters
     ----------
-    formats : of html, md, tex, csv, parquet
-    factor : verified means every residual within factor·tol
-    fail_on : what `Report.failed_on` tells of: ``worse``, a verdict became worse;
-        ``slower``, an interval lies wholly above 1, see docs/statistics.md
-    pool_forms : means, ranks and profiles compare the cases of all forms together, not
-        form by form; a form that a solver declines is unsolved by it
-    registries : whose way to report is used, instead of ours
+    folder : result folder; its report is written to DIR/report
+    others : if any, the changes from `folder` to each of them are reported instead, in
+        the folder ``report`` of the latter
+    formats : among html, md, tex, csv, parquet
+    factor : verified means that every residual is within factor·tol
+    fail_on : conditions listed in `Report.failed_on` if they are met: ``worse``, a
+        verdict became worse; ``slower``, the interval of a ratio of times lies above
+        1, see docs/statistics-growth.md
+    pool_forms : compare solvers over the cases of all forms together in means, ranks
+        and profiles, instead of form by form; a declined form counts as unsolved
+    registries : replaces our registries, whose report function is used
 
     Raises
     ------
     InputError
-        When a folder holds no measurements, a format or the factor is none, forms are
-        to be pooled in a comparison, or what to fail on cannot be judged.
+        If a folder contains no measurements, a format or the factor is invalid, forms
+        are to be pooled in a comparison, or a condition of `fail_on` cannot be decided.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> results = mb.run("smoke", out="out/smoke", cases=["*/dual"], solvers=["pdas"])
+    >>> mb.report("out/smoke", formats=["html"]).page.name
+    'index.html'
 
     """
     formats = checked.texts("formats", formats)
-    check_known("format", formats, FORMATS, "formats")
+    check_names("format", formats, FORMATS, "formats")
     fail_on = checked.texts("fail_on", fail_on)
-    check_known("gate", fail_on, GATES, "fail_on")
+    check_names("gate", fail_on, GATES, "fail_on")
     factor = checked.positive("factor", factor)
     pool_forms = checked.flag("pool_forms", pool_forms)
-    registries = known((), Registries() if registries is None else registries)
+    registries = load_registries((), Registries() if registries is None else registries)
     first = checked.path("folder", folder)
     after = [checked.path("others", other) for other in others if other is not None]
     if fail_on and not after:
@@ -100,7 +111,7 @@ def report(
         write = registries.report
         with report_full_disk(first):
             files = write(first, formats, factor=factor, pool_forms=pool_forms)
-        if write is not report_folder:  # somebody's own report has no such sentence
+        if write is not report_folder:  # a report function of a plug-in has no `answer`
             return Report(files=tuple(files))
         from mortarbench.reports import answer
 
@@ -112,25 +123,25 @@ def report(
         )
     from mortarbench.reports import write_comparisons
 
-    with ExitStack() as told:
+    with ExitStack() as stack:
         for one in after:
-            told.enter_context(report_full_disk(one))
-        found, said, pages = write_comparisons(first, after, formats, factor)
-    changes = tuple(map(_change, found))
+            stack.enter_context(report_full_disk(one))
+        comparisons, said, pages = write_comparisons(first, after, formats, factor)
+    changes = tuple(map(_comparison_data, comparisons))
     failed = [what for what in fail_on if any(change[what] for change in changes)]
-    unjudged = _unjudged(changes, fail_on)
-    if unjudged and not failed:
-        raise InputError(unjudged[0])
+    undecided = _undecided(changes, fail_on)
+    if undecided and not failed:
+        raise InputError(undecided[0])
     return Report(
         files=tuple(pages),
-        said=(*said, *unjudged),
+        said=(*said, *undecided),
         changes=changes,
         failed_on=tuple(dict.fromkeys(failed)),
     )
 
 
-def _unjudged(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list[str]:
-    """List the reasons why a gate cannot tell that nothing is worse, or slower."""
+def _undecided(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list[str]:
+    """Return the reasons why a condition of `fail_on` cannot be decided."""
     lines = []
     for change in changes if fail_on else ():
         between = f"{change['before']} and {change['after']}"
@@ -144,8 +155,8 @@ def _unjudged(changes: Sequence[dict[str, Any]], fail_on: Sequence[str]) -> list
     return lines
 
 
-def _change(c: Comparison) -> dict[str, Any]:
-    """Say what changed between two folders as plain data."""
+def _comparison_data(c: Comparison) -> dict[str, Any]:
+    """Return the changes between two folders as plain data."""
     from mortarbench.reports.compare.changes import mean_ratio
     from mortarbench.reports.compare.regressions import regressions
 
@@ -176,8 +187,8 @@ def _cell(p: Pair) -> dict[str, Any]:
 
 
 def _verdicts(p: Pair) -> dict[str, Any]:
-    turned = {"before": p.before.verdict.value, "after": p.after.verdict.value}
-    return _cell(p) | turned
+    verdicts = {"before": p.before.verdict.value, "after": p.after.verdict.value}
+    return _cell(p) | verdicts
 
 
 def _slower(one: Slower) -> dict[str, Any]:
@@ -191,7 +202,7 @@ def _slower(one: Slower) -> dict[str, Any]:
 
 
 def _interval(ratio: Ratio | Any) -> dict[str, float | None]:
-    """Give a ratio and its interval, whose ends are None where it has none."""
+    """Return a ratio with the ends of its interval, None if it has no interval."""
     bounded = 0 < ratio.low <= ratio.high < float("inf")
     return {
         "value": ratio.value,

@@ -1,4 +1,4 @@
-"""A suite measured into a folder, and what such a folder holds."""
+"""Runs of suites, and the results in their folders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mortarbench.arguments import PICTURES, writable
+from mortarbench.arguments import PICTURES, check_output_file
 from mortarbench.harness import checked
 from mortarbench.harness.checked import located
 from mortarbench.harness.environment.doctor import load_advice
@@ -26,15 +26,15 @@ from mortarbench.harness.results.faults import in_words
 from mortarbench.harness.results.folder import keep_environment, refuse_links
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.merge import merge as merge_folders
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.run import Missing
 from mortarbench.harness.running.run import run as run_suite
 from mortarbench.harness.suite.overrides import with_overrides
-from mortarbench.harness.suite.solver_options import as_given
+from mortarbench.harness.suite.solver_options import options_as_texts
 from mortarbench.harness.suite.suite import load_suite, name_in, parse_suite, suite_text
 from mortarbench.progress import Callback, ignore, shown
-from mortarbench.registries import TURN, Plugins, Registries, known
+from mortarbench.registries import TURN, Plugins, Registries, load_registries
 from mortarbench.reporting import Report, report
 from mortarbench.text import summary, summary_rows
 from mortarbench.validation import Validation, validate
@@ -43,29 +43,29 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-    from mortarbench.harness.results.work_unit import Opens
+    from mortarbench.harness.results.work_unit import EngineFactory
 
 
-#: the solver said something of its answer that is not so
+#: verdicts that refute the solver's claim
 REFUTED = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Results:
-    """The measurements of a result folder."""
+    """Measurements of a result folder."""
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    solvers: tuple[str, ...] = ()  #: of the suite, in its order; of the folder
-    cases: frozenset[str] = frozenset()  #: that were asked for; all where none is named
-    #: what was not measured; the same call tries it again
+    solvers: tuple[str, ...] = ()  #: labels of the suite, in its order; `load`: of all
+    cases: frozenset[str] = frozenset()  #: names of the requested cases; empty: all
+    #: requested measurements that are missing; the same call tries them again
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
     def df(self) -> DataFrame:
-        """A row per measurement, a column per field of the journal.
+        """Table with a row per measurement and a column per field of the journal.
 
-        A field without values is None: Parquet has no type for a mapping of nothing.
+        An empty mapping becomes None, because Parquet has no type for it.
         """
         from pandas import DataFrame
 
@@ -76,24 +76,24 @@ class Results:
 
     @property
     def refuted(self) -> tuple[Record, ...]:
-        """Of what was asked for, the answers whose claim is refuted."""
-        return tuple(r for r in self._asked if r.verdict in REFUTED)
+        """Requested measurements in which the solver's claim is refuted."""
+        return tuple(r for r in self._requested if r.verdict in REFUTED)
 
     @property
     def failed(self) -> tuple[Record, ...]:
-        """Of what was asked for, measurements that ended without an answer.
+        """Requested measurements that ended without an answer.
 
-        A limit that was met is among them; what a solver declined is not.
+        Those that reached a limit are included, declined ones are not.
         """
-        ended = (*REFUTED, Verdict.DECLINED)
+        excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(
             r
-            for r in self._asked
-            if r.verdict not in ended and not r.verdict.is_verified
+            for r in self._requested
+            if r.verdict not in excluded and not r.verdict.is_verified
         )
 
     @property
-    def _asked(self) -> tuple[Record, ...]:
+    def _requested(self) -> tuple[Record, ...]:
         return tuple(
             r
             for r in self.records
@@ -102,9 +102,9 @@ class Results:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """Give counts and failures as plain data, as ``run --json`` prints them."""
+        """Return counts and failures as plain data, as ``run --json`` prints them."""
         counts: dict[str, Counter[str]] = {}
-        for r in self._asked:
+        for r in self._requested:
             counts.setdefault(r.solver, Counter())[r.verdict.value] += 1
         return {
             "folder": str(self.folder),
@@ -117,7 +117,7 @@ class Results:
 
     @property
     def shortfall(self) -> list[str]:
-        """Say what could not be measured, a line each; none if all was."""
+        """Reasons why requested measurements are missing, a line each."""
         lines = []
         if count := len(self.missing.unbuilt):
             cases = "case" if count == 1 else "cases"
@@ -135,26 +135,28 @@ class Results:
     def plot(self, kind: str, path: str | Path | None = None) -> Figure:
         """Draw a figure of the report.
 
-        kind : its name in the folder ``figures`` of the report, such as ``accuracy`` or
-            ``scaling-1``; ``scaling`` where there is only one of these
-        path : of a file to write it to: .png, .pdf or .svg
+        Parameters
+        ----------
+        kind : name of the figure in the folder ``figures`` of the report, such as
+            ``accuracy`` or ``scaling-1``; ``scaling`` if there is only one of these
+        path : file to which the figure is also written: .png, .pdf or .svg
 
         Raises
         ------
         InputError
-            When the report has no such figure, with those that it has, or the file
-            cannot be written.
+            If the report has no such figure (the message lists its figures), or the
+            file cannot be written.
 
         """
         from mortarbench.reports import figures
         from mortarbench.reports.render.saving import draw, save
 
-        target = None if path is None else writable(path, PICTURES)
-        drawn = figures(self.folder)
-        wanted = [name for name in drawn if name == kind or name.startswith(f"{kind}-")]
-        if len(wanted) != 1:
-            raise unknown("figure", str(kind), drawn, where=str(self.folder))
-        figure = drawn[wanted[0]]
+        target = None if path is None else check_output_file(path, PICTURES)
+        available = figures(self.folder)
+        names = [n for n in available if n == kind or n.startswith(f"{kind}-")]
+        if len(names) != 1:
+            raise unknown("figure", str(kind), available, where=str(self.folder))
+        figure = available[names[0]]
         if target is not None:
             save(figure, target)
         return draw(figure)
@@ -181,7 +183,7 @@ class Results:
 
 
 def _named(r: Record) -> dict[str, Any]:
-    """Say which measurement it is and how it ended."""
+    """Return the identity of a measurement and how it ended."""
     return {
         "run_id": r.run_id,
         "case": r.case,
@@ -197,12 +199,24 @@ def _named(r: Record) -> dict[str, Any]:
 def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results:
     """Read the measurements of a result folder.
 
-    warn : is told of lines that were cut off, or damaged
+    Parameters
+    ----------
+    folder : result folder, as `run` writes it
+    warn : called with a message for each damaged or incomplete line of the journal
 
     Raises
     ------
     InputError
-        When the folder holds no measurements.
+        If the folder contains no measurements.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> results = mb.run("smoke", out="out/smoke", cases=["*/dual"], solvers=["pdas"])
+    >>> len(mb.load("out/smoke")) == len(results)
+    True
+    >>> sorted(set(mb.load("out/smoke").df.solver))
+    ['pdas']
 
     """
     path = checked.path("folder", folder)
@@ -220,19 +234,23 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
 def merge(
     *folders: str | Path, out: str | Path, tell: Callable[[str], None] = ignore
 ) -> Results:
-    """Make one result folder of several, or add them to one that was made so.
+    """Merge result folders into a new one, or into one of an earlier merge.
 
-    Every measurement is there once. What was measured in different environments stays
-    apart: records keep theirs, and reports mark it.
+    Duplicate measurements are stored once. Records keep their environment, and reports
+    distinguish environments.
 
+    Parameters
+    ----------
+    folders : result folders
     out : a new folder, or one of an earlier merge
-    tell : is told, in a line each, what was there before, or is missing
+    tell : called with a line about records that `out` already has, and about solutions
+        and environments that are missing
 
     Raises
     ------
     InputError
-        When a folder holds no measurements, or two suites differ in their limits,
-        their accuracy or in what a label means; `out` is then as it was.
+        If a folder contains no measurements, or two suites differ in their limits,
+        their accuracy or the meaning of a label; `out` is then unchanged.
 
     """
     if not folders:
@@ -245,7 +263,7 @@ def merge(
 
 
 def _refuse_objects(solvers: object) -> None:
-    """Refuse solver objects, which no result folder could name again."""
+    """Refuse solver objects: a result folder stores names only."""
     for one in solvers if isinstance(solvers, list | tuple) else [solvers]:
         if is_solver(one):
             raise InputError(
@@ -271,34 +289,56 @@ def run(
     progress: bool | Callback | Progress | None = None,
     registries: Registries | None = None,
 ) -> Results:
-    """Measure what a result folder lacks of a suite.
+    """Measure a suite into a result folder; measurements already there are kept.
 
     Parameters
     ----------
-    suite : path of a TOML, the name of one of `suites`, or a dict with the keys of a
-        TOML, whose relative paths start in the working directory
-    out : the result folder; ``out/NAME`` of the suite if not given
-    solvers : only these; names that the suite has not are added
-    cases : only these, patterns or names
-    repeats, time_limit, memory_limit : instead of the suite's; s, MiB
-    options : of every solver that has them; a list of values sweeps
-    fresh : forget first what the folder holds
+    suite : path of a TOML file, the name of one of `suites`, or a dict with the keys of
+        such a file, whose relative paths start in the working directory
+    out : result folder; default: ``out/NAME`` for the suite NAME
+    solvers : only these; solvers that are not in the suite are added
+    cases : only these, by names or patterns
+    repeats, time_limit, memory_limit : override those of the suite; s, MiB
+    options : options for every solver that has them; a list of values is a sweep
+    fresh : delete the contents of the folder first
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families
-    progress : True: a bar, or lines where stderr is no terminal; a function: is called
+    progress : True: a bar, or lines if stderr is not a terminal; a function: called
         with every `Event`; False: nothing; None: a bar in a notebook, else nothing
-    registries : what is known, instead of ours, what is installed and `plugins`
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        When something of that is wrong, the folder is in use, or its disk is full.
+        If an argument is wrong, the folder is in use, or its disk is full.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> results = mb.run(
+    ...     {
+    ...         "name": "steps",
+    ...         "tolerances": [1e-6],
+    ...         "repeats": 1,
+    ...         "solvers": ["smalbe"],
+    ...         "problems": [
+    ...             {
+    ...                 "family": "beam-ring",
+    ...                 "forms": ["dual"],
+    ...                 "params": {"Nr": 4, "Nh": 3, "step": [1, 10]},
+    ...             }
+    ...         ],
+    ...     },
+    ...     out="out/steps",
+    ... )
+    >>> [str(verdict) for verdict in results.df.status]
+    ['verified', 'verified']
 
     """
     _refuse_objects(solvers)
     if isinstance(suite, Mapping):
         _refuse_objects(suite.get("solvers"))
-    registries = known(plugins, registries)
+    registries = load_registries(plugins, registries)
     folder = None if out is None else checked.path("out", out)
     if not isinstance(dask, str | None):
         raise InputError(f"dask = {given(dask)}; expected the address of a scheduler")
@@ -308,9 +348,10 @@ def run(
     else:
         text = read_text(registries.suite_path(suite), "a TOML file", MAX_TOML_MIB)
     folder = folder or Path("out") / name_in(text)
-    fresh = checked.flag("fresh", fresh)  # which forgets copies of files, too
+    fresh = checked.flag("fresh", fresh)  # True deletes the copies of files as well
     if folder.is_dir():
-        refuse_links(folder)  # before copies of files are read
+        # before copies of files are read: a link could lead outside the folder
+        refuse_links(folder)
     families = registries.families_with_copies(None if fresh else folder)
     known_solvers = registries.solvers
     if isinstance(suite, Mapping):
@@ -326,7 +367,7 @@ def run(
         repeats=repeats,
         time_limit=time_limit,
         memory_limit=memory_limit,
-        options=as_given({} if options is None else options),
+        options=options_as_texts({} if options is None else options),
     )
     environment = registries.environment()
     with shown(progress) as display, ExitStack() as stack:
@@ -335,9 +376,9 @@ def run(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
                 "be less certain"
             )
-        engine: Opens
+        engine: EngineFactory
         if dask is None:
-            engine = partial(one_by_one, operators=registries.operators)
+            engine = partial(local_engine, operators=registries.operators)
         else:
             from mortarbench.harness.running.cluster import on_cluster
 

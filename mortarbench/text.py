@@ -1,4 +1,4 @@
-"""What commands print for people: aligned text from plain data."""
+"""Text output of commands: aligned tables from plain data."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
     from mortarbench.harness.solution import History
 
-#: of quantities of elastic bodies in the plane, as the interface promises them; others
-#: are bare
+#: units of quantities of elastic bodies in the plane; other quantities have none
 UNITS = {
     "energy": "J/m",
     "dissipation": "J/m",
@@ -27,9 +26,9 @@ UNITS = {
     "max_von_mises": "Pa",
     "stress_error": "(dimensionless)",
 }
-_CONTACTS = "contacts"  #: the quantity that has a table per pair of sides
-_SHARE = "shear_without_contact"  #: beside `sliding_without_contact`
-_OF_A_CONTACT = {
+_CONTACTS = "contacts"  #: quantity with a table for each pair of sides
+_SHARE = "shear_without_contact"  #: shown beside `sliding_without_contact`
+_CONTACT_UNITS = {
     "largest_pressure": "Pa",
     "smallest_gap": "m",
     "half_width": "m",
@@ -47,21 +46,21 @@ _LEGEND = {
     "free_gradient": "‖φ‖: free gradient, of the variables off their bounds",
     "chopped_gradient": "‖β‖: chopped gradient, of those that should leave theirs",
     "infeasibility": "‖Ax−b‖: how far the equality rows are from holding, relative",
-    "active": "at bound: variables that meet one",
-    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
+    "active": "at bound: variables at one of their bounds",
+    "two_sided": "of two: those among them with two bounds; with friction, rows that "
     "slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }
-_UNTOLD = ("seconds",)  #: of a history: one run says nothing about time
-CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED`, in a record
-_ROWS = 15  #: of a table of convergence
+_HIDDEN = ("seconds",)  #: columns of a history not shown: one run measures no times
+CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED` in a record
+_MAX_ROWS = 15  #: rows of a table of convergence
 
 
 def first_sentence(thing: object) -> str:
-    """Cut the docstring of an instance's class after its first sentence.
+    """Return the first sentence of the docstring of an instance's class.
 
-    Empty where the class has none but that which `dataclass` makes of its fields.
+    Empty if the class has none, or only the signature that `dataclass` generates.
     """
     kind = type(thing)
     paragraph = (inspect.getdoc(kind) or "").partition("\n\n")[0]
@@ -72,14 +71,14 @@ def first_sentence(thing: object) -> str:
 
 
 def first_comment(path: Path) -> str:
-    """Read the comment that a suite starts with."""
+    """Return the comment in the first line of a suite; empty if there is none."""
     line = path.read_text("utf-8").partition("\n")[0]
     return line.removeprefix("#").strip() if line.startswith("#") else ""
 
 
 def listing(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Lay out one line per row: name, description, and what can be set."""
-    return aligned(
+    """Return a line per row: name, description, keys or options, forms."""
+    return align(
         [
             row["name"],
             row["description"],
@@ -96,15 +95,15 @@ def listing(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
-    """Lay out `summary_rows`."""
+    """Return `summary_rows` as aligned text."""
     rows = summary_rows(records, solvers)
-    return aligned(rows, right=range(1, len(rows[0])))
+    return align(rows, right=range(1, len(rows[0])))
 
 
 def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
-    """Count what each of `solvers` claimed and what of it is so; others come last.
+    """Return a table of the claims and verdicts of each solver, with a header row.
 
-    The first row has the heads of the columns.
+    `solvers` come first, other solvers of the records after them.
     """
     latest = {r.run_id: r for r in records}.values()
     header = [
@@ -116,25 +115,25 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
     for solver in dict.fromkeys([*solvers, *sorted(present)]):
         every = [r for r in latest if r.solver == solver]
         declined = [r for r in every if r.verdict is Verdict.DECLINED]
-        own = [r for r in every if r.verdict is not Verdict.DECLINED]
-        claimed = [r for r in own if r.claimed == CLAIMED_SOLVED]
-        verified = [r for r in own if r.verdict.is_verified]
+        measured = [r for r in every if r.verdict is not Verdict.DECLINED]
+        claimed = [r for r in measured if r.claimed == CLAIMED_SOLVED]
+        verified = [r for r in measured if r.verdict.is_verified]
         refuted = [r for r in claimed if not r.verdict.is_verified]
-        other = len(own) - len(verified) - len(refuted)
-        counts = map(len, (own, claimed, verified, refuted, declined))
+        other = len(measured) - len(verified) - len(refuted)
+        counts = map(len, (measured, claimed, verified, refuted, declined))
         rows.append([solver, *map(str, counts), str(other)])
     return rows
 
 
 def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
-    """Lay out `outcome_rows`."""
-    return aligned(outcome_rows(r, defaults))
+    """Return `outcome_rows` as aligned text."""
+    return align(outcome_rows(r, defaults))
 
 
 def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Name and value of what there is to say of one measurement, in SI units.
+    """Return names and values that describe one measurement, in SI units.
 
-    defaults : options of the solver that go without saying
+    defaults : options of the solver that are not shown at these values
     """
     options = ", ".join(
         f"{key}={value}"
@@ -161,12 +160,12 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
         ("solve", _text(r.solve_seconds, "s (one run)", digits=3)),
         ("peak memory", _text(r.peak_mib, "MiB", digits=4)),
         *(
-            (f"{name} residual", _text(_known(getattr(r, name)), digits=2))
+            (f"{name} residual", _text(_none_if_nan(getattr(r, name)), digits=2))
             for name in ("primal", "dual", "complementarity", "gap")
         ),
-        ("off optimum", _text(_known(r.optimum_error), digits=2)),
+        ("off optimum", _text(_none_if_nan(r.optimum_error), digits=2)),
         ("solver error", _bound(r)),
-        ("objective", _text(_known(r.objective))),
+        ("objective", _text(_none_if_nan(r.objective))),
         *(
             (name.replace("_", " "), _quantity(r, name, units.get(name, "")))
             for name in r.quantities
@@ -178,12 +177,12 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
 
 
 def _units(per: str) -> Mapping[str, str]:
-    """Name the units of quantities per thickness ("/m"), or of bodies without one."""
+    """Return units of quantities; `per` is "/m", per thickness, or "" in space."""
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _quantity(r: Record, name: str, unit: str) -> str:
-    """Show a quantity; of nodes that slide without contact their part of the shear."""
+    """Return the text of a quantity; for sliding without contact with its shear."""
     text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
     if name != "sliding_without_contact" or not isinstance(share, float):
         return text
@@ -191,26 +190,26 @@ def _quantity(r: Record, name: str, unit: str) -> str:
 
 
 def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
-    """Lay out what elastic bodies tell of each pair of sides that may touch.
+    """Return rows for each pair of sides that may touch.
 
-    force : its unit
+    force : unit of forces
     """
     if not isinstance(pairs, Mapping):
         return []
     rows = []
-    for name, found in pairs.items():
+    for name, values in pairs.items():
         parts = (
-            f"{what.replace('_', ' ')} {_text(found.get(what), unit, digits=4)}"
-            for what, unit in _OF_A_CONTACT.items()
-            if found.get(what) is not None
+            f"{key.replace('_', ' ')} {_text(values.get(key), unit, digits=4)}"
+            for key, unit in _CONTACT_UNITS.items()
+            if values.get(key) is not None
         )
         rows.append((f"contact {name}", ", ".join(parts)))
-        rows.append(("  force on", _text(found.get("force"), force, digits=6)))
+        rows.append(("  force on", _text(values.get("force"), force, digits=6)))
     return rows
 
 
 def _bound(r: Record) -> str:
-    """Show the certified error: of the answer, of nothing that bodies can do freely."""
+    """Return the text of the certified error; rigid motions may be excluded."""
     if r.energy_bound is None:
         return ""
     beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
@@ -221,12 +220,12 @@ def _bound(r: Record) -> str:
 
 
 def convergence(history: History) -> str:
-    """Lay out how a solver got there, by its own account; empty without a history.
+    """Return a table of the iterations that a solver reports; empty without a history.
 
-    A row ends each outer iteration, or one in so many steps where there are none; what
-    happened since the row before is counted by kinds of steps: "c12 e3".
+    There is a row for the end of each outer iteration, or, without outer iterations,
+    for at most 15 steps. Kinds of steps since the row before are counted: "c12 e3".
     """
-    columns = {k: v for k, v in history.items() if v.size and k not in _UNTOLD}
+    columns = {k: v for k, v in history.items() if v.size and k not in _HIDDEN}
     if not columns:
         return ""
     ends = _milestones(history)
@@ -239,17 +238,17 @@ def convergence(history: History) -> str:
             else [_entry(name, values[end].item()) for end in ends]
         )
         cells.append([_HEADS.get(name, name.replace("_", " ")), *texts])
-    return aligned(zip(*cells, strict=True), right=range(len(cells)))
+    return align(zip(*cells, strict=True), right=range(len(cells)))
 
 
 def legend(history: History) -> str:
-    """Explain what `convergence` shows, a column a line; empty without a history."""
-    told = (text for k, text in _LEGEND.items() if k in history and history[k].size)
-    return "\n".join(told)
+    """Return the legend of `convergence`, a line per column of the history."""
+    lines = (text for k, text in _LEGEND.items() if k in history and history[k].size)
+    return "\n".join(lines)
 
 
 def _milestones(history: History) -> list[int]:
-    """Choose the rows to show: the last of each outer iteration, or of equal parts."""
+    """Return the rows to show: the last of each outer iteration, or of equal parts."""
     import numpy as np
 
     length = next(iter(history.values())).size
@@ -257,9 +256,10 @@ def _milestones(history: History) -> list[int]:
     ends = [*np.flatnonzero(outer[1:] != outer[:-1]).tolist(), length - 1]
     if len(ends) == 1:
         ends = list(range(length))
-    if len(ends) <= _ROWS:
+    if len(ends) <= _MAX_ROWS:
         return ends
-    return [ends[i] for i in np.linspace(0, len(ends) - 1, _ROWS).round().astype(int)]
+    shown = np.linspace(0, len(ends) - 1, _MAX_ROWS).round().astype(int)
+    return [ends[i] for i in shown]
 
 
 def _tally(letters: NDArray[np.str_]) -> str:
@@ -274,8 +274,8 @@ def _entry(name: str, value: float) -> str:
     return str(value) if isinstance(value, int) else f"{value:{digits}}"
 
 
-def aligned(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
-    """Pad columns to their widest cell; those listed in `right` on the left side."""
+def align(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
+    """Return rows as text with columns padded; those in `right` are right-aligned."""
     table = list(rows)
     widths = [max(map(len, column)) for column in zip(*table, strict=True)]
     right = set(right)
@@ -289,13 +289,13 @@ def aligned(rows: Iterable[Sequence[str]], right: Iterable[int] = ()) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def _known(value: float | None) -> float | None:
-    """Take NaN for what it says: there is no such number."""
+def _none_if_nan(value: float | None) -> float | None:
+    """Return None for NaN, which stands for a missing number."""
     return None if value is None or math.isnan(value) else value
 
 
 def _text(value: Any, unit: str = "", digits: int = 9) -> str:
-    """Show a number, or nested numbers, with a unit; empty where there is nothing."""
+    """Return a number, or nested numbers, as text with a unit; empty for None."""
     match value:
         case None:
             return ""
@@ -311,7 +311,7 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
     return f"{text} {unit}".rstrip()
 
 
-def legible(text: str) -> str:
-    """Make foreign text fit for a terminal: one line, and nothing that steers it."""
+def printable(text: str) -> str:
+    """Return text of a solver or plug-in in one line without control characters."""
     line = " ".join(text.split())
     return "".join(c if c.isprintable() else "\ufffd" for c in line)

@@ -1,4 +1,4 @@
-"""Cross-validation of the answers in a result folder, and conformance of a solver."""
+"""Cross-validation of the answers in a result folder, and conformance of solvers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 
 from mortarbench.arguments import budget as checked_budget
 from mortarbench.harness import checked
+from mortarbench.harness.conformance import conformance
 from mortarbench.harness.conformance.conformance import (
-    CHECKS,
-    FINDS,
-    KEEPS,
+    INVARIANCE_PREFIX,
+    SOLUTION_PREFIX,
     Grade,
     Result,
 )
@@ -37,26 +37,26 @@ from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.registry import SolverSpec, check_solver, resolve
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.progress import ignore
-from mortarbench.registries import Plugins, Registries, known, one_thread
-from mortarbench.text import aligned, legible
+from mortarbench.registries import Plugins, Registries, load_registries, one_thread
+from mortarbench.text import align, printable
 
-OURS = "smalbe"  #: the solver that every other one is set against
+COMPARED_WITH = "smalbe"  #: solver with which the others are compared
 TIME_LIMIT = 60.0  #: s per check of the conformance suite
 MEMORY_LIMIT = 4096.0  #: MiB per check
-_MOST = 12  #: entries of a list on the terminal; the page has them all
+_MAX_ENTRIES = 12  #: entries of a list on the terminal; the page has all of them
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Validation:
-    """What a cross-validation found."""
+    """Result of a cross-validation."""
 
     agreed: bool  #: no claim is refuted, and no two answers disagree
-    data: Mapping[str, Any]  #: everything, as in validation.json
-    meshes: tuple[Discretisation, ...]  #: what finer meshes told
+    data: Mapping[str, Any]  #: contents of validation.json
+    meshes: tuple[Discretisation, ...]  #: discretisation errors, from finer meshes
     pages: tuple[Path, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for JSON, without what concerns single problems."""
+        """Return plain data for JSON, without the details of single problems."""
         verdict = {k: v for k, v in self.data.items() if k != "problems"}
         return {**verdict, "discretisation": [asdict(d) for d in self.meshes]}
 
@@ -76,32 +76,41 @@ def validate(
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
 ) -> Validation:
-    """Build every case of a result folder again, and judge every stored answer.
+    """Cross-validate the stored answers of a result folder, on cases built anew.
 
-    Writes validation.json and the page report/validation.html.
+    Write validation.json and the page report/validation.html.
 
     Parameters
     ----------
-    budget : s, for finer meshes, which tell discretisation errors
+    folder : result folder, as `run` writes it
+    budget : seconds for finer meshes, which yield discretisation errors
     plugins : Python files with more solvers or families
-    progress : is told what happens
-    registries : what is known, instead of ours, what is installed and `plugins`
+    progress : called with a message at each stage
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        When the folder holds no answer that can be judged.
+        If the folder contains no answer that can be validated.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> results = mb.run("smoke", out="out/smoke", cases=["*/dual"], solvers=["pdas"])
+    >>> mb.validate("out/smoke", budget=0).agreed
+    True
 
     """
     path = checked.path("folder", folder)
     checked_budget(budget)
     checked.function("progress", progress)
-    registries = known(plugins, registries)
+    registries = load_registries(plugins, registries)
     families = registries.families_with_copies(path)
-    found = validate_folder(path, families, registries.reference, progress)
-    data = as_data(found, path.resolve().name, ours=OURS)
-    if not (data["counts"]["answers"] or found.false_claims or found.proven):
-        why = found.not_validated[0].text if found.not_validated else "none is a claim"
+    result = validate_folder(path, families, registries.reference, progress)
+    data = as_data(result, path.resolve().name, ours=COMPARED_WITH)
+    if not (data["counts"]["answers"] or result.false_claims or result.proven):
+        reasons = [entry.text for entry in result.not_validated]
+        why = reasons[0] if reasons else "none is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
@@ -117,15 +126,15 @@ def validate(
                 if r.energy_bound is not None or _refines(case):
                     cases.append(case)
     meshes = discretisation_errors(cases, registries.reference, path, budget, progress)
-    if meshes:  # the page was there while they were solved
+    if meshes:  # the first page could be read while the finer meshes were solved
         pages = registries.validation_page(path, data, meshes)
     return Validation(
-        agreed=found.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
+        agreed=result.agreed, data=data, meshes=tuple(meshes), pages=tuple(pages)
     )
 
 
 def _refines(case: CaseId) -> bool:
-    """Return whether there is a finer mesh, or a reason why its family has none."""
+    """Return True if there is a finer mesh, or a reason why its family has none."""
     try:
         return case.family.refined(case.params) is not None
     except InputError:  # the reason, which `discretisation_errors` repeats
@@ -133,8 +142,8 @@ def _refines(case: CaseId) -> bool:
 
 
 def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
-    """Lay out one screen of what `harness.crossval.summary.as_data` returns."""
-    parts = [legible(data["headline"]), _solvers(data["solvers"])]
+    """Return the data of `harness.crossval.summary.as_data` as a screen of text."""
+    parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
         "Apart without a culprit": [
@@ -145,13 +154,13 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
         "Certificates contradicted (a fault of ours)": [
             f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
         ],
-        "Not validate_folder": _together(data["not_validated"]),
+        "Not validated": _count_equal(data["not_validated"]),
         "Without a reference": [
             f"{d['problem']}: {d['text']}" for d in data["without_reference"]
         ],
     }
     parts += [_list(title, lines) for title, lines in entries.items() if lines]
-    small = [
+    counts = [
         f"{data['counts'][key]} {words}"
         for key, words in (
             ("remarks", "stand out from the other solvers, within what they claim"),
@@ -159,7 +168,7 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
         )
         if data["counts"][key]
     ]
-    parts += ["; ".join(small) + "."] if small else []
+    parts += ["; ".join(counts) + "."] if counts else []
     if meshes:
         title = (
             "Errors of the meshes, relative, in the energy norm, to which the "
@@ -170,25 +179,25 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
 
 
 def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Lay out a row per solver."""
+    """Return the table of solvers, a row for each solver and tolerance."""
     columns = {
         "error_median": "error: median", "error_worst": "worst",
         "penetration": "penetration/h", "balance": "balance",
         "primal_dual": "primal-dual", "from_ours": "from smalbe",
     }  # fmt: skip
     if all(row["from_ours"] is None for row in rows):
-        del columns["from_ours"]  # there is no smalbe to compare with
+        del columns["from_ours"]  # smalbe has no answers here
     head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]
     lines = [
         [
-            legible(row["solver"]),
+            printable(row["solver"]),
             f"{row['tol']:g}",
             *(str(row[key]) for key in ("answers", "refuted", "unanswered")),
             *(_e(row[key]) for key in columns),
         ]
         for row in rows
     ]
-    table = aligned([head, *lines], right=range(1, len(head)))
+    table = align([head, *lines], right=range(1, len(head)))
     return (
         "Certified errors: relative, in the energy norm. They are those of the "
         f"solvers; the mesh adds its own.\n{table}"
@@ -196,16 +205,16 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
-    """List every claim, or, of very many, the worst of each solver."""
-    if len(wrong) <= _MOST:
+    """Return a line per refuted claim; if there are many, the worst of each solver."""
+    if len(wrong) <= _MAX_ENTRIES:
         return list(map(_wrong, wrong))
-    own: dict[str, list[Mapping[str, Any]]] = {}
+    by_solver: dict[str, list[Mapping[str, Any]]] = {}
     for d in wrong:
-        own.setdefault(d["solver"], []).append(d)
+        by_solver.setdefault(d["solver"], []).append(d)
     return [
         f"{_wrong(max(claims, key=lambda d: d['error'] or 0.0))}"
         + (f" (the worst of {len(claims)})" if len(claims) > 1 else "")
-        for claims in own.values()
+        for claims in by_solver.values()
     ]
 
 
@@ -218,9 +227,9 @@ def _measured(d: Mapping[str, Any]) -> str:
     return f"{d['solver']} on {d['case']}, tol {d['tol']:g}"
 
 
-def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Say once what concerns all answers to a case."""
-    counted = Counter((d["case"], d["text"]) for d in listed)
+def _count_equal(entries: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return a line for each different entry, with the number of its answers."""
+    counted = Counter((d["case"], d["text"]) for d in entries)
     return [
         f"{case} ({n} answer{'s' * (n != 1)}): {text}"
         for (case, text), n in counted.items()
@@ -228,8 +237,8 @@ def _together(listed: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _list(title: str, lines: Sequence[str]) -> str:
-    shown = [f"  {legible(line)}" for line in lines[:_MOST]]
-    more = len(lines) - _MOST
+    shown = [f"  {printable(line)}" for line in lines[:_MAX_ENTRIES]]
+    more = len(lines) - _MAX_ENTRIES
     if more > 0:
         shown.append(f"  … and {more} more, see the page")
     return "\n".join([f"{title}:", *shown])
@@ -245,24 +254,24 @@ def _e(value: float | None) -> str:
 class Conformance:
     """Results of the conformance suite for one solver."""
 
-    solver: str  #: its name, or the class of an object
+    solver: str  #: name, or class of an object
     results: Mapping[str, Result]  #: by the name of the check
 
     @property
     def conforms(self) -> bool:
-        """True if no check fails, and the solver solved something."""
+        """True if no check fails and the solver solves at least one QP."""
         return not self.objection
 
     @property
     def objection(self) -> str:
-        """The reason why the solver does not conform; empty if it does."""
+        """Reason why the solver does not conform; empty if it does."""
         if self.failed:
             return f"fails {some(map(repr, self.failed))}"
         if not any(
-            r.grade is Grade.PASS and name.startswith(FINDS)
+            r.grade is Grade.PASS and name.startswith(SOLUTION_PREFIX)
             for name, r in self.results.items()
         ):
-            return f"passes no check {FINDS!r}: it solved nothing"
+            return f"passes no check {SOLUTION_PREFIX!r}: it solved nothing"
         return ""
 
     @property
@@ -282,7 +291,7 @@ class Conformance:
         rows = [(r.grade, name, r.message) for name, r in self.results.items()]
         grades = Counter(r.grade for r in self.results.values())
         counts = ", ".join(f"{grades[g]} {g}" for g in Grade)
-        return f"{aligned(rows)}\n{self.solver}: {counts}"
+        return f"{align(rows)}\n{self.solver}: {counts}"
 
     def _repr_html_(self) -> str:
         return f"<pre>{escape(repr(self))}</pre>"
@@ -295,29 +304,35 @@ def test_solver(
     checks: Iterable[str] | None = None,  # noqa: PT028
     registries: Registries | None = None,  # noqa: PT028
 ) -> Conformance:
-    """Run the conformance suite on a solver, in a process of its own.
+    """Run the conformance suite on a solver, in a separate process.
 
-    A check whose process is killed or hangs fails; the others go on.
+    A check whose process is killed or hangs fails; the other checks are run.
 
     Parameters
     ----------
-    solver : a name of `solvers`, or an object as `mortarbench.solve` takes it
+    solver : a name of `solvers`, or an object as for `mortarbench.solve`
     plugins : Python files with more solvers
     checks : names of checks; None: all
-    registries : what is known, instead of ours, what is installed and `plugins`
+    registries : replaces our registries, installed plug-ins and `plugins`
 
     Raises
     ------
     InputError
-        When there is no such solver or check, or the solver cannot be copied.
+        If there is no such solver or check, or the solver cannot be copied.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> mb.test_solver("pdas", checks=["solves a sequence"]).failed
+    {}
 
     """
     check_solver(solver)
-    registries = known(plugins) if registries is None else registries
-    wanted = list(CHECKS if checks is None else checks)
-    for check in wanted:
-        if check not in CHECKS:
-            raise unknown("check", str(check), CHECKS)
+    registries = load_registries(plugins) if registries is None else registries
+    names = list(conformance.CHECKS if checks is None else checks)
+    for check in names:
+        if check not in conformance.CHECKS:
+            raise unknown("check", str(check), conformance.CHECKS)
     name = solver if isinstance(solver, str) else type(solver).__name__
     spec = SolverSpec(name=name, label=name)
     with scratch_folder() as scratch, ExitStack() as stack:
@@ -330,17 +345,17 @@ def test_solver(
         command = registries.worker_command(spec, copy)
         worker = WorkerProcess(command, scratch / "worker.log")
         stack.callback(worker.close)
-        results = {check: _checked(worker, check) for check in wanted}
+        results = {check: _run_check(worker, check) for check in names}
     return Conformance(solver=name, results=results)
 
 
-def _checked(worker: WorkerProcess, check: str) -> Result:
-    """Run one check; what ends the process of the solver is a failure of it."""
+def _run_check(worker: WorkerProcess, check: str) -> Result:
+    """Run one check; it fails if the process of the solver ends."""
     reply = worker.ask(
         {"check": check}, time_limit=TIME_LIMIT, memory_limit=MEMORY_LIMIT
     )
     if reply.answer is None:
-        is_weakness = check.startswith(KEEPS)
+        is_weakness = check.startswith(INVARIANCE_PREFIX)
         return Result(Grade.WEAK if is_weakness else Grade.FAIL, reply.message)
     grade, *others = (reply.answer[field] for field in Result._fields)
     return Result(Grade(grade), *others)

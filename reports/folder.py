@@ -1,4 +1,4 @@
-"""Write the report of a result folder."""
+"""Report of a result folder: files, figures and opening sentences."""
 
 from __future__ import annotations
 
@@ -29,18 +29,24 @@ def write_report(
     *,
     pool_forms: bool = False,
 ) -> list[Path]:
-    """Write DIR/report from DIR's journal; the same journal gives the same bytes.
+    """Write DIR/report from the journal in DIR; equal journals give equal bytes.
 
-    html: index.html. md: report.md. tex, csv: tables/. Figures (pdf, svg, png) go to
-    figures/ along with html, md or tex. parquet: records.parquet, the journal.
+    html writes index.html, md report.md, tex and csv tables/, and parquet the journal
+    as records.parquet. Figures (pdf, svg, png) accompany html, md and tex in figures/.
 
-    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
-    pool_forms : means, ranks and profiles are over the cases of all forms together
+    Parameters
+    ----------
+    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
+    pool_forms : compute means, ranks and profiles over the cases of all forms
+
+    Returns
+    -------
+    the files written
 
     Raises
     ------
     InputError
-        For an unknown format, or a folder that holds no measurements.
+        For an unknown format, or a folder without measurements.
 
     """
     for name in formats:
@@ -67,12 +73,12 @@ def figures(
 ) -> dict[str, Figure | FieldFigure]:
     """Compute the figures of the report on a folder, by the names of their files.
 
-    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
+    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
 
     Raises
     ------
     InputError
-        For a folder that holds no measurements.
+        For a folder without measurements.
 
     """
     page = compose(read_evidence(directory, factor))
@@ -81,31 +87,31 @@ def figures(
 
 
 def answer(directory: str | Path, factor: float = VERIFIED_FACTOR) -> list[str]:
-    """Return the sentences that the report of a folder opens with, a line each.
+    """Return the opening sentences of the report of a folder, one per line.
 
-    The first one names the best way from the mesh to a verified answer over all forms;
-    the others compare the solvers of each form, and name those that failed.
+    The first one names the fastest combination of solver and form, from the mesh to a
+    verified answer; the others compare the solvers of each form and name failures.
 
-    factor : verdicts are those at factor·tol; the journal's are those at 10·tol
+    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
 
     Raises
     ------
     InputError
-        For a folder that holds no measurements.
+        For a folder without measurements.
 
     """
     composed = opening(Analysis(read_evidence(Path(directory), factor)))
-    return [line for s in composed for told in s.statements for line in told.lines]
+    return [line for s in composed for each in s.statements for line in each.lines]
 
 
 def compose(evidence: Evidence, *, pool_forms: bool = False) -> Page:
-    """Put the report together: the answer, then what it rests on.
+    """Compose the report: the answer, then the evidence.
 
-    The answer compares ways over all forms and solvers form by form, whatever
-    `pool_forms`.
+    The answer compares combinations of solver and form, and solvers form by form;
+    `pool_forms` does not change it.
     """
     collecting = gc.isenabled()
-    gc.disable()  # cells hold no cycles; walking over millions of them took a third
+    gc.disable()  # cells have no cycles; traversing millions took a third of the time
     try:
         composed = tuple(sections(Analysis(evidence, pool_forms=pool_forms)))
     finally:

@@ -1,4 +1,4 @@
-"""Every solver of the comparison, one line each."""
+"""Registry of all solvers, one entry each."""
 
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import Registry, entry

@@ -1,4 +1,4 @@
-"""Shared by all tests: CPUs of pytest's workers, QPs of known solution."""
+"""Shared fixtures and hooks: CPUs and order of pytest's workers, manufactured QPs."""
 
 import gc
 import os
@@ -22,13 +22,13 @@ from tests.support.fork_server import Forks
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Run two tests per CPU where CPUs are few: a third of the time, tests wait."""
+    """Use two workers per CPU, up to eight: tests wait a third of their time."""
     cpus = len(os.sched_getaffinity(0))
     return max(cpus, min(2 * cpus, 8))
 
 
 class OneProcessPerModule(LoadScopeScheduling):
-    """Tests of a module marked `together` run in one process, others anywhere."""
+    """Scheduler that runs modules marked `together` in one process, others anywhere."""
 
     def _split_scope(self, nodeid: str) -> str:
         module = nodeid.partition("::")[0]
@@ -37,7 +37,7 @@ class OneProcessPerModule(LoadScopeScheduling):
     def mark_test_complete(
         self, node: WorkerController, item_index: int, duration: float = 0
     ) -> None:
-        """Forget a unit that is done: after each test, those pending are counted."""
+        """Drop a finished unit, since xdist counts all units after each test."""
         super().mark_test_complete(node, item_index, duration)
         units = self.assigned_work[node]
         scope = self._split_scope(self.registered_collections[node][item_index])
@@ -47,7 +47,7 @@ class OneProcessPerModule(LoadScopeScheduling):
 
 @cache
 def shares(module: str) -> bool:
-    """Whether a module of tests, by its path from the root, is marked `together`."""
+    """Return True if a test module (path from the root) is marked `together`."""
     return "pytestmark = pytest.mark.together" in (ROOT / module).read_text("utf-8")
 
 
@@ -55,7 +55,7 @@ def shares(module: str) -> bool:
 def pytest_xdist_make_scheduler(
     config: pytest.Config, log: Producer
 ) -> OneProcessPerModule:
-    """Group by modules; groups by marks need names of tests to change in collection."""
+    """Group tests by modules; groups by marks would change the names of tests."""
     return OneProcessPerModule(config, log)
 
 
@@ -76,7 +76,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection(session: pytest.Session) -> Iterator[None]:
-    """Look for no garbage while modules are imported: what that makes lives on."""
+    """Disable garbage collection during imports, which create no garbage."""
     gc.disable()
     try:
         import_share(session.config)
@@ -86,36 +86,36 @@ def pytest_collection(session: pytest.Session) -> Iterator[None]:
 
 
 def import_share(config: pytest.Config) -> None:
-    """Import a worker's share of all modules of tests, before it imports the others.
+    """Import a worker's share of the test modules before it imports the others.
 
-    Their asserts are rewritten, which takes ten times as long as importing what was
-    rewritten before: of a fresh checkout, each worker would rewrite them all.
+    pytest rewrites their asserts and caches the result; rewriting takes ten times as
+    long as loading from the cache. In a fresh checkout, each worker would rewrite all.
     """
     worker = getattr(config, "workerinput", None)
     if worker is None or config.args_source is not pytest.Config.ArgsSource.TESTPATHS:
         return
     index, count = int(worker["workerid"].removeprefix("gw")), worker["workercount"]
     for path in sorted((ROOT / "tests").rglob("test_*.py"))[index::count]:
-        # what cannot be imported is told when it is collected
+        # pytest reports a failing import when it collects the module
         with suppress(Exception, pytest.skip.Exception):
             import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
 
 def pytest_collection_finish() -> None:
-    """Keep tests and libraries out of the collections before every measurement."""
+    """Exclude tests and libraries from the collections before every measurement."""
     gc.collect()
     gc.freeze()
-    gc.set_threshold(10_000, 20, 20)  # those of tests leave little garbage
+    gc.set_threshold(10_000, 20, 20)  # tests create little garbage
 
 
 def pytest_unconfigure() -> None:
-    """Let the end of the process free what is left: some libraries look at that."""
+    """Undo `gc.freeze`: some libraries check their objects at the end of a process."""
     gc.unfreeze()
 
 
 @pytest.fixture(scope="session")
 def forks():
-    """What forks the processes of runs from interpreters that have loaded modules."""
+    """Fork server that starts the processes of runs with modules loaded."""
     forks = Forks()
     yield forks
     forks.close()
@@ -123,9 +123,9 @@ def forks():
 
 @pytest.fixture(scope="module", autouse=True)
 def how_processes_start(forks):
-    """Runs in this process start theirs as forks, see `tests.support.fork_server`.
+    """Start the processes of runs as forks, see `tests.support.fork_server`.
 
-    Where how they start is tested, a fixture of this name lets them start as they do.
+    A module that tests how processes start overrides this fixture.
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(supervisor, "subprocess", forks)
@@ -134,16 +134,16 @@ def how_processes_start(forks):
 
 @pytest.fixture
 def manufactured() -> Callable[..., tuple[QP, Solution]]:
-    """Factory: ``manufactured(shape, seed=…, dense=False, n=20)``, as in `harness`."""
+    """Return the factory ``manufactured(shape, seed=…, dense=False, n=20)``."""
     return drawn
 
 
 @pytest.fixture(scope="module")
 def svg_only():
-    """Factory: a context in which reports have their figures as SVG alone.
+    """Return a context manager in which reports write figures as SVG only.
 
-    That is what pages show; `reports/test_convergence.py` and
-    `reports/figures/test_pictures.py` have all formats.
+    Pages show these. All formats are tested in `reports/test_convergence.py` and
+    `reports/figures/test_pictures.py`.
     """
 
     @contextmanager
@@ -157,6 +157,6 @@ def svg_only():
 
 @pytest.fixture
 def only_svg(svg_only):
-    """Reports of this test have their figures as SVG alone."""
+    """Write the figures of reports as SVG only."""
     with svg_only():
         yield

@@ -1,10 +1,14 @@
-"""Write mortarbench/catalogue.json: what `list solvers` says of our own solvers."""
+"""Write mortarbench/catalogue.json and the pages of solvers from our own solvers."""
 
 import json
+from pathlib import Path
 
-from mortarbench.listing import CATALOGUE, described
+from mortarbench.cli.list_ import solvers_pages
+from mortarbench.listing import CATALOGUE, describe
 from mortarbench.solvers import SOLVERS
 
 CATALOGUE.write_text(
-    json.dumps({name: described(s) for name, s in SOLVERS.items()}, indent=1) + "\n"
+    json.dumps({name: describe(s) for name, s in SOLVERS.items()}, indent=1) + "\n"
 )
+for page, text in solvers_pages(SOLVERS).items():
+    (Path(__file__).parents[1] / "docs" / page).write_text(text, "utf-8")

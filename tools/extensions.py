@@ -1,7 +1,7 @@
-"""Compile the .pyx modules beside their sources, and put them into the wheel.
+"""Build hook that compiles the .pyx modules beside their sources and adds them.
 
-Hatchling runs it when the package is built or installed, for `pip install -e` too;
-`make setup` does that again when a .pyx file has changed.
+Hatchling runs it when the package is built or installed, also by `pip install -e`;
+`make setup` runs that again when a .pyx file has changed.
 """
 
 from __future__ import annotations
@@ -17,26 +17,28 @@ from hatchling.builders.hooks.plugin.interface import BuildHookInterface
 from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
-SCALES = ROOT / "harness" / "verify"  #: scales.h and scales.pxd, of solvers too
+SCALES = ROOT / "harness" / "verify"  #: scales.h and scales.pxd, which solvers include
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
+#: modules with their flags; without contraction to fused multiply-adds, results have
+#: the same digits on every machine
 MODULES = {
     "mortarbench.harness.verify.products": [],
-    # residuals have the same digits everywhere
+    # residuals must not depend on the machine
     "mortarbench.harness.verify.scales": ["-ffp-contract=off"],
     "mortarbench.harness.distributed.sparse": [],
-    # the digits of a stiffness, and the order of its factor, are the same everywhere
+    # neither must the stiffness and the order of its factor
     "mortarbench.problems.fem.kernels": ["-ffp-contract=off"],
     "mortarbench.problems.fem.ordering": ["-ffp-contract=off"],
     "mortarbench.problems.fem.elimination": ["-ffp-contract=off"],
     "mortarbench.problems.feti.blocks": [],
-    # sums may be vectorised, which needs another order; inf and NaN are kept
+    # sums may be reordered for vectorisation; inf and NaN keep their meaning
     "mortarbench.solvers.smalbe.compiled": ["-fassociative-math", "-fno-signed-zeros"],
     "mortarbench.solvers.smalbe.faces": ["-fassociative-math", "-fno-signed-zeros"],
 }
 
 
 def compiled() -> list[Path]:
-    """Compile what has changed; list the shared libraries."""
+    """Compile all modules; return the shared libraries beside their sources."""
     from Cython.Build import cythonize
     from setuptools.command.build_ext import build_ext
 
@@ -51,12 +53,12 @@ def compiled() -> list[Path]:
         command.parallel = os.cpu_count()
         command.ensure_finalized()
         command.run()
-        made = []
+        libraries = []
         for name in MODULES:
             library = Path(command.get_ext_fullpath(name))
             suffix = library.name.removeprefix(name.rpartition(".")[2])
-            made.append(Path(shutil.move(library, _path(name, suffix))))
-    return made
+            libraries.append(Path(shutil.move(library, _path(name, suffix))))
+    return libraries
 
 
 def _extension(name: str, flags: list[str]) -> Extension:
@@ -80,7 +82,7 @@ def _path(module: str, suffix: str) -> str:
 
 
 class Extensions(BuildHookInterface):  # type: ignore[type-arg]
-    """What hatchling calls."""
+    """Build hook of hatchling."""
 
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         """Compile before the files are collected."""

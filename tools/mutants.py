@@ -1,14 +1,14 @@
-"""Break chosen modules in small ways and see whether their tests notice.
+"""Mutation testing: change single expressions of modules and run their tests.
 
-A mutant is a copy of the project with one expression or statement changed: a sign, a
-comparison, a constant, a guard left out. The tests of the mutated module run on it. If
-one of them fails, the mutant is killed; if all pass, it survives, and nothing
-protects that line. `tests/mutants.toml` names the modules, their tests, how many
-mutants of each are tried, and which survivors are accepted, with a reason each. Any
-other survivor makes the exit code 1.
+A mutant is a copy of the project in which one expression or statement is changed: a
+sign, a comparison, a constant, a guard removed. The tests of the module run on it. If
+one of them fails, the mutant is killed; if all pass, it survives, and no test protects
+that line. `tests/mutants.toml` lists the modules, their tests, the number of mutants
+per module, and accepted survivors with a reason each. The exit code is 1 if any other
+mutant survives.
 
-Which mutants are tried depends on their text alone, so that a change in one function
-leaves the choice in others. The working tree is never touched.
+The choice of mutants depends only on their text, so a change in one function does not
+affect the choice in others. The working tree is not modified.
 
 Usage: python tools/mutants.py [MODULE ...] [--most N]
 """
@@ -44,9 +44,10 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PLAN = ROOT / "tests" / "mutants.toml"
-SLOWER, GRACE = 5.0, 20.0  #: a mutant hangs after that many times the usual, plus s
-SHOWN = 100  #: characters of code in a description
-#: imported once, not for each mutant
+#: a mutant counts as hanging after SLOWER times the usual time plus GRACE seconds
+SLOWER, GRACE = 5.0, 20.0
+MAX_LENGTH = 100  #: characters of code in a description
+#: imported once in each laboratory, not for each mutant
 LIBRARIES = ("hypothesis", "pandas", "scipy.sparse.linalg", "scipy.stats")
 
 OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
@@ -71,7 +72,7 @@ OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
     ast.In: ast.NotIn,
     ast.NotIn: ast.In,
 }
-#: tried where a side counts something: between floats the boundary seldom matters
+#: tried only if a side is a count: between floats the boundary seldom matters
 BOUNDARIES: dict[type[ast.AST], type[ast.AST]] = {
     ast.Lt: ast.LtE,
     ast.LtE: ast.Lt,
@@ -83,52 +84,52 @@ FUNCTIONS = {
     "any": "all", "all": "any", "floor": "ceil", "ceil": "floor",
     "argmin": "argmax", "argmax": "argmin",
 }  # fmt: skip
-DROPPED = ("abs", "sqrt", "sorted")  #: calls that leave their argument
-COUNTS = ("len", "size", "sum", "shape")
+DROPPED = ("abs", "sqrt", "sorted")  #: calls that are replaced by their argument
+COUNTS = ("len", "size", "sum", "shape")  #: names whose values are counts
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change of one module."""
+    """Module with one change."""
 
     module: str  #: path from the root
-    where: str  #: function or class, dotted; "" for the module's own level
-    change: str  #: ``old -> new``, with a number where a place has several such
+    where: str  #: dotted name of the function or class; "" at module level
+    change: str  #: ``old -> new``, numbered if the same change occurs several times
     line: int
-    source: bytes  #: of the whole module, changed
+    source: bytes  #: changed source of the whole module
 
     @property
     def key(self) -> tuple[str, str, str]:
-        """What a survivor is listed by; line numbers would not last."""
+        """Identity of a mutant in the list of survivors, without its line number."""
         return self.module, self.where, self.change
 
     @property
     def rank(self) -> bytes:
-        """A random number that depends on nothing but the mutant."""
+        """Pseudo-random number that depends on `key` only."""
         return hashlib.sha256("\0".join(self.key).encode()).digest()
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What `tests/mutants.toml` says."""
+    """Contents of `tests/mutants.toml`."""
 
     most: int  #: mutants per module
     tests: dict[str, list[str]]  #: arguments of pytest by module
-    accepted: dict[tuple[str, str, str], str]  #: reasons of survivors, by key
+    accepted: dict[tuple[str, str, str], str]  #: reasons of accepted survivors, by key
 
 
 # ---- mutating
 
 
 def mutants_of(module: str, source: bytes) -> list[Mutant]:
-    """Make all mutants of a module, in the order of its text."""
+    """Return all mutants of a module, in the order of its text."""
     starts = [0]
     for line in source.splitlines(keepends=True):
         starts.append(starts[-1] + len(line))
     seen: Counter[tuple[str, str]] = Counter()
-    found = []
+    mutants = []
     for where, node, new in _changes(ast.parse(source)):
         assert node.end_lineno is not None
         assert node.end_col_offset is not None
@@ -139,19 +140,19 @@ def mutants_of(module: str, source: bytes) -> list[Mutant]:
         if (number := seen[where, text]) > 1:
             text += f" ({number})"
         changed = source[:begin] + new.encode() + source[end:]
-        found.append(Mutant(module, where, text, node.lineno, changed))
-    return found
+        mutants.append(Mutant(module, where, text, node.lineno, changed))
+    return mutants
 
 
 def _shown(code: str) -> str:
     one_line = " ".join(code.split())
-    return one_line if len(one_line) <= SHOWN else one_line[: SHOWN - 1] + "…"
+    return one_line if len(one_line) <= MAX_LENGTH else one_line[: MAX_LENGTH - 1] + "…"
 
 
 def _changes(
     tree: ast.AST, where: str = ""
 ) -> Iterator[tuple[str, ast.expr | ast.stmt, str]]:
-    """Walk through what has a meaning for results: no texts, types or messages."""
+    """Yield the changes of code that affects results: no texts, types or messages."""
     for child in _children(tree):
         name = where
         if isinstance(child, Function | ast.ClassDef):
@@ -161,7 +162,7 @@ def _changes(
         ):
             for new in _expressions(child):
                 yield where, child, f"({ast.unparse(new)})"
-        if isinstance(child, ast.stmt) and _can_go(child, tree):
+        if isinstance(child, ast.stmt) and _is_removable(child, tree):
             yield where, child, "pass"
         yield from _changes(child, name)
 
@@ -186,7 +187,7 @@ def _children(node: ast.AST) -> Iterator[ast.AST]:
 
 
 def _expressions(node: ast.expr) -> Iterator[ast.expr]:
-    """Make the changes of one expression, not of its parts."""
+    """Yield the changes of one expression, without those of its parts."""
     match node:
         case ast.Compare(ops=[op]):
             yield _with(node, ops=[OPERATORS[type(op)]()])
@@ -256,8 +257,8 @@ def _is_text(node: ast.AST) -> bool:
     )
 
 
-def _can_go(node: ast.stmt, parent: ast.AST) -> bool:
-    """Whether a statement is left out: what acts on something, or guards."""
+def _is_removable(node: ast.stmt, parent: ast.AST) -> bool:
+    """Return True for statements with an effect, and for guards."""
     match node:
         case ast.Expr(value=ast.Constant()):
             return False  # a docstring
@@ -275,10 +276,10 @@ def _can_go(node: ast.stmt, parent: ast.AST) -> bool:
 
 
 class Laboratory:
-    """A copy of the project, a CPU, and a process that forks for each mutant.
+    """Copy of the project, a CPU, and a process that forks for each mutant.
 
-    That process has imported the libraries, which takes longer than most tests, but
-    nothing of the project.
+    That process has imported the libraries, which takes longer than most tests, but no
+    module of the project.
     """
 
     def __init__(self, folder: Path, cpu: int) -> None:
@@ -294,30 +295,33 @@ class Laboratory:
         self._pipe.close()
         self._process.join()
 
-    def noticed(self, tests: Sequence[str], limit: float = inf) -> str | None:
-        """Run tests: None if all pass, else what noticed."""
+    def failure(self, tests: Sequence[str], limit: float = inf) -> str | None:
+        """Run tests; return None if all pass, else the first failure."""
         self._pipe.send((tests, limit))
         return cast(str | None, self._pipe.recv())
 
-    def tried(self, mutant: Mutant, tests: Sequence[str], limit: float) -> str | None:
-        """Run tests on a mutant, and mend the copy again."""
+    def failure_on(
+        self, mutant: Mutant, tests: Sequence[str], limit: float
+    ) -> str | None:
+        """Run tests on a mutant; restore the module afterwards."""
         path = self.folder / mutant.module
-        intact = path.read_bytes()
+        original = path.read_bytes()
         try:
             self._write(path, mutant.source)
-            return self.noticed(tests, limit)
+            return self.failure(tests, limit)
         finally:
-            self._write(path, intact)
+            self._write(path, original)
 
     def _write(self, path: Path, source: bytes) -> None:
-        """Write a module and forget its bytecode, which is told by size and second."""
+        """Write a module and delete its bytecode."""
+        # Python recognises stale bytecode by size and time in seconds: not enough here
         path.write_bytes(source)
         for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*.pyc"):
             compiled.unlink()
 
 
 def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
-    """Run the tests that the pipe asks for, each time in a fork of this process."""
+    """Run the tests requested through the pipe, each time in a fork of this process."""
     os.sched_setaffinity(0, {cpu})
     os.chdir(folder)
     os.environ["PYTHONPATH"] = sys.path[0] = str(folder)
@@ -326,7 +330,7 @@ def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
     spec = find_spec("mortarbench.harness")
     assert spec is not None
     assert spec.origin is not None
-    assert Path(spec.origin).is_relative_to(folder), f"{spec.origin} is no copy"
+    assert Path(spec.origin).is_relative_to(folder), f"{spec.origin} is not a copy"
     while True:
         try:
             tests, limit = pipe.recv()
@@ -335,20 +339,20 @@ def _serve(pipe: Connection, folder: Path, cpu: int) -> None:
         output = folder / "output.txt"
         if (child := os.fork()) == 0:
             _run_tests(tests, output)
-        code = _waited(child, limit)
+        code = _wait(child, limit)
         lines = output.read_text(errors="replace").strip().splitlines()
-        named = [s for s in lines if s.startswith(("FAILED", "ERROR"))]
+        failures = [s for s in lines if s.startswith(("FAILED", "ERROR"))]
         if code is None:
             pipe.send(f"hangs ({limit:.0f} s)")
         elif code == 0:
             pipe.send(None)
-        else:  # below zero: by that signal
-            said = "; ".join([f"exit code {code}", *lines[-1:]])
-            pipe.send((named or [said])[0])
+        else:  # a negative code is the number of a signal
+            message = "; ".join([f"exit code {code}", *lines[-1:]])
+            pipe.send((failures or [message])[0])
 
 
 def _run_tests(tests: Sequence[str], output: Path) -> None:
-    """Be a process that runs tests; never returns."""
+    """Run tests in this process and exit."""
     os.setsid()
     fd = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(fd, 1)
@@ -357,15 +361,16 @@ def _run_tests(tests: Sequence[str], output: Path) -> None:
     try:
         options = ["-x", "-q", "--no-header", "--tb=no", "--hypothesis-seed=0"]
         plugins = ["-p", "no:cacheprovider", "-p", "no:xdist"]
-        early = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # LIBRARIES are
-        code = int(pytest.main([*options, *plugins, *early, *tests]))
+        # LIBRARIES are imported before pytest can rewrite their assertions
+        warnings = ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+        code = int(pytest.main([*options, *plugins, *warnings, *tests]))
     finally:
         sys.stdout.flush()
         os._exit(code)
 
 
-def _waited(child: int, limit: float) -> int | None:
-    """Wait for a fork that leads a session: its exit code, None if that took longer."""
+def _wait(child: int, limit: float) -> int | None:
+    """Return the exit code of a fork, or None after killing its session at `limit`."""
     end = monotonic() + limit
     while monotonic() < end:
         done, status = os.waitpid(child, os.WNOHANG)
@@ -378,7 +383,7 @@ def _waited(child: int, limit: float) -> int | None:
 
 
 def copy_of_the_project(folder: Path) -> None:
-    """Copy what git knows of, as it is in the working tree, and compiled modules."""
+    """Copy the files of the working tree that git does not ignore, and binaries."""
     command = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
     listed = subprocess.run(command, cwd=ROOT, check=True, capture_output=True)
     paths = [ROOT / name for name in os.fsdecode(listed.stdout).split("\0") if name]
@@ -407,7 +412,7 @@ def read_plan() -> Plan:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Try the mutants; returns 1 if one survives that is not listed, 2 on bad input."""
+    """Run the mutants; return 1 if one survives unaccepted, 2 on wrong input."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("modules", nargs="*", help="as in tests/mutants.toml; all")
     parser.add_argument("--most", type=int, help="mutants per module")
@@ -426,14 +431,14 @@ def main(argv: Sequence[str] | None = None) -> int:
             laboratories.append(Laboratory(folder, cpu))
         try:
             with ThreadPoolExecutor(len(laboratories)) as pool:
-                found = [
+                codes = [
                     report(plan, m, args.most or plan.most, laboratories, pool)
                     for m in modules
                 ]
         finally:
             for laboratory in laboratories:
                 laboratory.close()
-    return max(found)
+    return max(codes)
 
 
 def report(
@@ -443,11 +448,11 @@ def report(
     laboratories: Sequence[Laboratory],
     pool: ThreadPoolExecutor,
 ) -> int:
-    """Try the mutants of one module and say which survive; returns as `main` does."""
+    """Run the mutants of one module and print survivors; return the code of `main`."""
     start = monotonic()
     tests = plan.tests[module]
-    # unchanged, on each copy: for the time that it takes, and to fill caches
-    for failure in pool.map(lambda one: one.noticed(tests), laboratories):
+    # run on each unchanged copy, to measure the usual time and to fill caches
+    for failure in pool.map(lambda one: one.failure(tests), laboratories):
         if failure is not None:
             print(f"{module}: its tests fail unchanged: {failure}")
             return 2
@@ -461,21 +466,22 @@ def report(
     def survives(mutant: Mutant) -> bool:
         laboratory = free.get()
         try:
-            return laboratory.tried(mutant, tests, limit) is None
+            return laboratory.failure_on(mutant, tests, limit) is None
         finally:
             free.put(laboratory)
 
-    alive = [m for m, s in zip(chosen, pool.map(survives, chosen), strict=True) if s]
-    new = [m for m in alive if m.key not in plan.accepted]
+    flags = pool.map(survives, chosen)
+    survivors = [m for m, flag in zip(chosen, flags, strict=True) if flag]
+    new = [m for m in survivors if m.key not in plan.accepted]
     print(
-        f"{module}: {len(chosen) - len(alive)} of {len(chosen)} killed "
-        f"(of {len(every)} possible), {len(alive) - len(new)} accepted, "
+        f"{module}: {len(chosen) - len(survivors)} of {len(chosen)} killed "
+        f"(of {len(every)} possible), {len(survivors) - len(new)} accepted, "
         f"{len(new)} not; {monotonic() - start:.0f} s"
     )
     for m in sorted(new, key=lambda m: m.line):
         print(f"  survives: line {m.line}, {m.where or 'module'}: {m.change}")
-    killed = plan.accepted.keys() & ({m.key for m in chosen} - {m.key for m in alive})
-    for _, where, change in sorted(killed):
+    killed = {m.key for m in chosen} - {m.key for m in survivors}
+    for _, where, change in sorted(plan.accepted.keys() & killed):
         print(f"  accepted, but killed: {where}: {change}")
     sys.stdout.flush()
     return int(bool(new))

@@ -1,1 +1,1 @@
-"""Whether a solver keeps the contract, and where it is weak."""
+"""Conformance checks and weaknesses of solvers, with manufactured QPs to test them."""

@@ -1,8 +1,9 @@
-"""What every solver must do: the checks of ``mortarbench test-solver``.
+"""Checks of the contract of solvers, run by ``mortarbench test-solver``.
 
-Each check is named after what it shows. It passes, fails with what was wrong, or, where
-the solver declines its QP, is declined with the solver's reason. That an equivalent
-formulation changes the answer is told as a weakness; most solvers have one.
+The name of each check is a statement about the solver. A check passes, fails with a
+description of the violation, or is declined with the solver's reason if the solver
+declines the QP. If an equivalent formulation changes the answer, that is reported as a
+weakness, which most solvers have.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from scipy.sparse.linalg import aslinearoperator
 
 from mortarbench.harness.conformance.equivalence import (
     DeclinedError,
-    WeakError,
+    WeaknessError,
     changes_of,
     same_answer,
 )
@@ -47,40 +48,45 @@ from mortarbench.harness.verify.measure import (
     reason_to_decline,
 )
 
-FINDS = "finds the planted solution"  #: how the checks begin that need an answer
-KEEPS = "keeps its answer"  #: how those begin that compare equivalent formulations
-#: what a solver that needs the entries of P has to say
+#: beginning of the names of checks that need a solution
+SOLUTION_PREFIX = "finds the planted solution"
+#: beginning of the names of checks that compare equivalent formulations
+INVARIANCE_PREFIX = "keeps its answer"
+#: advice for solvers that need the entries of P
 _DECLINE_OPERATORS = (
     "a solver that needs the entries of P has in declines(self, qp) the line "
     "`if reason := needs_matrices(qp): return reason` (from harness import "
     "needs_matrices)"
 )
-LOST = 8 * float(np.finfo(float).eps)  #: of a gradient's terms: rounding
-ROUNDING = 1e-12  #: repeats may differ by; memory's alignment changes sums' order
+#: rounding of a gradient relative to its largest term, as in dual residuals
+GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
+#: difference between repeats that is neglected: the alignment of arrays in memory
+#: determines the order of sums
+REPEAT_ROUNDING = 1e-12
 
 
 class Grade(StrEnum):
-    """How a check ended."""
+    """Outcome of a check."""
 
     PASS = "pass"
-    DECLINE = "decline"  #: the solver says that it cannot
-    WEAK = "weak"  #: a weakness, reported; the solver conforms nevertheless
+    DECLINE = "decline"  #: the solver declines the QP
+    WEAK = "weak"  #: a weakness; the solver conforms nevertheless
     FAIL = "fail"
 
 
 class Result(NamedTuple):
-    """How a check ended; why where it did not pass, else a remark if there is one."""
+    """Result of a check: its grade, and the reason for it or a remark."""
 
     grade: Grade
     message: str = ""
-    work: float | None = None  #: iterations, relative to those before a change
+    work: float | None = None  #: iterations relative to those before a change
 
 
-class BrokenError(Exception):
-    """What a solver did wrong."""
+class ContractError(Exception):
+    """Violation of the contract by a solver."""
 
 
-#: raises that, DeclinedError or WeakError; where there is a remark, returns it
+#: raises ContractError, DeclinedError or WeaknessError; may return a result with remark
 Check = Callable[[Solver], Result | None]
 
 
@@ -88,24 +94,24 @@ def run_check(name: str, solver: Solver) -> Result:
     """Run one of `CHECKS`."""
     try:
         return CHECKS[name](solver) or Result(Grade.PASS)
-    except BrokenError as e:
+    except ContractError as e:
         return Result(Grade.FAIL, str(e))
     except DeclinedError as e:
         return Result(Grade.DECLINE, str(e))
-    except WeakError as e:
+    except WeaknessError as e:
         return Result(Grade.WEAK, str(e))
 
 
 def _solve(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by the harness's own clock, and insist on a point, right or wrong."""
-    s = _ended(solver, qp, tol)
+    """Solve by `measure`, and require a point, right or wrong."""
+    s = _end(solver, qp, tol)
     if s.status is Status.FAILED and np.isnan(s.x).any():
-        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+        raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
     return s
 
 
-def _ended(solver: Solver, qp: QP, tol: float) -> Solution:
-    """Solve by the harness's own clock, which makes a status of whatever happens."""
+def _end(solver: Solver, qp: QP, tol: float) -> Solution:
+    """Solve by `measure`, which turns exceptions of the solver into a status."""
     s = measure(solver, qp, tol).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -113,7 +119,7 @@ def _ended(solver: Solver, qp: QP, tol: float) -> Solution:
 
 
 def _solved(solver: Solver, qp: QP, tol: float, factor: float) -> Solution:
-    """Solve, and insist on a claim of success that holds within `factor`·tol."""
+    """Solve, and require a claim of success with residuals of at most `factor`·tol."""
     s = _solve(solver, qp, tol)
     _judge(qp, s, factor * tol)
     return s
@@ -121,11 +127,13 @@ def _solved(solver: Solver, qp: QP, tol: float, factor: float) -> Solution:
 
 def _judge(qp: QP, s: Solution, allowed: float) -> None:
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message or 'no message'}")
+        raise ContractError(f"ended as {s.status}: {s.message or 'no message'}")
     residuals = kkt_residuals(qp, s)
     if not residuals.worst <= allowed:
         values = ", ".join(f"{k} {v:.1e}" for k, v in residuals._asdict().items())
-        raise BrokenError(f"claimed solved, but residuals are {values}; {allowed:g} ok")
+        raise ContractError(
+            f"claimed solved, but residuals are {values}; expected at most {allowed:g}"
+        )
 
 
 def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None:
@@ -149,43 +157,45 @@ def _multipliers_have_our_signs(solver: Solver) -> None:
 
 
 def _absent_bounds_have_no_multipliers(solver: Solver) -> Result:
-    """Forgive multipliers of the size of rounding: the dual residual has room for them.
+    """Require zero multipliers on absent bounds, up to rounding.
 
-    That is 8·2⁻⁵² of the largest term of the gradient, as dual residuals forgive.
+    Multipliers of at most 8·2⁻⁵² times the largest term of the gradient pass with a
+    remark: the dual residual neglects as much.
     """
     qp, _ = manufactured("some bounds")
     s = _solve(solver, qp, 1e-3)
-    extra = s.z_box - qp.box.admissible(s.z_box)
-    worst = np.abs(extra).max(initial=0)
+    inadmissible = s.z_box - qp.box.admissible(s.z_box)
+    worst = np.abs(inadmissible).max(initial=0)
     if worst <= 0:
         return Result(Grade.PASS)
     size = max(np.abs(v).max(initial=0) for v in (qp.P @ s.x, qp.q, s.z_box))
-    what = f"a multiplier of {worst:.1e} on an absent bound"
-    if not worst <= LOST * size:
-        raise BrokenError(f"{what}; expected 0")
-    return Result(Grade.PASS, f"{what}: rounding; 0 would be right")
+    remark = f"a multiplier of {worst:.1e} on an absent bound"
+    if not worst <= GRADIENT_ROUNDING * size:
+        raise ContractError(f"{remark}; expected 0")
+    return Result(Grade.PASS, f"{remark}: rounding; 0 would be right")
 
 
 def _repeats_are_cold_and_alike(solver: Solver) -> None:
     qp, _ = manufactured("bounds", n=60)
     first, *others = (_solve(solver, qp, 1e-6) for _ in range(3))
     if first.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {first.status}: {first.message}")
+        raise ContractError(f"ended as {first.status}: {first.message}")
     for s in others:
         if s.iterations != first.iterations:
-            raise BrokenError(f"iterations: {first.iterations}, then {s.iterations}")
-        _near("x of a repeat", s.x, first.x, ROUNDING)
+            raise ContractError(f"iterations: {first.iterations}, then {s.iterations}")
+        _near("x of a repeat", s.x, first.x, REPEAT_ROUNDING)
 
 
 def _the_problem_is_left_alone(dense: bool, solver: Solver) -> None:
     qp, _ = manufactured("everything", dense=dense)
     before = [buffer.copy() for buffer in _buffers(qp)]
     s = _solve(solver, qp, 1e-6)
+    # the arrays are read-only, which a solver can undo: both are checked
     for buffer, copy in zip(_buffers(qp), before, strict=True):
         if buffer.flags.writeable or not np.array_equal(buffer, copy):
-            raise BrokenError("changed the QP that it was given")
+            raise ContractError("changed the QP that it was given")
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message}")
+        raise ContractError(f"ended as {s.status}: {s.message}")
 
 
 def _a_misspelt_option_is_refused(solver: Solver) -> None:
@@ -193,16 +203,16 @@ def _a_misspelt_option_is_refused(solver: Solver) -> None:
         type(solver)(**{"no_such_option": 1})
     except TypeError:
         return
-    raise BrokenError("takes any option; expected TypeError for no_such_option")
+    raise ContractError("accepts any option; expected TypeError for no_such_option")
 
 
 def _claims_no_success(problem: Callable[[], QP], solver: Solver) -> Result:
     qp = problem()
-    s = _ended(solver, qp, 1e-9)
+    s = _end(solver, qp, 1e-9)
     if s.status is Status.SOLVED:
-        raise BrokenError("claims to have solved what has no solution")
+        raise ContractError("claims to have solved a QP without a solution")
     if not s.message:
-        raise BrokenError(f"ended as {s.status} without a message; expected a reason")
+        raise ContractError(f"ended as {s.status} without a message; expected a reason")
     if s.status is Status.INFEASIBLE and infeasibility_margin(qp, s) is not None:
         return Result(Grade.PASS, "verified infeasible")
     return Result(Grade.PASS, f"ended as {s.status}: {s.message}")
@@ -212,22 +222,23 @@ def _an_operator_is_taken_or_declined(solver: Solver) -> None:
     qp, _ = manufactured("bounds")
     try:
         _solved(solver, replace(qp, P=aslinearoperator(qp.P)), 1e-6, VERIFIED_FACTOR)
-    except BrokenError as e:
-        raise BrokenError(f"P is an operator: {e}; {_DECLINE_OPERATORS}") from None
+    except ContractError as e:
+        raise ContractError(f"P is an operator: {e}; {_DECLINE_OPERATORS}") from None
 
 
 def _many_bounds_and_no_rows(solver: Solver) -> None:
-    """Catch an optimum claimed at the start, as some do where there are no rows."""
+    """Require a solution where some solvers claim that their first point is optimal.
+
+    They do so for QPs without rows.
+    """
     _solved(solver, membrane(20), 1e-6, VERIFIED_FACTOR)
 
 
 def _runs_in_one_thread(solver: Solver) -> None:
-    """Let no two threads compute: one cannot use more CPU time than passes.
-
-    The process may use all CPUs meanwhile, or two threads would take turns on one.
-    """
+    """Require that one thread computes: its CPU time cannot exceed the wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
+    # all CPUs: two threads on one would alternate, and not be seen
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()
@@ -236,13 +247,15 @@ def _runs_in_one_thread(solver: Solver) -> None:
     finally:
         os.sched_setaffinity(0, allowed)
     if s.status is not Status.SOLVED:
-        raise BrokenError(f"ended as {s.status}: {s.message}")
+        raise ContractError(f"ended as {s.status}: {s.message}")
     if used > 1.2 * passed + 0.02:
-        raise BrokenError(f"used {used:.2f} s CPU within {passed:.2f} s; one thread?")
+        raise ContractError(
+            f"used {used:.2f} s of CPU time in {passed:.2f} s; expected one thread"
+        )
 
 
 def _a_sequence_is_solved(solver: Solver) -> None:
-    """Two QPs with the same matrices, one with others, one of another size."""
+    """Require solutions of two QPs with equal matrices, and of two other QPs."""
     chain = getattr(solver, "chain", None)
     if chain is None:
         raise DeclinedError("has no chain()")
@@ -253,20 +266,21 @@ def _a_sequence_is_solved(solver: Solver) -> None:
             if (reason := reason_to_decline(solver, qp)) is not None:
                 raise DeclinedError(reason)
             _judge(qp, prepare(qp)(), VERIFIED_FACTOR * 1e-6)
-        except (BrokenError, ReasonError) as e:
-            raise BrokenError(f"QP {i + 1} of the sequence: {e}") from None
+        except (ContractError, ReasonError) as e:
+            raise ContractError(f"QP {i + 1} of the sequence: {e}") from None
         except DeclinedError:
             raise
         except ImportError as e:
             raise DeclinedError(f"not installed: {e.name}") from None
         except Exception as e:  # the solver's own code
             message = f"QP {i + 1} of the sequence: {failure(solver, e)}"
-            raise BrokenError(message) from None
+            raise ContractError(message) from None
 
 
 def _sequence() -> list[QP]:
     qp, point = manufactured("everything")
-    shift = 0.1 * np.cos(np.arange(qp.q.size))  # of the solution, the active set kept
+    # a translation of the solution and all constraints: the active set stays
+    shift = 0.1 * np.cos(np.arange(qp.q.size))
     moved = shift_unknowns(qp, -shift).qp
     softer = replace(qp, P=qp.P * 0.5, q=qp.q + 0.5 * (qp.P @ point.x))
     return [qp, moved, softer, manufactured("bounds", n=12)[0]]
@@ -280,10 +294,16 @@ def _keeps_its_answer(form: str, change: str, solver: Solver) -> Result:
     return Result(Grade.PASS, message, after / max(before, 1))
 
 
-def _near(what: str, got: Vector | float, expected: Vector | float, by: float) -> None:
-    error = float(np.max(np.abs(np.subtract(got, expected)), initial=0.0))
-    if not error <= by:
-        raise BrokenError(f"{what} is {error:.1e} off the known one; {by:.1e} is ok")
+def _near(
+    name: str, value: Vector | float, expected: Vector | float, tol: float
+) -> None:
+    """Require ‖value − expected‖∞ ≤ tol; NaN fails."""
+    error = float(np.max(np.abs(np.subtract(value, expected)), initial=0.0))
+    if not error <= tol:
+        raise ContractError(
+            f"{name} differs from the known one by {error:.1e}; expected at most "
+            f"{tol:.1e}"
+        )
 
 
 def _buffers(qp: QP) -> Iterator[Vector]:
@@ -296,7 +316,7 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     for shape in SHAPES:
         for dense in (False, True):
             stored = "dense" if dense else "sparse"
-            name = f"{FINDS}: {shape}, {stored}"
+            name = f"{SOLUTION_PREFIX}: {shape}, {stored}"
             yield name, partial(_finds_the_planted_solution, shape, dense)
     for shape in SHAPES:
         for tol in (1e-3, 1e-6):
@@ -317,7 +337,10 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
     yield "solves a sequence", _a_sequence_is_solved
     for form in FORMS:
         for change in changes_of(form):
-            yield f"{KEEPS}: {form}, {change}", partial(_keeps_its_answer, form, change)
+            yield (
+                f"{INVARIANCE_PREFIX}: {form}, {change}",
+                partial(_keeps_its_answer, form, change),
+            )
 
 
 CHECKS: Mapping[str, Check] = dict(_all_checks())

@@ -1,10 +1,10 @@
-"""What a solver makes of equivalent formulations of one contact problem.
+"""Invariance of a solver's answer under equivalent formulations of a contact problem.
 
-Two strings pressed together, in each form of
-`harness.conformance.manufactured.strings`, are solved as they are and as every change
-of `CHANGES` leaves them. Verdict and answer must be the same: of two verified points of
-one QP, the objectives differ by what the residuals may be, relative to the energies,
-and so does the energy ½‖x − x₀‖²_P of their difference.
+Two strings in contact, in each form of `harness.conformance.manufactured.strings`, are
+solved unchanged and after every change of `CHANGES`. Verdict and answer must be the
+same. For two verified points x and x₀ of one QP, the difference of the objectives and
+the energy ½‖x − x₀‖²_P of the difference are bounded by the residuals, relative to the
+energies.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8
-ALLOWED = 10 * VERIFIED_FACTOR * TOL  #: of the energies; 10 for what adds up over rows
+#: relative to the energies; a factor of 10 for residuals that add up over rows
+MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
-#: the beam-ring's load and length, 10⁸ N/m and 2 m, as powers of two: forces are per
-#: thickness, so that stiffness is measured in Pa, MPa and GPa
+#: load and length of beam-ring (10⁸ N/m and 2 m) in each system of units, as powers of
+#: two. Forces are per thickness, so the stiffness is in Pa, MPa and GPa
 UNITS: Mapping[str, tuple[float, float]] = {
     "N, m": (2.0**27, 2.0**1),
     "N, mm": (2.0**17, 2.0**11),
@@ -45,51 +46,53 @@ UNITS: Mapping[str, tuple[float, float]] = {
 }
 
 
-class WeakError(Exception):
-    """What an equivalent formulation changed."""
+class WeaknessError(Exception):
+    """Change of verdict or answer by an equivalent formulation."""
 
 
 class DeclinedError(Exception):
-    """Why a solver cannot take a QP."""
+    """Refusal of a QP by a solver, with its reason."""
 
 
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
-    """Solve the strings in `form` as they are, then as a change leaves them.
-
-    Return the iterations of both, where the solver tells.
+    """Solve the strings in a form unchanged and changed, and compare the answers.
 
     change : a key of `CHANGES`
-    old : the answer as they are, where it is known
+    old : the answer to the unchanged QP, if it is available
+
+    Returns
+    -------
+    the numbers of iterations of both solves; None where the solver reports none
 
     Raises
     ------
     DeclinedError
-        When the solver declines either, or does not solve them as they are.
-    WeakError
-        When verdict or answer are not the same; with no change: when it fails.
+        If the solver declines either QP, or fails on the unchanged one.
+    WeaknessError
+        If verdict or answer differ; without a change, if the solver fails.
 
     """
     qp = strings(form)
     old = old or answer(solver, qp)
     before = _fault(qp, old)
-    if before and change != AS_IT_IS:
+    if before and change != UNCHANGED:
         raise DeclinedError(f"not solved as it is: {before}")
     new = CHANGES[change](qp, form)
-    s = old if change == AS_IT_IS else answer(solver, new.qp)
+    s = old if change == UNCHANGED else answer(solver, new.qp)
     if after := _fault(new.qp, s):
-        raise WeakError(after)
-    back = new.recover(s)
+        raise WeaknessError(after)
+    recovered = new.recover(s)
     energy = max(_energy(qp, old.x), new.scale * _energy(new.qp, s.x))
-    by = back.x - old.x
-    _compare("objective", abs(qp.objective(back.x) - qp.objective(old.x)) / energy)
-    _compare("½‖x − x₀‖²_P", 0.5 * float(by @ (qp.P @ by)) / energy)
+    dx = recovered.x - old.x
+    _compare("objective", abs(qp.objective(recovered.x) - qp.objective(old.x)) / energy)
+    _compare("½‖x − x₀‖²_P", 0.5 * float(dx @ (qp.P @ dx)) / energy)
     return old.iterations, s.iterations
 
 
 def answer(solver: Solver, qp: QP) -> Solution:
-    """Solve; DeclinedError where that is declined."""
+    """Solve a QP; raise DeclinedError if the solver declines it."""
     s = measure(solver, qp, TOL).solution
     if s.status is Status.DECLINED:
         raise DeclinedError(s.message)
@@ -97,33 +100,33 @@ def answer(solver: Solver, qp: QP) -> Solution:
 
 
 def _fault(qp: QP, s: Solution) -> str:
-    """Say, with the evidence, what is not as good as claimed; empty: nothing."""
+    """Describe, with evidence, why an answer is not a verified success; "" if it is."""
     residuals = kkt_residuals(qp, s)
     judged = verdict(s.status, residuals, TOL)
     if s.status is Status.SOLVED and judged is Verdict.VERIFIED:
         return ""
-    words = f" ({s.message})" if s.message else ""
+    end = f"ended as {s.status}" + (f" ({s.message})" if s.message else "")
     if np.isnan(residuals.worst):
-        return f"ended as {s.status}{words}"
+        return end
     name, worst = max(residuals._asdict().items(), key=lambda item: item[1])
-    ended = f"ended as {s.status}{words}"
-    return f"{ended}, {judged}: {name} residual {worst:.1e} at tol {TOL:g}"
+    return f"{end}, {judged}: {name} residual {worst:.1e} at tol {TOL:g}"
 
 
 def _energy(qp: QP, x: Vector) -> float:
     return float(max(abs(x @ (qp.P @ x)), abs(qp.q @ x)))
 
 
-def _compare(what: str, by: float) -> None:
-    if not by <= ALLOWED:
-        raise WeakError(
-            f"verified, but {what} changed by {by:.1e} of the energy; {ALLOWED:g} is ok"
+def _compare(quantity: str, change: float) -> None:
+    if not change <= MAX_ENERGY_CHANGE:
+        raise WeaknessError(
+            f"verified, but {quantity} changed by {change:.1e} of the energy; "
+            f"expected at most {MAX_ENERGY_CHANGE:g}"
         )
 
 
 def _units(name: str, qp: QP, form: str) -> Equivalent:
     force, length = UNITS[name]
-    unit = length if form == "primal" else force  # of x, a displacement or a force
+    unit = length if form == "primal" else force  # x is a displacement or a force
     return change_units(qp, unknown=1 / unit, objective=force * length)
 
 
@@ -132,20 +135,20 @@ def _order(count: int) -> Order:
 
 
 def _rows_scaled(qp: QP, form: str) -> Equivalent:
-    """By factors from a thousandth to a thousand."""
+    """Scale each row by a random power of two between 2⁻¹⁰ and 2¹⁰."""
     exponents = np.random.default_rng(173205).integers(-10, 11, qp.b.size + qp.h.size)
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: of a shift: half of what the largest contact force, or deflection, is about
+#: by form: about half of the largest deflection, or contact force
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
-Change = Callable[[QP, str], Equivalent]  #: of the strings in a form
+Change = Callable[[QP, str], Equivalent]  #: from the strings in a form
 
-AS_IT_IS = "as it is"
+UNCHANGED = "as it is"
 
 CHANGES: Mapping[str, Change] = {
-    AS_IT_IS: lambda qp, form: Equivalent(qp, lambda s: s),
+    UNCHANGED: lambda qp, form: Equivalent(qp, lambda s: s),
     **{f"units {name}": partial(_units, name) for name in UNITS},
     "unknowns permuted": lambda qp, _: permute_unknowns(qp, _order(qp.q.size)),
     "rows permuted": lambda qp, _: permute_rows(
@@ -161,7 +164,7 @@ CHANGES: Mapping[str, Change] = {
     "unknowns shifted": lambda qp, form: shift_unknowns(
         qp, np.full(qp.q.size, _SHIFTS[form])
     ),
-    # what was pushed down is pushed up, and λ ≥ 0 becomes λ ≤ 0
+    # the load points upwards instead of downwards, and λ ≥ 0 becomes λ ≤ 0
     "mirrored": lambda qp, _: mirror(qp, np.arange(qp.q.size)),
 }
 
@@ -173,9 +176,9 @@ _ROWS = {
 
 
 def changes_of(form: str) -> list[str]:
-    """Name the changes that are any in this form; one without rows has none to scale.
+    """Return the changes that apply to a form; the first is `UNCHANGED`.
 
-    The first is none.
+    Changes of rows do not apply to forms without such rows.
     """
     return [
         name for name in CHANGES

@@ -1,4 +1,4 @@
-"""QPs whose solution is known by construction: what solvers are examined on."""
+"""Manufactured QPs, with solutions known by construction, to test solvers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from scipy.sparse import csr_array, diags_array, eye_array, kron
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector, no_rows
 from mortarbench.harness.solution import Solution, Status
 
-#: m equality and p inequality rows, which bounds, fixed variables, rank of P, …
+#: keys: m equality rows, p inequality rows, finite lower and upper bounds (of some
+#: variables), redundant rows, fixed variables, rank of P
 SHAPES: Mapping[str, Mapping[str, Any]] = {
     "bounds": dict(upper=False),
     "box": dict(),
@@ -30,11 +31,18 @@ SHAPES: Mapping[str, Mapping[str, Any]] = {
 def manufactured(
     shape: str, *, seed: int = 271828, dense: bool = False, n: int = 20
 ) -> tuple[QP, Solution]:
-    """Draw x*, multipliers and an active set; solve stationarity for q.
+    """Return a random QP with a known KKT point.
 
-    Give a QP and a KKT point of it. It has matrices of order one, active constraints of
-    every kind that the shape (a key of `SHAPES`) names and, but for "singular", one
-    minimiser.
+    Draw x*, the multipliers and the active set, and solve the stationarity condition
+    for q. The matrices are of order one. Every kind of constraint that the shape
+    contains is active, and the minimiser is unique except for "singular".
+
+    shape : a key of `SHAPES`
+
+    >>> qp, point = manufactured("equalities")
+    >>> bool(np.allclose(qp.P @ point.x + qp.q + qp.A.T @ point.y, 0))
+    True
+
     """
     store: Callable[[Matrix], Matrix] = np.asarray if dense else csr_array
     return _plant(np.random.default_rng(seed), n, store, SHAPES[shape])
@@ -55,8 +63,9 @@ def _plant(
         A[-1] = A[:-1].sum(axis=0)
     x = rng.standard_normal(n)
     y = rng.standard_normal(m)
+    # multipliers of active rows are at least 0.5: strict complementarity
     z = np.where(np.arange(p) % 2 == 0, 0.5 + rng.exponential(size=p), 0.0)
-    # of four variables one is at its lower, one at its upper bound, two are inside
+    # of four variables, one is at its lower bound, one at its upper, two are inside
     at_lb = lower & (np.arange(n) % 4 == 0)
     at_ub = upper & (np.arange(n) % 4 == 1)
     bounded = np.arange(n) % 4 < 2 if shape.get("some") else np.full(n, True)
@@ -90,9 +99,9 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
 
 
 def membrane(k: int) -> QP:
-    """Press a membrane of k·k nodes, fixed at its rim, onto a paraboloid.
+    """Return the QP of a membrane of k·k nodes, fixed at its rim, on a paraboloid.
 
-    Bounds only; its solution is not known beforehand, its KKT conditions are.
+    It has bounds only. Its solution is not known, but its KKT residuals are computable.
     """
     second = diags_array(
         [-np.ones(k - 1), 2 * np.ones(k), -np.ones(k - 1)], offsets=[-1, 0, 1]
@@ -113,15 +122,16 @@ FORMS = ("primal", "dual", "dual-bounds")  #: of `strings`
 
 
 def strings(form: str) -> QP:
-    """Pull a string of 24 cells onto a softer one of 16: frictionless contact in small.
+    """Return a small frictionless contact problem: a loaded string above a softer one.
 
-    The unknown is the deflection u (24 + 1 and 16 + 1 nodes), K the stiffness:
-    min ½uᵀKu − fᵀu, ends held by A u = 0, each inner node of the upper string kept
-    above the lower by a row of G u ≤ h (its own −1, the weights of two nodes there).
+    The strings have 24 and 16 cells. The unknown is the deflection u (25 + 17 nodes), K
+    is the stiffness:  min ½uᵀKu − fᵀu.  The ends are fixed by A u = 0. A row of
+    G u ≤ h keeps each inner node of the upper string above the lower string: −1 at the
+    node, and the weights of the two lower nodes around it.
 
-    form : "primal", that QP. "dual", with B = [A; G], c = [0; h] and an orthonormal
-        basis R of ker K:  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  λ_I ≥ 0.
-        "dual-bounds", the same of the held strings: λ ≥ 0 and no rows
+    form : "primal" is that QP. "dual", with B = [A; G], c = [0; h] and an orthonormal
+        basis R of ker K, is  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  RᵀBᵀλ = Rᵀf,  λ_I ≥ 0.
+        "dual-bounds" is the dual of the strings with fixed ends: λ ≥ 0 and no rows
     """
     K, f, R = _two_strings()
     upper, lower = np.arange(1, 24), np.linspace(0, 1, 17)
@@ -129,19 +139,19 @@ def strings(form: str) -> QP:
     weights = [np.interp(at, lower, hat) for hat in np.eye(17)]
     G = np.hstack([-np.eye(25)[1:-1], np.transpose(weights)])
     h = 0.01 + 0.1 * (at - 0.4) ** 2
-    held = np.array([0, 24, 25, 41])
-    A, no_box = np.eye(42)[held], np.full(42, np.inf)
+    ends = np.array([0, 24, 25, 41])
+    A, no_box = np.eye(42)[ends], np.full(42, np.inf)
     if form == "primal":
         return QP(
             P=csr_array(K), q=-f, A=csr_array(A), b=np.zeros(4), G=csr_array(G), h=h,
             lb=-no_box, ub=no_box,
         )  # fmt: skip
-    free = np.setdiff1d(np.arange(42), held)
+    free = np.setdiff1d(np.arange(42), ends)
     if form == "dual":
-        B, c, fixed = np.vstack([A, G]), np.append(np.zeros(4), h), held[:0]
+        B, c, fixed = np.vstack([A, G]), np.append(np.zeros(4), h), ends[:0]
         inverse = np.linalg.pinv(K, hermitian=True)
     else:
-        B, c, fixed, inverse = G, h, held, np.zeros((42, 42))
+        B, c, fixed, inverse = G, h, ends, np.zeros((42, 42))
         inverse[np.ix_(free, free)] = np.linalg.inv(K[np.ix_(free, free)])
         R = R[:, :0]
     F, m = B @ inverse @ B.T, c.size
@@ -154,7 +164,7 @@ def strings(form: str) -> QP:
 
 
 def _two_strings() -> tuple[Vector, Vector, Vector]:
-    """Assemble stiffness (42, 42), load (42,) on the upper and kernel (42, 2)."""
+    """Assemble stiffness (42, 42), load (42,) on the upper string, kernel (42, 2)."""
     K, R = np.zeros((42, 42)), np.zeros((42, 2))
     for body, (tension, cells, nodes) in enumerate(
         [(2.0, 24, slice(0, 25)), (0.5, 16, slice(25, 42))]
@@ -168,7 +178,7 @@ def _two_strings() -> tuple[Vector, Vector, Vector]:
 
 
 def infeasible() -> QP:
-    """Ask for x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
+    """Return a QP with the contradicting rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
     rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
     return QP(
         P=csr_array(np.eye(20)), q=np.ones(20), A=no_rows(20), b=np.zeros(0),
@@ -178,7 +188,7 @@ def infeasible() -> QP:
 
 
 def unbounded() -> QP:
-    """Leave no curvature and no upper bound along x₀, but a slope."""
+    """Return a QP that decreases along x₀ without curvature and without upper bound."""
     return QP(
         P=csr_array(np.diag([0.0] + [1.0] * 19)), q=-np.ones(20),
         A=no_rows(20), b=np.zeros(0), G=no_rows(20), h=np.zeros(0),

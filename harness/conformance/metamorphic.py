@@ -1,9 +1,9 @@
-"""Equivalent formulations of a QP, each with its way back.
+"""Equivalent formulations of a QP, each with the map back to the original solution.
 
-What is physically the same must get the same answer: a change of units, another order
-of unknowns and rows, a row times a positive number or written twice, unknowns counted
-from elsewhere, a mirror (metamorphic relations: T. Y. Chen et al., ACM Computing
-Surveys 51 (2018) 4). All are one of two substitutions:
+Physically equivalent problems must have the same answer: after a change of units, of
+the order of unknowns or rows, or of the origin or sign of unknowns, and with rows
+scaled or duplicated (metamorphic relations: T. Y. Chen et al., ACM Computing Surveys 51
+(2018) 4). All of these are one of two substitutions:
 
 * of unknowns,  x = T x' + a  with one entry in each row and column of T, and the
   objective times t:
@@ -16,9 +16,10 @@ Surveys 51 (2018) 4). All are one of two substitutions:
 
       y = Mᵀy',  z = Nᵀz'
 
-With powers of two for factors all but a shift lose no bit. A structure is carried: with
-P = BK⁺Bᵀ, it is P' = B'K'⁺B'ᵀ for B' = TᵀB and K' = K/t. What changes unknowns needs P
-as a matrix, and raises ValueError for an operator.
+If the factors are powers of two, every change except a shift is exact in floating-point
+arithmetic. The structure is transformed as well: P = BK⁺Bᵀ becomes P' = B'K'⁺B'ᵀ with
+B' = TᵀB and K' = K/t. Changes of the unknowns need P as a matrix and raise ValueError
+for an operator.
 """
 
 from __future__ import annotations
@@ -34,19 +35,19 @@ from scipy.sparse import csr_array, diags_array, eye_array
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector
 from mortarbench.harness.solution import Solution
 
-Order = NDArray[Any]  #: of indices, or a mask
+Order = NDArray[Any]  #: array of indices, or a mask
 
 
 class Equivalent(NamedTuple):
-    """A QP with the same solutions as an old one, and the way back."""
+    """A transformed QP, and the map of its points back to the original QP."""
 
     qp: QP
     recover: Callable[[Solution], Solution]  #: point of the new QP → of the old one
-    scale: float = 1.0  #: old objective = scale·new objective + constant,
-    constant: float = 0.0  #: at every point
+    scale: float = 1.0  #: old objective = scale·new objective + constant, at all points
+    constant: float = 0.0
 
-    def then(self, change: Callable[[QP], Equivalent]) -> Equivalent:
-        """Change the new QP once more."""
+    def followed_by(self, change: Callable[[QP], Equivalent]) -> Equivalent:
+        """Compose with a change of the transformed QP."""
         new = change(self.qp)
         return Equivalent(
             new.qp,
@@ -57,7 +58,7 @@ class Equivalent(NamedTuple):
 
 
 def change_units(qp: QP, *, unknown: float, objective: float) -> Equivalent:
-    """Measure x in another unit, and the objective.
+    """Change the units of x and of the objective.
 
     ::
 
@@ -65,55 +66,60 @@ def change_units(qp: QP, *, unknown: float, objective: float) -> Equivalent:
         P' = ts²P,  q' = ts q,  A' = A,  b' = b/s,  G' = G,  h' = h/s,  lb' = lb/s
         y = y'/(ts),  z = z'/(ts),  z_box = z_box'/(ts)
 
-    The rows keep their entries, which of contact rows are numbers, and their right-hand
-    sides the unit of x; with displacements the multipliers are forces.
+    The entries of contact rows are dimensionless, so rows keep their entries and
+    right-hand sides have the unit of x. If x is a displacement, multipliers are forces.
 
-    unknown : s, how many of the old unit of x are one of the new
-    objective : t, how many of the new unit of the objective are one of the old
+    unknown : s, the new unit of x in terms of the old one
+    objective : t, the old unit of the objective in terms of the new one
     """
     s = unknown
     T = diags_array(np.full(qp.q.size, s))
     A, G = (diags_array(np.full(v.size, 1 / s)) for v in (qp.b, qp.h))
-    return _unknowns(qp, T, objective=objective).then(lambda new: _rows(new, A, G))
+    return _unknowns(qp, T, objective=objective).followed_by(
+        lambda new: _rows(new, A, G)
+    )
 
 
 def permute_unknowns(qp: QP, order: Order) -> Equivalent:
-    """Put unknowns in another order: x' = x[order], and z_box with them."""
+    """Permute the unknowns: x' = x[order], z_box' = z_box[order]."""
     return _unknowns(qp, csr_array(eye_array(qp.q.size, format="csr")[order].T))
 
 
 def permute_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
-    """Put rows in another order: y' = y[equalities], z' = z[inequalities]."""
-    return _rows(qp, *_chosen(qp, equalities, inequalities))
+    """Permute the rows: y' = y[equalities], z' = z[inequalities]."""
+    return _rows(qp, *_selections(qp, equalities, inequalities))
 
 
 def scale_rows(qp: QP, equalities: Vector, inequalities: Vector) -> Equivalent:
-    """Multiply each row by a positive factor, by which its multiplier is divided."""
+    """Multiply each row by a positive factor; its multiplier is divided by it."""
     return _rows(qp, diags_array(equalities), diags_array(inequalities))
 
 
 def duplicate_rows(qp: QP, equalities: Order, inequalities: Order) -> Equivalent:
-    """Write the chosen rows a second time, below the others.
+    """Append copies of the selected rows below the others.
 
     The multiplier of a row is the sum of those of its copies, which are not unique.
     """
     every = [np.arange(v.size) for v in (qp.b, qp.h)]
     twice = [
-        np.append(rows, rows[chosen])
-        for rows, chosen in zip(every, (equalities, inequalities), strict=True)
+        np.append(rows, rows[selected])
+        for rows, selected in zip(every, (equalities, inequalities), strict=True)
     ]
-    return _rows(qp, *_chosen(qp, *twice))
+    return _rows(qp, *_selections(qp, *twice))
 
 
 def shift_unknowns(qp: QP, origin: Vector) -> Equivalent:
-    """Count unknowns from `origin` (n,): x = x' + a; the multipliers stay."""
+    """Shift the origin of the unknowns to a = `origin` (n,): x = x' + a.
+
+    The multipliers do not change.
+    """
     return _unknowns(qp, eye_array(qp.q.size, format="csr"), origin)
 
 
 def mirror(qp: QP, flipped: Order) -> Equivalent:
-    """Turn chosen unknowns round: xᵢ = −xᵢ', lbᵢ' = −ubᵢ, ubᵢ' = −lbᵢ.
+    """Reverse the sign of selected unknowns: xᵢ = −xᵢ', lbᵢ' = −ubᵢ, ubᵢ' = −lbᵢ.
 
-    z_boxᵢ = −z_boxᵢ', while y and z stay.
+    Then z_boxᵢ = −z_boxᵢ'; y and z do not change.
     """
     sign = np.ones(qp.q.size)
     sign[flipped] = -1
@@ -123,7 +129,14 @@ def mirror(qp: QP, flipped: Order) -> Equivalent:
 def _unknowns(
     qp: QP, T: Matrix, origin: Vector | None = None, objective: float = 1.0
 ) -> Equivalent:
-    """Substitute x = T x' + a, and multiply the objective by t."""
+    """Substitute x = T x' + a, and multiply the objective by t.
+
+    Raises
+    ------
+    ValueError
+        If P is an operator.
+
+    """
     if not qp.is_explicit:
         raise ValueError(f"QP.P is a {type(qp.P).__name__}, expected a matrix")
     T, t = csr_array(T), objective
@@ -161,14 +174,16 @@ def _rows(qp: QP, M: Matrix, N: Matrix) -> Equivalent:
     return Equivalent(new, lambda s: replace(s, y=M.T @ s.y, z=N.T @ s.z))
 
 
-def _chosen(qp: QP, equalities: Order, inequalities: Order) -> tuple[Matrix, Matrix]:
-    """Make the matrices that take these rows, in this order."""
+def _selections(
+    qp: QP, equalities: Order, inequalities: Order
+) -> tuple[Matrix, Matrix]:
+    """Return the matrices M, N that select these rows, in this order."""
     M, N = (eye_array(v.size, format="csr") for v in (qp.b, qp.h))
     return M[equalities], N[inequalities]
 
 
 def _sorted(M: Matrix) -> Matrix:
-    """Order the entries of sparse rows, which products leave as they come."""
+    """Sort the column indices of sparse rows, which products leave unsorted."""
     if hasattr(M, "sort_indices"):
         M.sort_indices()
     return M

@@ -1,50 +1,53 @@
-"""docs/weaknesses.md: what an equivalent formulation changes, solver by solver."""
+"""Page docs/weaknesses.md: effects of equivalent formulations, by solver."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from mortarbench.harness.conformance.conformance import KEEPS, Grade, Result
+from mortarbench.harness.conformance.conformance import INVARIANCE_PREFIX, Grade, Result
 from mortarbench.harness.conformance.equivalence import (
-    AS_IT_IS,
     CHANGES,
     TOL,
+    UNCHANGED,
     UNITS,
     changes_of,
 )
 from mortarbench.harness.conformance.manufactured import FORMS
 
-TOLD = 2.0  #: times the iterations that are worth telling
+MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
 
 Results = Mapping[str, Result]  #: of one solver, by the name of the check
 
 HEAD = f"""\
-# What an equivalent formulation changes
+# Effects of equivalent formulations
 
-Measured by `make weaknesses`, which writes this page; versions are those of
-`constraints.txt`. `mortarbench test-solver NAME` does the same for one solver.
+Measured by `make weaknesses`, which writes this page, with the versions in
+`constraints.txt`. `mortarbench test-solver NAME` measures one solver.
 
-Two strings in contact (`harness.conformance.manufactured.strings`: 42 unknowns, 4
-equality and 23 inequality rows; its dual; its dual with bounds only) are solved at tol
-{TOL:g} without dimensions, then written differently: in other units, in another order,
-with rows scaled by powers of two from 2⁻¹⁰ to 2¹⁰ or written twice, with unknowns
-counted from elsewhere or with the opposite sign. Each is an exact equivalence
-(`harness.conformance.metamorphic`), so verdict and answer should stay.
+The test problem is two strings in contact (`harness.conformance.manufactured.strings`):
+the primal QP with 42 unknowns, 4 equality and 23 inequality rows; its dual; and its
+dual with bounds only. Each is solved at tolerance {TOL:g} in non-dimensional form, and
+then in equivalent formulations: in other units, in another order, with rows scaled by
+powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
+opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
+verdict nor answer should change.
 
-Units are those of the paper's benchmark, as powers of two. What they multiply:
+The units are those of the paper's benchmark, as powers of two. They multiply the
+non-dimensional quantities by these factors:
 
 """
 
 KEY = """
-"·": every form keeps verdict and answer. ×k: at k times the iterations, at least twice,
-in the worst form. **form**: changed; how, is said below the table. (form): the solver
-declines the changed QP. A blank: it solves no form that this changes.
+"·": verdict and answer are the same in every form. ×k: in the worst form, k times as
+many iterations (for k ≥ 2). **form**: verdict or answer change; the evidence is below
+the table. (form): the solver declines the changed QP. Blank: the change applies to no
+form that the solver solves.
 """
 
 
 def weaknesses_page(results: Mapping[str, Results]) -> str:
-    """Tabulate how the checks of equivalent formulations ended, in Markdown."""
-    heads = [change for change in CHANGES if change != AS_IT_IS]
+    """Return a Markdown page with the results of the checks of equivalence."""
+    heads = [change for change in CHANGES if change != UNCHANGED]
     lines = [
         *_units(),
         KEY,
@@ -52,17 +55,18 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
         f"| --- | --- |{' --- |' * len(heads)}",
     ]
     for name, checks in results.items():
-        solved = [f for f in FORMS if _grade(checks, f, AS_IT_IS) is Grade.PASS]
+        solved = [f for f in FORMS if _grade(checks, f, UNCHANGED) is Grade.PASS]
         cells = [
             ", ".join(solved),
             *(_cell(checks, solved, change) for change in heads),
         ]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    return HEAD + "\n".join([*lines, "", "## How", "", *_told(results)]) + "\n"
+    entries = _weaknesses(results)
+    return HEAD + "\n".join([*lines, "", "## Evidence", "", *entries]) + "\n"
 
 
 def line_of(name: str, form: str, change: str) -> str:
-    """Begin the line that tells of a weakness."""
+    """Return the beginning of the line that describes a weakness."""
     return f"- `{name}`, {form}, {change}: "
 
 
@@ -75,7 +79,7 @@ def _units() -> Iterator[str]:
 
 
 def _grade(checks: Results, form: str, change: str) -> Grade | None:
-    check = checks.get(f"{KEEPS}: {form}, {change}")
+    check = checks.get(f"{INVARIANCE_PREFIX}: {form}, {change}")
     return check.grade if check else None
 
 
@@ -84,18 +88,20 @@ def _cell(checks: Results, solved: list[str], change: str) -> str:
     grades = {f: _grade(checks, f, change) for f in solved if change in changes_of(f)}
     if not grades:
         return ""
-    told = [marks[g].format(f) for f, g in grades.items() if g in marks]
-    work = max(checks[f"{KEEPS}: {f}, {change}"].work or 1.0 for f in grades)
-    if work >= TOLD:
-        told.append(f"×{work:.2g}")
-    return ", ".join(told) or "·"
+    entries = [marks[g].format(f) for f, g in grades.items() if g in marks]
+    work = max(
+        checks[f"{INVARIANCE_PREFIX}: {f}, {change}"].work or 1.0 for f in grades
+    )
+    if work >= MIN_LISTED_WORK_RATIO:
+        entries.append(f"×{work:.2g}")
+    return ", ".join(entries) or "·"
 
 
-def _told(results: Mapping[str, Results]) -> Iterator[str]:
-    """List every weakness with its evidence."""
+def _weaknesses(results: Mapping[str, Results]) -> Iterator[str]:
+    """Yield a line for every weakness, with its evidence."""
     for name, checks in results.items():
         for form in FORMS:
             for change in changes_of(form):
                 if _grade(checks, form, change) is Grade.WEAK:
-                    message = checks[f"{KEEPS}: {form}, {change}"].message
+                    message = checks[f"{INVARIANCE_PREFIX}: {form}, {change}"].message
                     yield f"{line_of(name, form, change)}{message}."

@@ -1,1 +1,1 @@
-"""What a machine is, whether it is fit, and how noisy."""
+"""Description of the machine and its software, fitness checks and noise."""

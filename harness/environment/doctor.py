@@ -1,4 +1,4 @@
-"""Is this machine fit for measuring? What was looked at, and what to change."""
+"""Checks of a machine's fitness for measuring, with advice on what to change."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from rich.text import Text
 from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.environment.noise import NoiseFloor
 
-ENOUGH_MEMORY_MIB = 2048
-QUIET_LOAD = 0.5  #: cores kept busy by others, as the one-minute load average tells
-FINE_CLOCK_SECONDS = 1e-6
-STEADY = 0.10  #: one pair of equal measurements differs by less, 19 times out of 20
-EQUAL = 0.01  #: an A/A ratio nearer to 1 than this is as good as 1
+MIN_MEMORY_MIB = 2048
+MAX_QUIET_LOAD = 0.5  #: cores that other programs may keep busy, one-minute average
+MAX_CLOCK_STEP_SECONDS = 1e-6
+MAX_PAIR_SCATTER = 0.10  #: difference of two equal measurements, not exceeded by 95 %
+MAX_RATIO_BIAS = 0.01  #: deviation of an A/A ratio from 1 that is neglected
 ONE_THREAD = (
     "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
     "RAYON_NUM_THREADS=1"
@@ -25,11 +25,11 @@ ONE_THREAD = (
 
 
 class Level(StrEnum):
-    """What a check came to."""
+    """Outcome of a check."""
 
     OK = "ok"
     WARN = "warn"
-    UNKNOWN = "unknown"  #: the machine does not tell
+    UNKNOWN = "unknown"  #: the system does not provide the value
 
 
 _SWITCH = {True: "on", False: "off", None: None}
@@ -38,19 +38,19 @@ _STYLES = {Level.OK: "green", Level.WARN: "bold yellow", Level.UNKNOWN: "dim"}
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One thing that was looked at."""
+    """One property of the machine, with its rating."""
 
     section: str
     name: str
     value: str
     level: Level = Level.OK
-    advice: str = ""  #: what to change, where the level is WARN
+    advice: str = ""  #: recommended change; empty unless the level is WARN
 
 
 def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
-    """Look at everything that times depend on.
+    """Check everything that measured times depend on.
 
-    environment : as `harness.environment.environment.capture` returns it
+    environment : result of `harness.environment.environment.capture`
     """
     return [
         *_machine(environment["machine"], environment["now"]),
@@ -64,7 +64,7 @@ def examine(environment: Mapping[str, Any], noise: NoiseFloor) -> list[Check]:
 def as_json(
     environment: Mapping[str, Any], noise: NoiseFloor, checks: Sequence[Check]
 ) -> dict[str, Any]:
-    """Collect all that `examine` saw and said, as plain data."""
+    """Return the input and the result of `examine` as plain data."""
     return {
         "digest": digest(environment),
         "fit": all(check.level is not Level.WARN for check in checks),
@@ -75,20 +75,20 @@ def as_json(
 
 
 def load_advice(load: float) -> str:
-    """Say what to do about other programs; empty where they keep quiet."""
-    if load <= QUIET_LOAD:
+    """Return advice on other programs; "" if the load average is low."""
+    if load <= MAX_QUIET_LOAD:
         return ""
     return (
         "Stop other programs (top lists them) and wait until the load is below "
-        f"{QUIET_LOAD}"
+        f"{MAX_QUIET_LOAD}"
     )
 
 
 def _check(section: str, name: str, value: object, advice: str = "") -> Check:
-    """Make a check that warns where there is advice; a value None is unknown."""
+    """Return a check: WARN with advice, UNKNOWN without a value, otherwise OK."""
     level = Level.WARN if advice else Level.UNKNOWN if value is None else Level.OK
-    shown = "the system does not tell" if value is None else str(value)
-    return Check(section=section, name=name, value=shown, level=level, advice=advice)
+    text = "not reported by the system" if value is None else str(value)
+    return Check(section=section, name=name, value=text, level=level, advice=advice)
 
 
 def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Check]:
@@ -137,8 +137,8 @@ def _machine(machine: Mapping[str, Any], now: Mapping[str, Any]) -> Iterable[Che
     yield check(
         "memory",
         f"{available} of {total} MiB free" if is_known else None,
-        f"Make room for {ENOUGH_MEMORY_MIB} MiB, or lower memory_limit in the suite"
-        * (is_known and available < ENOUGH_MEMORY_MIB),
+        f"Make room for {MIN_MEMORY_MIB} MiB, or lower memory_limit in the suite"
+        * (is_known and available < MIN_MEMORY_MIB),
     )
 
 
@@ -162,7 +162,7 @@ def _blas(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
-    """Name the BLAS in a package's wheel; without one there, that of the system."""
+    """Return the BLAS in a package's wheel, or without one that of the system."""
     for place in (owner, "system"):
         for pool in pools:
             if pool["owner"] == place and pool["library"] != "libgomp":
@@ -173,7 +173,7 @@ def _blas_of(owner: str, pools: Sequence[Mapping[str, Any]]) -> str | None:
 def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
     for pool in threads["pools"]:
         count = pool["threads"]
-        advice = f"More than one blurs times: {ONE_THREAD}" if count > 1 else ""
+        advice = f"Several threads make times vary: {ONE_THREAD}" if count > 1 else ""
         value = f"{count} thread{'s' if count > 1 else ''}"
         yield _check("Threads", f"{pool['library']} ({pool['owner']})", value, advice)
     variables = ", ".join(f"{k}={v}" for k, v in threads["variables"].items())
@@ -182,17 +182,19 @@ def _threads(threads: Mapping[str, Any]) -> Iterable[Check]:
 
 def _clock(noise: NoiseFloor) -> Iterable[Check]:
     step = noise.clock_seconds
-    coarse = "" if step <= FINE_CLOCK_SECONDS else "Measure on a machine with a clock"
+    coarse = (
+        "" if step <= MAX_CLOCK_STEP_SECONDS else "Measure on a machine with a clock"
+    )
     yield _check(
         "Clock", "smallest step", f"{step * 1e9:.0f} ns", coarse and f"{coarse} to 1 µs"
     )
-    biased = abs(noise.ratio - 1) > EQUAL and not noise.low <= 1 <= noise.high
+    biased = abs(noise.ratio - 1) > MAX_RATIO_BIAS and not noise.low <= 1 <= noise.high
     yield _check(
         "Clock",
         "A/A ratio",
         f"{noise.ratio:.4f}, 95 % interval [{noise.low:.4f}, {noise.high:.4f}], "
         f"{noise.pairs} pairs of {noise.kernel_seconds * 1e3:.2g} ms",
-        "Equal things seem to differ: let the machine rest, then ask again"
+        "A kernel seems to differ from itself: repeat when the machine is idle"
         if biased
         else "",
     )
@@ -200,8 +202,8 @@ def _clock(noise: NoiseFloor) -> Iterable[Check]:
         "Clock",
         "noise floor",
         f"two equal measurements differ by up to {noise.one_pair:.1%} (19 of 20)",
-        f"Raise repeats: a single measurement tells nothing below {noise.one_pair:.0%}"
-        if noise.one_pair > STEADY
+        f"Raise repeats: a single pair cannot resolve less than {noise.one_pair:.0%}"
+        if noise.one_pair > MAX_PAIR_SCATTER
         else "",
     )
 
@@ -221,9 +223,9 @@ def _versions(environment: Mapping[str, Any]) -> Iterable[Check]:
 
 
 def render(checks: Sequence[Check], environment: str) -> Text:
-    """Lay out what `mortarbench doctor` prints: sections, marks, what to change.
+    """Lay out the output of `mortarbench doctor`: sections, levels and advice.
 
-    environment : its digest, as records name it
+    environment : digest of the environment, as in records
     """
     width = max(len(check.name) for check in checks)
     text, section = Text(), ""

@@ -1,7 +1,7 @@
-"""What a measurement depends on besides the code: machine, versions, threads, BLAS.
+"""Environment of a measurement: machine, versions, source, threads and BLAS.
 
-Everything is plain data without host names, user names or absolute paths, so that a
-result folder can be handed to others.
+It is plain data without host names, user names and absolute paths, so that a result
+folder can be passed on to others.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from threadpoolctl import threadpool_info
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.registry import PluginFile
 
-#: that measurements rest on, whichever solvers there are
+#: packages that every measurement depends on, whatever the solver
 PACKAGES = ("mortarbench", "numpy", "scipy", "scikit-sparse", "pandas")
 
 THREAD_VARIABLES = (
@@ -36,19 +36,23 @@ THREAD_VARIABLES = (
     "RAYON_NUM_THREADS",
 )  # fmt: skip
 
-#: libraries that bring a BLAS; the plain name comes last because shells bear it too
+#: libraries that contain a BLAS. The plain name comes last: shells around an optimised
+#: BLAS have the same one
 BLAS_LIBRARIES = (
     ("libopenblas", "OpenBLAS"), ("libmkl", "MKL"), ("libblis", "BLIS"),
     ("libflexiblas", "FlexiBLAS"), ("libatlas", "ATLAS"), ("libsatlas", "ATLAS"),
     ("libblas", "reference BLAS"),
 )  # fmt: skip
-#: whose thread pools what we measure with calls
+#: owners of the libraries whose thread pools our code may use
 OWNERS = ("system", "numpy", "scipy", "scikit_sparse")
-CHOLMOD_OWNERS = ("system", "scikit_sparse")  #: whose libraries CHOLMOD may call
+CHOLMOD_OWNERS = (
+    "system",
+    "scikit_sparse",
+)  #: owners of libraries that CHOLMOD may use
 
-VOLATILE = ("now",)  #: the parts of an environment that its digest leaves out
+VOLATILE = ("now",)  #: parts of an environment that its digest excludes
 
-_CODE = ("harness", "problems", "solvers", "reports", "mortarbench")  #: of a checkout
+_CODE = ("harness", "problems", "solvers", "reports", "mortarbench")  #: in a checkout
 _CPU = Path("/sys/devices/system/cpu")
 _CGROUP = Path("/sys/fs/cgroup")
 
@@ -56,18 +60,19 @@ _CGROUP = Path("/sys/fs/cgroup")
 def capture(
     plugins: Iterable[str | Path | PluginFile] = (), packages: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """Describe this process: nested plain data, None where something is unreadable.
+    """Describe the environment of this process as nested plain data.
 
-    The threads are those of the calling process: for a worker's, use `capture_in`.
+    Entries that cannot be read are None. The threads are those of the calling process;
+    use `capture_in` for those of a worker.
 
-    plugins : files whose code is measured along with ours
-    packages : of solvers, whose versions belong to it
+    plugins : files of plug-ins, whose code is measured along with ours
+    packages : additional packages, of solvers, whose versions are recorded
     """
-    # Only libraries in memory can be asked for their threads.
+    # threadpoolctl finds only libraries that are loaded
     for module in ("numpy", "scipy.linalg", "sksparse.cholmod"):
         with suppress(ImportError):
             import_module(module)
-    # others may be loaded, too: plug-ins' libraries, or those of a notebook
+    # libraries of plug-ins, or of a notebook, may be loaded as well: filtered by owner
     pools = sorted(
         (p for p in map(_pool, threadpool_info()) if p["owner"] in OWNERS),
         key=lambda p: (p["library"], p["owner"]),
@@ -120,37 +125,38 @@ def capture_in(
     plugins: Iterable[str | Path | PluginFile] = (),
     packages: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Describe a process that is started with some variables set, as workers are.
+    """Describe the environment of a new process with some variables set, like workers.
 
-    Libraries read their thread variables only once, when they are loaded.
+    A new process is needed because libraries read their thread variables once, when
+    they are loaded.
     """
     program = (
         "import json, sys, mortarbench.harness.environment.environment as e; "
         "plugins, packages = map(json.loads, sys.argv[1:]); "
         "print(json.dumps(e.capture(plugins, packages)))"
     )
-    given = ([*map(str, plugins)], [*packages])
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", program, *map(json.dumps, given)],
+    arguments = ([*map(str, plugins)], [*packages])
+    process = subprocess.run(
+        [sys.executable, "-P", "-c", program, *map(json.dumps, arguments)],
         env=os.environ | variables,
         capture_output=True,
         text=True,
         check=True,
     )
-    captured: dict[str, Any] = json.loads(done.stdout)
-    return captured
+    environment: dict[str, Any] = json.loads(process.stdout)
+    return environment
 
 
 def packages_of(environment: Mapping[str, Any]) -> list[str]:
-    """Name the packages of solvers whose versions an environment has."""
-    known = ("python", *PACKAGES)
-    return [name for name in environment.get("versions", ()) if name not in known]
+    """Return the packages of solvers whose versions an environment contains."""
+    common = ("python", *PACKAGES)
+    return [name for name in environment.get("versions", ()) if name not in common]
 
 
 def digest(environment: Mapping[str, Any]) -> str:
-    """Name the environment by 12 hex digits; load, free memory and time do not count.
+    """Return 12 hex digits that identify an environment, without load and free memory.
 
-    Equal digests mean that times may be compared.
+    Times of environments with equal digests may be compared.
     """
     lasting = {k: v for k, v in environment.items() if k not in VOLATILE}
     canonical = json.dumps(lasting, sort_keys=True, separators=(",", ":"))
@@ -158,10 +164,16 @@ def digest(environment: Mapping[str, Any]) -> str:
 
 
 def source(root: Path) -> dict[str, Any] | None:
-    """Name the commit of a checkout, and the changes since then by a digest.
+    """Identify the code of a checkout; return None outside of one.
 
-    dirty : whether code differs from the commit
-    changes : 12 hex digits of what differs and of new Python files; None if clean
+    Returns
+    -------
+    a dict with
+    commit : the full hash
+    dirty : True if code differs from the commit
+    changes : 12 hex digits, a digest of the differences and of new Python files; None
+        if there are none
+
     """
 
     def git(*arguments: str) -> bytes:
@@ -174,6 +186,7 @@ def source(root: Path) -> dict[str, Any] | None:
         commit = git("rev-parse", "HEAD").decode().strip()
         if not git("status", "--porcelain", "--", *_CODE):
             return {"commit": commit, "dirty": False, "changes": None}
+        # an external diff tool of the user's would change the digest
         changes = [git("diff", "--no-ext-diff", "HEAD", "--", *_CODE)]
         listed = git("ls-files", "-z", "--others", "--exclude-standard", "--", *_CODE)
         for name in sorted(listed.split(b"\0")):
@@ -185,7 +198,7 @@ def source(root: Path) -> dict[str, Any] | None:
 
 
 def mapped_libraries() -> list[str]:
-    """List the files that this process has mapped; empty where the system won't say."""
+    """List the files that this process has mapped; [] if /proc cannot be read."""
     lines = _read(Path("/proc/self/maps")).splitlines()
     return sorted({line.split(maxsplit=5)[5] for line in lines if " /" in line})
 
@@ -193,15 +206,15 @@ def mapped_libraries() -> list[str]:
 def system_blas(
     mapped: Iterable[str], pools: Iterable[Mapping[str, Any]]
 ) -> str | None:
-    """Name the BLAS behind CHOLMOD, e.g. "OpenBLAS 0.3.21 (pthreads)".
+    """Return the BLAS that CHOLMOD uses, such as "OpenBLAS 0.3.21 (pthreads)".
 
-    Wheels bring a BLAS of their own, which CHOLMOD does not call: whatever lies in
-    site-packages is left out, unless it is scikit-sparse's own. A system library named
-    libblas is the reference BLAS unless an optimised one stands behind it: Debian's
-    alternatives make libblas.so.3 a thin shell around the real library.
+    Wheels contain a BLAS of their own, which CHOLMOD does not call: libraries in
+    site-packages are ignored, except those of scikit-sparse. A system library libblas
+    is the reference BLAS only if no optimised one is loaded: in Debian's alternatives
+    system, libblas.so.3 can be a thin shell around OpenBLAS or MKL.
 
     mapped : absolute paths, as in /proc/self/maps
-    pools : as under threads in `capture`
+    pools : entries ``threads.pools`` of `capture`
     """
     names = {Path(file).name for file in mapped if not _in_foreign_wheel(file)}
     for stem, title in BLAS_LIBRARIES:
@@ -215,20 +228,22 @@ def system_blas(
 
 
 def cholmod_version(mapped: Iterable[str]) -> str | None:
-    """Read the version of CHOLMOD off the name of its library."""
+    """Return the version of CHOLMOD, from the file name of its library."""
     for path in mapped:
-        if found := re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", path):
-            return found[1]
+        if name := re.search(r"/libcholmod[^/]*\.so\.([\d.]+)$", path):
+            return name[1]
     return None
 
 
 def _in_foreign_wheel(path: str) -> bool:
-    found = re.search(r"/(?:site|dist)-packages/([^/]+)", path)
-    return found is not None and not found[1].startswith(("scikit_sparse", "sksparse"))
+    package = re.search(r"/(?:site|dist)-packages/([^/]+)", path)
+    return package is not None and not package[1].startswith(
+        ("scikit_sparse", "sksparse")
+    )
 
 
 def _pool(info: Mapping[str, Any]) -> dict[str, Any]:
-    """Keep of a threadpoolctl entry what is no path."""
+    """Return the entries of a threadpoolctl record that are not paths."""
     bundled = re.search(r"/(\w+)\.libs/", info["filepath"])
     return {
         "library": info["prefix"],
@@ -248,7 +263,7 @@ def _version(package: str) -> str | None:
 
 
 def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
-    """Name the code of plug-ins by 12 hex digits; those of one name are as one."""
+    """Return digests of the code of plug-ins, by name; equal names share one."""
     contents: dict[str, list[bytes]] = defaultdict(list)
     for file in files:
         contents[file.name].extend(file.content())
@@ -256,7 +271,7 @@ def _plugins(files: Iterable[PluginFile]) -> dict[str, str]:
 
 
 def _cpu_limit() -> float | None:
-    """Read the container's share of processor time, in cores; None without a limit."""
+    """Return the container's limit of processor time, in cores; None without one."""
     quota, period = ([*_read(_CGROUP / "cpu.max").split(), "", ""])[:2]
     if not quota:  # the older layout of control groups
         quota = _read(_CGROUP / "cpu/cpu.cfs_quota_us")
@@ -272,9 +287,9 @@ def _turbo() -> bool | None:
 
 
 def _meminfo(key: str) -> int | None:
-    """Read one entry of /proc/meminfo, in MiB."""
-    found = re.search(rf"^{key}:\s+(\d+) kB", _read(Path("/proc/meminfo")), re.M)
-    return int(found[1]) // 1024 if found else None
+    """Return an entry of /proc/meminfo, in MiB; None if it is missing."""
+    entry = re.search(rf"^{key}:\s+(\d+) kB", _read(Path("/proc/meminfo")), re.M)
+    return int(entry[1]) // 1024 if entry else None
 
 
 def _cpuinfo(key: str) -> list[str]:
@@ -282,7 +297,7 @@ def _cpuinfo(key: str) -> list[str]:
 
 
 def _read(path: Path) -> str:
-    """Read a small system file; empty where there is none or it may not be read."""
+    """Return the text of a small system file; "" if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:

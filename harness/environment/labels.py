@@ -1,4 +1,4 @@
-"""The entries of an environment as people call them, and what differs in words."""
+"""Readable names for the entries of an environment, and sentences on differences."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from mortarbench.harness.errors import shortened
 
 Difference = tuple[str, Any, Any]  #: dotted key, value in the one, in the other
 
-_MOST = 48  #: characters of a value
-_TOLD = 3  #: differences
+_MAX_VALUE_CHARACTERS = 48
+_MAX_LISTED = 3  #: number of differences that are spelt out
 
 _NAMES = {
     "machine.cpu": "processor",
@@ -45,7 +45,12 @@ _GROUPS = {
 
 
 def named(key: str) -> str:
-    """Name an entry of an environment, given as a dotted key, for people."""
+    """Return the readable name of an entry of an environment.
+
+    >>> named("versions.numpy")
+    'version of numpy'
+
+    """
     for group, text in _GROUPS.items():
         if key.startswith(group):
             return text.format(key.removeprefix(group))
@@ -53,20 +58,22 @@ def named(key: str) -> str:
 
 
 def in_words(changes: Iterable[Difference], one: str, other: str) -> str:
-    """Say what differs: "processor: A then, B now; kernel: 6.1 then, 6.2 now".
+    """Return a list of differences in words; the first few, and the number of others.
 
-    The first few differences are told, and how many more there are.
+    one, other : words that distinguish the two values, such as "then" and "now"
 
-    one, other : when, or where, the one and the other was found, as "then" and "now"
+    >>> in_words([("machine.kernel", "6.1", "6.2")], "then", "now")
+    'kernel: 6.1 then, 6.2 now'
+
     """
-    told = [
+    texts = [
         f"{named(key)}: {_shown(a)} {one}, {_shown(b)} {other}"
         if _is_short(a) and _is_short(b)
         else f"other {named(key)}"
         for key, a, b in changes
     ]
-    rest = [f"and {len(told) - _TOLD} more"] * (len(told) > _TOLD)
-    return "; ".join([*told[:_TOLD], *rest])
+    rest = [f"and {len(texts) - _MAX_LISTED} more"] * (len(texts) > _MAX_LISTED)
+    return "; ".join([*texts[:_MAX_LISTED], *rest])
 
 
 def _is_short(value: Any) -> bool:
@@ -80,4 +87,4 @@ def _shown(value: Any) -> str:
         case bool():
             return "yes" if value else "no"
         case _:
-            return shortened(str(value), _MOST)
+            return shortened(str(value), _MAX_VALUE_CHARACTERS)

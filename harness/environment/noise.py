@@ -1,7 +1,7 @@
-"""How well this machine tells two equal things apart, when one times them.
+"""Noise floor of a machine, by an A/A comparison.
 
-An A/A comparison: a fixed kernel against itself, in pairs, as solvers are compared in
-blocks. What two solvers differ by less than that is noise.
+A fixed kernel is timed against itself in pairs, in the same way as solvers are compared
+in blocks. Smaller differences between two solvers are noise.
 """
 
 from __future__ import annotations
@@ -16,35 +16,35 @@ from math import exp
 import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
-_SIDE = 120  #: of the kernel's square grid: its matrix has 14 400 rows
-_PRODUCTS = 10  #: about 1 ms
-_BLOCKS = 20  #: of consecutive pairs, for the bootstrap
-_DRAWS = 1000
+_SIDE = 120  #: nodes per side of the kernel's square grid; 14 400 rows
+_PRODUCTS = 10  #: matrix-vector products per timing, about 1 ms
+_BLOCKS = 20  #: number of blocks of consecutive pairs in the bootstrap
+_DRAWS = 1000  #: bootstrap samples
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoiseFloor:
-    """What an A/A comparison found; ratios are of times, arm A over arm B."""
+    """Result of an A/A comparison; ratios are times of arm A over those of arm B."""
 
-    clock_seconds: float  #: smallest step of the clock that was seen
+    clock_seconds: float  #: smallest observed step of the clock
     kernel_seconds: float  #: median time of the kernel
-    pairs: int
-    ratio: float  #: exp of the median paired log ratio: 1 but for noise
-    low: float  #: of the ratio's 95 % bootstrap interval
-    high: float
-    one_pair: float  #: 95 % of the single pairs lie within ±this, relative
+    pairs: int  #: number of pairs
+    ratio: float  #: exp of the median log ratio of pairs; 1 except for noise
+    low: float  #: lower end of the ratio's 95 % bootstrap interval
+    high: float  #: upper end
+    one_pair: float  #: relative difference that 95 % of the single pairs do not exceed
 
 
 def noise_floor(
     seconds: float = 2.0, clock: Callable[[], float] = time.perf_counter
 ) -> NoiseFloor:
-    """Time one kernel against itself, on the CPU and in the manner of a run.
+    """Time a kernel against itself, on the CPU of the workers of a run.
 
     Pairs are run as AB, BA, AB, …, and two successive pairs are averaged, so that a
-    steady drift of the machine cancels. The interval resamples blocks of consecutive
-    pairs, not single ones, because disturbances last longer than one pair.
+    linear drift of the machine cancels. The bootstrap resamples blocks of consecutive
+    pairs instead of single pairs, because disturbances last longer than one pair.
 
-    seconds : how long to go on, by `clock`
+    seconds : duration of the comparison, by `clock`
     clock : returns seconds
     """
     with _on_the_workers_cpu():
@@ -59,7 +59,7 @@ def noise_floor(
                 v /= np.abs(v).max()
             return clock() - start
 
-        timed()  # finds cold caches
+        timed()  # discarded: it finds cold caches
         arms: tuple[list[float], list[float]] = ([], [])
         end = clock() + seconds
         while clock() < end or not arms[0]:
@@ -87,7 +87,7 @@ def noise_floor(
 
 @contextmanager
 def _on_the_workers_cpu() -> Iterator[None]:
-    """Run where `harness.processes.supervisor` binds workers: on the last CPU."""
+    """Run on the last CPU, to which `harness.processes.supervisor` binds workers."""
     usable = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(usable)})
     try:
@@ -97,7 +97,7 @@ def _on_the_workers_cpu() -> Iterator[None]:
 
 
 def _clock_step(clock: Callable[[], float], tries: int = 1000) -> float:
-    """Find the smallest step between consecutive readings that is not zero."""
+    """Return the smallest non-zero step between consecutive readings of a clock."""
     readings = np.array([clock() for _ in range(tries)])
     steps = np.diff(readings)
     return float(steps[steps > 0].min(initial=np.inf))

@@ -1,1 +1,1 @@
-"""The processes of a run: workers, what they say, what holds them."""
+"""Processes of a run: workers, their protocol with the parent, limits and measuring."""

@@ -1,10 +1,11 @@
-"""Built cases on disk: ``FOLDER/DIGEST.npz``, a QP under the digest of its content.
+"""Cache of built cases on disk, shared by the processes of a run.
 
-``FOLDER/KEY.json`` says which QP a case is: the key names the case and the environment
-that it was built in, so that another version of the code builds its own. Several
-processes may use one folder. Each file is stored with a digest, and an entry with a
-damaged file is built again. Digests are not signatures: whoever writes to the folder
-can store another QP under the name of a case (docs/security.md).
+``FOLDER/DIGEST.npz`` contains a QP and is named after the digest of its content.
+``FOLDER/KEY.json`` maps a case to such a file; the key is a digest of the case and of
+the environment it was built in, so another version of the code builds its own. Every
+file is stored with a digest, and a case whose file is damaged is built again. Digests
+are not signatures: anyone who can write to the folder can store another QP under the
+name of a case (docs/security.md).
 """
 
 from __future__ import annotations
@@ -25,32 +26,34 @@ from mortarbench.harness.files.reading import read_text
 
 
 @dataclass(frozen=True, kw_only=True)
-class Entry:
-    """A built case."""
+class StoredCase:
+    """A built case in the folder."""
 
-    qp: Path  #: see `harness.files.qpfile`
+    qp: Path  #: file that contains the QP, see `harness.files.qpfile`
     digest: str  #: of the content of that file
-    meta: Mapping[str, Any]  #: of the case, as the case worker told it
+    meta: Mapping[str, Any]  #: meta data that the case worker reported
 
 
-def entry(
+def find_or_build(
     folder: Path,
     identity: Sequence[Any],
     make: Callable[[Path], Mapping[str, Any]],
-) -> Entry:
-    """Find a case, or have it built by the one process that comes first.
+) -> StoredCase:
+    """Return a case from the folder, building it first if it is missing or damaged.
 
-    folder : made if need be, in one that is there
-    identity : plain data: of the case, and of what it is built with
-    make : writes the QP to a file, on the disk, and returns the meta data; what it
-        raises comes through and leaves no entry
+    Only one process at a time looks up or builds a case; the others wait.
+
+    folder : created if it does not exist; its parent must exist
+    identity : plain data that identify the case and the environment of the build
+    make : writes the QP to a file, flushes it and returns the meta data. Exceptions
+        propagate, and nothing is stored then
     """
-    folder.mkdir(exist_ok=True)  # in one that is there, or was moved away
+    folder.mkdir(exist_ok=True)  # without parents: fails if the folder was moved
     key = hex_digest([json.dumps(identity, sort_keys=True).encode()], 16)
-    with _held(folder / f"{key}.lock"):
-        found = _found(folder, key)
-        if found is not None:
-            return found
+    with _locked(folder / f"{key}.lock"):
+        stored = _look_up(folder, key)
+        if stored is not None:
+            return stored
         new = folder / f"{key}.new"
         try:
             meta = make(new)
@@ -62,8 +65,9 @@ def entry(
         size = path.stat().st_size
         index = {"digest": digest, "bytes": size, "name": identity, "meta": meta}
         text = json.dumps({**index, "check": _check(index)})
+        # The index comes last: a build that is killed before leaves no entry.
         replace_file(folder / f"{key}.json", text.encode())
-        return Entry(qp=path, digest=digest, meta=meta)
+        return StoredCase(qp=path, digest=digest, meta=meta)
 
 
 def content_digest(path: Path) -> str:
@@ -72,18 +76,19 @@ def content_digest(path: Path) -> str:
         return hex_digest(pieces(file), 24)
 
 
-def _found(folder: Path, key: str) -> Entry | None:
-    """Look up an entry; return None if there is none, or a damaged one."""
+def _look_up(folder: Path, key: str) -> StoredCase | None:
+    """Return the stored case of a key, or None if it is missing or damaged."""
     try:
         index = json.loads(read_text(folder / f"{key}.json"))
         if index.pop("check") != _check(index):
             return None
         path = folder / f"{index['digest']}.npz"
-        if path.stat().st_size != index["bytes"]:  # it would be read to its end
+        # Sizes first: hashing would read a file that was enlarged to its end.
+        if path.stat().st_size != index["bytes"]:
             return None
         if content_digest(path) != index["digest"]:
             return None
-        return Entry(qp=path, digest=index["digest"], meta=index["meta"])
+        return StoredCase(qp=path, digest=index["digest"], meta=index["meta"])
     except (
         InputError, OSError, ValueError, KeyError, TypeError, AttributeError,
         RecursionError,
@@ -92,16 +97,16 @@ def _found(folder: Path, key: str) -> Entry | None:
 
 
 def _check(index: Mapping[str, Any]) -> str:
-    """Hash an index, whose meta data no digest of the QP protects from damage."""
+    """Hash an index: the digest of the QP does not cover its meta data."""
     return hex_digest([json.dumps(index, sort_keys=True).encode()], 16)
 
 
 @contextmanager
-def _held(lock: Path) -> Iterator[None]:
-    """Have one process at a time look up or build a case."""
+def _locked(lock: Path) -> Iterator[None]:
+    """Hold an exclusive lock on a file; it is released when its process ends."""
     fd = os.open(lock, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX)
         yield
     finally:
-        os.close(fd)  # which unlocks
+        os.close(fd)  # also releases the lock

@@ -1,23 +1,25 @@
-"""The process that builds cases: the code of families, away from what counts.
+"""Process that builds cases, so that the code of families runs outside the parent.
 
-It answers the requests of `harness.processes.protocol` with these of its own:
+It speaks `harness.processes.protocol` and answers four kinds of requests:
 
-* ``{"build": NAME, "qp": PATH, "keep": N}``: it builds the case, writes its QP to PATH
-  and says ``{"event": "done", "meta": {…}}``, with the digest of its numbers
-* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}``: what a
-  point means: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``
-  with bounds of its error, and the deformed state in ``fields`` where there is one
-* ``{"shared": NAME}``: whether ranks can emit the QP of a case themselves, which is not
-  built: ``{"event": "done", "shared": …}``
-* ``{"solve": PATH, "point": PATH}``: the reference solve of the QP in the first file,
-  for verdicts that residuals cannot give; it writes a point to the second, and says
-  ``{"event": "done", "found": true}``, or false where it finds none
+* ``{"build": NAME, "qp": PATH, "keep": N}`` builds the case and writes its QP to PATH.
+  Reply: ``{"event": "done", "meta": {…}}``, with the digest of the QP's numbers
+* ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates a
+  point. Reply: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``:
+  its physical quantities and the bounds of its error. The deformed state is written to
+  ``fields``, if the case has one
+* ``{"shared": NAME}`` asks, without building the case, whether ranks can emit its QP
+  themselves. Reply: ``{"event": "done", "shared": …}``
+* ``{"solve": PATH, "point": PATH}`` solves the QP in the first file by the reference,
+  for verdicts that residuals cannot decide, and writes the point to the second. Reply:
+  ``{"event": "done", "found": …}``, false if the reference fails
 
-or to the first two ``{"event": "done", "unbuilt": REASON, "trace": TEXT, "past_end":
-…}``, the last true where a sequence has fewer problems (`PastEndError`); where NAME is
-``{"family": …, "params": {…}, "form": …, "name": …}`` and N the number of cases that
-are to stay in memory. What leads back from a point to the bodies is code, which no file
-can hold: a case that is on file is built again when a point of it comes.
+If a case cannot be built, the reply to the first two is ``{"event": "done", "unbuilt":
+REASON, "trace": TEXT, "past_end": …}``; ``past_end`` is true beyond the last problem of
+a sequence (`PastEndError`). NAME is ``{"family": …, "params": {…}, "form": …, "name":
+…}``; N is the number of cases to keep in memory. The map from a point back to the
+bodies is code and cannot be stored in a file, so a case whose QP is in the cache is
+built again when a point of it is described.
 """
 
 from __future__ import annotations
@@ -49,36 +51,36 @@ from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
-MOST_CERTIFIED = 10_000  #: points whose bounds are kept
-#: s; the first dual case of a process is built twice where building took less. First
-#: calls (pages, caches, late imports) took 12 of the 14 ms of dualising the smallest
-#: demo case, and would be charged to its form. Importing alone may take a second. After
-#: ten seconds of building, such milliseconds do not matter, and building twice would.
-WARM_UP = 10.0
+MAX_STORED_BOUNDS = 10_000  #: number of points whose error bounds are cached
+#: s. The first dual case of a process is built twice if its first build took less:
+#: first calls (page faults, caches, late imports) took 12 of the 14 ms of dualising the
+#: smallest demo case, and would be charged to its form; imports alone may take a
+#: second. Relative to ten seconds these costs are negligible, a second build is not.
+MAX_WARM_UP_SECONDS = 10.0
 
 
 @dataclass(eq=False)
 class CaseWorker:
-    """Builds cases of `families`, with the injected `reference` solve."""
+    """Builder of the cases of `families`, with the injected `reference` solver."""
 
     families: Mapping[str, Family]
     reference: Reference
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
-    #: by canonical name, the last one used last
+    #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
-    _build_seconds: float = 0.0  # of the last case that was built
-    _warm: bool = False  # whether a dual case has been built
-    #: certified
+    _build_seconds: float = 0.0  # duration of the last build
+    _warm: bool = False  # True once a dual case has been built
+    #: bounds and objection by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
         default_factory=dict
     )
 
     def answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Answer one request, whatever the family's code does."""
+        """Answer one request; a failure of the family's code is part of the reply."""
         if "solve" in request:
-            return self._solved(Path(request["solve"]), Path(request["point"]))
-        asked = request.get("build") or request.get("describe") or request["shared"]
-        name = CaseId(**{**asked, "family": self.families[asked["family"]]})
+            return self._solve(Path(request["solve"]), Path(request["point"]))
+        fields = request.get("build") or request.get("describe") or request["shared"]
+        name = CaseId(**{**fields, "family": self.families[fields["family"]]})
         if "shared" in request:
             return {"shared": is_shared(name)}
         try:
@@ -90,17 +92,17 @@ class CaseWorker:
                 "past_end": isinstance(e, PastEndError),
             }
         if "build" in request:
-            return self._written(case, name, Path(request["qp"]))
-        return self._described(case, name, request)
+            return self._write(case, name, Path(request["qp"]))
+        return self._describe(case, name, request)
 
-    def _described(
+    def _describe(
         self, case: Case, name: CaseId, request: dict[str, Any]
     ) -> dict[str, Any]:
         s = read_point(Path(request["point"]), Status.SOLVED)
         start = perf_counter()
         quantities, note = quantities_of(case, s)
         seconds = perf_counter() - start
-        bounds, objection = self._certified(case, name, s)
+        bounds, objection = self._certify(case, name, s)
         notes = [text for text in (note, objection) if text]
         if request["fields"] is not None and case.fields is not None:
             try:
@@ -116,13 +118,13 @@ class CaseWorker:
             "seconds": seconds,
         }
 
-    def _certified(
+    def _certify(
         self, case: Case, name: CaseId, s: Solution
     ) -> tuple[dict[str, Any], str]:
-        """Bound the error of a point; one that came before is not certified again.
+        """Bound the error of a point, or return the bounds of an identical earlier one.
 
-        Most solvers give the same digits at each repeat. Only the first takes time, and
-        only its record has a `certify_seconds`.
+        Most solvers return the same digits in every repeat. Only the first of them is
+        certified, and only its record has a `certify_seconds`.
         """
         key = name.name, digest_of(point_arrays(s))
         if key in self._bounds:
@@ -130,12 +132,12 @@ class CaseWorker:
             return {
                 k: v for k, v in bounds.items() if k != "certify_seconds"
             }, objection
-        while len(self._bounds) >= MOST_CERTIFIED:
+        while len(self._bounds) >= MAX_STORED_BOUNDS:
             del self._bounds[next(iter(self._bounds))]
         self._bounds[key] = certified(case, s)
         return self._bounds[key]
 
-    def _solved(self, qp: Path, point: Path) -> dict[str, Any]:
+    def _solve(self, qp: Path, point: Path) -> dict[str, Any]:
         try:
             write_point(point, self.reference(load_qp(qp, operators=self.operators)[0]))
         except (ArithmeticError, ValueError, np.linalg.LinAlgError):
@@ -144,24 +146,24 @@ class CaseWorker:
 
     def _case(self, name: CaseId, keep: int) -> Case:
         case = self._cases.pop(name.name, None)
-        while len(self._cases) >= keep:  # before building: two may be too large
+        while len(self._cases) >= keep:  # before the build: two may not fit in memory
             del self._cases[next(iter(self._cases))]
         if case is None:
-            case = self._built(name)
+            case = self._build(name)
             if not self._warm and case.dualise_seconds is not None:
                 self._warm = True
-                if self._build_seconds < WARM_UP:
-                    case = self._built(name)
+                if self._build_seconds < MAX_WARM_UP_SECONDS:
+                    case = self._build(name)
         self._cases[name.name] = case
         return case
 
-    def _built(self, name: CaseId) -> Case:
+    def _build(self, name: CaseId) -> Case:
         start = perf_counter()
         case = name.build(self.reference)
         self._build_seconds = perf_counter() - start
         return case
 
-    def _written(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
+    def _write(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
         meta = {
             "name": name.name,
             "scale": case.scale,
@@ -177,7 +179,7 @@ class CaseWorker:
 
 
 def serve(worker: CaseWorker, request_fd: int, reply_fd: int) -> None:
-    """Answer requests until there are no more."""
+    """Answer requests until the pipe of requests is closed."""
 
     def handle(request: dict[str, Any], events: Events) -> dict[str, Any]:
         events.start()

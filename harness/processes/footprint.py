@@ -1,10 +1,10 @@
-"""Memory that a tree of processes holds, shared memory included.
+"""Memory of a tree of processes, shared memory included.
 
 Resident memory (VmRSS) counts shared memory only where it is mapped and touched. A file
-in /dev/shm holds memory without being mapped, and after its makers are gone: those that
-the tree made are counted, each once, and removed with the tree. Libraries that share
-arrays between processes (joblib, multiprocessing, MPI) leave such files when they are
-killed.
+in /dev/shm occupies memory even when it is not mapped, and after the processes that
+created it have ended. Such files are therefore counted once each, and removed with the
+tree. Libraries that share arrays between processes (joblib, multiprocessing, MPI) leave
+them behind when they are killed.
 """
 
 from __future__ import annotations
@@ -19,74 +19,81 @@ SHARED = Path("/dev/shm")
 
 
 class Footprint:
-    """Looks at a tree of processes again and again, and remembers what it has made."""
+    """Memory meter of one tree of processes, with the shared files that it created."""
 
     def __init__(self) -> None:
         self._before = set(_listed().items())
-        self._made: dict[str, int] = {}  # in SHARED, seen in the tree's hands: inodes
+        # inodes by name, of new files in SHARED that a process of the tree had open
+        self._created: dict[str, int] = {}
 
     def mib(self, tree: Iterable[int], limit: float) -> float:
-        """Give what a tree holds, in MiB.
+        """Return the memory of a tree, in MiB.
 
-        Pages that processes share are counted for each of them at first, which is
-        cheap. Only where that exceeds `limit` is every page divided by its users.
+        The cheap sum counts a shared page once per process. Only if that exceeds
+        `limit` are the proportional set sizes read, which divide a page among its users
+        but make the kernel walk all page tables.
         """
         tree = list(tree)
         self.notice(tree)
-        sizes: dict[int, int] = {}
-        for made in self._left():
-            for path in (made, *made.rglob("*")):
+        sizes: dict[int, int] = {}  # by inode: hard links count once
+        for created in self._remaining():
+            for path in (created, *created.rglob("*")):
                 with suppress(OSError):
-                    at = path.lstat()
-                    sizes[at.st_ino] = 512 * at.st_blocks
+                    status = path.lstat()
+                    sizes[status.st_ino] = 512 * status.st_blocks
         files = sum(sizes.values()) / 2**20
-        own, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
-        held = own + max(mapped, files)
-        if held > limit and len(tree) > 1:
-            own, mapped = _sum(
+        private, mapped = _sum(tree, "status", ("RssAnon", "RssFile"), ("RssShmem",))
+        # The maximum, not the sum: mapped pages of these files are in both.
+        total = private + max(mapped, files)
+        if total > limit and len(tree) > 1:
+            private, mapped = _sum(
                 tree, "smaps_rollup", ("Pss_Anon", "Pss_File"), ("Pss_Shmem",)
             )
-            held = own + max(mapped, files) if own else held
-        return held
+            total = private + max(mapped, files) if private else total
+        return total
 
     def notice(self, tree: Iterable[int]) -> None:
-        """Take note of the files in SHARED that processes of a tree hold and made."""
+        """Record the new files in SHARED that processes of a tree have open or mapped.
+
+        Files of other programs appear there too, so being new is not enough.
+        """
         new = dict(set(_listed().items()) - self._before)
-        for process in tree if new.keys() - self._made.keys() else ():
+        for process in tree if new.keys() - self._created.keys() else ():
             for path in (*_open_files(process), *_mapped_files(process)):
                 name = path.removeprefix(f"{SHARED}/").partition("/")[0]
                 if path.startswith(f"{SHARED}/") and name in new:
-                    self._made[name] = new[name]
+                    self._created[name] = new[name]
 
     def remove_shared(self) -> None:
-        """Remove the files that a tree which has ended left in SHARED."""
-        for path in self._left():
+        """Remove the files that the tree, which has ended, left in SHARED."""
+        for path in self._remaining():
             with suppress(OSError):
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
                 else:
                     path.unlink()
-        self._made.clear()
+        self._created.clear()
 
-    def _left(self) -> list[Path]:
-        """List the files of this user that the tree made and that are still there."""
-        left = []
-        for name, inode in self._made.items():
+    def _remaining(self) -> list[Path]:
+        """List this user's files that the tree created and that still exist."""
+        remaining = []
+        for name, inode in self._created.items():
             with suppress(OSError):
-                at = (SHARED / name).lstat()
-                if at.st_ino == inode and at.st_uid == os.getuid():
-                    left.append(SHARED / name)
-        return left
+                status = (SHARED / name).lstat()
+                # another program may have created a file of the same name since
+                if status.st_ino == inode and status.st_uid == os.getuid():
+                    remaining.append(SHARED / name)
+        return remaining
 
 
 def _open_files(process: int) -> list[str]:
     """List the paths of the files that a process has open."""
-    found = []
+    paths = []
     with suppress(OSError), os.scandir(f"/proc/{process}/fd") as entries:
         for entry in entries:
             with suppress(OSError):
-                found.append(os.readlink(entry.path))
-    return found
+                paths.append(os.readlink(entry.path))
+    return paths
 
 
 def _mapped_files(process: int) -> list[str]:
@@ -99,7 +106,7 @@ def _mapped_files(process: int) -> list[str]:
 
 
 def _listed() -> dict[str, int]:
-    """List what lies in SHARED: names with their inode numbers."""
+    """Return the inode numbers of the files in SHARED, by name."""
     try:
         with os.scandir(SHARED) as entries:
             return {entry.name: entry.inode() for entry in entries}
@@ -115,7 +122,7 @@ def _sum(tree: list[int], file: str, *groups: tuple[str, ...]) -> tuple[float, .
             with open(f"/proc/{process}/{file}") as lines:
                 values = dict(line.split(":", 1) for line in lines if ":" in line)
         except OSError:
-            continue  # it has ended
+            continue  # the process has ended
         for i, group in enumerate(groups):
             for name in group:
                 totals[i] += int(values.get(name, "0").split()[0]) / 1024

@@ -1,10 +1,10 @@
-"""A worker that is a fork of the process that asks it, in place of a new interpreter.
+"""Workers forked from the parent, instead of started as new interpreters.
 
-To load numpy and scipy takes a process half a second of CPU time, and a fork has them
-already. Like a worker that is started by its command it lives below a sub-reaper
-(`harness.processes.reaper`), in a session of its own, on one CPU, and has no open files
-but its log and its two pipes. It begins with a copy of our memory. So it is forked
-before anything is read or built, and only where no other thread runs, see `is_safe`.
+Loading numpy and scipy takes half a second of CPU time, which a fork saves. Like a
+worker started by its command, a forked one runs below a sub-reaper
+(`harness.processes.reaper`), in its own session, on one CPU, with no open files except
+its log and its two pipes. It starts with a copy of the parent's memory; so it is forked
+before anything is read or built, and only by a parent with one thread (`is_safe`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import BinaryIO
 
 from mortarbench.harness.processes import reaper
 
-#: what a worker does with the two file descriptors of its requests and its replies
+#: serves requests from the first file descriptor, with replies to the second
 Serve = Callable[[int, int], None]
 
 _POLL_SECONDS = 0.001
@@ -30,44 +30,43 @@ _ENDED = os.WEXITED | os.WNOHANG
 
 
 def is_safe() -> bool:
-    """Return True if this process has one thread, and so may fork.
+    """Return True if this process has a single thread, so that it may fork.
 
-    Locks that other threads hold would stay locked in the fork.
+    A lock held by another thread would stay locked for ever in the fork.
     """
     return len(os.listdir("/proc/self/task")) == 1
 
 
 class Fork:
-    """The sub-reaper above a forked worker: what is used of a `subprocess.Popen`."""
+    """Sub-reaper above a forked worker, with the used part of `subprocess.Popen`."""
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
-        self._pinned = os.pidfd_open(
-            pid
-        )  # its number is another's once it is collected
-        self.stdin = stdin  #: its tree is killed when this is closed, or we are dead
+        # A number is reused once its process is collected; the descriptor is not.
+        self._process_fd = os.pidfd_open(pid)
+        self.stdin = stdin  #: closing it, or the parent's death, kills the tree
 
     def wait(self, timeout: float | None = None) -> None:
-        """Wait until it has ended.
+        """Wait until the process has ended.
 
         Raises
         ------
         subprocess.TimeoutExpired
-            When it has not after `timeout` seconds.
+            If it is still running after `timeout` seconds.
 
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with suppress(ChildProcessError):  # it was collected with its tree
-            while os.waitid(os.P_PIDFD, self._pinned, _ENDED) is None:
+        with suppress(ChildProcessError):  # collected already, together with its tree
+            while os.waitid(os.P_PIDFD, self._process_fd, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)
                 time.sleep(_POLL_SECONDS)
-        os.close(self._pinned)
+        os.close(self._process_fd)
 
     def kill(self) -> None:
         """Send SIGKILL."""
         with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._pinned, signal.SIGKILL)
+            signal.pidfd_send_signal(self._process_fd, signal.SIGKILL)
 
 
 def fork(
@@ -78,33 +77,36 @@ def fork(
     log: int,
     environment: Mapping[str, str],
 ) -> Fork:
-    """Start a worker; the caller has seen that it `is_safe`.
+    """Fork a worker; the caller has checked that this `is_safe`.
 
-    cpu, pipes : as of `reaper.supervise`; the pipes are those that `serve` is given
-    log : a file descriptor, its standard output and error
-    environment : variables that differ from ours
+    cpu, pipes : as for `reaper.supervise`; `serve` is called with the pipes
+    log : file descriptor of its standard output and error
+    environment : variables to set in the worker
     """
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        stream.flush()  # or the fork would write it once more
-    theirs, ours = os.pipe()
+        stream.flush()  # the fork would write a copy of the buffer
+    child_end, parent_end = os.pipe()
     pid = os.fork()
     if pid:
-        os.close(theirs)
-        return Fork(pid, os.fdopen(ours, "wb"))
+        os.close(child_end)
+        return Fork(pid, os.fdopen(parent_end, "wb"))
     try:
         os.setsid()
-        for number in (signal.SIGTERM, signal.SIGHUP):  # which may unwind the parent
+        # The parent's handlers raise `TerminatedError`; in the fork that would unwind a
+        # copy of the parent's stack.
+        for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) is not signal.SIG_IGN:
                 signal.signal(number, signal.SIG_DFL)
-        for fd, at in ((theirs, 0), (log, 1), (log, 2)):
-            os.dup2(fd, at)
+        for fd, target in ((child_end, 0), (log, 1), (log, 2)):
+            os.dup2(fd, target)
+        # An inherited end of another worker's pipe would keep that worker alive.
         for fd in map(int, os.listdir("/proc/self/fd")):
             if fd > 2 and fd not in pipes:
-                with suppress(OSError):  # that of the list itself
+                with suppress(OSError):  # the descriptor of this listing is closed
                     os.close(fd)
         os.environ.update(environment)
         reaper.supervise(partial(_serve, serve, pipes), cpu, pipes)
-    finally:  # whatever happens: only the parent goes back to where it came from
+    finally:  # the fork must never return into the caller's frames
         os._exit(1)
 
 

@@ -1,4 +1,4 @@
-"""One measurement by a worker process, judged: what `run` and `solve` share."""
+"""A measurement by a worker process and its verdict, shared by `run` and `solve`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mortarbench.harness.plugin import Case, Reference
 from mortarbench.harness.processes.case_folder import content_digest
 from mortarbench.harness.processes.forking import Serve
 from mortarbench.harness.processes.protocol import Source, source_of
-from mortarbench.harness.processes.ranks import without_content
+from mortarbench.harness.processes.ranks import qp_of_sizes
 from mortarbench.harness.processes.supervisor import Reply, WorkerProcess, out_of_memory
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import (
@@ -43,29 +43,32 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-OWN_SECONDS = 0.005  #: of our own work while a worker's clock is stopped
-OWN_SECONDS_PER_REPEAT = (
-    3e-4  #: 0.12 ms on a busy machine, so that none is accused of it
-)
-FAR_LESS = 20.0  #: a repeat that is so many times faster …
-LEAST_GAIN_SECONDS = 1e-3  #: … and faster by that is suspicious, within a sample
-LEAST_GAIN_BETWEEN_SECONDS = 5e-3  #: and between measurements
+#: CPU time of the harness between "start" and "timed", beside the worker's clock
+HARNESS_SECONDS = 0.005
+#: the same per repeat; 0.12 ms were seen on a busy machine, and no solver is to be
+#: suspected because of it
+HARNESS_SECONDS_PER_REPEAT = 3e-4
+#: A repeat is suspected of reusing results if it is faster than the first solve by this
+#: factor and also by the time below: the ratio of two tiny times alone proves nothing.
+MIN_SUSPICIOUS_SPEEDUP = 20.0
+MIN_GAIN_SECONDS = 1e-3  #: between the solves of one measurement
+MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: between two measurements
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
 
 
-class Measured(NamedTuple):
-    """One measurement, judged."""
+class JudgedMeasurement(NamedTuple):
+    """A measurement with its verdict."""
 
     record: Record
-    solution: Solution | None  #: None where the worker ended
-    #: whether quantities or bounds are lacking, though there is a point: ranks that
-    #: evaluate an answer fill in what they can
-    is_undescribed: bool = True
+    solution: Solution | None  #: None if the worker ended without an answer
+    #: True if there is a point but quantities or error bounds are missing. Ranks that
+    #: evaluate their answer fill in what they can
+    needs_evaluation: bool = True
 
 
-def measured(
+def measure_and_judge(
     worker: WorkerProcess,
     whole: Callable[[], QP],
     record: Record,
@@ -74,22 +77,22 @@ def measured(
     time_limit: float,
     memory_limit: float,
     prove: Proves,
-) -> Measured:
-    """Fill in `record` by one measurement.
+) -> JudgedMeasurement:
+    """Measure once with a worker process, and complete `record` with costs and verdict.
 
-    whole : gives the QP. Where ranks emit it themselves and evaluate the answer, it is
-        asked for only if they cannot
-    request : to the worker, see `harness.processes.worker`; less what stands in the
-        record. The worker writes the point to the file ``out``
+    whole : returns the entire QP. If ranks emit the QP and evaluate the answer, it is
+        called only for what they cannot evaluate
+    request : request to the worker, see `harness.processes.worker`, without the entries
+        that follow from the record. The worker writes the point to the file ``out``
     time_limit, memory_limit : s and MiB
-    prove : finds the optimum where residuals cannot decide, see
+    prove : computes a proven optimum if residuals cannot decide, see
         `harness.verify.optimum`
 
     Raises
     ------
     FaultError
-        When the measurement failed for a reason that is not the solver's: a worker that
-        was not started or was killed before its solve, a full disk, a lost file.
+        If the measurement failed for a reason other than the solver: a worker that
+        could not be started or was killed before its solve, a full disk, a lost file.
 
     """
     request = {**request, "tol": record.asked_tol}
@@ -110,12 +113,12 @@ def measured(
             cpu=reply.cpu,
         )
         if source_of(request) is Source.RANKS:
-            qp, record = _as_told(reply.emitted, record)
+            qp, record = sizes_from_ranks(reply.emitted, record)
         else:
             qp = whole()
             record = record.replace(sizes=qp.sizes)
         if reply.answer is None:
-            return Measured(record.replace(verdict=reply.verdict), None)
+            return JudgedMeasurement(record.replace(verdict=reply.verdict), None)
         solution = replace(
             read_point(out, Status(reply.answer["claimed"])),
             iterations=reply.answer["iterations"],
@@ -130,121 +133,134 @@ def measured(
     except OSError as e:
         what = f"{e.filename or out}: {e.strerror or e}"
         raise FaultError(f"{record.solver} on {record.case}: {what}") from None
-    record, *notes = _timed(reply, record, worker.first_seconds)
+    record, *notes = _with_cost(reply, record, worker.first_seconds)
     sizes, by_ranks = record.sizes, source_of(request) is Source.RANKS
     is_pointless = by_ranks and not has_point(solution)
-    found = reply.answer["evaluated"] if by_ranks else None
-    notes += found["notes"] if found is not None else []
-    if found is not None and found["values"] is not None:
-        record = judged(record, qp, solution, values=found["values"]).replace(
-            quantities=found["quantities"] or {},
-            recover_seconds=found["recover_seconds"],
-            **(found["bounds"] or {}),
+    evaluation = reply.answer["evaluated"] if by_ranks else None
+    notes += evaluation["notes"] if evaluation is not None else []
+    if evaluation is not None and evaluation["values"] is not None:
+        record = judged(record, qp, solution, values=evaluation["values"]).replace(
+            quantities=evaluation["quantities"] or {},
+            recover_seconds=evaluation["recover_seconds"],
+            **(evaluation["bounds"] or {}),
         )
     elif is_pointless:
         record = judged(record, qp, solution, values=_NO_POINT)
     else:
         record = judged(record, whole() if by_ranks else qp, solution, prove)
-    record = _within(memory_limit, noted(record, reply.message, *notes)).replace(
+    record = _check_memory(memory_limit, noted(record, reply.message, *notes)).replace(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
-    lacks = found is None or None in (found["quantities"], found["bounds"])
-    return Measured(record, solution, lacks and not is_pointless)
+    is_incomplete = evaluation is None or None in (
+        evaluation["quantities"], evaluation["bounds"]
+    )  # fmt: skip
+    return JudgedMeasurement(record, solution, is_incomplete and not is_pointless)
 
 
 def _as_tuples(data: Any) -> Any:
-    """Undo what JSON makes of tuples in a table."""
+    """Convert lists back to tuples: JSON has no tuples."""
     if isinstance(data, dict):
         return {key: _as_tuples(value) for key, value in data.items()}
     return tuple(data) if isinstance(data, list) else data
 
 
-def _timed(
+def _with_cost(
     reply: Reply, record: Record, first_seconds: dict[Hashable, float]
 ) -> tuple[Record, *tuple[str, ...]]:
-    """Fill in what the measurement cost; with notes on what cannot be believed."""
+    """Add the cost of a measurement to its record; return it with notes on times."""
     assert reply.answer is not None
-    cost, *notes = _believed(reply)
-    if record.ranks > 1:  # the worker knows its own memory, we that of all ranks
+    cost, *notes = _plausible_cost(reply)
+    if record.ranks > 1:  # rank 0 measures its own memory, the parent that of all ranks
         cost = replace(cost, peak_mib=reply.peak_mib)
     if not notes:
-        first, what = reply.answer["first_seconds"], (record.qp, record.asked_tol)
-        notes = _cached(cost, first, first_seconds, what)
+        first, key = reply.answer["first_seconds"], (record.qp, record.asked_tol)
+        notes = _caching_notes(cost, first, first_seconds, key)
     return record.replace(**asdict(cost)), *notes
 
 
 def case_request(record: Record) -> dict[str, Any]:
-    """Name the case of a record to ranks that make its QP."""
+    """Return the entry of a request that names the case to ranks that emit its QP."""
     case = {
         "family": record.family, "params": dict(record.params), "form": record.form
     }  # fmt: skip
     return {"case": case}
 
 
-def _as_told(emitted: Mapping[str, Any] | None, record: Record) -> tuple[QP, Record]:
-    """Take what ranks tell of a QP that they have emitted; nothing, if they did not."""
+def sizes_from_ranks(
+    emitted: Mapping[str, Any] | None, record: Record
+) -> tuple[QP, Record]:
+    """Complete a record by the sizes of the QP that its ranks emitted.
+
+    Return with it a QP of these sizes without content. If the ranks emitted none, the
+    record is unchanged and the sizes are zero.
+    """
     if emitted is None or not emitted["sizes"]:
-        return without_content(0, 0), record
+        return qp_of_sizes(0, 0), record
     sizes = emitted["sizes"]
-    return without_content(sizes["variables"], sizes["equalities"]), record.replace(
+    return qp_of_sizes(sizes["variables"], sizes["equalities"]), record.replace(
         sizes=sizes, qp=emitted["digest"], build_seconds=emitted["build_seconds"]
     )
 
 
-def _believed(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
-    """Return the worker's times if the parent's clock allows them, else the parent's.
+def _plausible_cost(reply: Reply) -> tuple[Measurement, *tuple[str, ...]]:
+    """Return the worker's times if they are possible, else the parent's and a note.
 
-    They may sum to no more time than passed between request and end, and to no less
-    than the CPU time that the kernel counted, but for our own work meanwhile.
+    Their sum T must satisfy  CPU time − harness overhead ≤ T ≤ wall time  between the
+    request and the end. If T is larger, the worker's clock was wrong; if it is smaller,
+    work was done outside of it.
     """
     answer, clock = reply.answer, reply.clock
     assert answer is not None
-    told = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
-    if clock is None or told.total_seconds is None:
-        return (told,)
-    inner, first = told.inner_loops, answer["first_seconds"]
-    times = inner + (first is not None)
-    reported = (first or 0.0) + inner * told.total_seconds
-    least = clock.least - OWN_SECONDS - inner * OWN_SECONDS_PER_REPEAT
-    if max(0.0, least) <= reported <= clock.most:
-        return (told,)
-    seen = clock.seen / times
-    ours = replace(told, prepare_seconds=None, solve_seconds=None, total_seconds=seen)
-    return ours, (
-        f"the worker told of {reported:.3g} s of work; by our clock it was busy for "
-        f"{clock.least:.3g} s, and done after {clock.seen:.3g} s: the time is ours"
+    cost = Measurement(**{name: answer[journal_name(name)] for name in MEASURED})
+    if clock is None or cost.total_seconds is None:
+        return (cost,)
+    inner, first = cost.inner_loops, answer["first_seconds"]
+    solves = inner + (first is not None)
+    reported = (first or 0.0) + inner * cost.total_seconds
+    least = clock.min_seconds - HARNESS_SECONDS - inner * HARNESS_SECONDS_PER_REPEAT
+    if max(0.0, least) <= reported <= clock.max_seconds:
+        return (cost,)
+    mean = clock.elapsed_seconds / solves
+    corrected = replace(
+        cost, prepare_seconds=None, solve_seconds=None, total_seconds=mean
+    )
+    return corrected, (
+        f"the worker reported {reported:.3g} s of work; by the parent's clock it used "
+        f"{clock.min_seconds:.3g} s of CPU time and was done after "
+        f"{clock.elapsed_seconds:.3g} s; the parent's time is recorded"
     )
 
 
-def _cached(
+def _caching_notes(
     m: Measurement,
     first: float | None,
     first_seconds: dict[Hashable, float],
-    what: Hashable,
+    key: Hashable,
 ) -> list[str]:
-    """Say so where a repeat took far less than the first time.
+    """Return notes on repeats that were much faster than the first solve.
 
-    first : what the first time took, where there were others
-    first_seconds : of each QP and tolerance, in the first measurement; `what` is added
+    first : time of the first solve of this measurement; None if there was only one
+    first_seconds : time of the first solve ever, by QP and tolerance; that of `key` is
+        added if it is missing
     """
     if m.total_seconds is None:
         return []
     first = first or m.total_seconds
-    before = first_seconds.setdefault(what, first)
+    before = first_seconds.setdefault(key, first)
     compared = [
-        (first, m.total_seconds, LEAST_GAIN_SECONDS, "solves"),
-        (before, first, LEAST_GAIN_BETWEEN_SECONDS, "measurements"),
+        (first, m.total_seconds, MIN_GAIN_SECONDS, "solves"),
+        (before, first, MIN_GAIN_BETWEEN_SECONDS, "measurements"),
     ]
     return [
-        f"took {slow:.3g} s the first time and {fast:.3g} s later: something is kept "
-        f"between {these}, or was loaded at the first"
+        f"took {slow:.3g} s the first time and {fast:.3g} s later: results are cached "
+        f"between {these}, or something was loaded the first time"
         for slow, fast, gain, these in compared
-        if slow > FAR_LESS * fast and slow - fast > gain
+        if slow > MIN_SUSPICIOUS_SPEEDUP * fast and slow - fast > gain
     ]
 
 
-def _within(limit: float, record: Record) -> Record:
-    """Say so where an answer went beyond the memory limit, or failed because of it."""
+def _check_memory(limit: float, record: Record) -> Record:
+    """Change the verdict if an answer exceeded the memory limit, or failed by it."""
     if record.verdict is Verdict.DECLINED:
         return record
     peak = record.peak_mib
@@ -261,11 +277,12 @@ def _within(limit: float, record: Record) -> Record:
 def single_worker(
     command: list[str], serve: Serve | None = None
 ) -> Iterator[WorkerProcess]:
-    """Give a worker for one measurement, which ends with the context.
+    """Provide a worker for one measurement; it ends with the context.
 
     command : starts the worker; two file descriptors are appended to it
-    serve : what a fork of this process does in its place, if that is safe; now, before
-        anything is in memory that it has no use for
+    serve : main function of a fork of this process, which replaces the command if a
+        fork is safe. It is forked at once, before data that it does not need are in
+        memory
     """
     with scratch_folder() as scratch:
         worker = WorkerProcess(command, scratch / "worker.log")
@@ -277,7 +294,7 @@ def single_worker(
             worker.close()
 
 
-def measured_once(
+def measure_once(
     worker: WorkerProcess,
     case: Callable[[], Case],
     record: Record,
@@ -285,17 +302,17 @@ def measured_once(
     *,
     source: Source = Source.FILE,
 ) -> tuple[Record, Solution | None]:
-    """Do as `measured`, without limits, and say what the point means.
+    """Measure once without limits, judge the answer, and evaluate its quantities.
 
-    case : gives the case, built when it is first asked for
-    reference : solves the QP where residuals cannot decide
-    source : of the QP; ranks judge answers only where no code but ours runs in them,
-        and what is asked of the case is then what they cannot tell
+    case : returns the case, which is built by the first call
+    reference : solves the QP if residuals cannot decide
+    source : origin of the QP. Ranks judge their answers only if all code in them is
+        ours; the case then evaluates only what they cannot
 
     Raises
     ------
     FaultError
-        As `measured`, after a second try.
+        If the measurement fails twice for a reason other than the solver.
 
     """
     with scratch_folder() as scratch:
@@ -310,15 +327,15 @@ def measured_once(
             if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
-            measured, worker, lambda: case().qp, record, request,
+            measure_and_judge, worker, lambda: case().qp, record, request,
             time_limit=inf, memory_limit=inf, prove=proves(reference),
         )  # fmt: skip
         try:
-            record, solution, is_undescribed = once()
+            record, solution, needs_evaluation = once()
         except FaultError:
-            record, solution, is_undescribed = once()
+            record, solution, needs_evaluation = once()
     declined = record.verdict is Verdict.DECLINED
-    if solution is None or declined or not is_undescribed:
+    if solution is None or declined or not needs_evaluation:
         return record, solution
     if not record.quantities:
         quantities, note = quantities_of(case(), solution)
@@ -331,10 +348,10 @@ def measured_once(
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Make a folder for temporary files, which goes when it is left.
+    """Create a folder for temporary files, removed at the end of the context.
 
-    Those that a killed process could not remove go first: who uses one holds a lock in
-    it, which ends with the process.
+    Folders that killed processes left behind are removed first. They are recognised by
+    the lock in them: its owner holds it, and the kernel releases it with the process.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):
@@ -346,7 +363,9 @@ def scratch_folder() -> Iterator[Path]:
                 finally:
                     os.close(lock)
     is_ours = False
-    while not is_ours:  # until we lock it, somebody may take it for stale
+    # Between creation and lock another process may take the new folder for a stale one
+    # and remove it; then a new one is tried.
+    while not is_ours:
         with TemporaryDirectory(prefix=_SCRATCH) as name:
             path = Path(name) / _LOCK
             lock = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)

@@ -1,17 +1,21 @@
-"""A process that answers requests: one line of JSON on one pipe, some on another.
+"""Protocol between the parent and its workers: lines of JSON over two pipes.
 
-* it says ``{"event": "ready"}`` when it can be asked
-* ``{"warm_up": true}``: it does what need not be timed, and says ``{"event": "warm"}``
-* any other request: it says ``{"event": "start"}`` when it begins what is to be timed
-  from outside, and ``{"event": "done", …}`` with its answer. One that measures says
-  ``{"event": "timed"}`` when its clock has stopped, and waits for a line before it goes
-  on: until then the parent looks at the CPU time of the process. One on ranks that make
-  the QP of a case says ``{"event": "emitted", …}`` before "start", and
-  ``{"event": "measured"}`` after "timed", before it judges the answer
-* ``{"event": "fault", "what": …}`` in place of each: our own code failed
+The parent writes one request per line, and the process answers it by one or more
+events. It ends when the pipe of requests is closed.
 
-and ends when its requests do. A library that writes to the wrong file descriptor can
-mix other bytes into the replies: `event_of` refuses them.
+* ``{"event": "ready"}`` is sent once, when the process accepts requests.
+* ``{"warm_up": true}`` requests untimed preparations; reply: ``{"event": "warm"}``.
+* Every other request is answered by ``{"event": "start"}``, from which on the parent
+  times it, and ``{"event": "done", …}`` with the answer. In a measurement,
+  ``{"event": "timed"}`` comes between them when the worker's clock has stopped; the
+  worker then waits for a line, so that the parent can read its CPU time before it does
+  anything else. Ranks that emit the QP of a case send ``{"event": "emitted", …}``
+  before "start", and ``{"event": "measured"}`` after "timed", before they judge the
+  answer.
+* ``{"event": "fault", "what": …}`` replaces any of these if our own code fails.
+
+A library that writes to the wrong file descriptor can mix other bytes into the replies;
+`event_of` refuses them.
 """
 
 from __future__ import annotations
@@ -27,18 +31,19 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-LONGEST_REPLY = 2**22  #: bytes
-MOST_ECHOED = 200  #: characters of a foreign reply that a message repeats
-LONGEST_FAULT = 2000  #: characters
+MAX_REPLY_BYTES = 2**22
+MAX_EXCERPT_CHARACTERS = 200  #: of a foreign reply, quoted in a message
+MAX_FAULT_CHARACTERS = 2000  #: of the message of a fault
 
 
 @dataclass(frozen=True)
 class Events:
-    """What the handler of a request calls while it measures."""
+    """Callbacks by which the handler of a request reports its progress."""
 
-    start: Callable[[], None]  #: the clock starts
-    timed: Callable[[], None]  #: it has stopped; returns when the parent has looked
-    #: a stage beside the clock is done, by its name, with what is to be told of it
+    start: Callable[[], None]  #: reports that the clock starts
+    #: reports that it has stopped; returns when the parent has read the CPU time
+    timed: Callable[[], None]
+    #: reports the end of a stage outside the clock: name of the event, its entries
     reached: Callable[[str, Mapping[str, Any]], None]
 
 
@@ -51,15 +56,14 @@ def answer_requests(
     request_fd: int,
     reply_fd: int,
 ) -> None:
-    """Answer requests until there are no more.
+    """Answer requests until the pipe of requests is closed.
 
-    handle : takes a request and what to call meanwhile; returns the answer
-    warm_up : returns what is to be told of it
+    handle : computes the answer to a request, with callbacks that report its progress
+    warm_up : performs the warm-up; returns entries of the reply, or None
     """
+    # A program that a solver starts must not hold the pipes open, or write into them.
     for fd in (request_fd, reply_fd):
-        os.set_inheritable(
-            fd, False
-        )  # programs that a solver starts have no use for it
+        os.set_inheritable(fd, False)
     with os.fdopen(request_fd) as requests, os.fdopen(reply_fd, "w") as replies:
         _send(replies, event="ready")
         while line := requests.readline():
@@ -70,11 +74,11 @@ def answer_requests(
                 else:
                     answer = handle(request, _events(requests, replies))
                     reply = {"event": "done", **answer}
-                sys.stdout.flush()  # what was printed belongs to this request
-            except Exception as e:  # ours: handlers let nothing through that is not
+                sys.stdout.flush()  # the log is truncated at the next request
+            except Exception as e:  # our own fault: handlers catch those of solvers
                 traceback.print_exc()
                 what = " ".join(f"{type(e).__name__}: {e}".split())
-                reply = {"event": "fault", "what": what[:LONGEST_FAULT]}
+                reply = {"event": "fault", "what": what[:MAX_FAULT_CHARACTERS]}
             _send(replies, **reply)
 
 
@@ -83,8 +87,8 @@ def _events(requests: TextIO, replies: TextIO) -> Events:
         _send(replies, event="timed")
         requests.readline()
 
-    def reached(event: str, told: Mapping[str, Any]) -> None:
-        _send(replies, event=event, **told)
+    def reached(event: str, entries: Mapping[str, Any]) -> None:
+        _send(replies, event=event, **entries)
 
     return Events(lambda: _send(replies, event="start"), timed, reached)
 
@@ -95,7 +99,7 @@ def _send(replies: TextIO, **event: Any) -> None:
 
 
 class ForeignReplyError(Exception):
-    """A reply that none of our processes sends; the message repeats its beginning."""
+    """Reply that violates the protocol; the message quotes its beginning."""
 
 
 def event_of(line: bytes, expected: str) -> dict[str, Any]:
@@ -104,41 +108,45 @@ def event_of(line: bytes, expected: str) -> dict[str, Any]:
     Raises
     ------
     ForeignReplyError
-        When the line is anything else.
+        If the line is anything else.
 
     """
     try:
         reply = json.loads(line)
     except ValueError:
-        raise ForeignReplyError(f"{_shown(line)} came, expected a reply") from None
+        raise ForeignReplyError(f"{_excerpt(line)} came, expected a reply") from None
     if not isinstance(reply, dict) or reply.get("event") not in (expected, "fault"):
-        raise ForeignReplyError(f"{_shown(line)} came, expected {expected!r}")
+        raise ForeignReplyError(f"{_excerpt(line)} came, expected {expected!r}")
     return reply
 
 
-def _shown(line: bytes) -> str:
-    text = repr(line[: MOST_ECHOED + 1].decode(errors="backslashreplace"))
-    return text if len(line) <= MOST_ECHOED else f"{text[:MOST_ECHOED]}…"
+def _excerpt(line: bytes) -> str:
+    text = repr(line[: MAX_EXCERPT_CHARACTERS + 1].decode(errors="backslashreplace"))
+    return (
+        text
+        if len(line) <= MAX_EXCERPT_CHARACTERS
+        else f"{text[:MAX_EXCERPT_CHARACTERS]}…"
+    )
 
 
 def measures(request: Mapping[str, Any]) -> bool:
-    """Return True for a measurement, which is the only request with a clock."""
+    """Return True if a request is a measurement, the only kind with a clock."""
     return "out" in request
 
 
 class Source(StrEnum):
-    """The origin of the QP of a measurement, and the judge of the answer."""
+    """Origin of the QP of a measurement, and with it the judge of the answer."""
 
-    FILE = "file"  #: a file, which the parent reads, too, and judges by
-    SHARES = "shares"  #: ranks, each its share; the parent judges by the whole
-    RANKS = "ranks"  #: ranks, which judge the answer together: nobody has the whole
+    FILE = "file"  #: a file; the parent reads it as well, and judges
+    SHARES = "shares"  #: ranks emit a share each; the parent judges by the entire QP
+    RANKS = "ranks"  #: ranks emit a share each and judge together; none has all of it
 
     @property
     def is_shared(self) -> bool:
-        """True where ranks make the QP."""
+        """True if ranks emit the QP."""
         return self is not Source.FILE
 
 
 def source_of(request: Mapping[str, Any]) -> Source:
-    """Return the source of the QP that a request is about."""
+    """Return the origin of the QP of a request."""
     return Source(request.get("source", Source.FILE))

@@ -1,18 +1,17 @@
-"""A worker on several ranks of MPI, and the process that starts them.
+"""Workers on several MPI ranks, and the process that starts them.
 
-`launch` is what runs start in place of a worker: it has `mpiexec` start the worker as
-so many processes, which inherit the pipes to the parent. Rank 0 is the worker of
-`harness.processes.worker`, and speaks with the parent; the others follow it. Each rank
-has a CPU to itself while there are enough. What all of them hold together counts for
-the limit of memory, and all of them end with any of them.
+Runs start `launch` in place of a worker: it calls `mpiexec`, which starts the worker's
+command on every rank. The ranks inherit the pipes to the parent. Rank 0 is the worker
+of `harness.processes.worker` and communicates with the parent; the others follow its
+orders. Each rank has a CPU to itself while there are enough. The memory limit holds for
+the sum over all ranks, and all end when one ends.
 
-A solver that can run so says `on_ranks = True`: its `prepare` is called on every rank
-with that rank's share of the QP (`harness.distributed.vectors.Share`), and every rank
-comes to the same solution, in slices.
+A solver that supports ranks declares `on_ranks = True`. Its `prepare` is called on
+every rank with that rank's share of the QP (`harness.distributed.vectors.Share`), and
+each rank returns its slice of the same solution.
 
-Copies are what ranks are compared with: each rank solves all of the QP by itself, at
-the same time as the others, with whom it shares nothing but the machine. The slowest
-tells the time.
+Copies are the baseline for ranks: each rank solves the entire QP independently, at the
+same time as the others. The slowest determines the measured time.
 """
 
 from __future__ import annotations
@@ -62,24 +61,31 @@ from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.measure import memory_mib
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks
 
-_ORDER = 7  #: tag of what rank 0 tells the others to do
-_IDLE_SECONDS = 2e-4  #: between two looks for an order
+_ORDER = 7  #: MPI tag of the orders that rank 0 sends to the others
+_IDLE_SECONDS = 2e-4  #: between two probes for an order
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
-    """Start `command` on so many ranks, wait until they have ended, and say how.
+    """Run `command` on some number of ranks and report how they ended on stderr.
 
-    Above each rank is a process that records its end (`harness.processes.reaper`). The
-    rank that ended first is named: others end because it did. One that ends while the
-    others go on ends them, too, whatever its exit code. What ranks print is not read.
+    A process above each rank records its end (`harness.processes.reaper`). The message
+    names the rank that ended first, since the others end because of it. If one rank
+    ends while others go on, these are ended whatever its exit code. The output of the
+    ranks is not parsed: its lines may be interleaved.
 
-    The last two words of the command are file descriptors, which the ranks inherit.
+    command : its last two words are file descriptors, which the ranks inherit
+
+    Returns
+    -------
+    the exit code: 0 if mpiexec exits with 0, otherwise 1
+
     """
     start, fds = mpiexec(), tuple(map(int, command[-2:]))
     if start is None:
         print(f"{ranks} ranks: {MISSING}", file=sys.stderr)
         return 1
-    # ours is one CPU, that of a worker; our parent has the rest
+    # The supervisor bound this process to one CPU; the sub-reaper above it, its parent,
+    # has the others.
     with suppress(OSError):
         usable = os.sched_getaffinity(os.getppid()) | os.sched_getaffinity(0)
         os.sched_setaffinity(0, usable)
@@ -89,22 +95,25 @@ def launch(ranks: int, command: Sequence[str]) -> int:
         [start, "-n", str(ranks), *above, *command], stdin=subprocess.DEVNULL,
         pass_fds=(*fds, write), env=os.environ | {RECORD: str(write)},
     )  # fmt: skip
+    # An end kept open here would hide that the ranks, or the parent, closed theirs.
     for fd in (*fds, write):
         os.close(fd)
-    first = _Ends(read, ranks).first(process.pid)
+    first = _RankExits(read, ranks).first(process.pid)
     code = process.poll()
     if code != 0 or first:
-        said = first or f"one of {ranks} ranks ended: mpiexec says {code}"
-        print(f"\n{said}", file=sys.stderr)  # after a line that has no end
+        message = first or f"one of {ranks} ranks ended: mpiexec says {code}"
+        # The parent quotes the last line; a rank may have left an unfinished one.
+        print(f"\n{message}", file=sys.stderr)
     return 0 if code == 0 else 1
 
 
-class _Ends:
-    """The ends of ranks, in the order of time.
+class _RankExits:
+    """Exits of ranks in the order of time.
 
-    The kernel lists what becomes ready in that order, see epoll(7), however late we
-    look. The exit status of a rank comes from the process above it, and is not known
-    where that one was killed first.
+    epoll(7) lists file descriptors in the order in which they became ready, however
+    late it is polled, so the first rank to end is known; mpiexec names the lowest one.
+    The process above a rank writes the exit status of the rank; the status is unknown
+    if that process was killed first.
     """
 
     def __init__(self, record: int, ranks: int) -> None:
@@ -112,17 +121,17 @@ class _Ends:
         self._record = record
         self._ranks = ranks
         self._unread = b""
-        self._rank_of: dict[int, int] = {}  # by a file descriptor of its process
-        self._first: int | str | None = None  # a rank, or what one said of its failure
-        self._way: dict[int, str] = {}  # how ranks ended
+        self._rank_of: dict[int, int] = {}  # rank by a file descriptor of its process
+        self._first: int | str | None = None  # a rank, or the message of its failure
+        self._exit_description: dict[int, str] = {}  # by rank
         self._events = epoll()
         self._events.register(record, EPOLLIN)
 
     def first(self, mpiexec: int) -> str:
-        """Wait until mpiexec has ended, and describe the end of the first rank.
+        """Wait until mpiexec has ended; describe the exit of the first rank that ended.
 
-        The others have `PEER_TIMEOUT` to end after it, whatever its exit code. Empty
-        where mpiexec was the first to end.
+        After it the others have `PEER_TIMEOUT` to end, whatever its exit code. Return
+        "" if mpiexec was the first to end.
         """
         mpi, deadline = os.pidfd_open(mpiexec), np.inf
         self._events.register(mpi, EPOLLIN)
@@ -132,18 +141,20 @@ class _Ends:
             has_ended = mpi in ready
             for fd in ready:
                 if fd in self._rank_of:
-                    self._note(self._rank_of.pop(fd))
+                    self._record_first(self._rank_of.pop(fd))
                     os.close(fd)
                 else:
                     self._take_records()
-                if fd == mpi:  # ranks that end now, end because it has
-                    self._note("")
+                if fd == mpi:  # ranks that end from now on do so because of it
+                    self._record_first("")
             if self._first is not None and deadline == np.inf:
                 deadline = time.monotonic() + PEER_TIMEOUT
         if self._first is None or isinstance(self._first, str):
             return self._first or ""
         one = f"rank {self._first}" if self._first >= 0 else "one"
-        way = self._way.get(self._first, "killed, as was the process above it")
+        way = self._exit_description.get(
+            self._first, "killed, as was the process above it"
+        )
         return f"{one} of {self._ranks} ranks ended: {way}"
 
     def _take_records(self) -> None:
@@ -154,30 +165,30 @@ class _Ends:
                 for line in lines:
                     with suppress(ValueError, KeyError, TypeError, OSError):
                         self._take(json.loads(line))
-            with suppress(FileNotFoundError):  # nobody can write any longer
+            with suppress(FileNotFoundError):  # end of file: all writers have ended
                 self._events.unregister(self._record)
 
     def _take(self, line: Mapping[str, Any]) -> None:
         if "failed" in line:
-            self._note(line["failed"])
+            self._record_first(line["failed"])
         elif "status" in line:
-            self._way[line["rank"]] = _way_to_end(line["status"])
+            self._exit_description[line["rank"]] = _describe_exit(line["status"])
         else:
             for number in (line["process"], line["above"]):
                 try:
                     process = os.pidfd_open(number)
-                except ProcessLookupError:  # it has ended already
-                    self._note(line["rank"])
+                except ProcessLookupError:  # ended before its record was read
+                    self._record_first(line["rank"])
                 else:
                     self._rank_of[process] = line["rank"]
                     self._events.register(process, EPOLLIN)
 
-    def _note(self, first: int | str) -> None:
+    def _record_first(self, first: int | str) -> None:
         if self._first is None:
             self._first = first
 
 
-def _way_to_end(status: int) -> str:
+def _describe_exit(status: int) -> str:
     if os.WIFSIGNALED(status):
         number = os.WTERMSIG(status)
         return f"{signal.strsignal(number)} (signal {number})"
@@ -185,11 +196,11 @@ def _way_to_end(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks, on a CPU of our own if there is one for each.
+    """Join the other ranks, on a CPU of its own for each if there are enough.
 
-    How fast they talk to one another is measured at once, before anything is timed.
+    The speed of communication is measured here, before any solve is timed.
     """
-    from mpi4py import MPI  # late: whoever starts no ranks needs none
+    from mpi4py import MPI  # late: runs without ranks do not need it installed
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
@@ -205,10 +216,10 @@ def follow(
     emit: Emit,
     limit: Callable[[float | None], None],
 ) -> None:
-    """Do on this rank what rank 0 orders, until it orders nothing more.
+    """Execute the orders of rank 0 on this rank, until it sends None.
 
-    emit : makes this rank's share of a case
-    limit : limits the memory of this process, in MiB
+    emit : assembles this rank's share of a case
+    limit : limits the memory of this process, in MiB; None lifts the limit
     """
     run: Callable[[], Solution] | None = None
     share: Share | None = None
@@ -217,10 +228,10 @@ def follow(
     while (order := _next_order(ranks)) is not None:
         try:
             if "case" in order:
-                run = share = emitted = None  # before another one is made
-                # what all raise, or agree upon, is told by rank 0
+                run = share = emitted = None  # free memory before the next emission
+                # raised on all ranks alike; rank 0 reports it
                 with suppress(InputError, RankFailedError):
-                    emitted, _ = _emitted(emit, order["case"], ranks)
+                    emitted, _ = _emit_on_ranks(emit, order["case"], ranks)
                 limit(order["memory_limit"])
             elif "declines" in order and emitted is not None:
                 solver.declines(emitted.share().qp)
@@ -235,25 +246,30 @@ def follow(
                 run = solver.prepare(share.qp, order["tol"])
                 ranks.comm.Barrier()
             elif "evaluate" in order and emitted and solution:
-                run = share = None  # what the solver has made makes room
+                run = share = None  # free the solver's memory before evaluating
                 limit(None)
                 evaluated_by_ranks(emitted, solution, ranks)
             elif run is not None and share is not None:
-                solution, _ = _solved(run, share, ranks)
+                solution, _ = _solve_on_ranks(run, share, ranks)
         except BaseException as e:
-            if _ordered(ranks, PEER_TIMEOUT):
-                continue  # rank 0 has failed alike, and says so
+            # If rank 0 failed as well, it reports that and sends its next order. If no
+            # order comes, it still waits for this rank.
+            if _wait_for_order(ranks, PEER_TIMEOUT):
+                continue
             abort(ranks, e)
 
 
 def _next_order(ranks: Ranks) -> dict[str, Any] | None:
-    _ordered(ranks, np.inf)
+    _wait_for_order(ranks, np.inf)
     order: dict[str, Any] | None = ranks.comm.recv(source=0, tag=_ORDER)
     return order
 
 
-def _ordered(ranks: Ranks, seconds: float) -> bool:
-    """Wait for an order without keeping a CPU busy; whether one came."""
+def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
+    """Wait for an order without spinning; return False if none came in time.
+
+    A blocking receive would keep the CPU busy.
+    """
     deadline = time.monotonic() + seconds
     while not ranks.comm.iprobe(source=0, tag=_ORDER):
         if time.monotonic() > deadline:
@@ -262,101 +278,104 @@ def _ordered(ranks: Ranks, seconds: float) -> bool:
     return True
 
 
-class Spent(NamedTuple):
-    """What ranks spent on a solve, the mean and the largest; nothing on one rank."""
+class RankCosts(NamedTuple):
+    """Cost of a solve on several ranks: (mean, largest); empty tables on one rank."""
 
-    seconds: Mapping[str, tuple[float, float]] = {}
-    counts: Mapping[str, tuple[float, float]] = {}
-    network: Mapping[str, tuple[float, float]] = {}  #: as each of them measured it
+    seconds: Mapping[str, tuple[float, float]] = {}  #: by phase
+    counts: Mapping[str, tuple[float, float]] = {}  #: by operation
+    network: Mapping[str, tuple[float, float]] = {}  #: speed measured at the start
 
     def fields(self) -> dict[str, Any]:
-        """Name the tables as fields of a record."""
+        """Return the tables as fields of a record."""
         return {f"rank_{name}": table for name, table in self._asdict().items()}
 
 
-class OnRanks:
-    """A solver on rank 0, which has the others do their share, or the same.
+class ParallelSolver:
+    """Solver on rank 0 that directs the other ranks.
+
+    The ranks solve one QP together, each with its share, or each a copy of it.
 
     Attributes
     ----------
-    spent : what the last solve cost the ranks
+    spent : cost of the last solve on the ranks
 
     """
 
     def __init__(
         self, solver: Solver, ranks: Ranks, emit: Emit, *, copies: bool = False
     ) -> None:
-        self._solver = self.__wrapped__ = solver  # its file is that of failures
+        # messages of failures name the file of the wrapped solver
+        self._solver = self.__wrapped__ = solver
         self._ranks = ranks
         self._emit = emit
         self._emitted: DistributedQP | None = None
-        self._unemitted: Exception | None = None
+        self._emission_error: Exception | None = None
         self._copies = copies
         self._path = Path()
         self._memory_limit: float | None = None
-        self.spent = Spent()
-        self._own: Solution | None = None
+        self.spent = RankCosts()
+        self._local_solution: Solution | None = None
 
-    def shares(
+    def emit(
         self, case: Mapping[str, Any], memory_limit: float | None
     ) -> tuple[QP, dict[str, Any]]:
-        """Have all ranks make their shares of the next QP.
+        """Order all ranks to emit their shares of the next QP.
 
         Returns
         -------
-        its sizes, as a QP without content; and what is to be told of it: its `sizes`,
-        its `digest` and the seconds that the slowest rank took. Where ranks fail to
-        emit it, a QP of no size: what is wrong is said when it is to be solved.
+        a QP of its sizes without content, and the entries of the event "emitted": its
+        `sizes`, its `digest` and the seconds of the slowest rank. If the emission
+        fails, the sizes are zero and `declines` or `prepare` reports the failure.
 
         """
         self._order({"case": dict(case), "memory_limit": memory_limit})
-        self._emitted = self._unemitted = self._own = None
+        self._emitted = self._emission_error = self._local_solution = None
         try:
-            self._emitted, told = _emitted(self._emit, case, self._ranks)
+            self._emitted, emission = _emit_on_ranks(self._emit, case, self._ranks)
         except (InputError, RankFailedError) as e:
-            self._unemitted = e
-            return without_content(0, 0), {
+            self._emission_error = e
+            return qp_of_sizes(0, 0), {
                 "sizes": {}, "digest": "", "build_seconds": None
             }  # fmt: skip
-        of = self._emitted
-        return without_content(of.variables, of.equality_rows), told
+        sizes = self._emitted.variables, self._emitted.equality_rows
+        return qp_of_sizes(*sizes), emission
 
-    def evaluated(self) -> dict[str, Any] | None:
-        """Have all ranks evaluate the last answer, if they emitted its QP; see there.
+    def evaluate(self) -> dict[str, Any] | None:
+        """Evaluate the last answer on all ranks; None if they did not emit its QP.
 
         Returns
         -------
-        as `harness.verify.verdicts.evaluated_by_ranks`
+        the result of `harness.verify.verdicts.evaluated_by_ranks`
 
         """
-        if self._emitted is None or self._own is None:
+        if self._emitted is None or self._local_solution is None:
             return None
         self._order({"evaluate": True})
-        return evaluated_by_ranks(self._emitted, self._own, self._ranks)
+        return evaluated_by_ranks(self._emitted, self._local_solution, self._ranks)
 
-    def takes(self, path: Path, memory_limit: float | None) -> None:
-        """Say in which file the next QP is, which is not emitted."""
-        self._emitted = self._unemitted = self._own = None
+    def use_file(self, path: Path, memory_limit: float | None) -> None:
+        """Set the file from which all ranks read the next QP instead of emitting it."""
+        self._emitted = self._emission_error = self._local_solution = None
         self._path, self._memory_limit = path, memory_limit
 
     def end(self) -> None:
-        """Let the others end."""
+        """Order the other ranks to end."""
         self._order(None)
 
     @property
     def accepts(self) -> tuple[type, ...]:
-        """The convex sets that the solver declares."""
+        """Convex sets that the solver accepts."""
         return getattr(self._solver, "accepts", (Box,))
 
     def declines(self, qp: QP) -> str | None:
-        """Decline what cannot be shared, besides what the solver declines."""
+        """Return why the solver, or the distribution over ranks, declines a QP."""
         if self._copies:
             return self._solver.declines(qp)
         if not getattr(self._solver, "on_ranks", False):
             return "runs in one process only; expected one rank"
-        if self._unemitted is not None:  # other failures show when it is prepared
-            of_input = isinstance(self._unemitted, InputError)
-            return str(self._unemitted) if of_input else None
+        if self._emission_error is not None:  # `prepare` raises the other failures
+            is_input_error = isinstance(self._emission_error, InputError)
+            return str(self._emission_error) if is_input_error else None
         if self._emitted is not None:
             self._order({"declines": True})
             return self._solver.declines(self._emitted.share().qp)
@@ -371,9 +390,9 @@ class OnRanks:
         return self._solver.declines(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Prepare on all ranks; it is done when the last one is."""
-        if self._unemitted is not None:
-            raise self._unemitted
+        """Prepare on all ranks; return when the last one is ready."""
+        if self._emission_error is not None:
+            raise self._emission_error
         if self._emitted is not None:
             self._order({"tol": tol})
             share = self._emitted.share()
@@ -389,10 +408,10 @@ class OnRanks:
 
         def solve() -> Solution:
             self._order({})
-            self._own, found = _solved(run, share, self._ranks)
-            assert found is not None  # this is rank 0
-            solution, spent = found
-            self.spent = Spent() if self._copies else spent
+            self._local_solution, result = _solve_on_ranks(run, share, self._ranks)
+            assert result is not None  # on rank 0
+            solution, spent = result
+            self.spent = RankCosts() if self._copies else spent
             return solution
 
         return solve
@@ -402,26 +421,27 @@ class OnRanks:
             self._ranks.comm.send(order, dest=rank, tag=_ORDER)
 
 
-def _emitted(
+def _emit_on_ranks(
     emit: Emit, case: Mapping[str, Any], ranks: Ranks
 ) -> tuple[DistributedQP, dict[str, Any]]:
-    """Emit on all ranks, and tell of it what `OnRanks.shares` does.
+    """Emit a case on all ranks; return this rank's part and the entries of the event.
 
     Raises
     ------
-    InputError, RankFailedError
-        On all ranks; the first as the family raises it.
+    InputError
+        If the family raises it; on all ranks.
+    RankFailedError
+        If one rank fails otherwise; on all ranks.
 
     """
     start = time.perf_counter()
     try:
-        made = run_collectively(
-            ranks, lambda: emit(case, ranks)
-        )  # by then the slowest is done
+        emitted = run_collectively(ranks, lambda: emit(case, ranks))
+        # `agreed` is collective, so the slowest rank is done as well
         seconds = time.perf_counter() - start
-        digest = run_collectively(ranks, made.digest)
-        told = {"sizes": made.sizes, "digest": digest, "build_seconds": seconds}
-        return made, told
+        digest = run_collectively(ranks, emitted.digest)
+        entries = {"sizes": emitted.sizes, "digest": digest, "build_seconds": seconds}
+        return emitted, entries
     except InputError:
         raise
     except Exception as e:
@@ -429,13 +449,16 @@ def _emitted(
         raise RankFailedError(f"emission: {why}") from e
 
 
-def without_content(variables: int, equality_rows: int) -> QP:
-    """Make a QP with the sizes of one that no process has; it holds no numbers."""
+def qp_of_sizes(variables: int, equality_rows: int) -> QP:
+    """Return a placeholder of given sizes for a QP that no single process has.
+
+    Its vectors are broadcast scalars, so it takes no memory.
+    """
     n, m = variables, equality_rows
-    nothing = np.broadcast_to(0.0, n)
+    zeros = np.broadcast_to(0.0, n)
     return QP(
         P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
-        q=nothing, lb=nothing, ub=nothing, G=no_rows(n), h=np.zeros(0),
+        q=zeros, lb=zeros, ub=zeros, G=no_rows(n), h=np.zeros(0),
         A=csr_array((m, n)), b=np.zeros(m),
     )  # fmt: skip
 
@@ -448,26 +471,34 @@ def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
     return product.share(qp, ranks)
 
 
-def _solved(
+def _solve_on_ranks(
     run: Callable[[], Solution], share: Share, ranks: Ranks
-) -> tuple[Solution, tuple[Solution, Spent] | None]:
-    """Solve: a slice of the solution, and on rank 0 all of it and what was spent."""
+) -> tuple[Solution, tuple[Solution, RankCosts] | None]:
+    """Solve on this rank.
+
+    Returns
+    -------
+    the local slice of the solution, and on rank 0 the entire solution with the costs of
+    all ranks
+
+    """
     ranks.clear()
     s = run()
+    # before `share.whole`, whose communication is not a part of the solve
     seconds, counts = dict(ranks.seconds), dict(ranks.counts)
-    found = share.whole(s)
+    solution = share.whole(s)
     peak = memory_mib("VmHWM") or 0.0
-    told = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
-    if found is None or told is None:
+    costs = ranks.comm.gather((seconds, counts, dict(ranks.network), peak))
+    if solution is None or costs is None:
         return s, None
-    *tables, peaks = zip(*told, strict=True)
+    *tables, peaks = zip(*costs, strict=True)
     reported = {
-        **found.reported, "ranks": ranks.size,
+        **solution.reported, "ranks": ranks.size,
         "rank_peak_mib_largest": max(peaks),
         "rank_peak_mib_mean": sum(peaks) / ranks.size,
     }  # fmt: skip
-    spent = Spent(*map(_mean_and_largest, tables))
-    return s, (replace(found, reported=reported), spent)
+    spent = RankCosts(*map(_mean_and_largest, tables))
+    return s, (replace(solution, reported=reported), spent)
 
 
 def _mean_and_largest(

@@ -1,26 +1,26 @@
-"""The process that a worker lives under, with all that it starts.
+"""Sub-reaper: the process above a worker that ends all processes the worker started.
 
-Run as a program (``reaper.py CPU REQUESTS REPLIES COMMAND…``, by an interpreter without
-site packages, since every worker has one) it starts COMMAND, bound to one CPU, in a
-session of its own, and ends as COMMAND ends, with the same exit code or signal. It is a
-*sub-reaper*, see prctl(2): a process below it whose parent ends becomes its child, so
-that no double fork and no setsid leaves its tree. The tree is killed
+Run as ``reaper.py CPU REQUESTS REPLIES COMMAND…``, it starts COMMAND in a session of
+its own, bound to one CPU, and exits with the same code or signal. Every worker has one,
+so it is run by an interpreter without site packages, which starts faster. It is a
+*sub-reaper*, see prctl(2): a descendant whose parent ends becomes its child, so that
+neither a double fork nor setsid escapes from its tree. The tree is killed
 
 * when COMMAND ends, and
-* when the other end of its standard input is closed: the process that started it does
-  that, or is dead, even by SIGKILL.
+* when the other end of its standard input is closed, by the process that started it or
+  by the kernel when that process dies, even by SIGKILL.
 
-System V segments of shared memory that COMMAND has created are removed with it: they
-outlive every process.
+System V segments of shared memory that COMMAND created are removed as well, because
+they outlive all processes.
 
-Run as ``reaper.py rank RECORD COMMAND…`` it stands above one rank of MPI: it starts
-COMMAND, writes to the file descriptor RECORD which process that is and with which
-status it ended, and ends alike. Until then it keeps open what COMMAND has inherited, so
-that mpiexec ends no other rank before the record is written.
+Run as ``reaper.py rank RECORD COMMAND…``, it stands above one MPI rank: it starts
+COMMAND, writes the process and later its wait status to the file descriptor RECORD, and
+exits with the same code or signal. Until then it keeps the inherited descriptors open,
+so that mpiexec ends no other rank before the record is written.
 
-A process of its own rather than the run itself is the sub-reaper, because it outlives a
-run that is killed, tells the trees of two workers apart, and leaves a Python session
-that uses us as a library as it is.
+The run itself is not the sub-reaper, for three reasons: a killed run could not clean
+up, the trees of two workers would be indistinguishable, and a Python session that uses
+this package as a library would be changed.
 """
 
 from __future__ import annotations
@@ -36,27 +36,29 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 
-TYPE_CHECKING = False  # to load typing, or json, would take each worker 10 ms
+TYPE_CHECKING = False  # importing typing (or json) would cost each worker 10 ms
 if TYPE_CHECKING:
     from typing import NoReturn
 
 SEGMENTS = "/proc/sysvipc/shm"  #: see proc(5)
-END_SECONDS = 5.0  #: within which processes that were sent SIGKILL are gone
+END_SECONDS = 5.0  #: longest wait for processes that were sent SIGKILL
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
 _PR_SET_PDEATHSIG = 1
 _IPC_RMID = 0  # shmctl(2)
-_RANKS = ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "PMIX_RANK")  #: variables, by MPI
-_NOT_STARTED = 127  #: exit code, as of a shell that finds no command
+#: environment variables that contain the rank: MPICH, Open MPI, PMIx
+_RANKS = ("PMI_RANK", "OMPI_COMM_WORLD_RANK", "PMIX_RANK")
+_NOT_STARTED = 127  #: exit code of shells for a command that is not found
 
 
 def descendants(root: int) -> list[int]:
-    """List the processes below `root` that live: neither zombies nor dead."""
-    found: list[int] = []
+    """List the living processes below `root`, zombies excluded."""
+    processes: list[int] = []
     unseen = [root]
     while unseen:
         process = unseen.pop()
-        with suppress(OSError):  # it may have ended, or a thread of it
+        with suppress(OSError):  # the process, or a thread of it, may have ended
+            # children are listed under the thread that forked them
             for task in os.listdir(f"/proc/{process}/task"):
                 with (
                     suppress(OSError),
@@ -64,8 +66,8 @@ def descendants(root: int) -> list[int]:
                 ):
                     children = list(map(int, file.read().split()))
                     unseen += children
-                    found += children
-    return [process for process in found if lives(process)]
+                    processes += children
+    return [process for process in processes if is_alive(process)]
 
 
 def _is_below(process: int, root: int) -> bool:
@@ -75,33 +77,35 @@ def _is_below(process: int, root: int) -> bool:
     return process == root > 0
 
 
-def lives(process: int) -> bool:
-    """Whether there is such a process, and it is no zombie."""
+def is_alive(process: int) -> bool:
+    """Return True if the process exists and is not a zombie."""
     return state(process) not in ("", "Z", "X")
 
 
 def state(process: int, task: int | None = None) -> str:
-    """Give the letter of a process's or thread's state, see proc(5); "" for none."""
+    """Return the state of a process or thread, a letter of proc(5); "" if it ended."""
     where = str(process) if task is None else f"{process}/task/{task}"
     return _status(where, 0)
 
 
 def _status(where: int | str, field: int) -> str:
-    """Read a field of /proc/WHERE/stat after the name; "" where there is none."""
+    """Return a field of /proc/WHERE/stat, counted after the name; "" if missing."""
     try:
         with open(f"/proc/{where}/stat", "rb") as file:
+            # the last ")" ends the name, which may contain spaces and parentheses
             return file.read().rpartition(b")")[2].split()[field].decode()
     except (OSError, IndexError):
         return ""
 
 
-def end_all(root: int) -> None:
-    """Kill every process below `root`, and wait until they are gone.
+def kill_descendants(root: int) -> None:
+    """Kill every process below `root`, and wait until they have ended.
 
-    They are stopped first, until there are no new ones: what is stopped cannot fork,
-    and killing one by one would let a process that forks faster escape. One that the
-    kernel holds is waited for `END_SECONDS` at most; none is left without its signal,
-    however slow the machine.
+    All are stopped before the first is killed, and the tree is listed again until no
+    new process appears: a stopped process cannot fork, whereas killing one by one would
+    let a process escape that forks faster. A process in uninterruptible sleep is waited
+    for `END_SECONDS` at most; every process is sent its signal, however slow the
+    machine.
     """
     deadline = time.monotonic() + END_SECONDS
     while True:
@@ -115,50 +119,50 @@ def end_all(root: int) -> None:
         for process in stopped:
             _send(process, signal.SIGKILL, root)
         if root == os.getpid():
-            _reap()
-        if time.monotonic() > deadline:
+            _reap()  # orphans became children of the sub-reaper
+        if time.monotonic() > deadline:  # after the signals, so that all are sent once
             return
         time.sleep(0.001)
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process of the tree, and to no other that got its number.
+    """Send a signal to a process of the tree, but to no later one of the same number.
 
-    The file descriptor stands for one process. Where that is in the tree after it was
-    opened, it is the one that is meant.
+    A pidfd refers to one process for ever. If the number belongs to the tree after the
+    pidfd was opened, the pidfd refers to that process.
     """
-    with suppress(OSError):  # it has ended, or another user's program took its place
-        opened = os.pidfd_open(process)
+    with suppress(OSError):  # it has ended, or the number is now another user's
+        fd = os.pidfd_open(process)
         try:
             if _is_below(process, root):
-                signal.pidfd_send_signal(opened, number)
+                signal.pidfd_send_signal(fd, number)
         finally:
-            os.close(opened)
+            os.close(fd)
 
 
-def segments() -> dict[int, int]:
-    """List this user's System V segments: number and creator."""
-    found = {}
-    with suppress(OSError), open(SEGMENTS) as file:  # a kernel without them
+def shared_segments() -> dict[int, int]:
+    """Return the creators of this user's System V segments, by segment number."""
+    creators = {}
+    with suppress(OSError), open(SEGMENTS) as file:  # OSError: not in this kernel
         names = file.readline().split()
         for line in file:
             row = dict(zip(names, map(int, line.split()), strict=False))
             if row["cuid"] == os.getuid():
-                found[row["shmid"]] = row["cpid"]
-    return found
+                creators[row["shmid"]] = row["cpid"]
+    return creators
 
 
 def _reap() -> dict[int, int]:
-    """Take note of the children that ended: their wait statuses."""
-    ended = {}
+    """Collect the children that have ended; return their wait statuses."""
+    statuses = {}
     with suppress(ChildProcessError):
-        while (got := os.waitpid(-1, os.WNOHANG))[0]:
-            ended[got[0]] = got[1]
-    return ended
+        while (child := os.waitpid(-1, os.WNOHANG))[0]:
+            statuses[child[0]] = child[1]
+    return statuses
 
 
 def main(arguments: list[str]) -> None:
-    """Start the command, see that nothing is left of it, and end as it ended."""
+    """Run the command, kill what it leaves behind, and end as it ended."""
     if arguments[0] == "rank":
         _stand_above_rank(int(arguments[1]), arguments[2:])
     cpu, requests, replies, *command = arguments
@@ -167,17 +171,19 @@ def main(arguments: list[str]) -> None:
 
 
 def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> None:
-    """Be the sub-reaper above a worker; this process ends as the worker ends.
+    """Become the sub-reaper above a worker; this process ends as the worker ends.
 
-    begin : what the worker, a fork of this process, does; it does not return
-    pipes : the worker's, which it has to itself
+    begin : main function of the worker, a fork of this process; must not return
+    pipes : the worker's pipes, closed in this process
     """
     ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+    # SIGCHLD wakes the poll below through a pipe; a signal between a check and the poll
+    # would otherwise be missed.
     woken, wakes = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.set_wakeup_fd(wakes)
-    reaper, before = os.getpid(), segments().keys()
-    worker = _mortal_fork()
+    reaper, before = os.getpid(), shared_segments().keys()
+    worker = _fork_bound_to_parent()
     if worker == 0:
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
@@ -189,11 +195,12 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         os.close(null)
         os.sched_setaffinity(0, {cpu})
         begin()
+    # Kept open here, the pipes would not report the death of the worker to the parent.
     for fd in pipes:
         os.close(fd)
     others = os.sched_getaffinity(0) - {cpu}
     if others:
-        os.sched_setaffinity(0, others)  # not in the way of what is measured
+        os.sched_setaffinity(0, others)  # leave the measured CPU to the worker
     events = select.poll()
     events.register(0, select.POLLIN)
     events.register(woken, select.POLLIN)
@@ -206,19 +213,20 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
         ended |= _reap()
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
-    end_all(reaper)
-    _reap()  # or they stay in the table of processes where init collects nothing
-    # System V segments of processes that have ended; a number that belongs to a living
-    # process is not theirs any longer
-    for segment, creator in segments().items():
-        if segment not in before and creator in creators and not lives(creator):
+    kill_descendants(reaper)
+    # In a container whose init collects nothing, zombies would fill the process table.
+    _reap()
+    # Only segments whose creator has ended: a living process with its number is another
+    # one, to which the segment may belong.
+    for segment, creator in shared_segments().items():
+        if segment not in before and creator in creators and not is_alive(creator):
             ctypes.CDLL(None).shmctl(segment, _IPC_RMID, None)
     _end_as(status)
 
 
 def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
     rank = int(next((os.environ[name] for name in _RANKS if name in os.environ), -1))
-    child = _mortal_fork()
+    child = _fork_bound_to_parent()
     if child == 0:
         _execute(command)
     _write(record, rank=rank, process=child, above=os.getpid())
@@ -228,26 +236,28 @@ def _stand_above_rank(record: int, command: list[str]) -> NoReturn:
 
 
 def _write(record: int, **what: int) -> None:
-    """Write one line of JSON at once, so that lines of several ranks do not mix."""
+    """Write a line of JSON by one write(2), so that lines of ranks do not mix."""
     line = ", ".join(f'"{name}": {value}' for name, value in what.items())
-    with suppress(OSError):  # who reads them has ended
+    with suppress(OSError):  # the reader has ended
         os.write(record, f"{{{line}}}\n".encode())
 
 
-def _mortal_fork() -> int:
-    """Fork a process that is killed when this one ends; returns as `os.fork`."""
+def _fork_bound_to_parent() -> int:
+    """Fork a process that is killed when this one ends; return like `os.fork`."""
     parent = os.getpid()
     child = os.fork()
     if child == 0:
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+        # The parent may have died before prctl; no signal would come for that.
         if os.getppid() != parent:
             os._exit(_NOT_STARTED)
     return child
 
 
 def _execute(command: list[str]) -> NoReturn:
-    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by this interpreter
-        signal.signal(ignored, signal.SIG_DFL)
+    # Python ignores these two, and the disposition would survive execve(2).
+    for number in (signal.SIGPIPE, signal.SIGXFSZ):
+        signal.signal(number, signal.SIG_DFL)
     try:
         os.execvp(command[0], command)
     except OSError as e:
@@ -256,14 +266,14 @@ def _execute(command: list[str]) -> NoReturn:
 
 
 def _end_as(status: int | None) -> NoReturn:
-    """End as a wait status says; None: the parent wishes it."""
+    """End with the exit code or signal of a wait status; with 0 if the parent asked."""
     if status is None or os.WIFEXITED(status):
         os._exit(0 if status is None else os.WEXITSTATUS(status))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    with suppress(OSError):  # SIGKILL has no handler
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of this process
+    with suppress(OSError):  # the handler of SIGKILL cannot be set
         signal.signal(os.WTERMSIG(status), signal.SIG_DFL)
     signal.raise_signal(os.WTERMSIG(status))
-    os._exit(_NOT_STARTED)  # a signal that ends no process
+    os._exit(_NOT_STARTED)  # reached if the signal does not end a process
 
 
 if __name__ == "__main__":

@@ -1,9 +1,10 @@
-"""A solver object as a file, by which a worker process receives a copy of it.
+"""Solver objects stored in files, by which a worker process receives a copy.
 
-cloudpickle stores functions and classes of `__main__` (a script or a notebook) with
-their code, which pickle cannot. It refers to those of modules by name, so code that a
-worker would not find under the same name is stored, too: modules beside the script,
-since a worker does not search the working directory, and plug-ins.
+Unlike pickle, cloudpickle stores functions and classes of `__main__` (a script or a
+notebook) with their code. It refers to those of modules by name. Modules that a worker
+would not find under the same name are therefore stored with their code as well:
+plug-ins, and modules beside the script, since workers do not search the working
+directory.
 """
 
 from __future__ import annotations
@@ -30,19 +31,19 @@ def write_solver(path: Path, solver: Solver) -> None:
     Raises
     ------
     InputError
-        When it refers to something that cannot be copied, such as an open file.
+        If it refers to something that cannot be copied, such as an open file.
 
     """
-    import cloudpickle  # late: most solvers have names
+    import cloudpickle  # late: solvers of the registry are resolved by name instead
 
     kind = type(solver).__name__
     with ExitStack() as stack:
-        for module in _unknown_to_workers():
+        for module in _modules_unknown_to_workers():
             cloudpickle.register_pickle_by_value(module)
             stack.callback(cloudpickle.unregister_pickle_by_value, module)
         try:
             content = cloudpickle.dumps(solver)
-        except Exception as e:  # its own __reduce__, or whatever it refers to
+        except Exception as e:  # raised by any __reduce__ that is reached
             raise InputError(
                 f"solver {kind} cannot be copied into a worker process: "
                 f"{one_line(str(e) or type(e).__name__)}; expected attributes that can "
@@ -52,17 +53,17 @@ def write_solver(path: Path, solver: Solver) -> None:
 
 
 def read_solver(path: Path) -> Any:
-    """Load the copy that `write_solver` stored; it comes from this user's process.
+    """Load the copy that `write_solver` stored in a process of the same user.
 
     Raises
     ------
     InputError
-        When a module that it refers to cannot be imported, or it cannot be rebuilt.
+        If a module that it refers to cannot be imported, or it cannot be rebuilt.
 
     """
     try:
         return pickle.loads(path.read_bytes())
-    except Exception as e:  # its own __setstate__, or a module that is imported
+    except Exception as e:  # raised by a __setstate__, or by an imported module
         reason = f"{type(e).__name__}: {e}"
         raise InputError(
             f"the solver cannot be rebuilt in a worker process: {one_line(reason)}; "
@@ -70,9 +71,9 @@ def read_solver(path: Path) -> Any:
         ) from None
 
 
-def _unknown_to_workers() -> Iterator[ModuleType]:
-    """List loaded Python modules that a worker would not find, or find elsewhere."""
-    known: dict[str, bool] = {}
+def _modules_unknown_to_workers() -> Iterator[ModuleType]:
+    """Yield the loaded modules that a worker would not find, or find elsewhere."""
+    importable: dict[str, bool] = {}  # by top-level package
     for name, module in list(sys.modules.items()):
         file = getattr(module, "__file__", None)
         if not isinstance(module, ModuleType) or not str(file).endswith(".py"):
@@ -80,16 +81,16 @@ def _unknown_to_workers() -> Iterator[ModuleType]:
         if name == "__main__" or module.__name__ != name:
             continue
         top = name.partition(".")[0]
-        if top not in known:
-            known[top] = top in sys.stdlib_module_names or _is_found(
+        if top not in importable:
+            importable[top] = top in sys.stdlib_module_names or _is_importable(
                 sys.modules.get(top)
             )
-        if not known[top]:
+        if not importable[top]:
             yield module
 
 
-def _is_found(module: ModuleType | None) -> bool:
-    """Return whether a worker would import this module under its name."""
+def _is_importable(module: ModuleType | None) -> bool:
+    """Return True if a worker would import this very module under its name."""
     if module is None:
         return False
     spec = PathFinder.find_spec(module.__name__, [*_worker_path()])
@@ -102,14 +103,14 @@ def _is_found(module: ModuleType | None) -> bool:
 
 @cache
 def _worker_path() -> tuple[str, ...]:
-    """Ask an interpreter that is started like a worker where it finds modules."""
+    """Return `sys.path` of an interpreter that is started like a worker."""
     program = "import json, sys; print(json.dumps(sys.path))"
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-P", "-c", program],
         capture_output=True,
         text=True,
         check=False,
     )
-    if done.returncode:
-        raise FaultError(f"{sys.executable}: {one_line(done.stderr)}")
-    return tuple(json.loads(done.stdout))
+    if process.returncode:
+        raise FaultError(f"{sys.executable}: {one_line(process.stderr)}")
+    return tuple(json.loads(process.stdout))

@@ -1,16 +1,17 @@
-"""The parent's side of a worker process: ask it, limit it, and tell how it died.
+"""Parent's side of a worker process: requests, limits, and the diagnosis of its end.
 
-Only SIGKILL to all processes that it started stops every solver: C code ignores alarms,
-and some ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
-keeps them together. Memory is limited by looking at what is held, since a limit on
-address space counts what libraries reserve and never touch. Needs Linux's /proc.
+Only SIGKILL to all processes of a worker stops every solver: C code ignores alarms, and
+some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
+keeps its processes together. Memory is limited by polling the resident size, because
+RLIMIT_AS counts address space that libraries reserve and never touch. Requires Linux's
+/proc.
 
-The times that a worker reports must agree with the clock of the parent and with the CPU
-time that the kernel counts. While one worker is asked, those that share its CPU are
-stopped by SIGSTOP: nothing that a solver leaves running in its process disturbs
-another's measurement. So threads of one process ask in turn. Signals go to file
-descriptors of processes, see pidfd_open(2), and never to numbers, which the kernel
-gives to others.
+The times that a worker reports are checked against the parent's clock and against the
+CPU time that the kernel counts. While one worker executes a request, all others on its
+CPU are stopped by SIGSTOP, so that threads which a solver leaves running do not disturb
+another's measurement; requests from several threads are therefore serialised. Signals
+are sent to pidfds, see pidfd_open(2), never to process numbers, which the kernel
+reuses.
 """
 
 from __future__ import annotations
@@ -37,43 +38,47 @@ from mortarbench.harness.limits import ONE_THREAD
 from mortarbench.harness.processes import reaper
 from mortarbench.harness.processes.footprint import Footprint
 from mortarbench.harness.processes.forking import Fork, Serve, fork, is_safe
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.protocol import (
-    LONGEST_REPLY,
+    MAX_REPLY_BYTES,
     ForeignReplyError,
     event_of,
     measures,
     source_of,
 )
-from mortarbench.harness.processes.turns import Turn
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
 POLL_SECONDS = 0.02
-START_SECONDS = 120.0  #: for imports, and for loading a QP
-WARM_UP_SECONDS = 60.0
-POINT_SECONDS = 120.0  #: to write the point of an answer
-CLOSE_SECONDS = 1.0
-END_SECONDS = 1.0  #: for the sub-reaper to end when all below it are dead
-SETTLE_SECONDS = 0.5  #: after an answer: threads of pools go to sleep within that
-BUSY = 0.5  #: share of the time between answer and request that is too much CPU time
-LEAST_BUSY_SECONDS = 0.01  #: CPU time between answer and request that is nothing
-LOG_BYTES = 2**20  #: what a solver may print before we drop it
-LAST_WORDS = 300  #: characters of its last line that a message holds
-_LAST_BYTES = 2**16  #: of the log, among which its last line is looked for
-_LEAST_FD = 3  #: of a pipe: those below are the standard streams, even if closed
-NEAR = 0.9  #: of the memory limit: who fails beyond that failed for want of memory
+START_SECONDS = 120.0  #: limit of imports, and of loading a QP
+WARM_UP_SECONDS = 60.0  #: limit of the warm-up
+POINT_SECONDS = 120.0  #: limit of writing the point of an answer
+CLOSE_SECONDS = 1.0  #: time to end after the requests are closed, before SIGKILL
+END_SECONDS = 1.0  #: time for the sub-reaper to end when all below it are dead
+SETTLE_SECONDS = 0.5  #: idle threads of pools spin for less than that after an answer
+#: CPU time between answer and request, relative to wall time, above which a worker
+#: counts as busy
+MAX_IDLE_CPU_SHARE = 0.5
+MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is neglected
+LOG_BYTES = 2**20  #: size at which the log of a worker is truncated
+MAX_LAST_LINE_CHARACTERS = 300  #: of the last line of the log, quoted in a message
+_LOG_TAIL_BYTES = 2**16  #: part of the log that is searched for its last line
+_MIN_FD = 3  #: a pipe must not take the place of a standard stream that is closed
+#: share of the memory limit above which a failure is attributed to lack of memory
+MEMORY_LIMIT_SHARE = 0.9
 
-_TURN = Turn()  #: of the thread that starts, asks, stops or ends a worker
+_LOCK = ForkSafeLock()  #: held while a thread starts, asks, stops or ends a worker
 
-REPLACED = "the worker was busy while idle, and was replaced"
+REPLACEMENT_NOTE = "the worker used CPU time between measurements, and was replaced"
 
-_CPUCLOCK_SCHED = 2  #: with a process number, names its clock; see clock_getcpuclockid
-#: signals that solvers do not end by; before a solve, somebody else sent them
-_FROM_OUTSIDE = {
+_CPUCLOCK_SCHED = 2  #: part of the id of a process's CPU clock, see clock_getcpuclockid
+#: Signals by which solvers do not end themselves. A worker that one of them ends before
+#: a solve was killed by somebody else.
+_EXTERNAL_SIGNALS = {
     signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT,
 }  # fmt: skip
-#: last words of a process that the machine let down before it solved anything
-_MACHINE = re.compile(
+#: last lines of processes that failed before a solve because of the machine
+_MACHINE_FAILURE = re.compile(
     r"No space left on device|Disk quota exceeded|Too many open files"
     r"|Read-only file system|Input/output error|cannot be started"
 )
@@ -83,40 +88,41 @@ _MACHINE = re.compile(
 class Clock:
     """Bounds of the time that a worker may report, in seconds."""
 
-    least: float  #: CPU time that the kernel counted between "start" and "timed"
-    seen: float  #: from "start" to "timed", as they were read
-    most: float  #: from the request to "timed"
+    min_seconds: float  #: CPU time that the kernel counted between "start" and "timed"
+    elapsed_seconds: float  #: wall time between the receipts of "start" and "timed"
+    max_seconds: float  #: wall time from the request to "timed"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reply:
-    """What came of a request: the worker's own answer, or how the worker ended."""
+    """Result of a request: the worker's answer, or a diagnosis of its end."""
 
     answer: Mapping[str, Any] | None = None
-    verdict: Verdict | None = None  #: None where there is an answer, or a fault
-    fault: bool = False  #: ours or the machine's, which `message` tells
+    verdict: Verdict | None = None  #: None if there is an answer, or a fault
+    fault: bool = False  #: True for a failure of ours or of the machine, see `message`
     message: str = ""
-    peak_mib: float | None = None  #: most memory seen from outside
-    clock: Clock | None = None  #: where a measurement was made
-    threads: int | None = None  #: of the worker, as it found by itself
-    cpu: int | None = None
-    #: sizes, digest and seconds of the QP that ranks have emitted, as soon as they had
+    peak_mib: float | None = None  #: largest memory that the parent saw
+    clock: Clock | None = None  #: None unless something was measured
+    threads: int | None = None  #: number of threads that the worker reported
+    cpu: int | None = None  #: number of the CPU that the worker is bound to
+    #: sizes, digest and seconds of the QP that ranks have emitted; None before that
     emitted: Mapping[str, Any] | None = None
 
 
 class WorkerProcess:
-    """One worker, started when it is first asked, and anew after each death.
+    """A worker, started by the first request and restarted after each death.
 
-    `command` is what starts it, to which two file descriptors are appended: where it
-    reads requests, where it replies. It runs in a session of its own, on one CPU (the
-    last one that we may use), with one thread in every library that obeys its
-    environment variable. What it prints goes to the file `log`.
+    Two file descriptors are appended to `command`: of its requests and of its replies.
+    It runs in a session of its own, on one CPU (the last one that this process may
+    use), with one thread in every library that obeys its environment variable. Its
+    output goes to the file `log`.
 
-    Threads of one process may have workers, or share one: each request waits until the
-    one before is answered. What this process forks has none of its workers.
+    Several threads of a process may have workers, or share one: each request waits
+    until the previous one is answered. Forks of this process own none of its workers.
     """
 
-    first_seconds: dict[Hashable, float]  #: for who asks: what took how long at first
+    #: seconds of the first solve, by a key of the caller; not used here
+    first_seconds: dict[Hashable, float]
 
     _all: ClassVar[WeakSet[WorkerProcess]] = WeakSet()
 
@@ -125,81 +131,83 @@ class WorkerProcess:
         self._command = command
         self._log = log
         self._process: subprocess.Popen[bytes] | Fork | None = None  # the sub-reaper
-        self._worker = 0  # its child, once it is ready
-        self._pinned = self._pinned_worker = -1  # file descriptors of both
+        self._worker = 0  # process number of the worker, once it is ready
+        self._reaper_fd = self._worker_fd = -1  # pidfds of both
         self._cpu = -1
-        self._requests = self._replies = -1  # our ends of the two pipes
+        self._requests = self._replies = -1  # this process's ends of the two pipes
         self._unread = bytearray()
         self._warms_up = True
         self._is_warm = False
         self._is_stopped = self._was_busy = False
-        self._idle_since: tuple[float, float] | None = None  # our clock, its CPU time
-        self._facts: dict[str, Any] = {}  # what it told of its warm-up
+        # clock of the parent and CPU time of the worker at its last answer
+        self._idle_since: tuple[float, float] | None = None
+        self._facts: dict[str, Any] = {}  # fields reported after the warm-up
         self._footprint = Footprint()
         self._peak_mib = 0.0
-        self._emitted: dict[str, Any] | None = None  # what was told of the QP
-        with _TURN:
+        self._emitted: dict[str, Any] | None = None  # entries of the event "emitted"
+        with _LOCK:
             self._all.add(self)
 
-    @_TURN
+    @_LOCK
     def fork(self, serve: Serve) -> None:
-        """Start at once, as a fork of this process that calls `serve`.
+        """Start the worker at once, as a fork of this process that calls `serve`.
 
-        It does what the command would do, and has loaded already what we have, see
-        `harness.processes.forking`. Where that is not safe, or comes to nothing, the
-        command starts the worker when it is asked; and always if it is to be replaced.
+        The fork replaces the command and inherits the loaded modules, see
+        `harness.processes.forking`. If forking is not safe, or fails, the first request
+        starts the worker by its command. A replacement is always started so.
         """
         if not is_safe():
             return
         try:
             self._spawn(inf, serve)
-        except (_EndedError, OSError):
+        except (_WorkerEndError, OSError):
             self._kill()
 
-    @_TURN
+    @_LOCK
     def ask(
         self, request: Mapping[str, Any], *, time_limit: float, memory_limit: float
     ) -> Reply:
-        """Have one measurement made.
+        """Send a request, enforce its limits, and return the answer or the diagnosis.
 
-        What a solver does to its process before it is asked to solve is no fault of the
-        solve: the request goes to a new process then, once.
+        If the process of an earlier request dies before the solve starts, the request
+        is repeated once in a new process: an earlier solve may have damaged it.
 
-        time_limit : s, from the worker's "start" on: neither its imports nor its
-            warm-up nor loading the QP count. Where ranks emit the QP themselves, they
-            have as long for that; and to evaluate the answer, but `POINT_SECONDS` at
-            least
-        memory_limit : MiB, of all its processes together
+        time_limit : s, from the event "start" on, which excludes imports, warm-up and
+            loading the QP. Ranks that emit the QP themselves have the same time for
+            that, and to evaluate the answer, in that case `POINT_SECONDS` at least
+        memory_limit : MiB, of all processes of the worker together
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
+        # before this worker is resumed: two must never run on its CPU
         for worker in [w for w in self._all if w is not self and w._cpu == cpu]:
             worker._stop()
         was_busy = self._resume()
-        notes = [REPLACED] if was_busy else []
+        notes = [REPLACEMENT_NOTE] if was_busy else []
         while True:
             is_new = not self._is_warm
             try:
                 if is_new:
                     self._start(memory_limit)
                     self._is_warm = True
-                answer, clock = self._asked(request, time_limit, memory_limit)
+                answer, clock = self._exchange(request, time_limit, memory_limit)
                 break
-            except _EndedError as end:
+            except _WorkerEndError as end:
                 self._kill()
                 if end.is_early and not is_new:
                     continue
-                return self._ended(end, memory_limit)
-            except OSError as e:  # no process, no pipe, no log: ours, or the machine's
+                return self._reply_to_end(end, memory_limit)
+            except OSError as e:  # a process, pipe or log could not be created
                 self._kill()
                 return Reply(fault=True, message=one_line(e))
+        # copied here, because `_kill` below may reset them
         peak = self._peak_mib or None
         facts = self._facts
-        if self._others():  # they would disturb the next measurement
+        if self._others():  # processes left running would disturb the next measurement
             self._kill()
         elif self._stays_busy():
             self._kill()
-            notes.append(REPLACED)
+            notes.append(REPLACEMENT_NOTE)
         else:
             self._idle_since = (time.monotonic(), self._cpu_seconds())
         return Reply(
@@ -211,9 +219,9 @@ class WorkerProcess:
             **facts,
         )
 
-    @_TURN
+    @_LOCK
     def close(self) -> None:
-        """Let the worker end by itself, soon; its children end with it."""
+        """Close the requests, wait up to `CLOSE_SECONDS` for the end, then kill."""
         try:
             self._resume()
             self._close("_requests")
@@ -225,17 +233,17 @@ class WorkerProcess:
 
     @classmethod
     def forget_all(cls) -> None:
-        """Leave all workers to the process that this one is a fork of."""
+        """Disown all workers; called in a fork, whose parent keeps them."""
         for worker in tuple(cls._all):
             worker._disown()
         cls._all.clear()
 
-    def _asked(
+    def _exchange(
         self, request: Mapping[str, Any], time_limit: float, memory_limit: float
     ) -> tuple[dict[str, Any], Clock | None]:
         with suppress(OSError):
             self._log.write_bytes(b"")
-        asked = time.monotonic()
+        sent = time.monotonic()
         self._send(request)
         is_shared = source_of(request).is_shared
         if is_shared:
@@ -251,15 +259,16 @@ class WorkerProcess:
                 self._await("timed", time_limit, memory_limit)
                 ended = time.monotonic()
                 clock = Clock(
-                    least=min(self._cpu_seconds() - used, ended - started),
-                    seen=ended - started,
-                    most=ended - asked,
+                    min_seconds=min(self._cpu_seconds() - used, ended - started),
+                    elapsed_seconds=ended - started,
+                    max_seconds=ended - sent,
                 )
+                # The worker waits, so no file in shared memory escapes notice.
                 self._footprint.notice(self._tree())
                 self._send({"go": True})
             if is_shared:
                 self._await("measured", POINT_SECONDS, memory_limit)
-                peak = self._peak_mib  # what evaluating takes is not limited
+                peak = self._peak_mib  # the evaluation is not the solver's memory
                 stage = "evaluation of the answer: "
                 limit = max(time_limit, POINT_SECONDS)
                 try:
@@ -269,24 +278,29 @@ class WorkerProcess:
             else:
                 limit = POINT_SECONDS if measures(request) else time_limit
                 answer = self._await("done", limit, memory_limit)
-        except _EndedError as end:
+        except _WorkerEndError as end:
             end.is_oom = end.signal == signal.SIGKILL and _oom_kills() > oom_kills
             raise
         self._trim_log()
         return answer, clock
 
-    def _ended(self, end: _EndedError, memory_limit: float) -> Reply:
-        """Tell a solver's end from one that the machine or somebody brought about."""
+    def _reply_to_end(self, end: _WorkerEndError, memory_limit: float) -> Reply:
+        """Diagnose the end of a worker: a verdict on the solver, or a fault."""
         peak, message, verdict = self._peak_mib or None, str(end), end.verdict
         is_fault = end.is_fault or (
             end.is_early
-            and (end.signal in _FROM_OUTSIDE or _MACHINE.search(message) is not None)
+            and (
+                end.signal in _EXTERNAL_SIGNALS
+                or _MACHINE_FAILURE.search(message) is not None
+            )
         )
         if out_of_memory(message, peak, memory_limit):
             verdict, is_fault = Verdict.MEMORY_LIMIT, False
         elif end.is_oom:
             message = f"{message}: the machine ran out of memory"
             verdict = Verdict.MEMORY_LIMIT
+            # The kernel's choice need not be the cause: a worker with less than half of
+            # the available memory is not to blame.
             is_fault = (peak or 0.0) < limits.memory_limit_mib() / 2
         return Reply(
             verdict=None if is_fault else verdict,
@@ -298,9 +312,10 @@ class WorkerProcess:
         )
 
     def _start(self, memory_limit: float) -> None:
-        """Start and warm up; a solver that dies of the warm-up does without one.
+        """Start and warm up.
 
-        Who is killed from outside meanwhile is warmed up once more.
+        A solver that dies in its warm-up is restarted without one, unless something
+        else killed it; then the warm-up is repeated once.
         """
         if self._process is None:
             self._spawn(memory_limit)
@@ -311,15 +326,15 @@ class WorkerProcess:
                 self._send({"warm_up": True})
                 self._facts = _facts(self._await("warm", WARM_UP_SECONDS, memory_limit))
                 return
-            except _EndedError as end:
+            except _WorkerEndError as end:
                 if end.is_fault:
                     raise
-                self._warms_up = end.signal in _FROM_OUTSIDE and not is_last
+                self._warms_up = end.signal in _EXTERNAL_SIGNALS and not is_last
                 self._kill()
                 self._spawn(memory_limit)
 
     def _spawn(self, memory_limit: float, serve: Serve | None = None) -> None:
-        """Start; `serve` is what a fork does, and without one, the command is run."""
+        """Start a process: a fork that calls `serve`, or without that the command."""
         usable = os.sched_getaffinity(0)
         self._cpu = max(usable)
         self._footprint = Footprint()
@@ -330,7 +345,8 @@ class WorkerProcess:
         environment = ONE_THREAD | {limits.VARIABLE: str(memory_limit)}
         try:
             self._log.write_bytes(b"")
-            # appending: it survives our truncating it
+            # Append mode: after `_trim_log` the worker writes at the new end. At its
+            # old offset, it would make the file as long as before.
             with self._log.open("ab") as log:
                 if serve is not None:
                     self._process = fork(
@@ -343,7 +359,8 @@ class WorkerProcess:
                             sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
                             *map(str, pipes), *self._command,
                         ],
-                        stdin=subprocess.PIPE,  # closed when we die: the tree dies, too
+                        # closed by the kernel when this process dies; ends the tree
+                        stdin=subprocess.PIPE,
                         stdout=log,
                         stderr=log,
                         env=os.environ | environment,
@@ -353,49 +370,60 @@ class WorkerProcess:
         finally:
             os.close(their_requests)
             os.close(their_replies)
-        self._pinned = os.pidfd_open(self._process.pid)
+        self._reaper_fd = os.pidfd_open(self._process.pid)
         self._await("ready", START_SECONDS, memory_limit)
-        for worker in self._tree()[:1]:  # what comes later is listed later
-            self._pinned_worker = os.pidfd_open(worker)
-            if worker in self._tree():  # or its number could be another's by now
+        for worker in self._tree()[:1]:  # the child comes before its own children
+            self._worker_fd = os.pidfd_open(worker)
+            # Still in the tree after pidfd_open, so the pidfd refers to the worker and
+            # not to a process that got its number in between.
+            if worker in self._tree():
                 self._worker = worker
         if not self._worker:
-            raise OSError(f"nothing runs below process {self._process.pid}, says /proc")
+            raise OSError(f"/proc lists no process below {self._process.pid}")
 
     def _send(self, request: Mapping[str, Any]) -> None:
-        with suppress(BrokenPipeError):  # it died; waiting for its reply tells how
+        with suppress(BrokenPipeError):  # it has died; `_await` diagnoses that
             os.write(self._requests, (json.dumps(request) + "\n").encode())
 
     def _await(
         self, event: str, limit: float, memory_limit: float, *, stage: str = ""
     ) -> dict[str, Any]:
-        """Wait for an event; whatever else happens is raised as `_EndedError`.
+        """Wait for an event.
 
-        stage : of a measurement, which the error then begins with
+        stage : of a measurement; prefix of the error's message
+
+        Raises
+        ------
+        _WorkerEndError
+            If the worker ends, exceeds a limit, or replies anything else.
+
         """
 
-        def ended(verdict: Verdict, how: str, *more: int) -> _EndedError:
-            return _EndedError(event, verdict, how, *more, stage=stage)
+        def ended(verdict: Verdict, how: str, *more: int) -> _WorkerEndError:
+            return _WorkerEndError(event, verdict, how, *more, stage=stage)
 
         deadline = time.monotonic() + limit
         while True:
-            dead = self._is_dead()  # before reading: it may reply and then die
+            # Before reading: a worker that replies and then dies has still replied.
+            dead = self._is_dead()
             has_more = self._read(0 if dead else POLL_SECONDS)
             line, newline, rest = self._unread.partition(b"\n")
             if newline:
                 self._unread = rest
                 break
-            if len(self._unread) > LONGEST_REPLY:
-                how = f"more than {LONGEST_REPLY >> 20} MiB came without an end of line"
+            if len(self._unread) > MAX_REPLY_BYTES:
+                how = (
+                    f"more than {MAX_REPLY_BYTES >> 20} MiB came without an end of line"
+                )
                 raise ended(Verdict.FAILED, how)
             if dead and not has_more:
                 raise ended(Verdict.CRASHED, *self._death())
             if time.monotonic() > deadline:
                 raise ended(Verdict.TIME_LIMIT, f"killed after {limit:g} s")
-            held = self._footprint.mib(self._tree(), memory_limit)
-            self._peak_mib = max(self._peak_mib, held)
-            if held > memory_limit:
-                how = f"killed at {held:.0f} MiB, above the limit of {memory_limit:g}"
+            memory = self._footprint.mib(self._tree(), memory_limit)
+            self._peak_mib = max(self._peak_mib, memory)
+            if memory > memory_limit:
+                how = f"killed at {memory:.0f} MiB, above the limit of {memory_limit:g}"
                 raise ended(Verdict.MEMORY_LIMIT, f"{how} MiB")
             self._trim_log()
         try:
@@ -409,41 +437,44 @@ class WorkerProcess:
         return reply
 
     def _trim_log(self) -> None:
-        with suppress(OSError):  # the folder is gone: whoever writes there will say so
+        with suppress(OSError):  # the folder was deleted; writers of results report it
             if self._log.stat().st_size > LOG_BYTES:
                 os.truncate(self._log, 0)
 
     def _read(self, timeout: float) -> bool:
-        """Take in what the worker has replied, waiting at most `timeout` seconds.
+        """Read replies of the worker, waiting at most `timeout` seconds.
 
-        Returns whether anything is there to be looked at.
+        Return True if there is a complete line, or new bytes.
         """
-        if b"\n" in self._unread:  # two replies came at once
+        if b"\n" in self._unread:  # a second reply came with the last one
             return True
         has_more = False
         while select([self._replies], [], [], 0 if has_more else timeout)[0]:
             chunk = os.read(self._replies, 2**16)
-            if not chunk:  # closed: the worker is dying, or its solver closed all
+            # End of file: the worker is dying, or its solver closed all descriptors.
+            if not chunk:
                 time.sleep(timeout)
                 break
             self._unread += chunk
             has_more = True
-            if b"\n" in chunk or len(self._unread) > LONGEST_REPLY:
+            if b"\n" in chunk or len(self._unread) > MAX_REPLY_BYTES:
                 break
         return has_more
 
     def _tree(self) -> list[int]:
-        """List the worker, what it has started, and what these have."""
+        """List the worker and all processes below it; empty if it has ended."""
         if self._process is None:
             return []
-        found = reaper.descendants(self._process.pid)
-        return [] if self._is_dead() else found  # of somebody who got its number
+        processes = reaper.descendants(self._process.pid)
+        # Checked afterwards: of a dead sub-reaper the number may be another process's,
+        # and so may these descendants.
+        return [] if self._is_dead() else processes
 
     def _others(self) -> list[int]:
         return [process for process in self._tree() if process != self._worker]
 
     def _cpu_seconds(self) -> float:
-        """Give the CPU time of the worker, all its threads, as the kernel counts it."""
+        """Return the CPU time of all threads of the worker, as the kernel counts it."""
         with suppress(OSError):  # it may have ended
             return time.clock_gettime(~self._worker << 3 | _CPUCLOCK_SCHED)
         return 0.0
@@ -452,16 +483,16 @@ class WorkerProcess:
         if self._process is None or self._is_stopped:
             return
         if self._others():
-            self._kill()  # started since it answered
+            self._kill()  # processes started after its answer; SIGSTOP misses them
             return
         self._was_busy = self._was_busy or self._has_been_busy()
         self._signal(signal.SIGSTOP)
         self._is_stopped = True
 
     def _resume(self) -> bool:
-        """Go on where `_stop` stopped; tell if the worker was busy while it was idle.
+        """Resume the worker after `_stop`; return True if it was busy while idle.
 
-        Who was, and who has died meanwhile, is replaced when it is asked.
+        A worker that was busy, or has died, is killed; the next request replaces it.
         """
         if self._process is None:
             return False
@@ -476,29 +507,32 @@ class WorkerProcess:
         return was_busy
 
     def _signal(self, number: signal.Signals) -> None:
-        """Send a signal to the worker, if it is there."""
-        if self._pinned_worker != -1:
+        """Send a signal to the worker, if it is running."""
+        if self._worker_fd != -1:
             with suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pinned_worker, number)
+                signal.pidfd_send_signal(self._worker_fd, number)
 
     def _has_been_busy(self) -> bool:
         if self._idle_since is None:
             return False
         since, used = self._idle_since
-        allowed = max(LEAST_BUSY_SECONDS, BUSY * (time.monotonic() - since))
+        allowed = max(
+            MIN_BUSY_CPU_SECONDS, MAX_IDLE_CPU_SHARE * (time.monotonic() - since)
+        )
         return self._cpu_seconds() - used > allowed
 
     def _stays_busy(self) -> bool:
-        """Whether threads of the worker run on although it has answered.
+        """Return True if threads of the worker continue to compute after its answer.
 
-        Threads of pools spin for a while before they sleep. One that only waits for a
-        CPU, on a machine that is not ours alone, uses none.
+        Threads of pools spin for a while before they sleep, for which `SETTLE_SECONDS`
+        are allowed. State "R" alone is no evidence: on a busy machine, a thread that
+        waits for a CPU has it too. So CPU time decides.
         """
         deadline = time.monotonic() + SETTLE_SECONDS
         pause, used = POLL_SECONDS / 100, self._cpu_seconds()
         while self._runs():
             if time.monotonic() > deadline:
-                return self._cpu_seconds() - used > LEAST_BUSY_SECONDS
+                return self._cpu_seconds() - used > MIN_BUSY_CPU_SECONDS
             time.sleep(pause)
             pause = min(2 * pause, POLL_SECONDS)
         return False
@@ -510,26 +544,27 @@ class WorkerProcess:
         return False
 
     def _is_dead(self) -> bool:
-        """Look without collecting it; whoever does that, the descriptor stands for it.
+        """Return True if the sub-reaper has ended, or was not started.
 
-        True where there is none.
+        A pidfd becomes readable at the end of its process, and stays so whoever
+        collects the process; waitpid(2) would fail after other code has done that.
         """
-        if self._pinned == -1:
+        if self._reaper_fd == -1:
             return True
-        look = poll()
-        look.register(self._pinned)
-        return bool(look.poll(0))
+        poller = poll()
+        poller.register(self._reaper_fd)
+        return bool(poller.poll(0))
 
     def _death(self) -> tuple[str, int]:
-        """How a dead worker ended, its last words included, and by which signal."""
+        """Describe a worker's end, with its last line; return that and the signal."""
         how, number = "ended, and other code of this process took its exit code", 0
         with suppress(ChildProcessError):
-            how, number = _way_to_end(self._pinned)
+            how, number = _describe_exit(self._reaper_fd)
         last = ""
         with suppress(OSError), self._log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - _LAST_BYTES))
-            text = file.read(_LAST_BYTES).decode(errors="replace")
-            last = text.strip().rpartition("\n")[2][-LAST_WORDS:]
+            file.seek(max(0, file.seek(0, os.SEEK_END) - _LOG_TAIL_BYTES))
+            text = file.read(_LOG_TAIL_BYTES).decode(errors="replace")
+            last = text.strip().rpartition("\n")[2][-MAX_LAST_LINE_CHARACTERS:]
         return (f"{how}: {last}" if last else how), number
 
     def _kill(self) -> None:
@@ -537,21 +572,21 @@ class WorkerProcess:
         if self._process is not None:
             self._footprint.notice(self._tree())
             if not self._is_dead():
-                reaper.end_all(self._process.pid)
+                reaper.kill_descendants(self._process.pid)
             if self._process.stdin is not None:
-                self._process.stdin.close()  # the sub-reaper collects the dead and ends
+                self._process.stdin.close()  # the sub-reaper collects them and ends
             try:
                 self._process.wait(END_SECONDS)
-            except subprocess.TimeoutExpired:  # a solver has stopped it
+            except subprocess.TimeoutExpired:  # a solver may have sent it SIGSTOP
                 self._process.kill()
                 self._process.wait()
             self._footprint.remove_shared()
         self._forget()
 
     def _disown(self) -> None:
-        """Forget a worker of the process that this one is a fork of.
+        """Close this fork's copies of the descriptors of a worker of its parent.
 
-        An end of its pipes that stayed open here would keep it alive.
+        A copy that stayed open would keep the worker alive after its parent's death.
         """
         if self._process is not None and self._process.stdin is not None:
             self._process.stdin.close()
@@ -562,11 +597,11 @@ class WorkerProcess:
         self._is_warm = False
         self._worker, self._is_stopped, self._was_busy = 0, False, False
         self._idle_since = None
-        for name in ("_replies", "_requests", "_pinned", "_pinned_worker"):
+        for name in ("_replies", "_requests", "_reaper_fd", "_worker_fd"):
             self._close(name)
 
     def _close(self, name: str) -> None:
-        """Close a file descriptor once: its number may be another file's afterwards."""
+        """Close a file descriptor only once: its number may then be another file's."""
         fd: int = getattr(self, name)
         setattr(self, name, -1)
         if fd != -1:
@@ -577,27 +612,31 @@ os.register_at_fork(after_in_child=WorkerProcess.forget_all)
 
 
 def _pipe() -> tuple[int, int]:
-    """Open a pipe whose numbers a program can inherit beside its standard streams."""
+    """Open a pipe whose descriptors do not collide with the standard streams.
+
+    If the calling program has closed a standard stream, pipe(2) returns its number,
+    which the worker's own standard streams would then replace.
+    """
     ends = os.pipe()
-    if min(ends) >= _LEAST_FD:
+    if min(ends) >= _MIN_FD:
         return ends
     try:
-        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _LEAST_FD) for e in ends)
+        read, write = (fcntl.fcntl(e, fcntl.F_DUPFD_CLOEXEC, _MIN_FD) for e in ends)
     finally:
         for end in ends:
             os.close(end)
     return read, write
 
 
-def _way_to_end(process: int) -> tuple[str, int]:
-    """Describe the end of a process, and return the signal that ended it; 0: none.
+def _describe_exit(process: int) -> tuple[str, int]:
+    """Describe the end of a process; return with it the signal that ended it, or 0.
 
-    process : a file descriptor, see pidfd_open(2)
+    process : its pidfd
 
     Raises
     ------
     ChildProcessError
-        When it was collected, or is no child of this process.
+        If it was collected already, or is not a child of this process.
 
     """
     end = os.waitid(os.P_PIDFD, process, os.WEXITED | os.WNOWAIT)
@@ -608,13 +647,13 @@ def _way_to_end(process: int) -> tuple[str, int]:
     return names.get(end.si_status, f"signal {end.si_status}"), end.si_status
 
 
-class _EndedError(Exception):
-    """A worker that did not come to the event we waited for.
+class _WorkerEndError(Exception):
+    """End of a worker before an expected event.
 
-    event : that
-    verdict : on the solver, if it was after the start
-    number : of the signal that ended it, or 0
-    stage : what the message begins with
+    event : the expected one
+    verdict : on the solver, if the solve had started
+    number : signal that ended it, or 0
+    stage : prefix of the message
     """
 
     def __init__(
@@ -623,23 +662,23 @@ class _EndedError(Exception):
         self.is_early = event not in ("emitted", "timed", "measured", "done")
         super().__init__(stage + (f"before solving: {how}" if self.is_early else how))
         if self.is_early and verdict is Verdict.TIME_LIMIT:
-            verdict = Verdict.FAILED  # no fault of the solver's speed
+            verdict = Verdict.FAILED  # the limit of a start, not that of the suite
         self.verdict = verdict
         self.signal = number
-        self.is_fault = False  #: it says itself that our own code failed
-        self.is_oom = False
+        self.is_fault = False  #: True if the worker reported a failure of our own code
+        self.is_oom = False  #: True if the kernel killed it because memory ran out
 
 
-def _facts(told: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields of a reply that a worker reports once, when it is warm."""
-    cpus = told.get("cpus", ())
+def _facts(reply: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the fields that a worker reports once, after its warm-up."""
+    cpus = reply.get("cpus", ())
     return {
-        "threads": told.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None
+        "threads": reply.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None
     }  # fmt: skip
 
 
 def _oom_kills() -> int:
-    """Count the processes that the kernel has killed for want of memory."""
+    """Return the number of processes that the kernel has killed for lack of memory."""
     with suppress(OSError), open("/proc/vmstat") as lines:
         for line in lines:
             if line.startswith("oom_kill "):
@@ -647,7 +686,7 @@ def _oom_kills() -> int:
     return 0
 
 
-_EXHAUSTION = re.compile(
+_ALLOCATION_FAILURE = re.compile(
     r"MemoryError|bad_?alloc|out of memory|(un|can ?not |not )(able to )?allocate"
     r"|memory allocation|allocation (error|fail)",
     re.IGNORECASE,
@@ -655,14 +694,14 @@ _EXHAUSTION = re.compile(
 
 
 def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
-    """Tell whether what failed did so for want of memory.
+    """Return True if a failure is due to lack of memory.
 
-    Solvers answer exhaustion by an exception, an abort, a segmentation fault, a hang or
-    a false result. What gives them away is their peak or, where a single allocation
-    was refused, what the library says.
+    Solvers react to it by an exception, an abort, a segmentation fault, a hang or a
+    wrong result. It shows in their peak memory or, if a single allocation was refused,
+    in the message of the library.
 
-    message : of the failure, its last words included
+    message : of the failure, including the last line of output
     limit : MiB
     """
-    near = peak_mib is not None and peak_mib >= NEAR * limit
-    return near or _EXHAUSTION.search(message) is not None
+    near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit
+    return near or _ALLOCATION_FAILURE.search(message) is not None

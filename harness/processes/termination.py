@@ -1,4 +1,4 @@
-"""Ending at SIGTERM and SIGHUP as at Ctrl-C: processes end, and scratch folders go."""
+"""Clean exit at SIGTERM and SIGHUP: processes end and scratch folders are removed."""
 
 from __future__ import annotations
 
@@ -8,19 +8,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import current_thread, main_thread
 
-_ONCE_SECONDS = 5.0  #: within which another signal does not interrupt the cleaning up
+#: within this time after a signal, a further one does not interrupt the cleanup
+_ONCE_SECONDS = 5.0
 
 
 class TerminatedError(BaseException):
-    """A signal asked this process to end. No `except` of ours or others' takes it."""
+    """Termination by a signal, of a type that `except Exception` does not catch."""
 
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Raise `TerminatedError` at SIGTERM or SIGHUP, and then exit by 128 + its number.
+    """Raise `TerminatedError` at SIGTERM or SIGHUP, then exit with 128 + its number.
 
-    Signals that somebody else handles, or ignores as nohup does, are left as they are,
-    and so are all in a thread that is not the main one.
+    Signals that are handled elsewhere, or ignored (nohup ignores SIGHUP), keep their
+    disposition. Outside the main thread nothing changes: Python allows signal handlers
+    to be set only there.
     """
     numbers = [
         number
@@ -28,12 +30,14 @@ def ended_by_signals() -> Iterator[None]:
         if current_thread() is main_thread()
         and signal.getsignal(number) is signal.SIG_DFL
     ]
-    came: list[tuple[float, int]] = []
+    received: list[tuple[float, int]] = []  # time and number
 
     def end(number: int, _: object) -> None:
         now = time.monotonic()
-        if not came or now > came[-1][0] + _ONCE_SECONDS:
-            came.append((now, number))
+        # A second signal must not interrupt the `finally` blocks that the first one
+        # runs; one that comes later ends a cleanup that hangs.
+        if not received or now > received[-1][0] + _ONCE_SECONDS:
+            received.append((now, number))
             raise TerminatedError
 
     for number in numbers:
@@ -41,8 +45,9 @@ def ended_by_signals() -> Iterator[None]:
     try:
         yield
     except BaseException:
-        if came:  # whatever went wrong afterwards: a terminal that hung up, say
-            raise SystemExit(128 + came[0][1]) from None
+        # Also for a later error: writing to a terminal that hung up raises OSError.
+        if received:
+            raise SystemExit(128 + received[0][1]) from None
         raise
     finally:
         for number in numbers:

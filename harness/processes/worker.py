@@ -1,22 +1,22 @@
-"""The process that one solver lives in, between measurements too.
+"""Process of one solver, for all of its measurements.
 
-It answers the requests of `harness.processes.protocol` with these of its own:
+It speaks `harness.processes.protocol`. Its warm-up solves tiny QPs, so that imports
+which a solver defers until its first solve are not timed. It answers three kinds of
+requests:
 
-* the warm-up solves tiny QPs, so that imports which a solver puts off until its first
-  solve are not timed
-* ``{"qp": PATH, "tol": TOL, "out": PATH}``: it maps the QP into memory, measures, and
-  writes the point to `out`. Optional: ``digest`` of the file, which is checked, and
-  without which the file may hold no operator; ``memory_limit`` in MiB;
-  ``sample_seconds``, see `harness.verify.measure`; ``step`` 0, 1, … of a sequence, and
-  whether it ``tightens``: then every step comes with its own tolerance
-* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks which
-  emit the QP of a case themselves (`harness.plugin.Family.emission`), and evaluate the
-  answer together if that is asked for. It says ``emitted`` when the QP is there, with
-  its ``sizes`` and ``digest``, and ``measured`` when the point is written
-* ``{"check": NAME}``: it runs one of `harness.conformance.conformance.CHECKS`
+* ``{"qp": PATH, "tol": TOL, "out": PATH}``: map the QP into memory, measure, and write
+  the point to ``out``. Optional entries: ``digest`` of the file, which is checked;
+  without it, QPs with an operator are refused. ``memory_limit`` in MiB.
+  ``sample_seconds``, see `harness.verify.measure`. ``step`` 0, 1, … of a sequence.
+  ``tightens``: true if each step of the sequence has its own tolerance
+* ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks that emit
+  the QP of a case themselves (`harness.plugin.Family.emission`) and, if ``source`` is
+  "ranks", evaluate the answer together. The event ``emitted`` contains the ``sizes``
+  and the ``digest`` of the QP; ``measured`` follows when the point is written
+* ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
 
-Every measurement loads its QP afresh, so that nothing that a solver did to the last one
-is left.
+Every measurement loads its QP again, so that changes which a solver made to its arrays
+cannot carry over.
 """
 
 from __future__ import annotations
@@ -50,13 +50,13 @@ from mortarbench.harness.processes.protocol import (
     answer_requests,
     source_of,
 )
-from mortarbench.harness.processes.ranks import OnRanks, Spent, follow
+from mortarbench.harness.processes.ranks import ParallelSolver, RankCosts, follow
 from mortarbench.harness.qp import QP, Vector, no_rows
 from mortarbench.harness.record import finite, journal_name
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.measure import Prepare, Timed, measure, memory_mib
 
-_MOST_BALLAST = 2**18  #: numbers, 2 MiB: never touched, so never resident
+_MAX_BALLAST = 2**18  #: numbers, 2 MiB; never touched, so never resident
 
 
 def serve(
@@ -69,14 +69,14 @@ def serve(
     *,
     copies: bool = False,
 ) -> None:
-    """Answer requests until there are no more.
+    """Answer requests until the pipe of requests is closed.
 
-    operators : what puts an operator P of a request together, see `harness.operators`
-    ranks : that solve together, this process being one of them
-    emit : has ranks emit the case of a request
-    copies : each of them solves by itself instead, all at the same time
+    operators : makers of operators P by name, see `harness.operators`
+    ranks : communicator of the ranks that solve together; None in a single process
+    emit : assembles the local share of a case on each rank
+    copies : True if each rank solves the entire QP independently, all at the same time
     """
-    bench = _Bench(solver, operators)
+    bench = _SolverHost(solver, operators)
     if ranks is None or emit is None:
         answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
         return
@@ -86,28 +86,32 @@ def serve(
         bench.warm_up()
         follow(solver, ranks, operators, emit, _limit_memory)
         return
-    bench.on_ranks = OnRanks(solver, ranks, emit, copies=copies)
+    bench.parallel = ParallelSolver(solver, ranks, emit, copies=copies)
     answer_requests(bench.answer, bench.warm_up, request_fd, reply_fd)
-    bench.on_ranks.end()
+    bench.parallel.end()
 
 
-class _Bench:
-    """One solver, what it was handed last, and the sequence that it is in."""
+class _SolverHost:
+    """A solver with its state between requests: its sequence and verified files."""
 
     def __init__(self, solver: Solver, operators: Mapping[str, Maker]) -> None:
         self._solver = solver
         self._operators = operators
         self._chain: Callable[[QP, float], Callable[[], Solution]] | None = None
-        self._at = -1  # the step of the sequence that came last
-        self._trusted: dict[str, tuple[int, ...]] = {}  # files by digest
+        self._last_step = -1  # last step of the sequence
+        # inode, size and time of the file, by the digest that its content was found to
+        # have
+        self._verified_files: dict[str, tuple[int, ...]] = {}
         self._ballast = np.empty(0)
-        self.on_ranks: OnRanks | None = None  #: what measures in place of the solver
+        self.parallel: ParallelSolver | None = (
+            None  #: what measures in place of the solver
+        )
 
     def warm_up(self) -> dict[str, Any]:
-        """Solve a QP with bounds and one with rows; how that ends will show later.
+        """Solve a QP with bounds and one with rows, ignoring how the solves end.
 
-        A chain of springs, long enough for every branch of a solver to be taken once:
-        what is compiled, or loaded, at its first use must not be timed.
+        Code that is compiled or loaded at its first use must not be timed. The QP is a
+        chain of springs, long enough that a solver takes all of its branches.
         """
         n = 32
         P = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
@@ -118,42 +122,43 @@ class _Bench:
         no_row = dict(A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0))
         one_row_each = dict(A=ones, b=np.ones(1), G=one, h=np.ones(1))
         for rows in (no_row, one_row_each):
-            _measured_here(self._solver, QP(P=P, **pull, **rows), 1e-6)
+            _measure_in_process(self._solver, QP(P=P, **pull, **rows), 1e-6)
         canary_seconds()
-        gc.freeze()  # the modules that are loaded by now need no further collecting
+        gc.freeze()  # exclude the loaded modules from collections during measurements
         return {"threads": _one_thread(), "cpus": sorted(os.sched_getaffinity(0))}
 
     def answer(self, request: dict[str, Any], events: Events) -> dict[str, Any]:
         """Measure once, or run one check."""
         if "check" in request:
             from mortarbench.harness.conformance.conformance import (
-                run_check,  # few ask for it
+                run_check,  # late: few requests need it
             )
 
             events.start()
             return dict(run_check(request["check"], self._solver)._asdict())
-        # Arrays lie elsewhere than they did during the last measurement. Where they
-        # begin relative to a cache line is chance, but would be the same for as long as
-        # the process lives: two processes of one solver then differ by 10 % and more,
-        # however often they are measured (Mytkowicz et al., ASPLOS 2009). Varied, it is
-        # scatter, which intervals know.
+        # Move the arrays between measurements. Their alignment to cache lines is random
+        # but would stay the same as long as the process runs: times of two processes of
+        # one solver then differ by 10 % and more, however often they are measured
+        # (Mytkowicz et al., ASPLOS 2009). Varied, this bias becomes scatter, which
+        # confidence intervals contain.
         self._ballast = np.empty(0)
         with suppress(AttributeError):  # glibc only
-            ctypes.CDLL(None).malloc_trim(0)  # or freed pieces are used where they lie
-        self._ballast = np.empty(random.randrange(_MOST_BALLAST))
+            # otherwise the allocator reuses freed blocks at their old addresses
+            ctypes.CDLL(None).malloc_trim(0)
+        self._ballast = np.empty(random.randrange(_MAX_BALLAST))
         source = source_of(request)
         if source.is_shared:
-            assert self.on_ranks is not None
-            qp, told = self.on_ranks.shares(
+            assert self.parallel is not None
+            qp, emission = self.parallel.emit(
                 request["case"], request.get("memory_limit")
             )
-            events.reached("emitted", told)
+            events.reached("emitted", emission)
         else:
-            qp = self._loaded(request)
+            qp = self._load(request)
         canary = canary_seconds()
         _limit_memory(request.get("memory_limit"))
-        timed = _measured_here(
-            self.on_ranks or self._solver,
+        timed = _measure_in_process(
+            self.parallel or self._solver,
             qp,
             request["tol"],
             prepare=self._step(request),
@@ -164,13 +169,12 @@ class _Bench:
         _limit_memory(None)
         s = timed.solution
         write_point(Path(request["out"]), s)
-        spent = Spent() if self.on_ranks is None else self.on_ranks.spent
+        spent = RankCosts() if self.parallel is None else self.parallel.spent
         evaluated = dict[str, Any]()
-        if source.is_shared and self.on_ranks is not None:
+        if source.is_shared and self.parallel is not None:
             events.reached("measured", {})
-            judges = source is Source.RANKS
-            found = self.on_ranks.evaluated() if judges else None
-            evaluated = {"evaluated": found}
+            is_judge = source is Source.RANKS
+            evaluated = {"evaluated": self.parallel.evaluate() if is_judge else None}
         return {
             **evaluated,
             "claimed": s.status,
@@ -179,62 +183,66 @@ class _Bench:
             "counts": s.counts,
             "reported": finite(dict(s.reported)),
             "first_seconds": timed.first_seconds,
-            # fields of the record that the parent takes as they are
+            # fields that the parent copies into the record
             "record": {"canary_seconds": canary, **spent.fields()},
             **{journal_name(k): v for k, v in asdict(timed.cost).items()},
         }
 
-    def _loaded(self, request: dict[str, Any]) -> QP:
+    def _load(self, request: dict[str, Any]) -> QP:
         path, digest = Path(request["qp"]), request.get("digest")
         if digest is not None:
-            at = path.stat()  # a file that has not changed is known
-            seen = (at.st_ino, at.st_size, at.st_mtime_ns)
-            if self._trusted.get(digest) != seen:
+            status = path.stat()
+            # a file is hashed again only if one of these has changed
+            version = (status.st_ino, status.st_size, status.st_mtime_ns)
+            if self._verified_files.get(digest) != version:
                 if content_digest(path) != digest:
                     raise ValueError(f"{path.name} was changed on disk")
-                self._trusted[digest] = seen
-        vouched = digest is not None  # or it may be anybody's
-        qp, _ = load_qp(path, operators=self._operators if vouched else None)
-        if self.on_ranks is not None:
-            self.on_ranks.takes(path, request.get("memory_limit"))
+                self._verified_files[digest] = version
+        # A file without a digest may come from anyone; its operators are not built.
+        is_ours = digest is not None
+        qp, _ = load_qp(path, operators=self._operators if is_ours else None)
+        if self.parallel is not None:
+            self.parallel.use_file(path, request.get("memory_limit"))
         return qp
 
     def _step(self, request: dict[str, Any]) -> Prepare | None:
-        """Begin a sequence at its first step, and go on with it at the others."""
+        """Return the `prepare` of a step: the first one begins the sequence."""
         step = request.get("step")
         if step is None or not hasattr(self._solver, "chain"):
             return None
-        if step and self._at != step - 1:
-            raise LookupError("the process that drove the sequence so far has gone")
-        self._at, tol = step, request["tol"]
+        if step and self._last_step != step - 1:
+            raise LookupError("the process with the earlier steps has ended")
+        self._last_step, tol = step, request["tol"]
         if step == 0:
             self._chain = None
-        begin = partial(_begun, self._solver, tightens=request.get("tightens", False))
+        begin = partial(
+            _begin_sequence, self._solver, tightens=request.get("tightens", False)
+        )
 
         def prepare(qp: QP) -> Callable[[], Solution]:
-            if self._chain is None:  # on the clock, as its step is
+            if self._chain is None:  # here, because the clock runs during `prepare`
                 self._chain = begin(tol)
             return self._chain(qp, tol)
 
         return prepare
 
 
-def _begun(
+def _begin_sequence(
     solver: Any, tol: float, *, tightens: bool
 ) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Begin a sequence whose steps all have that tolerance, or each its own."""
+    """Begin a sequence with one tolerance for all steps, or with one for each step."""
     if not tightens:
-        same: Prepare = solver.chain(tol)
-        return lambda qp, tol: same(qp)
+        fixed: Prepare = solver.chain(tol)
+        return lambda qp, tol: fixed(qp)
     if hasattr(solver, "tightening"):
-        own: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
-        return own
+        varying: Callable[[QP, float], Callable[[], Solution]] = solver.tightening()
+        return varying
     why = "its chain() has one tolerance for all steps; tightening() would take others"
     return lambda qp, tol: partial(Solution.without_point, qp, Status.DECLINED, why)
 
 
 def canary_seconds() -> float:
-    """Time a fixed small kernel, the median of five: a drift of it is the machine's."""
+    """Time a fixed small kernel, median of five, to detect drift of the machine."""
     matrix, vector = _aligned(128 * 128).reshape(128, 128), _aligned(128)
     times = []
     for _ in range(5):
@@ -246,27 +254,28 @@ def canary_seconds() -> float:
 
 
 def _aligned(count: int) -> Vector:
-    """Make ones that begin with a cache line, so that chance does not move them."""
-    room = np.ones(count + 8)
-    start = -room.ctypes.data % 64 // 8
-    return room[start : start + count]
+    """Return ones aligned to a cache line, so that alignment does not affect times."""
+    buffer = np.ones(count + 8)
+    start = -buffer.ctypes.data % 64 // 8
+    return buffer[start : start + count]
 
 
 def _one_thread() -> int:
-    """Return the most threads of any library, after setting those that can be set."""
+    """Set all thread pools to one thread; return the largest remaining number."""
     libraries = ThreadpoolController()
     libraries.limit(limits=1)
     return max((pool["num_threads"] for pool in libraries.info()), default=1)
 
 
 def _limit_memory(mib: float | None) -> None:
-    """Have allocations fail that would exceed `mib`; None lifts the limit.
+    """Let allocations beyond `mib` more MiB fail; None lifts the limit.
 
-    The parent looks at what is resident and kills; that comes too late for a single
-    allocation beyond all memory. RLIMIT_DATA counts what is there already as well.
+    The parent polls resident memory and kills, which is too late for a single
+    allocation that exceeds the memory of the machine.
     """
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = hard
+    # RLIMIT_DATA includes what is allocated already.
     if mib is not None and (data := memory_mib("VmData")) is not None:
         soft = int((data + mib) * 2**20)
         if hard != resource.RLIM_INFINITY:
@@ -274,11 +283,15 @@ def _limit_memory(mib: float | None) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
-def _measured_here(
+def _measure_in_process(
     solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
     **how: Any,
 ) -> Timed:  # fmt: skip
-    """Measure; a child that the solver forked and let return to us ends here."""
+    """Measure in this process, and end any fork of it that returns from the solver.
+
+    A solver may fork and let the child return from its call. That child would answer
+    the request a second time.
+    """
     process = os.getpid()
 
     def ends_here() -> None:

@@ -1,1 +1,1 @@
-"""A result folder: its lines, its faults, and a run stored in it."""
+"""Result folders: journal, faults, merging, and repetition of stored measurements."""

@@ -1,8 +1,8 @@
-"""Faults of ours or of the machine: ``FOLDER/faults.jsonl``, never the journal.
+"""Faults of the harness or the machine, in ``FOLDER/faults.jsonl``.
 
-A fault prevents a measurement and says nothing of the solver. Each is one line, written
-like the journal's; the measurement counts as not made until the journal holds it, and
-the same command makes it.
+A fault prevents a measurement and implies nothing about the solver, so it is not in the
+journal. Each is one line, written like those of the journal. The measurement counts as
+missing until the journal contains it, and the same command retries it.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ _TYPES: dict[str, type] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """What prevented a measurement once."""
+    """A failure of the harness or the machine that prevented a measurement once."""
 
     time: str  #: UTC, ISO 8601
-    run_id: str  #: of the measurement that was to be made
+    run_id: str  #: of the prevented measurement
     case: str  #: canonical name
     solver: str  #: its label
-    what: str  #: one line
-    tried_again: bool  #: by the same run, at once; False: it was left
+    what: str  #: reason, one line
+    tried_again: bool  #: True if the same run retried at once, False if it gave up
 
     def to_json(self) -> str:
         """Serialise to one line."""
@@ -42,13 +42,13 @@ class Fault:
 
 
 def read_faults(folder: Path) -> list[Fault]:
-    """Read the faults of a result folder; none where there is no file.
+    """Read the faults of a result folder; return [] if there is no such file.
 
     Raises
     ------
     InputError
-        When a line other than a partial last one is damaged, or the file is none that
-        `harness.files.lines.read_lines` takes.
+        If a line other than a partial last one is damaged, or if
+        `harness.files.lines.read_lines` refuses the file.
 
     """
     path = folder / FAULTS
@@ -58,33 +58,36 @@ def read_faults(folder: Path) -> list[Fault]:
     return [_parsed(line, path, number) for number, line in enumerate(lines, 1)]
 
 
-def left(faults: Iterable[Fault], made: Iterable[str]) -> list[Fault]:
-    """Choose the last fault of each measurement that is not `made`, by run_id."""
+def remaining_faults(faults: Iterable[Fault], measured: Iterable[str]) -> list[Fault]:
+    """Return the last fault of each measurement that is still missing.
+
+    measured : run_ids of the measurements in the journal
+    """
     last = {fault.run_id: fault for fault in faults}
-    for run_id in made:
+    for run_id in measured:
         last.pop(run_id, None)
     return list(last.values())
 
 
 def in_words(faults: Iterable[Fault]) -> str:
-    """Say how many measurements could not be made, and why; "" if all could."""
-    every = list(faults)
-    if not every:
+    """Return a sentence with the number of faults and their reasons; "" for none."""
+    faults = list(faults)
+    if not faults:
         return ""
-    reasons = some(dict.fromkeys(fault.what for fault in every))
-    count = f"{len(every)} measurement{'s' * (len(every) != 1)}"
-    return f"{count} could not be made, by no fault of a solver: {reasons}"
+    reasons = some(dict.fromkeys(fault.what for fault in faults))
+    count = f"{len(faults)} measurement{'s' * (len(faults) != 1)}"
+    return f"{count} failed for reasons other than the solver: {reasons}"
 
 
 def _parsed(line: bytes, path: Path, number: int) -> Fault:
     try:
         row: Any = json.loads(line)
-        given = {name: row[name] for name in _TYPES}
+        fields = {name: row[name] for name in _TYPES}
     except (ValueError, TypeError, KeyError, RecursionError):
-        given = {}
-    if not given or any(type(given[k]) is not kind for k, kind in _TYPES.items()):
+        fields = {}
+    if not fields or any(type(fields[k]) is not kind for k, kind in _TYPES.items()):
         raise InputError(
             f"{path}, line {number}: damaged; expected a JSON object with "
             f"{', '.join(_TYPES)}, as a run appends it; the line may be deleted"
         )
-    return Fault(**given)
+    return Fault(**fields)

@@ -1,4 +1,4 @@
-"""A result folder: held by one run at a time, of one suite in one environment."""
+"""Result folder: locked by one run at a time, for one suite and one environment."""
 
 from __future__ import annotations
 
@@ -30,35 +30,37 @@ from mortarbench.harness.files.reading import (
     toml,
 )
 from mortarbench.harness.results.faults import FAULTS
-from mortarbench.harness.suite.growth import refused
+from mortarbench.harness.suite.growth import incompatibility
 from mortarbench.harness.suite.suite import Suite, read_stored
 
-#: all that a run writes, and what is made of it; `fresh` deletes that, nothing else
+#: everything that a run and its evaluations write; `fresh` deletes these, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-_CONCLUDED = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+_RESULT_FILES = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
 REMEDY = "choose another --out or use --fresh"
-MOST_LEVELS = 30  #: of folders in those of a run, which nests three
+MAX_FOLDER_DEPTH = 30  #: levels accepted in a result folder; runs write three
 _LOCK = ".lock"
-_MARK = b"held by runs of mortarbench\n"  #: what is in it
+_LOCK_CONTENT = b"held by runs of mortarbench\n"
 _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
-#: how the names of files begin that are written beside the folders
-_BESIDE = (_LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.")
+#: beginnings of the names of files that are written beside the folders
+_FILE_PREFIXES = (
+    _LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.",
+)  # fmt: skip
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse a result folder that leads out of itself, or to what is no file.
+    """Refuse a result folder that contains links, pipes, devices or too deep nesting.
 
-    It may come from anybody. A link in it would have us write over, or delete, a file
-    elsewhere; a pipe would have us wait for ever; folders nested without end lead any
-    recursion astray.
+    The folder may come from anyone. Through a link, files elsewhere would be
+    overwritten or deleted; opening a pipe would block for ever; deeply nested folders
+    would exhaust any recursion.
 
     Raises
     ------
     InputError
-        With the first link, device or pipe, a folder that is nested too deeply, or one
-        that cannot be listed.
+        If there is a link, device or pipe, a folder that is nested too deeply, or one
+        that cannot be listed; the message names the first.
 
     """
     try:
@@ -71,7 +73,7 @@ def refuse_links(folder: Path) -> None:
                         _only_plain(entry.path)
                 elif entry.name == COPIES:
                     _only_plain_copies(entry)
-                elif entry.name.startswith(_BESIDE) and not _is_plain(entry):
+                elif entry.name.startswith(_FILE_PREFIXES) and not _is_plain(entry):
                     raise _not_plain(entry.path, "a file of its own")
     except OSError as e:
         raise InputError(
@@ -82,7 +84,7 @@ def refuse_links(folder: Path) -> None:
 def _only_plain(folder: str) -> None:
     """Refuse links, pipes and devices in a folder, and folders nested too deeply."""
     level = [folder]
-    for _ in range(MOST_LEVELS):
+    for _ in range(MAX_FOLDER_DEPTH):
         inner = []
         for each in level:
             with os.scandir(each) as entries:
@@ -94,7 +96,7 @@ def _only_plain(folder: str) -> None:
         level = inner
     if level:
         raise InputError(
-            f"{folder}: folders nested deeper than {MOST_LEVELS} levels; expected "
+            f"{folder}: folders nested deeper than {MAX_FOLDER_DEPTH} levels; expected "
             "those that a run writes; move the deep ones away"
         )
 
@@ -102,7 +104,7 @@ def _only_plain(folder: str) -> None:
 def _only_plain_copies(folder: os.DirEntry[str]) -> None:
     """Refuse links, pipes and devices among copies of files.
 
-    A folder of that name may be a user's own: what has no name of ours is left alone.
+    The folder may be a user's own of the same name, so other files in it are ignored.
     """
     if folder.is_symlink():
         raise _not_plain(folder.path, "a folder of its own")
@@ -130,12 +132,13 @@ def _not_plain(path: str, expected: str) -> InputError:
 
 
 def refuse_foreign(folder: Path) -> None:
-    """Refuse a folder where we would write over, or delete, what is not ours.
+    """Refuse a folder in which a run would overwrite or delete files of others.
 
     Raises
     ------
     InputError
-        When something there has a name that we use, but no run made it, or is a link.
+        If it contains a link, or files with names that runs use but was not written by
+        a run.
 
     """
     if folder.is_dir():
@@ -145,26 +148,27 @@ def refuse_foreign(folder: Path) -> None:
     if next((folder / "journal").glob("*.jsonl"), None) is not None:
         return
     with suppress(InputError), opened(folder / _LOCK) as lock:
-        if lock.read(len(_MARK) + 1) == _MARK:  # of a run that was cut off at once
+        # left by a run that was killed before it wrote anything else
+        if lock.read(len(_LOCK_CONTENT) + 1) == _LOCK_CONTENT:
             return
-    ours = (*_FOLDERS, *_FILES, *_CONCLUDED)
+    ours = (*_FOLDERS, *_FILES, *_RESULT_FILES)
     taken = [name for name in ours if os.path.lexists(folder / name)]
     if taken:
         raise InputError(
-            f"{folder} holds {some(taken)} but is no result folder (no suite.toml with "
-            "environment.json, no journal/*.jsonl); choose another --out"
+            f"{folder} holds {some(taken)} but is not a result folder (no suite.toml "
+            "with environment.json, no journal/*.jsonl); choose another --out"
         )
 
 
-class Held:
-    """A result folder that this process holds against every other run.
+class FolderLock:
+    """Lock of a result folder against every other run.
 
     Raises
     ------
     InputError
-        When another run holds it.
+        If another run has locked it.
     OSError
-        When it cannot be made or written.
+        If it cannot be created or written.
 
     """
 
@@ -173,82 +177,85 @@ class Held:
         self._take()
 
     def is_there(self) -> bool:
-        """Whether it is still the folder that we took; if not, it was deleted.
+        """Return True if the path still leads to the locked folder, False if deleted.
 
-        A lock that was deleted is taken anew, and so is a folder.
+        A deleted folder is created again and locked; so is a deleted lock.
 
         Raises
         ------
         InputError
-            When the folder was moved away, or another run took it meanwhile.
+            If the folder was moved, or another run locked it meanwhile.
 
         """
-        there = _leads_to(self._folder, self._there)
-        if not there:
-            now = os.readlink(f"/proc/self/fd/{self._there}")
-            if not now.endswith(" (deleted)"):
+        is_there = _is_same_file(self._folder, self._folder_fd)
+        if not is_there:
+            path = os.readlink(f"/proc/self/fd/{self._folder_fd}")
+            if not path.endswith(" (deleted)"):
                 raise InputError(
-                    f"{self._folder} was moved to {now} while the run wrote to it; all "
-                    "that was measured is there, and --out with that path continues"
+                    f"{self._folder} was moved to {path} while the run wrote to it; "
+                    "all measurements are there, and --out with that path continues"
                 )
-        if not (there and _leads_to(self._folder / _LOCK, self._lock)):
+        if not (is_there and _is_same_file(self._folder / _LOCK, self._lock)):
             self.close()
             self._take()
-        return there
+        return is_there
 
     def _take(self) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _locked(self._folder)
+        self._lock = _open_lock(self._folder)
         flags = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
-        self._there = os.open(self._folder, flags)
+        self._folder_fd = os.open(self._folder, flags)
 
     def close(self) -> None:
-        """Let others have it."""
-        for name in ("_lock", "_there"):
+        """Release the lock."""
+        for name in ("_lock", "_folder_fd"):
             if (fd := vars(self).pop(name, None)) is not None:
-                os.close(fd)  # which unlocks
+                os.close(fd)
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[Held]:
-    """Keep every other run off a result folder, which is made if need be.
+def lock_folder(folder: Path) -> Iterator[FolderLock]:
+    """Lock a result folder against every other run, creating it if necessary.
 
-    What writers that were killed left unfinished there is deleted.
+    Unfinished files of writers that were killed are deleted.
 
     Raises
     ------
     InputError
-        When another run holds it, or it cannot be written.
+        If another run has locked it, or it cannot be written.
 
     """
     try:
         with report_full_disk(folder):
-            held = Held(folder)
+            lock = FolderLock(folder)
     except OSError as e:
         raise InputError(
             f"{folder}: {e.strerror}; expected a folder that can be written"
         ) from None
     try:
-        own = [folder / name for name in _FOLDERS]
-        remove_unfinished(folder, own, shared=[folder / COPIES])
-        yield held
+        # only now: while another run had the lock, these files were not left over
+        folders = [folder / name for name in _FOLDERS]
+        remove_unfinished(folder, folders, shared=[folder / COPIES])
+        yield lock
     finally:
-        held.close()
+        lock.close()
 
 
-def _locked(folder: Path) -> int:
-    """Open the lock of a folder and lock it, until the file descriptor is closed.
+def _open_lock(folder: Path) -> int:
+    """Lock a folder until the returned file descriptor is closed.
 
-    The file tells, too, that one of our runs began here: one that was killed at once
-    left nothing else by which it could be known.
+    The content of the lock file marks the folder as one of ours: a run that was killed
+    at once leaves nothing else by which it could be recognised.
     """
+    # a link in place of the lock would have a file elsewhere written
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-    while True:
+    while True:  # until the locked file is the one at the path
         fd = os.open(folder / _LOCK, flags, 0o666)
         try:
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if _leads_to(folder / _LOCK, fd):  # else it was deleted before we locked it
-                os.pwrite(fd, _MARK, 0)
+            # without this, the lock would be on a file deleted between open and flock
+            if _is_same_file(folder / _LOCK, fd):
+                os.pwrite(fd, _LOCK_CONTENT, 0)
                 return fd
         except BlockingIOError:
             os.close(fd)
@@ -261,8 +268,8 @@ def _locked(folder: Path) -> int:
         os.close(fd)
 
 
-def _leads_to(path: Path, fd: int) -> bool:
-    """Whether a path is that of an open file or folder."""
+def _is_same_file(path: Path, fd: int) -> bool:
+    """Return True if a path leads to an open file or folder."""
     try:
         return os.path.samestat(path.stat(), os.fstat(fd))
     except FileNotFoundError:
@@ -271,9 +278,9 @@ def _leads_to(path: Path, fd: int) -> bool:
 
 @contextmanager
 def scratch_in(folder: Path) -> Iterator[Path]:
-    """Make room in a locked folder for files that only last as long as a run.
+    """Create a temporary folder in a locked result folder, for the duration of a run.
 
-    What a killed run left there is deleted first.
+    Files that a killed run left there are deleted first.
     """
     scratch = folder / _SCRATCH
     shutil.rmtree(scratch, ignore_errors=True)
@@ -287,66 +294,70 @@ def scratch_in(folder: Path) -> Iterator[Path]:
 def claim(
     out: Path, suite: Suite, environment: Mapping[str, Any], *, fresh: bool
 ) -> None:
-    """Make a locked folder that of this suite in this environment.
+    """Assign a locked folder to a suite and an environment.
 
     environment : with its digest under the key ``digest``
-    fresh : forget first what the folder holds; see `refuse_other` if not
+    fresh : delete the previous content first; without it, call `refuse_other` before
     """
     if fresh:
         for name in _FOLDERS:
             shutil.rmtree(out / name, ignore_errors=True)
-        for name in _CONCLUDED:
+        for name in _RESULT_FILES:
             (out / name).unlink(missing_ok=True)
         remove_copies(out)
     describe(out, suite, environment)
 
 
 def describe(out: Path, suite: Suite, environment: Mapping[str, Any]) -> None:
-    """Write down what is measured, and where; `environment` as for `claim`."""
+    """Write the suite and the environment; `environment` as for `claim`."""
     replace_file(out / "suite.toml", suite.text.encode())
     text = json.dumps(environment, indent=1) + "\n"
     replace_file(out / "environment.json", text.encode())
 
 
 def refuse_other(out: Path, suite: Suite, environment: Mapping[str, Any]) -> bool:
-    """Refuse a folder of another suite or environment; tell whether the suite grew.
+    """Refuse a folder of another suite or environment.
 
     environment : as for `claim`
+
+    Returns
+    -------
+    True if the suite has changed, which it may only by asking for more
 
     Raises
     ------
     InputError
-        With what differs, and what to do.
+        If they differ; the message names the difference and the remedy.
 
     """
     suite_file, environment_file = out / "suite.toml", out / "environment.json"
     has_grown = False
     if suite_file.exists():
         try:
-            before, now = read_stored(suite_file), toml(suite.text)
+            old, new = read_stored(suite_file), toml(suite.text)
         except InputError as e:
             raise InputError(f"{e}; restore it, or use --fresh") from None
-        has_grown = before != now
-        if has_grown and (changed := refused(before, now)):
-            raise InputError(f"{out} holds another suite ({changed}); {REMEDY}")
+        has_grown = old != new
+        if has_grown and (difference := incompatibility(old, new)):
+            raise InputError(f"{out} holds another suite ({difference}); {REMEDY}")
     if environment_file.exists():
-        then = _environment(environment_file)
-        if then["digest"] != environment["digest"]:
-            what = in_words(differences(then, environment), "then", "now")
+        stored = _environment(environment_file)
+        if stored["digest"] != environment["digest"]:
+            what = in_words(differences(stored, environment), "then", "now")
             raise InputError(
-                f"{out} was measured in another environment ({then['digest']}, now "
+                f"{out} was measured in another environment ({stored['digest']}, now "
                 f"{environment['digest']}{what and f': {what}'}); {REMEDY}"
             )
     return has_grown
 
 
 def suite_text(folder: Path) -> str:
-    """Read the suite of a result folder, as TOML.
+    """Return the TOML of the suite of a result folder.
 
     Raises
     ------
     InputError
-        When it is missing, or no suite.
+        If it is missing, or not a suite.
 
     """
     path = folder / "suite.toml"
@@ -355,24 +366,26 @@ def suite_text(folder: Path) -> str:
 
 
 def environment_of(folder: Path, digest: str) -> dict[str, Any]:
-    """Read the environment of that digest from a result folder.
+    """Read the environment of a digest from a result folder.
 
     Raises
     ------
     InputError
-        When the folder does not hold it, or it is none.
+        If the folder does not contain it, or the digest or the file is malformed.
 
     """
-    if not _DIGEST.fullmatch(digest):  # it could lead out of the folder
-        raise InputError(f"{folder}: {shortened(digest)!r} is no environment's digest")
+    if not _DIGEST.fullmatch(digest):  # as a path it could lead out of the folder
+        raise InputError(
+            f"{folder}: {shortened(digest)!r} is not the digest of an environment"
+        )
     for path in (folder / "environment.json", _node_file(folder, digest)):
-        if path.is_file() and (found := _environment(path))["digest"] == digest:
-            return found
+        if path.is_file() and (environment := _environment(path))["digest"] == digest:
+            return environment
     raise InputError(f"{folder} does not hold the environment {digest}")
 
 
 def keep_environment(folder: Path, digest: str, environment: Mapping[str, Any]) -> None:
-    """Store what one machine of a cluster is, under its digest."""
+    """Store the environment of one machine of a cluster under its digest."""
     text = json.dumps({"digest": digest, **environment}, indent=1) + "\n"
     replace_file(_node_file(folder, digest), text.encode())
 
@@ -382,14 +395,14 @@ def _node_file(folder: Path, digest: str) -> Path:
 
 
 def differences(
-    then: Mapping[str, Any], now: Mapping[str, Any]
+    old: Mapping[str, Any], new: Mapping[str, Any]
 ) -> Iterator[tuple[str, Any, Any]]:
-    """Yield what differs in the lasting parts of two environments.
+    """Yield the differences between the lasting parts of two environments.
 
-    As (dotted key, value then, value now); None where there is none.
+    Each is (dotted key, old value, new value); a missing value is None.
     """
-    for key in sorted((then.keys() | now.keys()) - {"digest", *VOLATILE}):
-        a, b = then.get(key), now.get(key)
+    for key in sorted((old.keys() | new.keys()) - {"digest", *VOLATILE}):
+        a, b = old.get(key), new.get(key)
         if isinstance(a, Mapping) and isinstance(b, Mapping):
             yield from ((f"{key}.{k}", *pair) for k, *pair in differences(a, b))
         elif a != b:
@@ -397,9 +410,9 @@ def differences(
 
 
 def times_compare(one: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Return whether two environments agree in all that can change a time.
+    """Return True if the environments agree in everything that can affect times.
 
-    A plug-in that only one of them has changes no time of what both can measure.
+    A plug-in that only one of them has does not affect measurements that both can make.
     """
     return all(
         key.startswith("plugins.") and None in values

@@ -1,8 +1,7 @@
-"""The journal of a result folder: one fsynced line per measurement, only ever appended.
+"""Journal of a result folder: append-only, with one fsynced line per measurement.
 
-A process may die at any instant. What it leaves behind is whole lines and at most one
-partial line at the end, which counts for nothing: readers skip it, the next writer cuts
-it off.
+A process may die at any instant. It then leaves whole lines and at most one partial
+line at the end; readers ignore that, and the next writer truncates it.
 """
 
 from __future__ import annotations
@@ -21,13 +20,13 @@ from mortarbench.harness.results.folder import refuse_links
 
 
 class Journal:
-    """The writer's end of one file ``FOLDER/journal/NAME.jsonl``.
+    """Writer of a file ``FOLDER/journal/NAME.jsonl``.
 
-    Hold `harness.results.folder.locked` while one is open: a second writer could cut
-    off a line that this one is writing. Whatever files there are beside it are held
-    open, too, so that a journal that is deleted meanwhile can be written again.
+    Hold `harness.results.folder.lock_folder` while one is open: a second writer could
+    truncate a line that this one is writing. The other files of the journal are kept
+    open as well, so that files which are deleted meanwhile can be restored.
 
-    restored : told in a line when that was necessary
+    restored : receives a message, one line, when a file was restored
     """
 
     def __init__(
@@ -44,26 +43,26 @@ class Journal:
         )
 
     def append(self, record: Record) -> None:
-        """Write one line and return when it is on the disk, or raise and write none.
+        """Append one line, and return when it is on the disk; write none on an error.
 
         Raises
         ------
         InputError
-            When another program writes to the journal.
+            If another program writes to the journal.
         OSError
-            When the disk is full, say.
+            If writing fails, for instance on a full disk.
 
         """
         self.restore()
         self._own.append(record.to_json())
 
     def restore(self) -> None:
-        """Write files again that were deleted since they were opened.
+        """Restore files that were deleted since they were opened.
 
         Raises
         ------
         InputError
-            When another program writes to the journal.
+            If another program writes to the journal.
 
         """
         for file in (self._own, *self._others):
@@ -79,19 +78,19 @@ class Journal:
 def read_journal(
     folder: Path, tell: Callable[[str], None] = lambda _: None
 ) -> list[Record]:
-    """Read every record of a result folder, file by file in the order of their names.
+    """Read all records of a result folder, in the order of file names and lines.
 
-    Every run_id is there once: a line that repeats another one, field by field, is left
-    out. Equal texts and tables of different records are one in memory.
+    Every run_id occurs once: a line that equals an earlier one in all fields is
+    skipped. Equal strings and tables of different records share memory.
 
-    tell : is told, in a line, how many lines were left out
+    tell : receives a message, one line, with the number of skipped lines
 
     Raises
     ------
     InputError
-        When there is no folder, no journal, a link in the folder, when a line other
-        than a partial last one is bad, or when two lines tell different things of one
-        run_id.
+        If the folder or its journal is missing, or the folder contains a link; if a
+        line other than a partial last one is damaged; or if two different lines have
+        the same run_id.
 
     """
     if not os.path.isdir(folder):
@@ -119,21 +118,21 @@ def read_journal(
                     if other.run_id == record.run_id
                 )
                 raise InputError(
-                    f"{repeated[-1]}: tells of run_id {shown(record.run_id)} another "
-                    f"thing than {place}; expected one line for each; delete the one "
-                    "that is wrong"
+                    f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
+                    f"differs from that at {place}; expected one line for each; delete "
+                    "the one that is wrong"
                 )
     if repeated:
-        lines = "line is" if len(repeated) == 1 else "lines are"
+        lines = "line repeats" if len(repeated) == 1 else "lines repeat"
         tell(
-            f"{len(repeated)} journal {lines} there before, word for word, and left "
-            f"out: {some(repeated)}"
+            f"{len(repeated)} journal {lines} an earlier one word for word, and count "
+            f"once: {some(repeated)}"
         )
     return records
 
 
 def _records(path: Path) -> Iterator[tuple[int, Record]]:
-    """Read the records of one file with the numbers of their lines."""
+    """Yield the records of one file, with their line numbers."""
     shared: dict[Any, Any] = {}
     for number, line in enumerate(read_lines(path, "a journal"), 1):
         try:

@@ -1,11 +1,11 @@
-"""Several result folders as one: every measurement once, environments apart.
+"""Merging of result folders: every measurement once, environments kept apart.
 
-A measurement is known by its run_id and its environment. What two folders hold of both
-counts once, and the first folder's counts. What they hold in different environments is
-kept of each; the later one gets a run_id of its own, made of both.
+A measurement is identified by its run_id and its environment. If two folders contain
+the same one, that of the first folder is kept. Measurements of one run_id in different
+environments are all kept; the later ones get a new run_id, a digest of both.
 
-Nothing is a part of the new folder until its journal is, which is written last and as a
-whole: a merge that was killed is done again by the same command.
+The journal of the new folder is written last and as a whole, and nothing counts as a
+part of the folder before that: the same command repeats a merge that was killed.
 """
 
 from __future__ import annotations
@@ -27,41 +27,43 @@ from mortarbench.harness.results.faults import FAULTS, read_faults
 from mortarbench.harness.results.folder import (
     environment_of,
     keep_environment,
-    locked,
+    lock_folder,
     refuse_foreign,
     refuse_links,
 )
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.harness.suite.growth import as_toml, united
+from mortarbench.harness.suite.growth import as_toml, unite
 from mortarbench.harness.suite.suite import read_stored
 
-_AGAIN = "are there already, and count once"
-JOURNAL = "merged"  #: name of the only journal of a folder that was merged
+_DUPLICATES_NOTE = "are there already, and count once"
+JOURNAL = "merged"  #: name of the only journal of a merged folder
 
 
 @dataclass(eq=False)
 class _Union:
-    """What the folders hold together."""
+    """Union of the measurements of several folders."""
 
     records: dict[str, Record] = field(default_factory=dict)  # by run_id, in order
-    _known: dict[tuple[str, str], Record] = field(default_factory=dict)
-    _contents: set[str] = field(default_factory=set)
+    _keys: set[tuple[str, str]] = field(default_factory=set)  # run_id, environment
+    _contents: set[str] = field(default_factory=set)  # digests without run_id
 
     def add(self, record: Record) -> bool:
-        """Take a measurement; tell whether it is one that is there already."""
+        """Add a measurement; return True if it was present already."""
+        # Content first: a record that an earlier merge gave a new run_id is recognised
+        # when its source is merged again.
         content = hex_digest([record.replace(run_id="").to_json().encode()], 32)
         if content in self._contents:
             return True
-        if (record.run_id, record.environment) in self._known:
+        if (record.run_id, record.environment) in self._keys:
             return True
-        self._known[record.run_id, record.environment] = record
+        self._keys.add((record.run_id, record.environment))
         if record.run_id in self.records:
             record = record.replace(
                 run_id=hex_digest([f"{record.run_id} {record.environment}".encode()])
             )
         if record.run_id in self.records:
             return True
-        self._known[record.run_id, record.environment] = record
+        self._keys.add((record.run_id, record.environment))
         self._contents.add(content)
         self.records[record.run_id] = record
         return False
@@ -70,46 +72,46 @@ class _Union:
 def merge(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None] = lambda _: None
 ) -> list[Record]:
-    """Make one result folder of several, or add them to one that was made so.
+    """Merge result folders into a new one, or into one that was merged before.
 
-    tell : is told, in a line each, what was in a folder before, or is missing there
+    tell : receives messages, one line each, on duplicates and missing files
 
     Returns
     -------
-    what `out` holds
+    the records of `out`
 
     Raises
     ------
     InputError
-        When a folder holds no measurements or a link, when suites differ in what
-        measurements depend on, when `out` is one of the folders, lies in one or holds
-        one, holds a run or something foreign, or its disk is full. `out` is then as it
-        was.
+        If a folder contains no measurements, or a link; if the suites differ in
+        settings that measurements depend on; if `out` is one of the folders, lies in
+        one or contains one; if it contains a run or foreign files; or if its disk is
+        full. The journal of `out` is then unchanged.
 
     """
     for source in sources:
         _refuse_nested(source, out)
-    read = {source: _read(source, tell) for source in dict.fromkeys(sources)}
+    journals = {source: _read(source, tell) for source in dict.fromkeys(sources)}
     refuse_foreign(out)
     _refuse_run(out)
-    before = [out] if _journal(out).exists() else []
-    folders = [*before, *read]
+    existing = [out] if _journal(out).exists() else []
+    folders = [*existing, *journals]
     paths = {str(folder): folder / "suite.toml" for folder in folders}
     suites = {name: read_stored(path) for name, path in paths.items() if path.exists()}
-    suite = as_toml(united(suites))
+    suite = as_toml(unite(suites))
     for folder in folders:
         check_copies(folder)
-    with report_full_disk(out), locked(out):
+    with report_full_disk(out), lock_folder(out):
         union = _Union()
-        for folder in before:
+        for folder in existing:
             for record in read_journal(folder):
                 union.add(record)
-        for source, records in read.items():
-            if again := sum(map(union.add, records)):
-                tell(f"{source}: {again} of {len(records)} {_AGAIN}")
-        for source, records in read.items():
+        for source, records in journals.items():
+            if duplicates := sum(map(union.add, records)):
+                tell(f"{source}: {duplicates} of {len(records)} {_DUPLICATES_NOTE}")
+        for source, records in journals.items():
             _copy_solutions(source, out, records, tell)
-        merge_copies(list(read), out, tell)
+        merge_copies(list(journals), out, tell)
         _copy_environments(folders, out, union.records.values(), tell)
         faults = [f.to_json() for folder in folders for f in read_faults(folder)]
         if faults:
@@ -126,7 +128,10 @@ def _journal(folder: Path) -> Path:
 
 
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
-    """Read a folder; what has no session yet gets one, after its first measurement."""
+    """Read a folder; records of old versions, without a session, get one.
+
+    It is a digest of the environment and the start of its first such measurement.
+    """
     records = read_journal(source, tell)
     if not records:
         raise InputError(
@@ -147,13 +152,13 @@ def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
 
 
 def _refuse_nested(source: Path, out: Path) -> None:
-    """Refuse to write into a folder that is read, or beside what is read in ours."""
-    here, there = out.resolve(), source.resolve()
-    if here == there:
+    """Refuse an `out` that is a source, lies in one, or contains one."""
+    target, origin = out.resolve(), source.resolve()
+    if target == origin:
         raise InputError(
             f"--out {out} is one of the folders to merge; expected another one"
         )
-    for inner, outer in ((here, there), (there, here)):
+    for inner, outer in ((target, origin), (origin, target)):
         if outer in inner.parents:
             raise InputError(
                 f"--out {out}: {inner} lies inside of {outer}; expected a folder apart "
@@ -162,7 +167,7 @@ def _refuse_nested(source: Path, out: Path) -> None:
 
 
 def _refuse_run(out: Path) -> None:
-    """Refuse to add to a folder that a run wrote: it would be neither."""
+    """Refuse to add to the folder of a run, as opposed to a merged one."""
     if not out.is_dir():
         return
     refuse_links(out)
@@ -178,9 +183,11 @@ def _copy_solutions(
     source: Path, out: Path, records: Sequence[Record], tell: Callable[[str], None]
 ) -> None:
     digests = {d for r in records for d in (r.vectors, r.fields) if d is not None}
-    lost = [d for d in sorted(digests) if not copy_stored(source, out, d)]
-    if lost:
-        tell(f"{source}: {len(lost)} of {len(digests)} solutions are not in vectors/")
+    missing = [d for d in sorted(digests) if not copy_stored(source, out, d)]
+    if missing:
+        tell(
+            f"{source}: {len(missing)} of {len(digests)} solutions are not in vectors/"
+        )
 
 
 def _copy_environments(
@@ -189,17 +196,18 @@ def _copy_environments(
     records: Iterable[Record],
     tell: Callable[[str], None],
 ) -> None:
-    """Keep every environment under its digest; the first is environment.json, too."""
-    kept: list[Mapping[str, Any]] = []
+    """Store every environment under its digest, the first also as environment.json."""
+    stored: list[Mapping[str, Any]] = []
     for digest in dict.fromkeys(r.environment for r in records):
-        found = _environment(folders, digest)
-        if found is None:
+        environment = _environment(folders, digest)
+        if environment is None:
             tell(f"no folder holds the environment {digest}")
             continue
-        keep_environment(out, digest, {k: v for k, v in found.items() if k != "digest"})
-        kept.append(found)
-    if kept:
-        text = json.dumps(kept[0], indent=1) + "\n"
+        content = {k: v for k, v in environment.items() if k != "digest"}
+        keep_environment(out, digest, content)
+        stored.append(environment)
+    if stored:
+        text = json.dumps(stored[0], indent=1) + "\n"
         replace_file(out / "environment.json", text.encode())
 
 

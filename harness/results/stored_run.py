@@ -1,4 +1,4 @@
-"""One measurement as a result folder keeps it: enough to make or build it again."""
+"""Stored measurements, with everything needed to repeat them or rebuild their case."""
 
 from __future__ import annotations
 
@@ -19,17 +19,22 @@ from mortarbench.harness.results.folder import environment_of, suite_text
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.suite.solver_options import without_options
-from mortarbench.harness.suite.suite import NULL, asked_solvers, limits, steps_up_to
+from mortarbench.harness.suite.suite import (
+    NULL_SUFFIX,
+    limits,
+    solvers_by_label,
+    steps_up_to,
+)
 from mortarbench.harness.verify.verdicts import new_record, plain
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StoredRun:
-    """One stored measurement, and what it takes to repeat it."""
+    """A stored measurement with the data needed to repeat it."""
 
     record: Record
-    repeats: list[Record]  #: of the same cell: other repeats, and itself
-    cases: tuple[CaseId, ...]  #: its own is the last; of a sequence those before
+    repeats: list[Record]  #: all repeats of its cell, including itself
+    cases: tuple[CaseId, ...]  #: its case; in a sequence, after the earlier steps
     spec: SolverSpec
     environment: Mapping[str, Any]
     time_limit: float  #: s
@@ -42,21 +47,21 @@ def open_stored_run(
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> StoredRun:
-    """Find one measurement and resolve its case and solver in today's registries.
+    """Find a measurement, and resolve its case and solver in the current registries.
 
-    run_id : or the beginning of one, if it is the only one to begin so
+    run_id : a run_id, or an unambiguous beginning of one
 
     Raises
     ------
     InputError
-        When there is no such measurement, or its family, solver or one of their keys
-        is not known, or not loaded, or a file that its case rests on has changed.
+        If there is no such measurement, if its family, its solver or one of their keys
+        is unknown or not loaded, or if a file of its case has changed.
 
     """
     records = read_journal(folder)
-    record = _found(folder, run_id, records)
+    record = _find_record(folder, run_id, records)
     environment, text = environment_of(folder, record.environment), suite_text(folder)
-    spec = _asked(record, asked_solvers(text))
+    spec = _find_solver(record, solvers_by_label(text))
     try:
         if record.family not in families:
             raise InputError(f"unknown family {record.family!r}")
@@ -83,9 +88,9 @@ def work_unit_of(
     solvers: Mapping[str, Solver],
     environment: str,
 ) -> WorkUnit:
-    """Make the block that measures a stored run again; its last result is that.
+    """Return a block that repeats a stored measurement, as its last result.
 
-    environment : digest
+    environment : digest of the current environment
     """
     record = stored.record
     turn = tuple(
@@ -113,7 +118,7 @@ def _cell(r: Record) -> tuple[Any, ...]:
     return r.mode, r.case, r.solver, r.options, r.tol, r.accuracy
 
 
-def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
+def _find_record(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
     by_id = {r.run_id: r for r in records}
     candidates = [name for name in by_id if run_id and name.startswith(run_id)]
     if run_id in by_id or len(candidates) == 1:
@@ -130,12 +135,16 @@ def _found(folder: Path, run_id: str, records: Iterable[Record]) -> Record:
     raise InputError(f"unknown run_id {run_id!r}: {folder} holds {count}{hint}")
 
 
-def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
-    """Find the solver of a label: of the suite, or of the command line."""
+def _find_solver(record: Record, specs: Mapping[str, SolverSpec]) -> SolverSpec:
+    """Return the solver of a record's label, from the suite or the command line.
+
+    specs : solvers of the suite by label; a label that is not among them came from
+        ``--solver``, and is a name
+    """
     name = record.solver
-    for name in without_options(record.solver.removesuffix(NULL)):
-        if name in known:
-            spec = known[name]
+    for name in without_options(record.solver.removesuffix(NULL_SUFFIX)):
+        if name in specs:
+            spec = specs[name]
             break
     else:
         spec = SolverSpec(name=name, label=name)
@@ -145,19 +154,19 @@ def _asked(record: Record, known: Mapping[str, SolverSpec]) -> SolverSpec:
 def _with_options(
     record: Record, spec: SolverSpec, solvers: Mapping[str, Solver]
 ) -> SolverSpec:
-    """Ask for those stored options that are not today's defaults."""
-    asked = replace(spec, options={})
+    """Set the stored options that differ from the current defaults."""
+    default = replace(spec, options={})
     if spec.name not in solvers and f"{spec.name.rpartition(':')[0]}:*" not in solvers:
         raise InputError(f"unknown solver {spec.name!r}")
-    today = plain(options_of(resolve(asked, solvers)))
+    today = plain(options_of(resolve(default, solvers)))
     options = {k: v for k, v in record.options.items() if today.get(k, ...) != v}
-    changed = replace(spec, options=options)
-    resolve(changed, solvers)
-    return changed
+    configured = replace(spec, options=options)
+    resolve(configured, solvers)
+    return configured
 
 
 def plugins_needed(environment: Mapping[str, Any]) -> str:
-    """Remind of the plug-ins that a measurement was made with."""
+    """Return the end of a message that names the plug-ins of a measurement, or ""."""
     plugins = environment.get("plugins")
     named = plugins if isinstance(plugins, list | Mapping) else ()
     options = " ".join(f"--plugin {name}" for name in named)
@@ -172,8 +181,9 @@ def rebuild(
     Raises
     ------
     InputError
-        When its family is not known, or fails, or builds another QP than then. What
-        ranks have emitted is not compared: the whole has another digest.
+        If its family is unknown or fails, or if its QP differs from that of the record.
+        A QP that ranks emitted is not compared: the digest of its shares is not that of
+        the entire QP.
 
     """
     if r.family not in families:
@@ -189,9 +199,9 @@ def rebuild(
         raise InputError(unbuilt(r.case, e)) from None
     if r.qp is None or r.qp.startswith(DISTRIBUTED_DIGEST):
         return case
-    if (now := qp_digest(case.qp, serialised=True)) != r.qp:
+    if (digest := qp_digest(case.qp, serialised=True)) != r.qp:
         raise InputError(
-            f"its QP has the digest {now} now, {r.qp} when it was measured; expected "
-            "the same version of the code, of its libraries and of plug-ins"
+            f"its QP has the digest {digest} now, {r.qp} when it was measured; "
+            "expected the same version of the code, of its libraries and of plug-ins"
         )
     return case

@@ -1,8 +1,8 @@
-"""The unit of work of a run, as plain data that any process on any machine can take.
+"""Unit of work of a run, as plain data that can be sent to any process or machine.
 
-One block is every solver once on one case at one tolerance, in random order, so that a
-drift of the machine hits all alike and solvers are compared within a block. Of a
-sequence it is every solver once on all steps, one step after the other.
+A block is every solver once on one case at one tolerance, in random order. A drift of
+the machine then affects all solvers of a block alike, and they are compared within
+blocks. A block of a sequence is every solver once on all steps, one after the other.
 """
 
 from __future__ import annotations
@@ -19,33 +19,33 @@ from mortarbench.harness.record import Record
 
 @dataclass(frozen=True, kw_only=True)
 class Commands:
-    """How the processes of a run are started, less the two pipes of each."""
+    """Command lines of the processes of a run, without the two pipes of each."""
 
-    solvers: Mapping[str, list[str]]  #: by label; they serve `harness.processes.worker`
-    case_worker: list[str]  #: serves `harness.processes.case_worker`
-    #: whether no code but ours runs in the first: then ranks evaluate what they solve
+    solvers: Mapping[str, list[str]]  #: by label; they run `harness.processes.worker`
+    case_worker: list[str]  #: runs `harness.processes.case_worker`
+    #: True if all code in the solvers' processes is ours; ranks then judge answers
     own_code_only: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class WorkUnit:
-    """What to measure, in which order."""
+    """A block: the measurements to be made, in order."""
 
     number: int
-    #: per solver, in the order to measure: its records to fill in, one per case, which
-    #: is one, or the steps of a sequence
+    #: one turn per solver, in the order of measurement: its records, to be completed,
+    #: one for the case or one for each step of the sequence
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
 
     @property
     def cases(self) -> tuple[str, ...]:
-        """The names of its cases, in order."""
+        """Names of its cases, in order."""
         return tuple(record.case for record in self.turns[0])
 
     @property
     def is_sequence(self) -> bool:
-        """Whether each solver may use, at a step, what the earlier ones left."""
+        """True if solvers may use, in a step, data of the earlier steps."""
         return self.turns[0][0].mode != "cold"
 
 
@@ -53,15 +53,15 @@ class WorkUnit:
 class Result:
     """One measurement of a block."""
 
-    record: Record  #: complete but for the digests of what is to be stored
-    part: int = 0  #: of its block; parts of one block were not measured together
-    point: Arrays | None = None  #: where the solver returned one
-    fields: Arrays | None = None  #: the deformed state, where it is to be stored
+    record: Record  #: complete except for the digests of `point` and `fields`
+    part: int = 0  #: part of its block; parts were not measured next to each other
+    point: Arrays | None = None  #: None if the solver returned none
+    fields: Arrays | None = None  #: deformed state, if it is to be stored
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unbuilt:
-    """Instead of results: a case of the block could not be built."""
+class BuildFailure:
+    """Outcome of a block with a case that could not be built."""
 
     block: WorkUnit
     reason: str  #: one line
@@ -69,37 +69,38 @@ class Unbuilt:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Unmade:
-    """Instead of a result: a fault of ours or of the machine prevented it."""
+class MeasurementFault:
+    """Outcome of a measurement that the harness or the machine prevented."""
 
-    record: Record  #: of what was to be measured
+    record: Record  #: of the missing measurement
     reason: str  #: one line
-    tried_again: bool  #: at once: another `Unmade`, or a `Result`, follows
+    tried_again: bool  #: True if another `MeasurementFault`, or a `Result`, follows
 
 
-Outcome = Result | Unbuilt | Unmade
+Outcome = Result | BuildFailure | MeasurementFault
 
 
 class Engine(Protocol):
-    """Where blocks are carried out: on this machine one by one, or elsewhere.
+    """Executor of blocks, on this machine one by one, or elsewhere.
 
-    It may take blocks ahead of giving back their results, and give results of several
-    blocks in any order; those of a block that is lost it may give again. Blocks are
-    made as they are taken: the less is taken ahead, the sooner a run can stop.
+    An engine may take several blocks before it yields results, yield the outcomes of
+    several blocks in any order, and yield those of a lost block again. Blocks are
+    created when they are taken, and the stopping rule sees only earlier results. So an
+    engine should take as few as possible in advance.
     """
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Carry out all of `blocks`."""
+        """Execute all of `blocks`."""
 
 
-class Opens(Protocol):
-    """What makes the engine of a run."""
+class EngineFactory(Protocol):
+    """Factory of the engine of a run."""
 
     def __call__(
         self, commands: Commands, scratch: Path, cases: Path
     ) -> AbstractContextManager[Engine]:
-        """Make an engine.
+        """Open an engine.
 
-        scratch : a folder that lasts as long as the run
-        cases : the folder of built cases, see `harness.processes.case_folder`
+        scratch : temporary folder that exists for the duration of the run
+        cases : folder of built cases, see `harness.processes.case_folder`
         """

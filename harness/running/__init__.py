@@ -1,1 +1,1 @@
-"""What a run does, in which order, and where."""
+"""Runs of a suite: schedule, engines on one machine or a cluster, and progress."""

@@ -1,10 +1,10 @@
-"""More than one machine: the blocks of a run as tasks of Dask distributed.
+"""Engine for several machines: the blocks of a run as tasks of Dask distributed.
 
-Every Dask worker carries out one block at a time, with the supervisor that a run on one
-machine uses. A task is one turn of a block: one solver, measured on one case, or on the
-steps of one sequence. The parent writes its records before it submits the next turn.
-What a worker that is lost has not returned is measured by another one, as a block of
-its own. The parent alone writes the result folder.
+Every Dask worker executes one block at a time, with the same supervisor as a run on one
+machine. A task is one turn of a block: one solver, measured on one case or on the steps
+of one sequence. The parent writes the records of a turn before it submits the next one.
+If a worker is lost, the turns that it has not returned are measured by another one, as
+a separate block. Only the parent writes the result folder.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from mortarbench.harness.record import Record
 from mortarbench.harness.registry import PluginFile
 from mortarbench.harness.results.folder import differences
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
     Engine,
-    Opens,
+    EngineFactory,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
     WorkUnit,
 )
 
@@ -45,13 +45,14 @@ if TYPE_CHECKING:  # it needs the package distributed
 
 LOCAL = "local"
 CONNECT_SECONDS = 10
-LOOK_SECONDS = 2.0  #: for workers that joined or were lost
-MOST_LOST = 4  #: workers that a block may cost
-_UNGUARDED = 75  #: exit code of a process whose main script starts a run at its import
+CLUSTER_POLL_SECONDS = 2.0  #: between two checks for workers that joined or were lost
+MAX_LOST_WORKERS = 4  #: a block is given up when it has lost so many workers
+#: exit code of a process whose main script starts a run at its import
+_UNGUARDED_SCRIPT_CODE = 75
 
 Keep = Callable[[str, Mapping[str, Any]], None]
 
-#: of an environment: nodes that differ here do not run the same code
+#: keys of an environment; nodes that differ in them do not run the same code
 _CODE = ("source", "versions.mortarbench", "plugins")
 
 
@@ -64,24 +65,24 @@ def on_cluster(
     environment: Mapping[str, Any],
     keep: Keep,
     warn: Callable[[str], None],
-) -> Iterator[Opens]:
-    """Connect to a Dask cluster, and give what opens the engine of a run on it.
+) -> Iterator[EngineFactory]:
+    """Connect to a Dask cluster; provide the factory of the engine of a run on it.
 
-    So an address that is wrong is refused before there is a result folder.
+    Connecting first refuses a wrong address before a result folder is created.
 
-    address : of a scheduler, or "local" for one with a worker for each CPU of this
+    address : of a scheduler, or "local" to start one with a worker for each CPU of this
         machine
-    plugins : files that nodes find under the same paths
-    operators : what puts an operator P together, less what is in `plugins`
-    environment : of this process, which nodes are compared with
+    plugins : files that exist under the same paths on every node
+    operators : makers of operators P by name, except those of `plugins`
+    environment : of this process, with which nodes are compared
     keep : stores a node's environment under its digest
-    warn : told in a line what the user should know
+    warn : receives messages to the user, one line each
 
     Raises
     ------
     InputError
-        When Dask is not installed, or there is no such scheduler; while blocks are
-        carried out, when a node is not fit to measure on.
+        If Dask is not installed or the scheduler does not answer; while blocks are
+        executed, if a node is not fit for measuring.
 
     """
     try:
@@ -93,7 +94,7 @@ def on_cluster(
         ) from None
 
     with ExitStack() as stack:
-        client = _connected(address, stack)
+        client = _connect(address, stack)
 
         @contextmanager
         def opened(commands: Commands, scratch: Path, cases: Path) -> Iterator[Engine]:
@@ -102,7 +103,7 @@ def on_cluster(
             name = f"mortarbench-{client.id}"
             nodes = Nodes(environment, keep, warn)
             try:
-                _forget_lost_runs(client)
+                _end_orphaned_runs(client)
                 files = [file.resolved() for file in plugins]
                 workers = client.scheduler_info(n_workers=-1)["workers"].values()
                 hosts = Counter(worker["host"] for worker in workers)
@@ -117,13 +118,14 @@ def on_cluster(
                 try:
                     yield _Cluster(client, name, nodes, address, warn)
                 finally:
-                    # end the processes of this run and of lost ones; the scheduler may
-                    # go while it is asked, as a local one does at Ctrl-C
-                    # (CommClosedError is an OSError), or not know of us yet (KeyError)
+                    # End the processes of this run and of orphaned ones. The scheduler
+                    # may go away during the call, as a local one does at Ctrl-C
+                    # (CommClosedError is an OSError), or not yet have the plug-in
+                    # (KeyError).
                     with suppress(OSError, KeyError):
                         if client.status == "running":
                             client.unregister_worker_plugin(name)
-                            _forget_lost_runs(client)
+                            _end_orphaned_runs(client)
             except Exception as e:
                 is_gone = isinstance(e, _SchedulerGoneError)
                 is_gone = is_gone or client.status != "running"
@@ -139,23 +141,23 @@ def on_cluster(
 
 @dataclass(eq=False)
 class Nodes:
-    """What is known of the machines that have measured."""
+    """Environments of the machines that have returned measurements."""
 
     here: Mapping[str, Any]  #: environment of this process
     keep: Keep
     warn: Callable[[str], None]
-    _seen: set[str] = field(default_factory=set)  # digests
+    _stored: set[str] = field(default_factory=set)  # digests
 
-    def meet(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
-        """Store an environment that is new, and tell how it differs from ours.
+    def add(self, node: str, digest: str, environment: Mapping[str, Any]) -> None:
+        """Store an environment if it is new, and warn if it differs from this one.
 
         Raises
         ------
         InputError
-            When the node runs other code.
+            If the node runs other code.
 
         """
-        if digest in self._seen:
+        if digest in self._stored:
             return
         changed = list(differences(self.here, environment))
         for key, here, there in changed:
@@ -165,7 +167,7 @@ class Nodes:
                     f"{node} runs other code than this machine ({what}); install the "
                     "same on every node"
                 )
-        self._seen.add(digest)
+        self._stored.add(digest)
         self.keep(digest, environment)
         if changed:
             what = in_words(changed, "here", "there")
@@ -176,23 +178,24 @@ class Nodes:
 
 
 @dataclass(eq=False, kw_only=True)
-class _Begun:
-    """A block, of which one turn at a time is a task of Dask."""
+class _ActiveBlock:
+    """A block in progress; one of its turns at a time is a Dask task."""
 
     block: WorkUnit
-    left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
+    turns_left: list[tuple[Record, ...]]  #: turns that no worker has returned yet
     worker: str = ""  #: address of the Dask worker that measures it
-    part: int = 0  #: one more whenever a worker was lost after its first turn
-    is_measured: bool = False  #: in part: the worker has returned a turn
-    lost: int = 0  #: workers that it has cost
+    part: int = 0  #: incremented when a worker is lost after it has returned a turn
+    is_measured: bool = False  #: True if the current worker has returned a turn
+    lost_workers: int = 0  #: number of workers that were lost while they had this block
 
 
 @dataclass(eq=False)
 class _Cluster:
-    """The engine: every Dask worker measures one block, a turn of a solver at a time.
+    """Engine in which every Dask worker measures one block, one turn at a time.
 
-    Tasks are bound to the worker of their block, so that the rest of a block whose
-    worker was lost is known here to be another part, measured elsewhere or later.
+    Each task is bound to the worker of its block. Otherwise Dask would move the tasks
+    of a lost worker by itself, and turns measured elsewhere would pass for the same
+    part of the block.
     """
 
     client: Any
@@ -200,140 +203,145 @@ class _Cluster:
     nodes: Nodes
     address: str
     warn: Callable[[str], None]
-    _done: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
-    _under_way: dict[Any, _Begun] = field(default_factory=dict)  # by their futures
-    _left: deque[_Begun] = field(default_factory=deque)
+    _finished: SimpleQueue[Any] = field(default_factory=SimpleQueue)  # futures
+    _active: dict[Any, _ActiveBlock] = field(default_factory=dict)  # by their futures
+    _queue: deque[_ActiveBlock] = field(default_factory=deque)
 
     def __call__(self, blocks: Iterator[WorkUnit]) -> Iterable[Outcome]:
-        """Carry out all of `blocks`."""
+        """Execute all of `blocks`."""
         try:
             while self._top_up(blocks):
                 try:
-                    yield from self._measured(self._done.get(timeout=LOOK_SECONDS))
+                    yield from self._measured(
+                        self._finished.get(timeout=CLUSTER_POLL_SECONDS)
+                    )
                 except Empty:
                     if self.client.status != "running":
                         raise _SchedulerGoneError from None
-                    # a worker may be busy with a run whose parent has died, and the
-                    # scheduler have noticed only now
-                    _forget_lost_runs(self.client)
+                    # A worker may be busy with a run whose parent has died, which the
+                    # scheduler notices with a delay.
+                    _end_orphaned_runs(self.client)
                 yield from self._recovered()
         finally:
-            for future in self._under_way:
+            for future in self._active:
                 future.cancel()
 
     def _top_up(self, blocks: Iterator[WorkUnit]) -> bool:
-        """Give every idle worker a block to do; False when all blocks are done."""
-        idle = self._workers() - {begun.worker for begun in self._under_way.values()}
-        while idle or not self._under_way:
-            if not self._left and (block := next(blocks, None)) is not None:
-                self._left.append(_Begun(block=block, left=list(block.turns)))
-            if not self._left:
-                return bool(self._under_way)
+        """Submit a block to every idle worker; return False if all blocks are done."""
+        idle = self._workers() - {active.worker for active in self._active.values()}
+        while idle or not self._active:
+            if not self._queue and (block := next(blocks, None)) is not None:
+                self._queue.append(
+                    _ActiveBlock(block=block, turns_left=list(block.turns))
+                )
+            if not self._queue:
+                return bool(self._active)
             if not idle:
                 self.warn(f"waiting for Dask workers to join {self.address}")
                 self.client.wait_for_workers(1)
                 idle = self._workers()
             if idle:
-                begun = self._left.popleft()
-                begun.worker = idle.pop()
-                self._submit(begun)
+                active = self._queue.popleft()
+                active.worker = idle.pop()
+                self._submit(active)
         return True
 
     def _workers(self) -> set[str]:
-        """List the addresses of the workers that are there."""
+        """Return the addresses of the workers that are connected."""
         try:
             return set(self.client.nthreads())
         except OSError as e:
             raise _SchedulerGoneError from e
 
-    def _submit(self, begun: _Begun) -> None:
+    def _submit(self, active: _ActiveBlock) -> None:
         """Submit the next turn of a block to its worker."""
         from mortarbench.harness.running.dask_worker import execute
 
-        turn = replace(begun.block, turns=(begun.left[0],))
+        turn = replace(active.block, turns=(active.turns_left[0],))
         future = self.client.submit(
-            execute, self.name, turn, workers=[begun.worker], pure=False
+            execute, self.name, turn, workers=[active.worker], pure=False
         )
-        self._under_way[future] = begun
-        future.add_done_callback(self._done.put)
+        self._active[future] = active
+        future.add_done_callback(self._finished.put)
 
     def _measured(self, future: Any) -> Iterator[Outcome]:
-        """Give back what came of a turn, and submit the next one of its block."""
+        """Yield the outcomes of a turn, then submit the next turn of its block."""
         from distributed import CancelledError
 
-        if (begun := self._under_way.get(future)) is None:  # its worker was lost
+        if (active := self._active.get(future)) is None:  # its worker was lost
             return
         try:
             delivery: Delivery = future.result(timeout=CONNECT_SECONDS)
-        except CancelledError as e:  # with the connection
+        except CancelledError as e:  # together with the connection
             raise _SchedulerGoneError from e
-        except TimeoutError:  # the worker is lost, or about to be found so
-            self._done.put(future)
+        except TimeoutError:  # the worker is lost; `_recovered` will find that
+            self._finished.put(future)
             return
-        del self._under_way[future], begun.left[0]
-        begun.is_measured = True
-        self.nodes.meet(delivery.node, delivery.digest, delivery.environment)
+        del self._active[future], active.turns_left[0]
+        active.is_measured = True
+        self.nodes.add(delivery.node, delivery.digest, delivery.environment)
         for outcome in delivery.outcomes:
             match outcome:
-                case Unbuilt():
-                    yield replace(outcome, block=begun.block)
+                case BuildFailure():
+                    yield replace(outcome, block=active.block)
                     return
                 case Result():
-                    yield replace(outcome, part=begun.part)
-                case Unmade():
+                    yield replace(outcome, part=active.part)
+                case MeasurementFault():
                     yield outcome
-        if begun.left:
-            self._submit(begun)
+        if active.turns_left:
+            self._submit(active)
 
     def _recovered(self) -> Iterator[Outcome]:
-        """Leave the blocks of workers that were lost to others."""
-        there = self._workers()
-        lost = {f: b for f, b in self._under_way.items() if b.worker not in there}
-        for future, begun in lost.items():
-            del self._under_way[future]
+        """Return the blocks of lost workers to the queue, or give them up."""
+        workers = self._workers()
+        lost = {f: b for f, b in self._active.items() if b.worker not in workers}
+        for future, active in lost.items():
+            del self._active[future]
             future.cancel()
-            begun.lost += 1
-            begun.part += begun.is_measured
-            begun.is_measured = False
-            if begun.lost < MOST_LOST:
-                self._left.append(begun)
+            active.lost_workers += 1
+            active.part += active.is_measured
+            active.is_measured = False
+            if active.lost_workers < MAX_LOST_WORKERS:
+                self._queue.append(active)
             else:
-                case = begun.block.turns[0][0].case
+                case = active.block.turns[0][0].case
                 reason = f"{case} was given up: every Dask worker that took it was lost"
-                yield Unbuilt(block=begun.block, reason=reason)
+                yield BuildFailure(block=active.block, reason=reason)
 
 
 class _SchedulerGoneError(Exception):
     pass
 
 
-def _connected(address: str, stack: ExitStack) -> Any:
-    """Connect to a scheduler, started first if it is to be local.
+def _connect(address: str, stack: ExitStack) -> Any:
+    """Connect to a scheduler; a local one is started first.
 
     Raises
     ------
     InputError
-        When there is none.
+        If no scheduler answers.
 
     """
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # we tell ourselves
+    # Dask's messages would repeat ours, with tracebacks.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
     if address == LOCAL:
-        with _interrupted_later():
+        with _delay_interrupt():
             _refuse_unguarded_script()
             cluster = LocalCluster(
                 n_workers=len(os.sched_getaffinity(0)),
                 threads_per_worker=1,
-                memory_limit=0,  # the supervisor's business
-                dashboard_address="127.0.0.1:0",  # any free port: several clusters
+                memory_limit=0,  # the supervisor limits memory
+                dashboard_address="127.0.0.1:0",  # any free port, for several clusters
                 scheduler_kwargs={"dashboard": False},
                 silence_logs=logging.CRITICAL,
             )
             return stack.enter_context(Client(stack.enter_context(cluster)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except Exception as e:  # of any library that a scheme of addresses asks for
+    except Exception as e:  # each scheme of addresses has a library with its own errors
         if isinstance(e, TypeError) and address.startswith("tls:"):
             raise InputError(
                 f"--dask {address}: Dask's configuration has no certificate for it; "
@@ -351,69 +359,74 @@ def _connected(address: str, stack: ExitStack) -> Any:
 def _refuse_unguarded_script() -> None:
     """Refuse a main script that would start this run again in every Dask worker.
 
-    Python imports it there before anything else. One process shows what that does, as
-    the first of Dask's would; in that process, this function ends the import.
+    Python imports the main script in each spawned process before anything else. One
+    process is spawned as a trial. If the script starts a run at its import, that run
+    calls this function in the trial process, which then exits with a code of its own.
 
     Raises
     ------
     InputError
-        When the script starts a run, or fails, where it is imported.
+        If importing the script starts a run, or fails.
 
     """
     if getattr(current_process(), "_inheriting", False):
-        raise SystemExit(_UNGUARDED)
-    first = get_context("spawn").Process(target=int)
-    first.start()
-    first.join()
-    if first.exitcode == _UNGUARDED:
+        raise SystemExit(_UNGUARDED_SCRIPT_CODE)
+    trial = get_context("spawn").Process(target=int)
+    trial.start()
+    trial.join()
+    if trial.exitcode == _UNGUARDED_SCRIPT_CODE:
         raise InputError(
             "the processes of Dask import the main script, which starts this run once "
             'more there; put what runs below `if __name__ == "__main__":`'
         )
-    if first.exitcode:
+    if trial.exitcode:
         raise InputError(
             "the processes of Dask import the main script, which fails there (exit "
-            f"code {first.exitcode})"
+            f"code {trial.exitcode})"
         )
 
 
 @contextmanager
-def _interrupted_later() -> Iterator[None]:
-    """Keep Ctrl-C from what is started here, and put it off until that is done.
+def _delay_interrupt() -> Iterator[None]:
+    """Shield processes started in this context from Ctrl-C, and delay it until the end.
 
-    A terminal sends SIGINT to all processes at once. Dask's would print a traceback
-    each; they inherit the mask of this thread, and end with the cluster, which this
-    process closes. A second Ctrl-C is not put off.
+    A terminal sends SIGINT to all processes of its group, and each of Dask's would
+    print a traceback. They inherit the signal mask of this thread, and end with the
+    cluster, which this process closes. A second Ctrl-C is not delayed.
     """
-    if current_thread() is not main_thread():  # which alone is interrupted
+    if current_thread() is not main_thread():  # only the main thread is interrupted
         yield
         return
     before = signal.getsignal(signal.SIGINT)
-    late = []
+    received = []
 
-    def put_off(*_: object) -> None:  # the signal came to another thread of ours
-        late.append(signal.SIGINT)
+    # The mask holds for this thread only: the kernel may deliver the signal to another
+    # thread, and Python then runs its handler in this one.
+    def delay(*_: object) -> None:
+        received.append(signal.SIGINT)
         signal.signal(signal.SIGINT, before)
 
-    resource_tracker.ensure_running()  # else it is started later, and lifts the mask
-    signal.signal(signal.SIGINT, put_off)
+    # Started later, multiprocessing's tracker would unblock SIGINT in this thread.
+    resource_tracker.ensure_running()
+    signal.signal(signal.SIGINT, delay)
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         signal.signal(signal.SIGINT, before)
-    if late:
+    if received:
         raise KeyboardInterrupt
 
 
-def _forget_lost_runs(client: Any) -> None:
-    """Have workers end the processes of runs whose parent has died."""
+def _end_orphaned_runs(client: Any) -> None:
+    """Unregister plug-ins of runs whose parent has died; that ends their processes."""
 
-    def lost(dask_scheduler: Any) -> list[str]:
+    # executed by the scheduler, which knows the clients that are connected
+    def orphaned(dask_scheduler: Any) -> list[str]:
         alive = {f"mortarbench-{client}" for client in dask_scheduler.clients}
         ours = (n for n in dask_scheduler.worker_plugins if n.startswith("mortarbench"))
         return [name for name in ours if name not in alive]
 
-    for name in client.run_on_scheduler(lost):
+    for name in client.run_on_scheduler(orphaned):
         client.unregister_worker_plugin(name)

@@ -1,7 +1,7 @@
-"""One machine of a cluster: what a Dask worker does for a run.
+"""Dask plug-in that executes the blocks of a run on one machine of a cluster.
 
-An `Executor` stays open in each Dask worker for as long as the run lasts; its solver
-processes are on a CPU that no other of that machine has. It ends with the run.
+Each Dask worker keeps an `Executor` open for the duration of the run. Its solver
+processes are bound to a CPU that no other executor on the machine uses.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from mortarbench.harness.running.executor import Executor
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Delivery:
-    """Outcomes of a block, and where they were measured."""
+    """Outcomes of a block, with the node and environment of their measurement."""
 
     outcomes: list[Outcome]
     node: str  #: host name
@@ -44,14 +44,14 @@ class Delivery:
 
 @dataclass(eq=False)
 class ExecutorPlugin(WorkerPlugin):
-    """Opens an executor in every Dask worker, those that join later included.
+    """Executor in every Dask worker, including workers that join later.
 
     commands : of the parent; its Python is replaced by that of the node
-    plugins : files, which must be there under the same paths
-    operators : what puts an operator P together, less what is in `plugins`
-    sharing : Dask workers on one machine; more than one disturb each other, which
-        makes another environment
-    packages : whose versions the environment of a node has
+    plugins : files that must exist under the same paths on the node
+    operators : makers of operators P by name, except those of `plugins`
+    sharing : largest number of Dask workers on one machine. Several disturb each other,
+        so the number is a part of the environment
+    packages : names of the packages whose versions an environment contains
     """
 
     commands: Commands
@@ -60,48 +60,49 @@ class ExecutorPlugin(WorkerPlugin):
     sharing: int
     packages: Sequence[str]
     _python: str = sys.executable
-    _open: _Open | None = None
+    _session: _Session | None = None
     _ended: bool = False
 
     def setup(self, worker: Worker) -> None:
-        """Open nothing yet: a block does, in the thread that it runs in.
+        """Prepare the plug-in; the first block opens the executor, in its own thread.
 
-        The kernel kills solver processes with the thread that started them.
+        The kernel kills solver processes when the thread that started them ends.
         """
         self._worker = worker.id
         self._busy = Lock()
 
     def teardown(self, worker: Worker | None = None) -> None:
-        """End the processes of the executor, at the latest when a measurement is made.
+        """End the processes of the executor, at the latest after a current measurement.
 
-        Dask cannot stop a block that is being carried out; its thread comes here last.
+        Dask cannot stop a block that is being executed. While one is, its thread holds
+        the lock and calls this method when it is done.
         """
         self._ended = True
         if not self._busy.acquire(blocking=False):
             return
-        if self._open is not None:
-            self._open.stack.close()
-            self._open = None
+        if self._session is not None:
+            self._session.stack.close()
+            self._session = None
         self._busy.release()
 
     def execute(self, block: WorkUnit) -> Delivery:
-        """Measure a block, or what can be measured of it before the run ends.
+        """Measure a block; stop after the current measurement if the run ends.
 
         Raises
         ------
         InputError
-            When this machine is not fit to measure on.
+            If this machine is not fit for measuring.
 
         """
         try:
             with self._busy:
-                return self._carried_out(block)
+                return self._carry_out(block)
         finally:
             if self._ended:
                 self.teardown()
 
-    def _carried_out(self, block: WorkUnit) -> Delivery:
-        opened = self._open = self._open or self._opened()
+    def _carry_out(self, block: WorkUnit) -> Delivery:
+        opened = self._session = self._session or self._open_session()
         os.sched_setaffinity(0, {opened.cpu.number})  # of this thread
         here = {"environment": opened.digest, "node": platform.node()}
         turns = tuple(tuple(r.replace(**here) for r in turn) for turn in block.turns)
@@ -120,7 +121,7 @@ class ExecutorPlugin(WorkerPlugin):
             environment=opened.environment,
         )
 
-    def _opened(self) -> _Open:
+    def _open_session(self) -> _Session:
         for file in self.plugins:
             if not file.path.is_file():
                 raise InputError(
@@ -148,7 +149,7 @@ class ExecutorPlugin(WorkerPlugin):
             )
             executor = Executor(commands, scratch, scratch / "cases", operators)
             stack.callback(executor.close)
-            return _Open(
+            return _Session(
                 executor=executor,
                 cpu=cpu,
                 environment=environment,
@@ -158,12 +159,12 @@ class ExecutorPlugin(WorkerPlugin):
 
 
 def execute(name: str, block: WorkUnit) -> Delivery:
-    """Measure a block by the node plug-in of that name; runs in a Dask worker.
+    """Measure a block by the plug-in of that name; runs in a Dask worker.
 
     Raises
     ------
     InputError
-        When this Dask worker is not fit to measure on.
+        If this Dask worker is not fit for measuring.
 
     """
     worker = get_worker()
@@ -177,7 +178,7 @@ def execute(name: str, block: WorkUnit) -> Delivery:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class _Open:
+class _Session:
     executor: Executor
     cpu: _Cpu
     environment: dict[str, Any]
@@ -186,43 +187,45 @@ class _Open:
 
 
 class _Cpu:
-    """A CPU that a Dask worker holds as long as one of its executors refers to it."""
+    """CPU claimed by a Dask worker, released when no executor refers to it any more."""
 
     def __init__(self) -> None:
         stack = ExitStack()
-        self.number = own_cpu(stack)
+        self.number = claim_cpu(stack)
         finalize(self, stack.close)
 
 
-#: by the Dask worker of this process
-_held: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
-_holding = Lock()
+#: claimed CPU by Dask worker of this process
+_cpus: WeakValueDictionary[str, _Cpu] = WeakValueDictionary()
+_cpus_lock = Lock()
 
 
 def _cpu_of(worker: str) -> _Cpu:
-    """Hold a CPU for a Dask worker, which all its executors share.
+    """Claim a CPU for a Dask worker; all of its executors share it.
 
-    There are several where several runs measure there, or where one has died and its
-    scheduler has not noticed yet. A Dask worker carries out one block at a time.
+    A worker has several executors if several runs use it, or if the scheduler has not
+    yet noticed that one has died. It still executes one block at a time.
 
     Raises
     ------
     InputError
-        As `own_cpu`.
+        If `claim_cpu` raises it.
 
     """
-    with _holding:
-        held = _held[worker] = _held.get(worker) or _Cpu()
-    return held
+    with _cpus_lock:
+        cpu = _cpus[worker] = _cpus.get(worker) or _Cpu()
+    return cpu
 
 
-def own_cpu(stack: ExitStack) -> int:
-    """Take a CPU that no other executor on this machine has; the kernel gives it back.
+def claim_cpu(stack: ExitStack) -> int:
+    """Claim a CPU that no other executor on this machine uses.
+
+    A file lock represents the claim, so the kernel releases it when the process ends.
 
     Raises
     ------
     InputError
-        When there is none left, or somebody else has made the folder of the locks.
+        If all CPUs are taken, or the folder of the locks is not safe to use.
 
     """
     usable = sorted(os.sched_getaffinity(os.getpid()), reverse=True)
@@ -245,13 +248,13 @@ def own_cpu(stack: ExitStack) -> int:
 
 @contextmanager
 def _lock_folder() -> Iterator[int]:
-    """Open the folder of this user's locks, in that of everybody's temporary files.
+    """Open the folder of this user's locks, in the shared folder of temporary files.
 
     Raises
     ------
     InputError
-        When what is there is a link or a file, is another user's, or open to others:
-        they could plant links in it, or hold the locks.
+        If it is a link or a file, belongs to another user or is accessible to others.
+        They could place links in it, or hold the locks.
 
     """
     path = Path(gettempdir()) / f"mortarbench-{os.getuid()}"
@@ -266,8 +269,8 @@ def _lock_folder() -> Iterator[int]:
     except OSError:
         raise wrong from None
     try:
-        found = os.fstat(fd)
-        if found.st_uid != os.getuid() or stat.S_IMODE(found.st_mode) & 0o077:
+        status = os.fstat(fd)
+        if status.st_uid != os.getuid() or stat.S_IMODE(status.st_mode) & 0o077:
             raise wrong
         yield fd
     finally:

@@ -1,4 +1,4 @@
-"""Where blocks are carried out: the processes of a run on one machine."""
+"""Executor of blocks: the processes of a run on one machine."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from mortarbench.harness.files.durable import refuse_full_disk, report_full_disk
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.files.store import point_arrays, read_arrays, read_point
 from mortarbench.harness.operators import NO_MAKERS, Maker
-from mortarbench.harness.processes.case_folder import Entry, entry
-from mortarbench.harness.processes.measurement import case_request, measured
+from mortarbench.harness.processes.case_folder import StoredCase, find_or_build
+from mortarbench.harness.processes.measurement import case_request, measure_and_judge
 from mortarbench.harness.processes.protocol import Source
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.harness.qp import QP
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.registry import COPIES
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
     Engine,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
     WorkUnit,
 )
 from mortarbench.harness.solution import Solution, Status
@@ -37,18 +37,18 @@ from mortarbench.harness.verify.measure import SAMPLE_SECONDS
 from mortarbench.harness.verify.optimum import Optimum, proven_optimum
 from mortarbench.harness.verify.verdicts import has_point, noted
 
-_MOST_PROVEN = 1000  #: small QPs whose optima are kept
-LOOSEST = 1e-2  #: tolerance of a step, however far its QP is from the fixed point
+_MAX_STORED_OPTIMA = 1000  #: number of small QPs whose optima are cached
+MAX_STEP_TOL = 1e-2  #: loosest tolerance of a step, far from the fixed point
 
 
 @dataclass(eq=False)
 class Executor:
-    """Carries out blocks one after the other, with one worker process per solver.
+    """Executor of blocks, one after the other, with one worker process per solver.
 
-    scratch : for files that last as long as the executor, of this executor alone
-    cases : folder of built cases, see `harness.processes.case_folder`; executors
-        may share it
-    operators : what puts an operator P together, see `harness.operators`
+    scratch : folder of temporary files, used by this executor alone
+    cases : folder of built cases, see `harness.processes.case_folder`; executors may
+        share it
+    operators : makers of operators P by name, see `harness.operators`
     """
 
     commands: Commands
@@ -57,12 +57,12 @@ class Executor:
     operators: Mapping[str, Maker] = field(default_factory=lambda: NO_MAKERS)
     _workers: dict[str, WorkerProcess] = field(default_factory=dict)
     _number: int = -1  # of the last block
-    _entries: tuple[Entry, ...] = ()  # of that, once they are built
-    _end: str = ""  # why there are fewer than its sequence asked for
-    _loaded: dict[str, QP] = field(default_factory=dict)  # theirs, by digest
-    #: of small QPs, by digest
+    _entries: tuple[StoredCase, ...] = ()  # cases of that block, once they are built
+    _end_reason: str = ""  # why there are fewer cases than steps of its sequence
+    _loaded: dict[str, QP] = field(default_factory=dict)  # their QPs, by digest
+    # proven optima of small QPs, by digest
     _optima: dict[str, Optimum | None] = field(default_factory=dict)
-    #: whether ranks emit the QP, by case
+    # True if ranks emit the QP, by case
     _shared: dict[str, bool] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -76,35 +76,36 @@ class Executor:
             process.close()
 
     def execute(self, block: WorkUnit) -> Iterator[Outcome]:
-        """Measure a block; each result comes as soon as it is there.
+        """Measure a block, and yield each outcome as soon as it is available.
 
         Raises
         ------
         InputError
-            When the disk is full.
+            If the disk is full.
 
         """
         with report_full_disk(self.scratch):
             try:
-                if block.number != self._number:  # else it goes on with its next turns
+                # On a cluster, the turns of a block come one by one.
+                if block.number != self._number:
                     self._number, self._entries = block.number, ()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
-            except _UnbuiltError as e:
-                yield Unbuilt(block=block, reason=e.reason, trace=e.trace)
+            except _BuildError as e:
+                yield BuildFailure(block=block, reason=e.reason, trace=e.trace)
 
     def _turn(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Outcome]:
-        """Measure one solver; after a fault that is not its own, once more.
+        """Measure one solver; after a fault that is not its own, retry once.
 
-        Of a sequence all steps are driven again, since what the solver carried is lost;
-        none is given back twice.
+        All steps of a sequence are repeated, because the data that the solver carried
+        are lost; no result is yielded twice.
         """
-        made: set[str] = set()
+        measured: set[str] = set()  # run ids
         for tried_again in (True, False):
             try:
                 for result in self._results(block, turn):
-                    if result.record.run_id not in made:
-                        made.add(result.record.run_id)
+                    if result.record.run_id not in measured:
+                        measured.add(result.record.run_id)
                         yield result
                 return
             except (FaultError, OSError) as e:
@@ -113,31 +114,33 @@ class Executor:
                     reason = f"{type(e).__name__}: {reason}"
                 refuse_full_disk(self.scratch, reason)
             label = turn[0].solver
-            self._entries = ()
-            with suppress(FileNotFoundError):  # the whole result folder has gone
+            self._entries = ()  # a lost or damaged file may be the cause: build again
+            with suppress(FileNotFoundError):  # the entire result folder was deleted
                 self.scratch.mkdir(exist_ok=True)
             self._worker(label).close()
-            missing = [record for record in turn if record.run_id not in made]
+            missing = [record for record in turn if record.run_id not in measured]
             for record in missing[: 1 if tried_again else None]:
-                yield Unmade(record=record, reason=reason, tried_again=tried_again)
+                yield MeasurementFault(
+                    record=record, reason=reason, tried_again=tried_again
+                )
 
     def _results(self, block: WorkUnit, turn: tuple[Record, ...]) -> Iterator[Result]:
         """Measure one solver once on each case.
 
-        Ranks that make a QP judge its answer, too, where no code but ours runs in them.
-        The case is built then only where they cannot tell something of it.
+        Ranks that emit a QP also judge the answer if all code in them is ours. The case
+        is then built only for what they cannot evaluate.
 
         Raises
         ------
         FaultError, OSError
-            When something else than the solver failed.
+            If something other than the solver failed.
 
         """
         source = self._source(turn[0])
         if source is not Source.RANKS:
             self._build(block, turn)
-        there = turn if source is Source.RANKS else turn[: len(self._entries)]
-        for step, record in enumerate(there):
+        available = turn if source is Source.RANKS else turn[: len(self._entries)]
+        for step, record in enumerate(available):
             request, record = self._request(block, record, step, source)
 
             def whole(step: int = step) -> QP:
@@ -147,30 +150,33 @@ class Executor:
             def proven(qp: QP, step: int = step) -> Optimum | None:
                 return self._optimum(self._entries[step], qp)
 
-            record, solution, is_undescribed = measured(
+            record, solution, needs_evaluation = measure_and_judge(
                 self._worker(turn[0].solver), whole, record, request,
                 time_limit=block.time_limit, memory_limit=block.memory_limit,
                 prove=proven,
             )  # fmt: skip
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
-                refuse_full_disk(self.scratch, "")  # whatever it died of
+                refuse_full_disk(self.scratch, "")  # the likely cause, if it is full
             is_pointless = solution is None or not has_point(solution)
-            if solution is None or is_pointless or is_undescribed:
-                yield self._described(block, record, solution)
+            if solution is None or is_pointless or needs_evaluation:
+                yield self._describe(block, record, solution)
             else:
                 yield Result(record=record, point=point_arrays(solution))
             stopped = is_pointless and record.verdict is not Verdict.DECLINED
-            if block.is_sequence and stopped:  # what it carried is lost
-                yield from _broken(there[step + 1 :], record)
+            # the solver's data for later steps are lost
+            if block.is_sequence and stopped:
+                yield from _unreached_steps(available[step + 1 :], record)
                 break
-        for record in turn[len(there) :]:
-            declined = record.replace(verdict=Verdict.DECLINED, message=self._end)
+        for record in turn[len(available) :]:
+            declined = record.replace(
+                verdict=Verdict.DECLINED, message=self._end_reason
+            )
             yield Result(record=declined)
 
     def _request(
         self, block: WorkUnit, record: Record, step: int, source: Source
     ) -> tuple[dict[str, Any], Record]:
-        """Ask for a measurement, and fill in what is known of its case before."""
+        """Return the request for a measurement, and its record with case data."""
         request = {
             "out": str(self._point),
             "source": source,
@@ -182,15 +188,15 @@ class Executor:
             request |= case_request(record)
         if source is Source.RANKS:
             return request, record
-        at = self._entries[step]
+        entry = self._entries[step]
         if not source.is_shared:
-            request |= {"qp": str(at.qp), "digest": at.digest}
+            request |= {"qp": str(entry.qp), "digest": entry.digest}
         keys = ("qp", "build_seconds", "dualise_seconds")
-        known = {key: at.meta.get(key) for key in keys}
-        return request, record.replace(**known, step_tol=_step_tol(record, at))
+        meta = {key: entry.meta.get(key) for key in keys}
+        return request, record.replace(**meta, step_tol=_step_tol(record, entry))
 
     def _source(self, record: Record) -> Source:
-        """Return where the QP of a record comes from."""
+        """Return the origin of the QP of a record, asking the case worker once."""
         if record.ranks == 1 or record.role == COPIES or record.mode != "cold":
             return Source.FILE
         if record.case not in self._shared:
@@ -204,26 +210,26 @@ class Executor:
         return Source.RANKS if self.commands.own_code_only else Source.SHARES
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
-        """Build the cases of a block, of a sequence as many as there are; once."""
+        """Build the cases of a block, once; a sequence may have fewer than steps."""
         if self._entries:
             return
-        entries: list[Entry] = []
-        self._end = ""
+        entries: list[StoredCase] = []
+        self._end_reason = ""
         for record in turn:
             try:
                 entries.append(self._entry(record, block))
-            except _UnbuiltError as e:
+            except _BuildError as e:
                 if not entries or not e.past_end:
                     raise
-                self._end = e.reason
+                self._end_reason = e.reason
                 break
         self._entries = tuple(entries)
         self._loaded = {e.digest: self._qp(e) for e in entries}
 
-    def _described(
+    def _describe(
         self, block: WorkUnit, record: Record, solution: Solution | None
     ) -> Result:
-        """Add what the point means, which the case worker knows."""
+        """Add quantities and error bounds of the point, from the case worker."""
         if solution is None or not has_point(solution):
             return Result(record=record)
         first = record.verdict is Verdict.VERIFIED and record.repeat == 0
@@ -243,26 +249,30 @@ class Executor:
                 recover_seconds=answer["seconds"],
                 **answer["bounds"],
             )
-        except _UnbuiltError as e:
+        except _BuildError as e:
             notes = [f"no quantities: {e.reason}"]
         stored = read_arrays(fields, ()) if fields.exists() else None
         return Result(
             record=noted(record, *notes), point=point_arrays(solution), fields=stored
         )
 
-    def _entry(self, record: Record, block: WorkUnit) -> Entry:
+    def _entry(self, record: Record, block: WorkUnit) -> StoredCase:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
             meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
             return meta
 
         r = record
-        return entry(self.cases, [r.family, r.params, r.form, r.environment], make)
+        return find_or_build(
+            self.cases, [r.family, r.params, r.form, r.environment], make
+        )
 
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
-        for _ in range(2):  # it may have died of something else
+        for _ in range(
+            2
+        ):  # it may have been killed from outside, or by an earlier case
             reply = self._case_worker.ask(
                 {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
             )
@@ -273,37 +283,37 @@ class Executor:
             if reply.fault:
                 raise FaultError(reply.message)
             case = block.turns[0][0].case
-            raise _UnbuiltError(f"{case} could not be built: {reply.message}", "")
+            raise _BuildError(f"{case} could not be built: {reply.message}", "")
         if "unbuilt" in reply.answer:
             refuse_full_disk(self.scratch, reply.answer["unbuilt"])
             answer = reply.answer
-            raise _UnbuiltError(
+            raise _BuildError(
                 answer["unbuilt"], answer["trace"], past_end=answer["past_end"]
             )
         return reply.answer
 
-    def _optimum(self, at: Entry, qp: QP) -> Optimum | None:
-        """Prove the optimum of the QP of an entry, once."""
-        if at.digest not in self._optima:
-            found = proven_optimum(qp, partial(self._reference, at))
-            while len(self._optima) >= _MOST_PROVEN:
+    def _optimum(self, entry: StoredCase, qp: QP) -> Optimum | None:
+        """Prove the optimum of the QP of a case, once."""
+        if entry.digest not in self._optima:
+            optimum = proven_optimum(qp, partial(self._reference, entry))
+            while len(self._optima) >= _MAX_STORED_OPTIMA:
                 del self._optima[next(iter(self._optima))]
-            self._optima[at.digest] = found
-        return self._optima[at.digest]
+            self._optima[entry.digest] = optimum
+        return self._optima[entry.digest]
 
-    def _reference(self, at: Entry, qp: QP) -> Solution:
-        """Have the case worker solve the QP of an entry by the reference.
+    def _reference(self, entry: StoredCase, qp: QP) -> Solution:
+        """Solve the QP of a case by the reference, in the case worker.
 
         Raises
         ------
         ArithmeticError
-            When it found no solution.
+            If the reference finds no solution.
         FaultError
-            When it died, or a file between us failed.
+            If the case worker dies, or a file cannot be exchanged with it.
 
         """
         point = self.scratch / "reference.npz"
-        request = {"solve": str(at.qp), "point": str(point)}
+        request = {"solve": str(entry.qp), "point": str(point)}
         reply = self._case_worker.ask(request, time_limit=inf, memory_limit=inf)
         if reply.answer is None:
             raise FaultError(f"the reference solve failed: {reply.message}")
@@ -317,10 +327,10 @@ class Executor:
             self._workers[label] = WorkerProcess(self.commands.solvers[label], log)
         return self._workers[label]
 
-    def _qp(self, at: Entry) -> QP:
-        if at.digest not in self._loaded:
-            self._loaded[at.digest] = load_qp(at.qp, operators=self.operators)[0]
-        return self._loaded[at.digest]
+    def _qp(self, entry: StoredCase) -> QP:
+        if entry.digest not in self._loaded:
+            self._loaded[entry.digest] = load_qp(entry.qp, operators=self.operators)[0]
+        return self._loaded[entry.digest]
 
     @property
     def _point(self) -> Path:
@@ -328,37 +338,39 @@ class Executor:
 
 
 @contextmanager
-def one_by_one(
+def local_engine(
     commands: Commands,
     scratch: Path,
     cases: Path,
     *,
     operators: Mapping[str, Maker] = NO_MAKERS,
 ) -> Iterator[Engine]:
-    """Open the engine of one machine: it makes a block when the last one is done."""
+    """Open the engine of one machine, which takes a block when the last one is done."""
     with closing(Executor(commands, scratch, cases, operators)) as executor:
         yield lambda blocks: chain.from_iterable(map(executor.execute, blocks))
 
 
-def _step_tol(record: Record, at: Entry) -> float | None:
-    """Find what a step is worth solving to, where that is looser than what is asked.
+def _step_tol(record: Record, entry: StoredCase) -> float | None:
+    """Return the tolerance of a step of a fixed-point iteration.
 
-    The QP is as far from the fixed point as `harness.plugin.Case.unsettled` says, and
-    a part θ of that is enough (Eisenstat and Walker 1996, SIAM J. Sci. Comput. 17). The
-    last QP of a fixed point is solved to the tolerance.
+    It is θ·δ, at most `MAX_STEP_TOL`, where δ is the distance of the QP from the fixed
+    point (`harness.plugin.Case.unsettled`) and θ is `Record.tighten` (Eisenstat and
+    Walker 1996, SIAM J. Sci. Comput. 17). Return None if that is not looser than the
+    tolerance asked for, as for the last QP, where δ = 0.
     """
-    worth = min(LOOSEST, record.tighten * float(at.meta.get("unsettled", 0.0)))
-    return worth if worth > record.tol else None
+    delta = float(entry.meta.get("unsettled", 0.0))
+    tol = min(MAX_STEP_TOL, record.tighten * delta)
+    return tol if tol > record.tol else None
 
 
-def _broken(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
-    """Give the steps that a sequence did not come to, because of how one ended."""
+def _unreached_steps(rest: tuple[Record, ...], end: Record) -> Iterator[Result]:
+    """Yield results of the steps after one that ended a sequence, with its verdict."""
     for record in rest:
         reason = f"the sequence ended at {end.case}: {end.message}"
         yield Result(record=record.replace(verdict=end.verdict, message=reason))
 
 
-class _UnbuiltError(Exception):
+class _BuildError(Exception):
     def __init__(self, reason: str, trace: str, *, past_end: bool = False) -> None:
         super().__init__(reason)
         self.reason = reason
@@ -367,5 +379,5 @@ class _UnbuiltError(Exception):
 
 
 def _case(r: Record) -> dict[str, Any]:
-    """Ask for the case of a record, as `harness.processes.case_worker` is asked."""
+    """Return the name of a record's case for `harness.processes.case_worker`."""
     return {"family": r.family, "params": r.params, "form": r.form, "name": r.case}

@@ -1,4 +1,4 @@
-"""How well the time of one solver is known relative to that of another."""
+"""Ratios of the times of two solvers, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,36 +9,42 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.special import stdtrit
 
-COVERAGE = 0.95
+COVERAGE = 0.95  #: of the intervals
 
-#: session and repeat: the solvers of one case and tolerance that have it in common were
-#: measured next to each other
+#: session and repeat; solvers that share it, for one case and tolerance, were measured
+#: next to each other
 Block = tuple[str, int]
 Key = TypeVar("Key", Block, int)
 
 
 class Ratio(NamedTuple):
-    """A ratio of times and its interval, of 95 % where nothing else is said."""
+    """A ratio of times and its confidence interval, of 95 % by default."""
 
     value: float
     low: float
     high: float
-    pairs: int  #: of what the interval is made: pairs, or the fewer of two samples
-    paired: bool = True  #: within blocks; else of two samples from different sessions
+    pairs: int  #: number of pairs; for two samples, the size of the smaller one
+    paired: bool = True  #: False for samples from different sessions
 
     @property
     def half_width(self) -> float:
-        """Relative: the interval is value·(1 + half_width)^±1."""
+        """Relative half-width w; the interval is value·(1 + w)^±1."""
         return float(np.sqrt(self.high / self.low) - 1)
 
 
 def paired_ratio(a: Mapping[Key, float], b: Mapping[Key, float]) -> Ratio | None:
-    """Compare two solvers by the blocks that both were measured in.
+    """Compare two solvers by the blocks in which both were measured.
 
-    The logarithms of the ratios within blocks are averaged; their interval is
-    Student's. What slows a whole block down cancels. None below two blocks.
+    The logarithms of the ratios within blocks are averaged, with Student's interval. A
+    disturbance that slows down a whole block cancels. Return None for fewer than two
+    common blocks.
 
     a, b : seconds by block
+
+    >>> ratio = paired_ratio({1: 2.0, 2: 4.2, 3: 1.9}, {1: 1.0, 2: 2.0, 3: 1.0})
+    >>> round(ratio.value, 2), ratio.pairs
+    (2.0, 3)
+
     """
     blocks = sorted(a.keys() & b.keys())
     n = len(blocks)
@@ -55,9 +61,9 @@ def unpaired_ratio(
 ) -> Ratio | None:
     """Compare two samples of times that have no block in common.
 
-    The means of their logarithms are compared, by Welch's interval [1]_: nothing
-    cancels, and what changed from one session to the other as a whole is not in it.
-    None below two values of either.
+    The means of their logarithms are compared, with Welch's interval [1]_. Nothing
+    cancels here, and a change of the machine between the two sessions is not contained
+    in the interval. Return None for fewer than two values in either sample.
 
     a, b : seconds
     coverage : of the interval
@@ -72,38 +78,42 @@ def unpaired_ratio(
     n, m = x.size, y.size
     if min(n, m) < 2:
         return None
-    of_x, of_y = x.var(ddof=1) / n, y.var(ddof=1) / m
+    # squared standard errors of the two means, and of their difference
+    x_error, y_error = x.var(ddof=1) / n, y.var(ddof=1) / m
     freedom = n + m - 2.0
-    if (error := of_x + of_y) > 0:
-        freedom = error**2 / (of_x**2 / (n - 1) + of_y**2 / (m - 1))
+    if (error := x_error + y_error) > 0:  # Welch-Satterthwaite degrees of freedom
+        freedom = error**2 / (x_error**2 / (n - 1) + y_error**2 / (m - 1))
     half = _student(float(freedom), coverage) * np.sqrt(error)
     low, value, high = np.exp(x.mean() - y.mean() + np.array([-half, 0.0, half]))
     return Ratio(float(value), float(low), float(high), min(n, m), paired=False)
 
 
 def ratio_of(a: Mapping[Block, float], b: Mapping[Block, float]) -> Ratio | None:
-    """Compare by the blocks that both were measured in, or else as two samples.
+    """Compare two solvers by their common blocks, or without them as two samples.
 
-    a, b : seconds by block; None where neither comparison has an interval
+    Return None if neither comparison has an interval.
+
+    a, b : seconds by block
     """
     return paired_ratio(a, b) or unpaired_ratio(a.values(), b.values())
 
 
 @cache
 def _student(freedom: float, coverage: float = COVERAGE) -> float:
-    """Half-width of an interval in errors of what it is of."""
+    """Return the half-width of Student's interval in standard errors."""
     return float(stdtrit(freedom, 0.5 + coverage / 2))
 
 
-def widest(times: Mapping[str, Mapping[Block, float]]) -> float | None:
-    """Return the half-width of the least certain ratio to the fastest solver.
+def largest_half_width(times: Mapping[str, Mapping[Block, float]]) -> float | None:
+    """Return the largest relative half-width of the ratios to the fastest solver.
 
-    times : seconds by solver and block; None with fewer than two solvers, infinity
-        where a ratio has no interval yet
+    Return None for fewer than two solvers, infinity if a ratio has no interval yet.
+
+    times : seconds by solver and block
     """
     if len(times) < 2:
         return None
-    medians = {s: float(np.median(list(of.values()))) for s, of in times.items()}
+    medians = {s: float(np.median(list(t.values()))) for s, t in times.items()}
     fastest = min(medians, key=lambda s: medians[s])
-    ratios = [ratio_of(of, times[fastest]) for s, of in times.items() if s != fastest]
+    ratios = [ratio_of(t, times[fastest]) for s, t in times.items() if s != fastest]
     return max(np.inf if r is None else r.half_width for r in ratios)

@@ -1,4 +1,4 @@
-"""Who is told how a run goes."""
+"""Progress callbacks of a run."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Progress(Protocol):
-    """Who is told how a run goes."""
+    """Progress callbacks.
+
+    A run calls `start` once, `say` before each unit of work, `advance` after a cell
+    (one measurement of one solver) and `warn` at any time.
+    """
 
     def start(self, total: int) -> None:
-        """Begin; `total` cells, those that an earlier run measured included."""
+        """Begin a run of `total` cells, counting those measured by earlier runs."""
 
     def say(self, text: str) -> None:
-        """Show what happens now."""
+        """Show the current activity."""
 
     def warn(self, text: str) -> None:
-        """Show what went wrong, in a line that stays."""
+        """Show a problem, in a line that stays visible."""
 
     def advance(self, record: Record | None) -> None:
-        """Count one cell as done; None where nothing had to be measured."""
+        """Count a cell as done, with its record; None if it was not measured."""

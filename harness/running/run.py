@@ -1,7 +1,7 @@
-"""A suite, measured: the schedule, resumption, and one journal line per measurement.
+"""Run of a suite: scheduling, resumption, and one journal line per measurement.
 
-This process decides what is measured, and alone writes the result folder; an engine
-carries out the blocks. So a run is the same on one machine and on many.
+This process decides what is measured, and it alone writes the result folder. An engine
+executes the blocks, so that a run is the same on one machine and on many.
 """
 
 from __future__ import annotations
@@ -27,24 +27,24 @@ from mortarbench.harness.registry import SolverSpec, options_of
 from mortarbench.harness.results.faults import FAULTS, Fault
 from mortarbench.harness.results.folder import (
     REMEDY,
-    Held,
+    FolderLock,
     claim,
     describe,
-    locked,
+    lock_folder,
     refuse_foreign,
     refuse_other,
     scratch_in,
 )
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.results.work_unit import (
+    BuildFailure,
     Commands,
-    Opens,
+    EngineFactory,
+    MeasurementFault,
     Outcome,
     Result,
-    Unbuilt,
-    Unmade,
 )
-from mortarbench.harness.running.executor import one_by_one
+from mortarbench.harness.running.executor import local_engine
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
@@ -55,12 +55,10 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, kw_only=True)
 class Missing:
-    """What a run could not measure; the same command tries it again."""
+    """Measurements that a run could not make; the same command retries them."""
 
     unbuilt: list[str]  #: names of the cases that could not be built
-    faults: list[
-        Fault
-    ]  #: of measurements that something else than the solver prevented
+    faults: list[Fault]  #: measurements prevented by something other than the solver
 
 
 def run(
@@ -73,21 +71,25 @@ def run(
     digest: str,
     progress: Progress,
     fresh: bool = False,
-    engine: Opens = one_by_one,
+    engine: EngineFactory = local_engine,
 ) -> Missing:
-    """Measure what the result folder `out` lacks of `suite`; return what it still does.
+    """Complete the measurements of `suite` in the result folder `out`.
 
-    resolve : configures the solver, whose options go into the records
-    environment, digest : what to write into environment.json, and its digest
-    fresh : forget first what `out` holds
-    engine : where the blocks are carried out
+    resolve : returns the configured solver, whose options are stored in the records
+    environment, digest : content of environment.json, and its digest
+    fresh : delete the content of `out` first
+    engine : opens the engine that executes the blocks
+
+    Returns
+    -------
+    the measurements that are still missing
 
     Raises
     ------
     InputError
-        When `out` is no result folder, holds another suite, case or environment, is in
-        use, or was moved or deleted meanwhile, or its disk is full. Any other failure
-        costs the measurements it concerns.
+        If `out` is not a result folder, belongs to another suite, case or environment,
+        is in use, was moved or deleted during the run, or if its disk is full. Any
+        other failure loses only the measurements that it affects.
 
     """
     refuse_foreign(out)
@@ -96,19 +98,19 @@ def run(
         ended_by_signals(),
         _continuation_told(progress),
         report_full_disk(out),
-        locked(out) as held,
+        lock_folder(out) as lock,
     ):
         options = {s.label: options_of(resolve(s)) for s in suite.solvers}
         past: list[Record] = []
         if not fresh:
-            grown = refuse_other(out, suite, environment)
-            there = next((out / "journal").glob("*.jsonl"), None) is not None
-            past = read_journal(out) if there else []
+            has_grown = refuse_other(out, suite, environment)
+            has_journal = next((out / "journal").glob("*.jsonl"), None) is not None
+            past = read_journal(out) if has_journal else []
             _check_same(out, past, suite, options)
-            if grown:
+            if has_grown:
                 _check_steps(out, past, suite)
         sources = [s for c in suite.names if (s := c.family.source_file(c.params))]
-        if fresh:
+        if fresh:  # before `claim`, which deletes the copies
             refuse_own_copies(out, sources)
         claim(out, suite, environment, fresh=fresh)
         keep_copies(out, sources, progress.warn)
@@ -124,88 +126,94 @@ def run(
                 progress=progress,
             )
             for record in past:
-                schedule.note(record)
+                schedule.add(record)
             progress.start(schedule.cells)
-            book = _Book(
+            recorder = _Recorder(
                 out=out,
-                held=held,
+                lock=lock,
                 journal=journal,
                 schedule=schedule,
                 progress=progress,
             )
             with engine(commands, scratch, out.resolve() / "cases") as execute:
                 for outcome in execute(schedule.blocks()):
-                    book.take(outcome)
-                    if book.was_deleted:
+                    recorder.take(outcome)
+                    if recorder.was_deleted:
                         describe(out, suite, environment)
                         journal.restore()
                         raise InputError(
                             f"{out} was deleted while the run wrote to it; its journal "
-                            "is there again, solutions stored before are lost; the "
-                            "same command continues"
+                            "was restored, solutions stored before are lost; the same "
+                            "command continues"
                         )
-        return Missing(unbuilt=schedule.unbuilt, faults=book.left())
+        return Missing(unbuilt=schedule.unbuilt, faults=recorder.remaining_faults())
 
 
 @dataclass(eq=False, kw_only=True)
-class _Book:
-    """Writes down what an engine gives back, once, and tells who watches."""
+class _Recorder:
+    """Writer of the outcomes of an engine, each once, and reporter of progress."""
 
     out: Path
-    held: Held
+    lock: FolderLock
     journal: Journal
     schedule: Schedule
     progress: Progress
-    was_deleted: bool = False  #: the folder, since the last time
-    _counted: set[str] = field(default_factory=set)  # run ids that were told
-    _left: dict[str, Fault] = field(default_factory=dict)
+    was_deleted: bool = False  #: True if the folder was deleted since the last outcome
+    _counted: set[str] = field(default_factory=set)  # run ids reported to `progress`
+    _faults: dict[str, Fault] = field(default_factory=dict)  # last one, by run id
 
     def take(self, outcome: Outcome) -> None:
-        """Write down one result, or why there is none.
+        """Write one result, or the reason why there is none.
 
         Raises
         ------
         InputError
-            When the folder was moved, or taken by another run, meanwhile.
+            If the folder was moved, or locked by another run, meanwhile.
         OSError
-            When the disk is full, say; then nothing of the result is in the journal.
+            If writing fails, for instance on a full disk; the journal then contains
+            nothing of the result.
 
         """
         match outcome:
-            case Unbuilt():
+            case BuildFailure():
                 _log.debug("%s\n%s", outcome.reason, outcome.trace)
                 if self.schedule.give_up(outcome.block):
                     self.progress.warn(outcome.reason)
                 for turn in outcome.block.turns:
                     for record in turn:
                         self._count(record, None)
-            case Unmade():
+            case MeasurementFault():
                 self._take_fault(outcome)
-            case Result() if self.schedule.knows(outcome.record):
-                # of a block, or a sequence, that was done again
+            case Result() if self.schedule.is_settled(outcome.record):
+                # a block or sequence that was repeated; the first result counts
                 self._count(outcome.record, None)
             case Result():
                 self._take_result(outcome)
 
-    def left(self) -> list[Fault]:
-        """List the last fault of each measurement that was not made."""
-        return [f for run_id, f in self._left.items() if not self.schedule.made(run_id)]
+    def remaining_faults(self) -> list[Fault]:
+        """List the last fault of each measurement that is still missing."""
+        return [
+            fault
+            for run_id, fault in self._faults.items()
+            if not self.schedule.is_measured(run_id)
+        ]
 
     def _take_result(self, result: Result) -> None:
         record = result.record
         if result.part:
-            number = self.schedule.number_of_part(record.block, result.part)
+            number = self.schedule.block_of_part(record.block, result.part)
             record = record.replace(block=number)
-        self.was_deleted = not self.held.is_there()
+        self.was_deleted = not self.lock.is_there()
+        # The line comes last: it must not refer to files that were not written.
         if result.point is not None:
             record = record.replace(vectors=save(self.out, result.point))
         if result.fields is not None:
             record = record.replace(fields=save(self.out, result.fields))
         self.journal.append(record)
-        self.schedule.note(record)
+        self.schedule.add(record)
         self._count(record, record)
 
-    def _take_fault(self, unmade: Unmade) -> None:
+    def _take_fault(self, unmade: MeasurementFault) -> None:
         record, what = unmade.record, unmade.reason
         fault = Fault(
             time=datetime.now(UTC).isoformat(timespec="milliseconds"),
@@ -215,20 +223,20 @@ class _Book:
             what=what,
             tried_again=unmade.tried_again,
         )
-        self.was_deleted = not self.held.is_there()
+        self.was_deleted = not self.lock.is_there()
         with Lines(self.out / FAULTS, self.progress.warn) as faults:
             faults.append(fault.to_json())
         then = "it is tried again" if unmade.tried_again else "it was not measured"
         self.progress.warn(f"{record.solver} on {record.case}: {what}; {then}")
         if not unmade.tried_again:
-            self._left[record.run_id] = fault
+            self._faults[record.run_id] = fault
             self._count(record, None)
 
-    def _count(self, record: Record, measured: Record | None) -> None:
-        """Tell of each cell once, whatever came of it and however often."""
+    def _count(self, record: Record, result: Record | None) -> None:
+        """Report a cell as done, once even if it has several outcomes."""
         if record.run_id not in self._counted:
             self._counted.add(record.run_id)
-            self.progress.advance(measured)
+            self.progress.advance(result)
 
 
 @contextmanager
@@ -246,26 +254,26 @@ def _check_same(
     suite: Suite,
     options: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Refuse to go on where a name now means another thing, or none.
+    """Refuse to continue if a name has changed its meaning since the last run.
 
-    A label has other options, a case is in the suite no longer, or its file has
-    changed.
+    That is the case if a label has other options, if a case has left the suite, or if
+    the file of a case has changed.
     """
     now = {case.name: case.params for case in suite.names}
-    asked = {label: finite(plain(given)) for label, given in options.items()}
+    configured = {label: finite(plain(value)) for label, value in options.items()}
     for record in past:
         if suite.every and record.case not in suite.every:
             raise InputError(
-                f"{out} holds {record.case}, which the suite has no longer; cases may "
-                f"be added, and --case narrows a run; {REMEDY}"
+                f"{out} holds {record.case}, which is no longer in the suite; cases "
+                f"may be added, and --case narrows a run; {REMEDY}"
             )
-        given = asked.get(record.solver, record.options)
-        for key in given.keys() | record.options.keys():
-            then, at_present = record.options.get(key), given.get(key)
-            if then != at_present:
+        today = configured.get(record.solver, record.options)
+        for key in today.keys() | record.options.keys():
+            old, new = record.options.get(key), today.get(key)
+            if old != new:
                 raise InputError(
-                    f"{out} holds {record.solver} with {key} = {shown(then)}, now "
-                    f"{shown(at_present)}; give other options another label"
+                    f"{out} holds {record.solver} with {key} = {shown(old)}, now "
+                    f"{shown(new)}; give other options another label"
                 )
         params = now.get(record.case, record.params)
         for key in params.keys() & record.params.keys():
@@ -277,17 +285,20 @@ def _check_same(
 
 
 def _check_steps(out: Path, past: list[Record], suite: Suite) -> None:
-    """Refuse a sequence that has new steps before some that were driven."""
-    driven: dict[tuple[str, str, float, int], list[str]] = {}
+    """Refuse new steps of a sequence in front of steps that were measured.
+
+    A solver carries data from step to step, so the measured steps would be others.
+    """
+    measured: dict[tuple[str, str, float, int], list[str]] = {}
     for r in past:
         if r.mode != "cold":
-            driven.setdefault((r.mode, r.solver, r.tol, r.repeat), []).append(r.case)
+            measured.setdefault((r.mode, r.solver, r.tol, r.repeat), []).append(r.case)
     for sequence in suite.sequences:
         steps = [case.name for case in sequence]
-        for cases in driven.values():
-            known = [case for case in cases if case in steps]
-            if known != steps[: len(known)]:
+        for cases in measured.values():
+            common = [case for case in cases if case in steps]
+            if common != steps[: len(common)]:
                 raise InputError(
-                    f"{out} holds a sequence that came to {known[-1]} by other steps; "
+                    f"{out} holds a sequence that reached {common[-1]} by other steps; "
                     f"steps may be added at its end; {REMEDY}"
                 )

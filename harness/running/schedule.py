@@ -1,12 +1,12 @@
-"""Which measurements of a suite are left, in which order, and when there are enough.
+"""Schedule of a suite: its remaining measurements, their order, and a stopping rule.
 
-Blocks are complete and randomised: each is every solver once on one case (or one
-sequence) at one tolerance, in random order, and every second one in the reverse order
-of the one before. With a precision to reach, blocks go on beyond the repeats
-of the suite until the ratio of every verified solver to the fastest is known so well,
-by the paired interval of `harness.running.pairs`, or a limit is met. The rule is in the
-suite, before anything is measured, and uses the journal alone: a resumed run stops
-where an undisturbed one does.
+The design consists of complete randomised blocks. A block is every solver once on one
+case (or one sequence) at one tolerance, in random order; every second block has the
+reverse order of the previous one. If the suite sets a precision, blocks continue beyond
+its repeats until the interval of every verified solver's ratio to the fastest
+(`harness.running.pairs`) is that narrow, or a limit is reached. The rule is fixed in
+the suite before the first measurement and depends on the journal alone, so a resumed
+run stops where an uninterrupted one does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
-from mortarbench.harness.running.pairs import Block, widest
+from mortarbench.harness.running.pairs import Block, largest_half_width
 from mortarbench.harness.running.progress import Progress
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
@@ -28,63 +28,74 @@ Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 @dataclass(eq=False, kw_only=True)
 class Schedule:
-    """The blocks of a suite, given what the journal holds."""
+    """Blocks of a suite that remain to be measured, given those in its journal."""
 
     suite: Suite
     options: Mapping[str, Mapping[str, Any]]  #: of each solver, defaults resolved
     environment: str  #: digest
     session: str = ""  #: of the run, see `harness.record.Record`
     progress: Progress
-    unbuilt: list[str] = field(default_factory=list)  #: names of cases
-    _seen: dict[Cell, list[Record]] = field(default_factory=dict)  # for `_enough`
-    _declined: set[tuple[str, Cell]] = field(default_factory=set)
-    _done: set[str] = field(default_factory=set)  #: run ids
-    _next: int = 0  #: number of a new block
+    unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
+    #: records by cell; empty unless the suite sets a precision
+    _records: dict[Cell, list[Record]] = field(default_factory=dict)
+    _declined: set[tuple[str, Cell]] = field(default_factory=set)  # solver and cell
+    _done: set[str] = field(default_factory=set)  # run ids
+    _next: int = 0  # number of the next new block
     _parts: dict[tuple[int, int], int] = field(default_factory=dict)  # their numbers
 
     @property
     def cells(self) -> int:
-        """Count the measurements that the suite has at most."""
+        """Largest number of measurements of the suite."""
         s = self.suite
-        return len(s.names) * len(s.tolerances) * self._most * len(s.solvers)
+        return len(s.names) * len(s.tolerances) * self._max_repeats * len(s.solvers)
 
-    def note(self, record: Record) -> None:
-        """Know of a measurement that is in the journal."""
+    def add(self, record: Record) -> None:
+        """Add a measurement that is in the journal."""
         self._done.add(record.run_id)
         self._next = max(self._next, record.block + 1)
         if record.verdict is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
         if self.suite.precision is not None:
-            self._seen.setdefault(_cell(record), []).append(record)
+            self._records.setdefault(_cell(record), []).append(record)
 
-    def knows(self, record: Record) -> bool:
-        """Whether nothing is left to be learnt from measuring that."""
+    def is_settled(self, record: Record) -> bool:
+        """Return True for a record that is in the journal, or that its solver declines.
+
+        A solver that declined a case once declines it in every repeat.
+        """
         declined = (record.solver, _cell(record)) in self._declined
         return declined or record.run_id in self._done
 
-    def made(self, run_id: str) -> bool:
-        """Whether that measurement is in the journal."""
+    def is_measured(self, run_id: str) -> bool:
+        """Return True if the measurement is in the journal."""
         return run_id in self._done
 
-    def number_of_part(self, block: int, part: int) -> int:
-        """Give what was measured later or elsewhere of a block a number of its own."""
+    def block_of_part(self, block: int, part: int) -> int:
+        """Return the block number of a part that was measured later or elsewhere.
+
+        Times are paired within blocks only, so such a part must not keep the number.
+        """
         if (block, part) not in self._parts:
             self._parts[block, part] = self._next
             self._next += 1
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Leave out the cases of a block that cannot be built; False if known."""
+        """Exclude the cases of a block, not built; return False if they already are."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)
 
     def blocks(self) -> Iterator[WorkUnit]:
-        """Make the blocks, each when it is asked for."""
+        """Yield the remaining blocks.
+
+        Each depends on what is in the journal when it is requested: the stopping rule
+        sees all blocks that were measured before.
+        """
         for group in self.suite.groups:
             for tol in self.suite.tolerances:
-                for repeat in range(self._most):
-                    if repeat >= self.suite.repeats and self._enough(group, tol):
+                for repeat in range(self._max_repeats):
+                    if repeat >= self.suite.repeats and self._is_enough(group, tol):
                         self._skip(len(group.cases) * len(self.suite.solvers))
                         continue
                     block = self._block(group, tol, repeat)
@@ -96,31 +107,36 @@ class Schedule:
                         yield block
 
     @property
-    def _most(self) -> int:
+    def _max_repeats(self) -> int:
         s = self.suite
         return s.repeats if s.precision is None else max(s.repeats, s.max_repeats)
 
-    def _enough(self, group: Group, tol: float) -> bool:
-        """Whether every ratio is known well enough, or there is no budget left."""
+    def _is_enough(self, group: Group, tol: float) -> bool:
+        """Return True if the precision is reached or the budget is spent."""
         assert self.suite.precision is not None
         records = [
             r
             for case in group.cases
-            for r in self._seen.get((group.mode, case.name, tol), ())
+            for r in self._records.get((group.mode, case.name, tol), ())
         ]
         if sum(r.total_seconds or 0.0 for r in records) >= self.suite.budget:
             return True
+        # one failure excludes a solver: its times are not those of solving the problem
         failed = {r.solver for r in records if not r.verdict.is_verified}
         times: dict[str, dict[Block, float]] = {}
         for solver in {r.solver for r in records} - failed:
-            mine = [r for r in records if r.solver == solver and r.total_seconds]
-            times[solver] = _by_block(mine)
-        width = widest(times)
+            times[solver] = _by_block(
+                r for r in records if r.solver == solver and r.total_seconds
+            )
+        width = largest_half_width(times)
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
-        """Shuffle what is left of a block; of a sequence, a solver's whole turn is."""
-        left = []
+        """Return the remaining turns of a block in random order; None without any.
+
+        A sequence is repeated as a whole: a solver carries data from step to step.
+        """
+        turns = []
         is_given_up = any(case.name in self.unbuilt for case in group.cases)
         for spec in self.suite.solvers:
             turn = tuple(
@@ -138,20 +154,22 @@ class Schedule:
                 )
                 for case in group.cases
             )
-            if is_given_up or all(map(self.knows, turn)):
+            if is_given_up or all(map(self.is_settled, turn)):
                 self._skip(len(turn))
             else:
-                left.append(turn)
-        if not left:
+                turns.append(turn)
+        if not turns:
             return None
+        # A pair of repeats shares the seed, so that the second reverses the first: over
+        # the pair, all solvers have the same mean position in their block.
         seed = f"{self.suite.name} {group.cases[0]} {tol} {repeat // 2}"
-        random.Random(seed).shuffle(left)
-        if repeat % 2:  # who was first is last: no place in a block favours anybody
-            left.reverse()
+        random.Random(seed).shuffle(turns)
+        if repeat % 2:
+            turns.reverse()
         self._next += 1
         return WorkUnit(
-            number=left[0][0].block,
-            turns=tuple(left),
+            number=turns[0][0].block,
+            turns=tuple(turns),
             time_limit=self.suite.time_limit,
             memory_limit=self.suite.memory_limit,
         )
@@ -162,10 +180,11 @@ class Schedule:
 
 
 def _by_block(records: Iterable[Record]) -> dict[Block, float]:
-    """Add the seconds of the steps of each repeat.
+    """Return the total seconds of the steps of each repeat, by block.
 
-    A sequence that was cut off and driven again is of several sessions, and is paired
-    with nothing but such.
+    A sequence that was interrupted and resumed has records of several sessions; their
+    names together form its block, so that it is paired only with sequences of the same
+    sessions.
     """
     repeats: dict[int, list[Record]] = {}
     for r in records:

@@ -1,1 +1,1 @@
-"""What a suite file asks for."""
+"""Suites: TOML files that specify measurements."""

@@ -1,9 +1,9 @@
-"""How a suite may change while its result folder lasts: by asking for more.
+"""Permitted changes of a suite with a result folder, and unions of suites.
 
-What was measured stays what it was asked for: under the same limits, judged at the
-same accuracy, by the same solver under one label. Solvers, cases and tolerances may be
-added, repeats raised, and a precision may be asked for or tightened. Of several suites
-that are alike in this sense, one can be made.
+A suite may only ask for more: solvers, cases and tolerances may be added, repeats
+raised, and a precision set or tightened. Limits, accuracy and the solver behind a label
+must stay, because the stored measurements depend on them. Suites that agree in these
+can be united.
 """
 
 from __future__ import annotations
@@ -15,119 +15,122 @@ from typing import Any
 from mortarbench.harness.errors import InputError, shown
 from mortarbench.harness.suite.suite import DEFAULTS, suite_text
 
-SAME = ("time_limit", "memory_limit", "accuracy")  #: what a verdict or time depends on
-RAISED = ("repeats", "max_repeats", "budget")  #: may grow
+#: settings that stored verdicts and times depend on
+FIXED_KEYS = ("time_limit", "memory_limit", "accuracy")
+GROWING_KEYS = ("repeats", "max_repeats", "budget")  #: may grow
 
-_AND = "-and-"  #: between the names of suites that were united
+_AND = "-and-"  #: separator of the names of united suites
 
-Table = Mapping[str, Any]  #: of a suite's TOML
+Table = Mapping[str, Any]  #: content of a suite's TOML
 
 
-def refused(then: Table, now: Table) -> str:
-    """Say what makes a changed suite another one; empty if it only asks for more.
+def incompatibility(old: Table, new: Table) -> str:
+    """Return a change that a suite may not make, or "" if it only asks for more.
 
-    Cases are not compared here: `harness.running.run` holds them against the journal.
+    Cases are not compared here: `harness.running.run` compares them with the journal.
     """
-    both = {**DEFAULTS, **then}, {**DEFAULTS, **now}
+    both = {**DEFAULTS, **old}, {**DEFAULTS, **new}
     return next(chain(_settings(*both), _members(*both)), "")
 
 
-def _settings(then: Table, now: Table) -> Iterator[str]:
-    for key in ("name", *SAME):
-        if then.get(key) != now.get(key):
-            yield _was(key, then.get(key), now.get(key))
-    for key in RAISED:
-        if now[key] < then[key]:
-            yield f"{_was(key, then[key], now[key])}; it may only grow"
+def _settings(old: Table, new: Table) -> Iterator[str]:
+    for key in ("name", *FIXED_KEYS):
+        if old.get(key) != new.get(key):
+            yield _change(key, old.get(key), new.get(key))
+    for key in GROWING_KEYS:
+        if new[key] < old[key]:
+            yield f"{_change(key, old[key], new[key])}; it may only grow"
     finer = "it may only become finer"
-    if then["precision"] is not None and (now["precision"] or 1) > then["precision"]:
-        yield f"{_was('precision', then['precision'], now['precision'])}; {finer}"
+    # no precision at all counts as the loosest one, 1
+    if old["precision"] is not None and (new["precision"] or 1) > old["precision"]:
+        yield f"{_change('precision', old['precision'], new['precision'])}; {finer}"
 
 
-def _members(then: Table, now: Table) -> Iterator[str]:
-    if then["null_arm"] not in (None, now["null_arm"]):
-        yield _was("null_arm", then["null_arm"], now["null_arm"])
-    for tol in then["tolerances"]:
-        if tol not in now["tolerances"]:
+def _members(old: Table, new: Table) -> Iterator[str]:
+    if old["null_arm"] not in (None, new["null_arm"]):
+        yield _change("null_arm", old["null_arm"], new["null_arm"])
+    for tol in old["tolerances"]:
+        if tol not in new["tolerances"]:
             yield f"tolerance {tol:g} is missing; tolerances may be added"
-    solvers = _entries(now)
-    for label, entry in _entries(then).items():
+    solvers = _entries(new)
+    for label, entry in _entries(old).items():
         if label not in solvers:
             yield f"solver {shown(label)} is missing; solvers may be added"
         elif solvers[label]["name"] != entry["name"]:
-            yield _was(f"solver {shown(label)}", entry["name"], solvers[label]["name"])
+            name = f"solver {shown(label)}"
+            yield _change(name, entry["name"], solvers[label]["name"])
 
 
-def _was(what: str, then: object, now: object) -> str:
-    return f"{what} was {_said(then)}, now {_said(now)}"
+def _change(name: str, old: object, new: object) -> str:
+    return f"{name} was {_text(old)}, now {_text(new)}"
 
 
-def _said(value: object) -> str:
+def _text(value: object) -> str:
     return "not set" if value is None else shown(value)
 
 
-def united(tables: Mapping[str, Table]) -> dict[str, Any]:
-    """Unite suites: the first one's settings, and all that any of them asks for.
+def unite(tables: Mapping[str, Table]) -> dict[str, Any]:
+    """Return the union of suites: settings of the first, and the measurements of all.
 
-    tables : by the folder that each is from, as `harness.suite.suite.read_stored` reads
+    tables : results of `harness.suite.suite.read_stored` by their folders
 
     Raises
     ------
     InputError
-        When two differ in a limit, the accuracy, or in what one label means.
+        If two differ in a limit, in the accuracy, or in the solver behind a label.
 
     """
-    whole: dict[str, Any] = {}
-    of = ""
+    union: dict[str, Any] = {}
+    first = ""
     for folder, table in tables.items():
-        _refuse_unequal(of, whole, folder, table)
-        _add(whole, table)
-        of = of or folder
-    return whole
+        _refuse_unequal(first, union, folder, table)
+        _add(union, table)
+        first = first or folder
+    return union
 
 
-def _refuse_unequal(of: str, whole: Table, folder: str, table: Table) -> None:
-    if not whole:
+def _refuse_unequal(first: str, union: Table, folder: str, table: Table) -> None:
+    if not union:
         return
-    a, b = {**DEFAULTS, **whole}, {**DEFAULTS, **table}
-    for key in SAME:
+    a, b = {**DEFAULTS, **union}, {**DEFAULTS, **table}
+    for key in FIXED_KEYS:
         if a[key] != b[key]:
             raise InputError(
-                f"{key} is {_said(a[key])} in {of}, {_said(b[key])} in {folder}; "
-                "expected suites whose measurements are alike"
+                f"{key} is {_text(a[key])} in {first}, {_text(b[key])} in {folder}; "
+                "expected equal settings"
             )
-    mine, its = _entries(whole), _entries(table)
-    for label in mine.keys() & its.keys():
-        if mine[label] != its[label]:
+    one, other = _entries(union), _entries(table)
+    for label in one.keys() & other.keys():
+        if one[label] != other[label]:
             raise InputError(
-                f"the label {shown(label)} is {_said(mine[label])} in {of}, "
-                f"{_said(its[label])} in {folder}; expected one solver for a label"
+                f"the label {shown(label)} is {_text(one[label])} in {first}, "
+                f"{_text(other[label])} in {folder}; expected one solver for a label"
             )
 
 
-def _add(whole: dict[str, Any], table: Table) -> None:
-    """Add to a suite what another one asks for."""
-    if not whole:
-        whole |= table
+def _add(union: dict[str, Any], table: Table) -> None:
+    """Add the measurements of a suite to a union."""
+    if not union:
+        union |= table
         return
     names = [
-        *str(whole.get("name", "")).split(_AND),
+        *str(union.get("name", "")).split(_AND),
         *str(table.get("name")).split(_AND),
     ]
-    whole["name"] = _AND.join(dict.fromkeys(filter(None, names)))
-    for key in RAISED:
+    union["name"] = _AND.join(dict.fromkeys(filter(None, names)))
+    for key in GROWING_KEYS:
         if key in table:
-            whole[key] = max(table[key], whole.get(key, DEFAULTS[key]))
+            union[key] = max(table[key], union.get(key, DEFAULTS[key]))
     for key in ("tolerances", "solvers", "problems"):
-        if key not in whole.keys() | table.keys():
+        if key not in union.keys() | table.keys():
             continue
-        there = list(whole.get(key, DEFAULTS.get(key, ())))
+        present = list(union.get(key, DEFAULTS.get(key, ())))
         more = table.get(key, DEFAULTS.get(key, ()))
-        whole[key] = there + [one for one in more if one not in there]
+        union[key] = present + [entry for entry in more if entry not in present]
 
 
 def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
-    """Give the name and options of a suite's solvers by their labels."""
+    """Return name and options of a suite's solvers by label."""
     entries = (
         entry if isinstance(entry, Mapping) else {"name": entry}
         for entry in table.get("solvers", ())
@@ -142,7 +145,7 @@ def _entries(table: Table) -> dict[str, Mapping[str, Any]]:
 
 
 def as_toml(table: Table) -> str:
-    """Write a suite as TOML: what is nested stands in one line."""
+    """Return a suite as TOML; nested tables are written on one line."""
     blocks = table.get("problems", ())
     head = suite_text({k: v for k, v in table.items() if k != "problems"})
     return "\n[[problems]]\n".join([head, *map(suite_text, blocks)])

@@ -1,4 +1,4 @@
-"""A suite narrowed, as the options of the command line say."""
+"""Overrides of a suite by options of the command line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from mortarbench.harness.files.reading import toml
 from mortarbench.harness.names import CaseId, match, parse
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.solver_options import swept
-from mortarbench.harness.suite.suite import NULL, Suite
+from mortarbench.harness.suite.solver_options import sweep
+from mortarbench.harness.suite.suite import NULL_SUFFIX, Suite
 
 
 def with_overrides(
@@ -30,33 +30,38 @@ def with_overrides(
     memory_limit: float | None = None,
     options: Mapping[str, Sequence[str]] | None = None,
 ) -> Suite:
-    """Narrow a suite as the options of the command line say.
+    """Return a suite with the overrides of the command line.
 
     solvers : labels of the suite to keep, or names of the registry to add
-    cases : what to keep: shell globs over canonical names, or names
-    options : of the solvers, as texts; several values sweep
+    cases : cases to keep: names, or shell globs over canonical names
+    options : options of the solvers, as texts; several values are swept
 
     Raises
     ------
     InputError
-        For an unknown solver, a pattern that matches nothing, a value out of range.
+        For an unknown solver, a pattern that matches nothing, or a value out of range.
 
     """
     changes: dict[str, Any] = {}
     if solvers:
         chosen = {spec.label: spec for spec in suite.solvers}
-        known = {label: resolve(spec, registry) for label, spec in chosen.items()}
+        resolved = {label: resolve(spec, registry) for label, spec in chosen.items()}
         for name in solvers:
             if name not in chosen:
                 chosen[name] = SolverSpec(name=name, label=name)
                 with checked.located("--solver"):
-                    resolve(chosen[name], {**known, **registry})
-        kept = dict.fromkeys(solvers)
-        null = [n for n in chosen if n not in kept and n.removesuffix(NULL) in kept]
-        changes["solvers"] = tuple(chosen[name] for name in (*kept, *null))
+                    resolve(chosen[name], {**resolved, **registry})
+        selected = dict.fromkeys(solvers)
+        # the second copy of an A/A comparison stays with the first
+        null = [
+            name
+            for name in chosen
+            if name not in selected and name.removesuffix(NULL_SUFFIX) in selected
+        ]
+        changes["solvers"] = tuple(chosen[name] for name in (*selected, *null))
     if options:
-        asked = changes.get("solvers", suite.solvers)
-        changes["solvers"] = swept(asked, options, registry)
+        specs = changes.get("solvers", suite.solvers)
+        changes["solvers"] = sweep(specs, options, registry)
     if cases:
         changes |= _chosen_cases(suite, cases, families)
     if repeats is not None:
@@ -65,9 +70,9 @@ def with_overrides(
     for key, limit in (("time_limit", time_limit), ("memory_limit", memory_limit)):
         if limit is not None:
             changes[key] = checked.positive(f"--{key.replace('_', '-')}", limit)
-            # Measurements under other limits are other measurements, unlike those of
-            # fewer solvers, cases or repeats: they make another suite. In TOML such
-            # keys come before those of any table.
+            # Results depend on the limits, unlike on the choice of solvers, cases and
+            # repeats. So other limits make another suite, and its text must show them.
+            # In TOML, top-level keys come before those of any table.
             line = f"{key} = {limit!r}"
             if key in toml(text):
                 old = rf"^[ \t]*{key}[ \t]*=.*$"
@@ -80,26 +85,26 @@ def with_overrides(
 def _chosen_cases(
     suite: Suite, patterns: Sequence[str], families: Mapping[str, Family]
 ) -> dict[str, Any]:
-    """Keep what matches; of a sequence all or nothing."""
-    named = [case.name for case in suite.names]
-    kept: set[str] = set()
+    """Return the cases that match a pattern, and the entire sequences of such cases."""
+    names = [case.name for case in suite.names]
+    selected: set[str] = set()
     for pattern in patterns:
         canonical = pattern
         if not set("*?[") & set(pattern):
             with suppress(InputError):
                 canonical = parse(pattern, families).name
-        matched = match(canonical, named)
-        if not matched:
+        matches = match(canonical, names)
+        if not matches:
             raise InputError(
-                f"--case {pattern!r} matches none of the {len(named)} cases of suite "
-                f"{suite.name!r}; there are {some(named)}"
+                f"--case {pattern!r} matches none of the {len(names)} cases of suite "
+                f"{suite.name!r}; there are {some(names)}"
             )
-        kept.update(matched)
+        selected.update(matches)
 
-    def wanted(case: CaseId) -> bool:
-        return case.name in kept
+    def is_selected(case: CaseId) -> bool:
+        return case.name in selected
 
     return {
-        "cases": tuple(filter(wanted, suite.cases)),
-        "sequences": tuple(s for s in suite.sequences if any(map(wanted, s))),
+        "cases": tuple(filter(is_selected, suite.cases)),
+        "sequences": tuple(s for s in suite.sequences if any(map(is_selected, s))),
     }

@@ -1,4 +1,4 @@
-"""The tables under ``problems`` of a suite: grids of cases, and sequences of them."""
+"""Expansion of the ``problems`` of a suite into grids and sequences of cases."""
 
 from __future__ import annotations
 
@@ -19,16 +19,23 @@ from mortarbench.harness.plugin import Family
 _PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
 
 
-def planned(
+def expand_problems(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> tuple[tuple[CaseId, ...], tuple[tuple[CaseId, ...], ...]]:
-    """All cold cases in the order written, and all sequences of cases.
+    """Return all cold cases in the order of the suite, and all sequences of cases.
 
-    A case that two blocks share is kept once. A sequence are the cases that differ in
-    its key only, and in those zipped with it, in the order of their values.
+    A case that occurs in two blocks is returned once. A sequence consists of the cases
+    that differ only in its key and in the keys zipped with that, in the order of their
+    values.
 
-    folder : of the suite; a path that leads nowhere from here is sought there
-    most : cases that the blocks may span in all
+    folder : folder of the suite; relative paths that do not exist are looked up there
+    most : largest number of cases of all blocks
+
+    Raises
+    ------
+    InputError
+        With the place in the suite, if a block is wrong or there are too many cases.
+
     """
     cold: dict[str, CaseId] = {}
     sequences: dict[str, tuple[CaseId, ...]] = {}
@@ -48,14 +55,14 @@ def planned(
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Block:
     cases: list[CaseId]
-    along: tuple[str, ...]  #: the keys of a sequence; none where cases are cold
+    along: tuple[str, ...]  #: keys of a sequence; empty if the cases are cold
 
 
 def _blocks(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
 ) -> Iterator[_Block]:
-    """Read the tables under problems, one by one."""
-    spanned = 0
+    """Yield the blocks of the tables under ``problems``."""
+    count = 0  # of cases, checked before they are created: a grid may span billions
     for i, block in enumerate(checked.filled_list("problems", blocks)):
         with checked.located(f"problems[{i}]"):
             table = checked.table("entry", block)
@@ -70,17 +77,19 @@ def _blocks(
             for key in params:
                 if key not in family.defaults:
                     raise unknown("key", key, family.defaults, where=name)
-            over = _along(table.get("sequence"), params)
+            sequence_key = _along(table.get("sequence"), params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
             if family.path_suffix is not None and "path" in params:
                 params = {**params, "path": _expanded(params["path"], folder, family)}
             axes = _axes(params, table.get("zip", []))
-            along = next((tuple(axis[0]) for axis in axes if over in axis[0]), ())
-            spanned += prod(map(len, axes)) * len(forms)
-            if spanned > most:
+            along = next(
+                (tuple(axis[0]) for axis in axes if sequence_key in axis[0]), ()
+            )
+            count += prod(map(len, axes)) * len(forms)
+            if count > most:
                 raise InputError(
-                    f"the grid spans {spanned} cases; expected at most {most} in all; "
-                    f"take fewer values, or set max_cases = {spanned} in the suite"
+                    f"the grid spans {count} cases; expected at most {most} in all; "
+                    f"take fewer values, or set max_cases = {count} in the suite"
                 )
             cases = [
                 assemble(
@@ -95,21 +104,21 @@ def _blocks(
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:
-    """Write out the shell patterns among paths: the files that match, sorted."""
-    listed = paths if isinstance(paths, list) else [paths]
-    if not any(_is_pattern(path, folder, family) for path in listed):
+    """Replace shell patterns among paths by the files that match, sorted."""
+    entries = paths if isinstance(paths, list) else [paths]
+    if not any(_is_pattern(path, folder, family) for path in entries):
         return paths
-    found: list[object] = []
-    for path in listed:
+    expanded: list[object] = []
+    for path in entries:
         if _is_pattern(path, folder, family):
-            found += _matching(str(path), folder, family)
+            expanded += _matching(str(path), folder, family)
         else:
-            found.append(path)
-    return found
+            expanded.append(path)
+    return expanded
 
 
 def _is_pattern(path: object, folder: Path, family: Family) -> bool:
-    """Whether a path has the signs of a pattern, and is no file's name as it is."""
+    """Return True if a path has wildcards and is not the literal name of a file."""
     if not isinstance(path, str) or not set("*?[") & set(path):
         return False
     if os.path.exists(path) or (folder / path).exists():
@@ -118,16 +127,16 @@ def _is_pattern(path: object, folder: Path, family: Family) -> bool:
 
 
 def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
-    """List the files that match from here, or else from the folder of the suite.
+    """List matching files of the working directory, or else of the suite's folder.
 
-    Files that are missing here count where the result folder knows of them.
+    Files that are missing but have a copy in the result folder are included.
     """
     missing = {p for p in _copied(pattern, family) if not os.path.lexists(p)}
-    if found := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
-        return found
+    if paths := sorted({*filter(os.path.isfile, glob(pattern)), *missing}):
+        return paths
     beside = glob(os.path.join(escape(str(folder)), pattern))
-    if found := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
-        return found
+    if paths := sorted(map(os.path.relpath, filter(os.path.isfile, beside))):
+        return paths
     raise InputError(
         f"params.path = {shown(pattern)} matches no file; expected a pattern of files, "
         "from here or from the folder of the suite"
@@ -135,7 +144,7 @@ def _matching(pattern: str, folder: Path, family: Family) -> list[str]:
 
 
 def _copied(pattern: str, family: Family) -> list[str]:
-    """List paths that the result folder knows and whose last parts match a pattern."""
+    """List the paths with a copy in the result folder whose last parts match."""
     if not PurePath(pattern).parts:
         return []
     return [path for path in family.copied_paths() if PurePath(path).match(pattern)]
@@ -144,10 +153,10 @@ def _copied(pattern: str, family: Family) -> list[str]:
 def _located(
     point: dict[str, object], folder: Path, family: Family
 ) -> dict[str, object]:
-    """Take a path that leads nowhere from here to be relative to the suite.
+    """Interpret a path that does not exist as relative to the suite's folder.
 
-    A file that is at neither place may have travelled with the results, under the path
-    that the suite had led to then.
+    If the file is missing there as well, it may have a copy in the result folder, under
+    the path at the time of the run.
     """
     match point:
         case {"path": str(text)} if text and not Path(text).is_file():
@@ -160,7 +169,7 @@ def _located(
 
 
 def _along(key: object, params: Mapping[str, Any]) -> str | None:
-    """Check the key that a sequence runs along."""
+    """Return the key of a sequence after checking that it has several values."""
     if key is None:
         return None
     values = params.get(checked.text("sequence", key))
@@ -168,14 +177,14 @@ def _along(key: object, params: Mapping[str, Any]) -> str | None:
         lists = [k for k, v in params.items() if isinstance(v, list)]
         hint = f"; there are {some(lists)}" if lists else ""
         raise InputError(
-            f"sequence = {shown(key)} is no list in params; expected the key whose "
+            f"sequence = {shown(key)} is not a list in params; expected the key whose "
             f"values are the steps{hint}"
         )
     return str(key)
 
 
 def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:
-    """List what each axis of a grid runs through; zipped keys run together."""
+    """Return the axes of a grid, lists of dicts; zipped keys share one axis."""
     columns = {
         key: checked.filled_list(f"params.{key}", v) if isinstance(v, list) else [v]
         for key, v in table.items()
@@ -188,7 +197,7 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
                 or key in zipped
             ):
                 raise InputError(
-                    f"zip: {shown(key)} is no list in params, or is paired twice; "
+                    f"zip: {shown(key)} is not a list in params, or is paired twice; "
                     'expected groups of such keys, like [["Nr", "Nh"]]'
                 )
             zipped[key] = group
@@ -205,6 +214,6 @@ def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, objec
 
 
 def _points(axes: Sequence[list[dict[str, object]]]) -> Iterator[dict[str, object]]:
-    """Span the grid of some axes, the first one slowest."""
+    """Yield the points of a grid; the first axis varies slowest."""
     for point in product(*axes):
         yield {k: v for part in point for k, v in part.items()}

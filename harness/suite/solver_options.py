@@ -1,7 +1,7 @@
-"""Options of solvers as the command line gives them: ``KEY=VALUE``, lists for sweeps.
+"""Options of solvers from the command line: ``KEY=VALUE``, with lists for sweeps.
 
-A value is read as the type that the solver declares for the option: the annotation of
-the field of its dataclass, or, where that says nothing, the type of its default.
+A value is converted to the type that the solver declares for the option: the annotation
+of the dataclass field or, if that is not specific, the type of its default.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mortarbench.harness.checked import located
 from mortarbench.harness.errors import InputError, shown, unknown
 from mortarbench.harness.plugin import Solver
 from mortarbench.harness.registry import SolverSpec, option_types, options_of, resolve
-from mortarbench.harness.suite.suite import NULL
+from mortarbench.harness.suite.suite import NULL_SUFFIX
 
 _KEY = re.compile(r"[^\W\d]\w*")
 _NUMBERS = {
@@ -28,50 +28,53 @@ _NUMBERS = {
         re.compile(r"[+-]?(inf|([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?)"),
         "a number",
     ),
-}  # digits of other scripts and 1_0 are numbers to Python alone
+}  # stricter than int() and float(), which accept 1_0 and digits of other scripts
 _TRUTH = {"true": True, "false": False}
 _PLAIN = (bool, Real, str, NoneType)  #: types of values from a Python program
-_MOST = 1000  #: solvers that a sweep may span
+_MAX_VARIANTS = 1000  #: variants of one solver in a sweep
 
 
-def given_options(texts: Iterable[str]) -> dict[str, list[str]]:
-    """Split ``KEY=VALUE`` or ``KEY=VALUE,VALUE``; of a key given again, go on.
+def parse_options(texts: Iterable[str]) -> dict[str, list[str]]:
+    """Split texts ``KEY=VALUE`` or ``KEY=VALUE,VALUE``; repeated keys are joined.
 
     Raises
     ------
     InputError
-        For what is nothing like it, and for a value that is given twice.
+        If a text has another form.
+
+    >>> parse_options(["max_iter=50,100", "rho=0.1", "max_iter=200"])
+    {'max_iter': ['50', '100', '200'], 'rho': ['0.1']}
 
     """
-    found: dict[str, list[str]] = {}
+    options: dict[str, list[str]] = {}
     for text in texts:
         key, equals, values = text.partition("=")
         if not equals or not _KEY.fullmatch(key) or not all(values.split(",")):
             raise InputError(
                 f"--option {shown(text)}; expected KEY=VALUE, such as max_iter=50"
             )
-        found.setdefault(key, []).extend(values.split(","))
-    return found
+        options.setdefault(key, []).extend(values.split(","))
+    return options
 
 
-def as_given(options: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Write options that a Python program gives as the command line does.
+def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
+    """Convert options of a Python program to texts, as on the command line.
 
     Raises
     ------
     InputError
-        When they are no mapping from names to plain values or lists of these.
+        If they are not a mapping from names to plain values or lists of these.
 
     """
     if not isinstance(options, Mapping):
         raise InputError(
             f'options = {shown(options)}; expected a dict such as {{"max_iter": 50}}'
         )
-    given: dict[str, list[str]] = {}
+    texts: dict[str, list[str]] = {}
     for key, value in options.items():
         if not isinstance(key, str) or not _KEY.fullmatch(key):
             raise InputError(
-                f"options: {shown(key)} is no name; expected one such as max_iter"
+                f"options: {shown(key)} is not a name; expected one such as max_iter"
             )
         values = value if isinstance(value, list | tuple) else [value]
         if not values or not all(isinstance(v, _PLAIN) for v in values):
@@ -79,53 +82,55 @@ def as_given(options: Mapping[str, Any]) -> dict[str, list[str]]:
                 f"options: {key} = {shown(value)}; expected a number, a text, True, "
                 "False or None, or a list of these"
             )
-        given[key] = [*map(_text, values)]
-    return given
+        texts[key] = [*map(_text, values)]
+    return texts
 
 
 def options_for(
     name: str, texts: Iterable[str], registry: Mapping[str, Solver]
 ) -> dict[str, Any]:
-    """Read the options of one solver, each given once, where nothing is swept.
+    """Return the options of one solver, with one value for each.
 
     name : of the solver in the registry
 
     Raises
     ------
     InputError
-        When an option has several values; as `swept`.
+        If an option has several values or is unknown, or the solver refuses its value.
 
     """
-    given = given_options(texts)
-    if not given:
+    options_of_texts = parse_options(texts)
+    if not options_of_texts:
         return {}
     with located("--option"):
-        for key, values in given.items():
+        for key, values in options_of_texts.items():
             if len(values) > 1:
                 raise InputError(
                     f"{key} has {len(values)} values; expected one, only `run` sweeps"
                 )
         spec = SolverSpec(name=name, label=name)
-        one = {key: value for key, (value,) in given.items()}
-        options = _typed(name, resolve(spec, registry), one)
+        single = {key: value for key, (value,) in options_of_texts.items()}
+        options = _typed(name, resolve(spec, registry), single)
         resolve(replace(spec, options=options), registry)
     return options
 
 
-def swept(
+def sweep(
     specs: Sequence[SolverSpec],
     given: Mapping[str, Sequence[str]],
     registry: Mapping[str, Solver],
 ) -> tuple[SolverSpec, ...]:
-    """Give every solver that has the options each combination of their values.
+    """Return a variant of each solver for every combination of the options' values.
 
-    Labels tell them apart, as in ``LABEL max_iter=50``. A solver that has some of the
-    options takes these; one that has none stays as it is.
+    Labels distinguish the variants, as in ``LABEL max_iter=50``. A solver that has only
+    some of the options is varied in these; one that has none is returned unchanged.
+
+    given : values by option
 
     Raises
     ------
     InputError
-        When no solver has one of the options, or one refuses a value of it.
+        If no solver has one of the options, or a solver refuses a value of it.
 
     """
     if not given:
@@ -135,82 +140,96 @@ def swept(
     for key in given:
         if key not in names:
             raise unknown("option", key, names, where="--option")
-    found: dict[str, SolverSpec] = {}
+    variants: dict[str, SolverSpec] = {}  # by label
     for spec, solver in zip(specs, solvers, strict=True):
         for options in _combinations(spec.name, solver, given):
-            null = NULL if spec.role == "null" else ""
+            null = NULL_SUFFIX if spec.role == "null" else ""
             label = f"{with_options(spec.label.removesuffix(null), options)}{null}"
-            if label in found:
+            if label in variants:
                 raise InputError(
-                    f"--option: {label!r} is asked for twice; expected distinct values"
+                    f"--option: {label!r} occurs twice; expected distinct values"
                 )
             changed = replace(spec, label=label, options={**spec.options, **options})
             with located("--option"):
                 resolve(changed, registry)
-            found[label] = changed
-    return tuple(found.values())
+            variants[label] = changed
+    return tuple(variants.values())
 
 
 def _combinations(
     name: str, solver: Solver, given: Mapping[str, Sequence[str]]
 ) -> Iterator[dict[str, Any]]:
-    own = {key: given[key] for key in given if key in options_of(solver)}
-    if (count := prod(map(len, own.values()))) > _MOST:
+    axes = {key: given[key] for key in given if key in options_of(solver)}
+    if (count := prod(map(len, axes.values()))) > _MAX_VARIANTS:
         raise InputError(
-            f"--option spans {count} variants of {name}; expected at most {_MOST}"
+            f"--option spans {count} variants of {name}; expected at most "
+            f"{_MAX_VARIANTS}"
         )
-    for values in product(*own.values()):
+    for values in product(*axes.values()):
         with located("--option"):
-            yield _typed(name, solver, dict(zip(own, values, strict=True)))
+            yield _typed(name, solver, dict(zip(axes, values, strict=True)))
 
 
-def _typed(name: str, solver: Solver, given: Mapping[str, str]) -> dict[str, Any]:
-    """Read the values of options as the types that a solver declares."""
-    known, annotated = options_of(solver), option_types(solver)
+def _typed(name: str, solver: Solver, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Convert the texts of options to the types that a solver declares."""
+    defaults, annotated = options_of(solver), option_types(solver)
     values = {}
-    for key, text in given.items():
-        if key not in known:
-            raise unknown("option", key, known, where=name)
-        kind = annotated.get(key, type(known[key]))
-        if kind is NoneType:  # nothing tells its type
+    for key, text in texts.items():
+        if key not in defaults:
+            raise unknown("option", key, defaults, where=name)
+        kind = annotated.get(key, type(defaults[key]))
+        if kind is NoneType:  # not annotated, and None by default
             kind = bool | int | float | str
-        read = [*_readings(text, kind, known[key])]
-        if not read:
-            expected = " or ".join(dict.fromkeys(_expected(kind, known[key])))
+        readings = [*_readings(text, kind, defaults[key])]
+        if not readings:
+            expected = " or ".join(dict.fromkeys(_expected(kind, defaults[key])))
             raise InputError(f"{name}: {key} = {shown(text)}; expected {expected}")
-        values[key] = read[0]
+        values[key] = readings[0]
     return values
 
 
 def with_options(label: str, options: Mapping[str, Any]) -> str:
-    """Write options after the label of a solver: ``LABEL max_iter=50 scaling=true``."""
+    """Append options to the label of a solver.
+
+    >>> with_options("LABEL", {"max_iter": 50, "scaling": True})
+    'LABEL max_iter=50 scaling=true'
+
+    """
     return " ".join([label, *(f"{k}={_text(v)}" for k, v in options.items())])
 
 
 def without_options(label: str) -> Iterator[str]:
-    """Give what of a label may be that of a suite: all of it, then less and less."""
+    """Yield a label, then the same without its last option, and so on.
+
+    >>> list(without_options("LABEL max_iter=50 scaling=true"))
+    ['LABEL max_iter=50 scaling=true', 'LABEL max_iter=50', 'LABEL']
+
+    """
     yield label
     while (shorter := re.sub(r" [^\W\d]\w*=\S*$", "", label)) != label:
         yield (label := shorter)
 
 
 def _text(value: object) -> str:
-    """Write a value as one word that is read as the same again."""
+    """Return a value as one word, which `_readings` converts back."""
     match value:
         case None | bool():
             return str(value).lower()
-        case str():
+        case str():  # labels are split at blanks, see `without_options`
             return "_".join(value.split())
-        case Integral():  # of numpy, too
+        case Integral():  # numpy's as well
             return repr(int(value))
         case Real():
             return repr(float(value))
     return repr(value)
 
 
-def _readings(text: str, kind: Any, current: object) -> Iterator[Any]:
-    """Give what a text may mean as an option of some type, `current` by default."""
-    if text == "none" and current is None:
+def _readings(text: str, kind: Any, default: object) -> Iterator[Any]:
+    """Yield the values of type `kind` that a text may stand for.
+
+    default : of the option; "none" is accepted only if it is None
+    """
+    if text == "none" and default is None:
         yield None
     if get_origin(kind) in (Union, UnionType):
         for part in get_args(kind):
@@ -226,8 +245,8 @@ def _readings(text: str, kind: Any, current: object) -> Iterator[Any]:
         yield text
 
 
-def _expected(kind: Any, current: object) -> Iterator[str]:
-    """Name the values that an option may have."""
+def _expected(kind: Any, default: object) -> Iterator[str]:
+    """Yield descriptions of the values that an option may have, for messages."""
     if get_origin(kind) in (Union, UnionType):
         for part in get_args(kind):
             yield from _expected(part, ...)
@@ -240,6 +259,6 @@ def _expected(kind: Any, current: object) -> Iterator[str]:
     elif kind is str:
         yield "a text"
     elif kind is not NoneType:
-        yield "what only a suite can give, as `options` of a solver"
-    if current is None:
+        yield "a value that only a suite can contain, as `options` of a solver"
+    if default is None:
         yield "none"

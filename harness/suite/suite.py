@@ -1,4 +1,4 @@
-"""Suites: which cases, which solvers, how often and within which limits; from TOML."""
+"""Suites read from TOML: cases, solvers, repeats, limits and tolerances."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.record import TIGHTENING
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.parameter_grid import planned
+from mortarbench.harness.suite.parameter_grid import expand_problems
 
 DEFAULTS: Mapping[str, Any] = {
     "tolerances": [1e-6],
@@ -39,11 +39,11 @@ DEFAULTS: Mapping[str, Any] = {
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
-NULL = " (A/A)"  #: after the label of a solver that is measured once more
+NULL_SUFFIX = " (A/A)"  #: of the label of a solver's second copy, see `null_arm`
 
 
 def _between(key: str, value: Any) -> float | None:
-    """Take nothing, or a number between 0 and 1."""
+    """Return None, or a number strictly between 0 and 1; refuse other values."""
     if value is None:
         return None
     if not checked.is_number(value) or not 0 < value < 1:
@@ -68,37 +68,39 @@ def _most_cases(table: Mapping[str, Any]) -> int:
 
 
 class Group(NamedTuple):
-    """What is measured together: one case, or a sequence."""
+    """Cases of one block: a single case, or the steps of a sequence."""
 
     cases: tuple[CaseId, ...]
-    mode: str  #: of its records
+    mode: str  #: of the records
 
 
 @dataclass(frozen=True, kw_only=True)
 class Suite:
-    """What one run measures: every solver on every case at every tolerance."""
+    """Measurements of a run: every solver on every case at every tolerance."""
 
     name: str
     tolerances: tuple[float, ...]
     repeats: int
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
-    solvers: tuple[SolverSpec, ...]  #: of distinct labels
-    cases: tuple[CaseId, ...]  #: all distinct; those that are solved cold
-    text: str  #: the TOML as read, but with the limits that hold
-    sequences: tuple[tuple[CaseId, ...], ...] = ()  #: each: its steps in order
-    #: each sequence is driven once with each: θ of `harness.record.Record.tighten`
+    solvers: tuple[SolverSpec, ...]  #: with distinct labels
+    cases: tuple[CaseId, ...]  #: cases that are solved cold, all distinct
+    text: str  #: TOML of the suite, with the limits that apply
+    sequences: tuple[tuple[CaseId, ...], ...] = ()  #: steps of each, in order
+    #: values of θ (`harness.record.Record.tighten`); each sequence is solved with each
     tighten: tuple[float, ...] = (0.0,)
+    #: relative half-width of every ratio to the fastest solver at which repeats end;
+    #: None: `repeats` alone decides
     precision: float | None = None
-    """Go on beyond `repeats` until every ratio to the fastest is known so well."""
-    max_repeats: int = 30  #: where there is a precision to reach
-    budget: float = 600.0  #: s of measured time per case and tolerance, likewise
-    accuracy: float | None = None  #: judge answers at this, whatever was asked for
-    every: frozenset[str] = frozenset()  #: names of the cases, where these are some
+    max_repeats: int = 30  #: largest number of repeats, if a precision is set
+    budget: float = 600.0  #: s per case and tolerance, if a precision is set
+    #: tolerance of the verdicts; None: the one that the solver was asked for
+    accuracy: float | None = None
+    every: frozenset[str] = frozenset()  #: names of all cases, before ``--case``
 
     @property
     def groups(self) -> tuple[Group, ...]:
-        """What one block is made of: a single case, or the steps of a sequence."""
+        """Groups of cases that form a block: single cases, then sequences."""
         return (
             *(Group((case,), "cold") for case in self.cases),
             *(
@@ -110,19 +112,19 @@ class Suite:
 
     @property
     def names(self) -> tuple[CaseId, ...]:
-        """Every case, cold or in a sequence."""
+        """All cases, cold or in a sequence."""
         return tuple(case for group in self.groups for case in group.cases)
 
 
 def load_suite(
     path: Path, families: Mapping[str, Family], solvers: Mapping[str, Solver]
 ) -> Suite:
-    """Read a suite and check all of it: nothing is left to fail during the run.
+    """Read a suite and check it completely, before a run starts.
 
     Raises
     ------
     InputError
-        With the file and the place in it, and what would be right.
+        If it is wrong; the message names the file, the place and the correct form.
 
     """
     text = read_text(path, "a TOML file", MAX_TOML_MIB)
@@ -136,15 +138,15 @@ def parse_suite(
     families: Mapping[str, Family],
     solvers: Mapping[str, Solver],
 ) -> Suite:
-    """Parse the TOML of a suite and check all of it.
+    """Parse the TOML of a suite and check it completely.
 
     where : name of the text in messages
-    folder : where relative paths of the suite start
+    folder : base of relative paths
 
     Raises
     ------
     InputError
-        With the place in it, and what would be right.
+        If it is wrong; the message names the place and the correct form.
 
     """
     with checked.located(where):
@@ -155,27 +157,27 @@ def parse_suite(
                 raise InputError(f"{key} is missing")
         if not _NAME.fullmatch(checked.text("name", table["name"])):
             raise InputError(
-                f"name = {shown(table['name'])} is no name of a folder; "
+                f"name = {shown(table['name'])} is not a valid folder name; "
                 "expected letters, digits, '.', '-' and '_'"
             )
-        cases, sequences = planned(
+        cases, sequences = expand_problems(
             table["problems"], families, folder, _most_cases(table)
         )
         numbers: dict[str, Any] = {
             key: check(key, table[key]) for key, check in _NUMBERS.items()
         }
-        asked = _solvers(table["solvers"], solvers)
-        asked = _on_ranks(asked, table, solvers, sequences)
+        specs = _solvers(table["solvers"], solvers)
+        specs = _on_ranks(specs, table, solvers, sequences)
         every = frozenset(case.name for group in (cases, *sequences) for case in group)
         return Suite(
             name=table["name"], tolerances=_tolerances(table["tolerances"]), text=text,
-            solvers=_with_null(asked, table["null_arm"]), cases=cases, every=every,
+            solvers=_with_null(specs, table["null_arm"]), cases=cases, every=every,
             sequences=sequences, tighten=_tightening(table, sequences), **numbers,
         )  # fmt: skip
 
 
 def name_in(text: str) -> str:
-    """Return the name in the TOML of a suite; empty where `parse_suite` refuses it."""
+    """Return the name in the TOML of a suite; "" if `parse_suite` would refuse it."""
     with suppress(InputError):
         name = toml(text).get("name")
         if isinstance(name, str) and _NAME.fullmatch(name):
@@ -184,14 +186,16 @@ def name_in(text: str) -> str:
 
 
 def read_stored(path: Path) -> dict[str, Any]:
-    """Read the suite of a result folder, and check the types of its values.
+    """Read the suite of a result folder, and check only the types of its values.
 
-    Solvers, families and ranges are not: another version, or a plug-in, may know them.
+    Names of solvers and families, and ranges, may be those of another version or of a
+    plug-in.
 
     Raises
     ------
     InputError
-        With the file and the first value of another type than a run writes.
+        If a value has another type than in a suite that a run wrote; the message names
+        the file and the value.
 
     """
     table = read_toml(path, "the suite of a result folder")
@@ -214,7 +218,7 @@ def read_stored(path: Path) -> dict[str, Any]:
         for block in checked.any_list("problems", table.get("problems", [])):
             checked.table("problems", block, instead="tables")
     except InputError as e:
-        raise InputError(f"{path} is no suite that a run wrote: {e}") from None
+        raise InputError(f"{path} is not a suite that a run wrote: {e}") from None
     return table
 
 
@@ -223,12 +227,16 @@ def _is_finite(value: Any) -> bool:
 
 
 def suite_text(suite: Mapping[str, Any]) -> str:
-    """Write a suite as TOML, a line per key.
+    """Return a suite as TOML, one line per key.
 
     Raises
     ------
     InputError
-        When it holds what TOML cannot, such as None.
+        If TOML cannot express a value, such as None.
+
+    >>> print(suite_text({"name": "demo", "tolerances": [1e-6]}), end="")
+    name = "demo"
+    tolerances = [1e-06]
 
     """
     lines = [f"{_toml_key(k)} = {_toml_value(str(k), v)}" for k, v in suite.items()]
@@ -242,14 +250,17 @@ def _toml_key(key: object) -> str:
 
 
 def _toml_value(where: str, value: Any) -> str:
-    """Write a value as TOML, on one line; arrays of numpy and ranges as lists."""
+    """Return a value as TOML on one line; numpy arrays and ranges become lists."""
     if hasattr(value, "tolist"):
         value = value.tolist()
     match value:
-        case bool():
+        case bool():  # before int, of which bool is a subclass
             return str(value).lower()
         case int() | float():
             return repr(value)
+        # A TOML string is a JSON string except for two things: it must not contain DEL,
+        # which JSON leaves as it is, nor surrogate pairs, into which JSON in ASCII
+        # splits characters beyond 16 bits.
         case str() | Path():
             return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
         case Mapping():
@@ -267,8 +278,8 @@ def _toml_value(where: str, value: Any) -> str:
     )
 
 
-def asked_solvers(text: str) -> dict[str, SolverSpec]:
-    """Read from a suite's TOML what solvers it asks for, by label, unresolved."""
+def solvers_by_label(text: str) -> dict[str, SolverSpec]:
+    """Return the solvers in the TOML of a suite by label, not resolved."""
     table = toml(text)
     specs = tuple(map(_spec, checked.filled_list("solvers", table.get("solvers"))))
     return {spec.label: spec for spec in _with_null(specs, table.get("null_arm"))}
@@ -277,16 +288,18 @@ def asked_solvers(text: str) -> dict[str, SolverSpec]:
 def steps_up_to(
     text: str, name: CaseId, families: Mapping[str, Family]
 ) -> tuple[CaseId, ...]:
-    """Read from a suite's TOML the steps of a sequence that lead to one of them.
+    """Return the steps of a sequence in the TOML of a suite, up to the case `name`.
 
     Raises
     ------
     InputError
-        When no sequence has it.
+        If no sequence contains the case.
 
     """
     table = {**DEFAULTS, **toml(text)}
-    _, sequences = planned(table.get("problems"), families, Path(), _most_cases(table))
+    _, sequences = expand_problems(
+        table.get("problems"), families, Path(), _most_cases(table)
+    )
     for steps in sequences:
         if name in steps:
             return steps[: steps.index(name) + 1]
@@ -294,7 +307,7 @@ def steps_up_to(
 
 
 def limits(text: str) -> tuple[float, float]:
-    """Read the limits of a measurement from a suite's TOML, s and MiB."""
+    """Return the time limit (s) and the memory limit (MiB) in the TOML of a suite."""
     table = {**DEFAULTS, **toml(text)}
     time_limit, memory_limit = (
         checked.positive(key, table[key]) for key in ("time_limit", "memory_limit")
@@ -303,18 +316,18 @@ def limits(text: str) -> tuple[float, float]:
 
 
 def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpec, ...]:
-    found: dict[str, SolverSpec] = {}
+    specs: dict[str, SolverSpec] = {}
     for i, entry in enumerate(checked.filled_list("solvers", entries)):
         with checked.located(f"solvers[{i}]"):
             spec = _spec(entry)
-            if spec.label in found:
+            if spec.label in specs:
                 raise InputError(
                     f"label {shown(spec.label)} is used twice; expected a label of its "
                     "own"
                 )
             resolve(spec, registry)
-        found[spec.label] = spec
-    return tuple(found.values())
+        specs[spec.label] = spec
+    return tuple(specs.values())
 
 
 def _on_ranks(
@@ -323,10 +336,10 @@ def _on_ranks(
     registry: Mapping[str, Solver],
     sequences: object,
 ) -> tuple[SolverSpec, ...]:
-    """Ask every solver that can for each number of ranks; others run on one.
+    """Return each solver for every number of ranks; without support, for one rank.
 
-    With `copies`, beside several ranks as many independent solves are asked for. What a
-    solver carries through a sequence lies in one process, so these are refused.
+    With ``copies``, each number of ranks n > 1 is accompanied by n independent solves.
+    Sequences are refused: the data that a solver carries are in one process.
     """
     ranks, copies = table["ranks"], table["copies"]
     counts = [ranks_asked(n, "ranks") for n in checked.filled_list("ranks", ranks)]
@@ -334,28 +347,28 @@ def _on_ranks(
         raise InputError(f"copies = {shown(copies)}; expected true or false")
     if copies and counts == [1]:
         raise InputError(
-            "copies = true: what copies reach is compared with ranks; expected several "
-            "of these, such as ranks = [1, 2]"
+            "copies = true: copies are compared with ranks; expected several ranks, "
+            "such as ranks = [1, 2]"
         )
     if len(set(counts)) < len(counts):
         raise InputError(f"ranks = {shown(counts)}; expected distinct numbers")
     if counts != [1] and sequences:
         raise InputError(
-            f"ranks = {shown(counts)}: one process drives a sequence; expected "
+            f"ranks = {shown(counts)}: a sequence runs in one process; expected "
             "problems without sequence, or no ranks"
         )
     able = {s.label: getattr(resolve(s, registry), "on_ranks", False) for s in specs}
     if counts != [1] and not any(able.values()):
         raise InputError(
-            f"ranks = {shown(counts)}: none of the solvers runs on several; expected "
+            f"ranks = {shown(counts)}: no solver runs on several ranks; expected "
             "one that does, or no ranks"
         )
-    found = []
+    on_ranks = []
     for spec in specs:
-        of_spec = counts if able[spec.label] else [1]
-        found += [spec.on(n) for n in of_spec]
-        found += [spec.copies(n) for n in of_spec if copies and n > 1]
-    return tuple(found)
+        numbers = counts if able[spec.label] else [1]
+        on_ranks += [spec.on(n) for n in numbers]
+        on_ranks += [spec.copies(n) for n in numbers if copies and n > 1]
+    return tuple(on_ranks)
 
 
 def _spec(entry: object) -> SolverSpec:
@@ -374,17 +387,18 @@ def _spec(entry: object) -> SolverSpec:
 
 
 def _with_null(specs: tuple[SolverSpec, ...], label: object) -> tuple[SolverSpec, ...]:
-    """Add the solver of that label once more, as a null arm."""
+    """Add a second copy of the solver with that label, for an A/A comparison."""
     if label is None:
         return specs
-    known = {spec.label: spec for spec in specs}
-    if (label := checked.text("null_arm", label)) not in known:
-        raise unknown("null_arm", label, known)
-    return (*specs, replace(known[label], label=f"{label}{NULL}", role="null"))
+    by_label = {spec.label: spec for spec in specs}
+    if (label := checked.text("null_arm", label)) not in by_label:
+        raise unknown("null_arm", label, by_label)
+    copy = replace(by_label[label], label=f"{label}{NULL_SUFFIX}", role="null")
+    return (*specs, copy)
 
 
 def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...]:
-    """Read how sequences tighten; refuse that where it means nothing."""
+    """Return the values of θ; refuse them without sequences, or with an accuracy."""
     thetas = checked.filled_list("tighten", table["tighten"])
     if not all(checked.is_number(t) and 0 <= t < 1 for t in thetas) or len(
         set(thetas)
@@ -395,8 +409,8 @@ def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...
         )
     if any(thetas) and not sequences:
         raise InputError(
-            f"tighten = {shown(thetas)}: no problems are a sequence; expected sequence "
-            "= KEY in one of them"
+            f"tighten = {shown(thetas)}: there is no sequence; expected sequence = KEY "
+            "in one of the problems"
         )
     if any(thetas) and table["accuracy"] is not None:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The command `doctor`: is this machine fit to measure."""
+"""The command `doctor`: check whether this machine is fit for measuring times."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Describe this machine and say what to change before measuring."""
+    """Print a description of this machine and advice on what to change."""
     from rich.console import Console
 
     from mortarbench.harness.environment.doctor import as_json, examine, render

@@ -1,4 +1,4 @@
-"""The command `list`: what there is, and docs/solvers.md of a registry."""
+"""The command `list`: list problems, solvers or suites; write docs/solvers.md."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import inspect
 import json
 from argparse import Namespace
 from collections.abc import Iterator, Mapping
+from dataclasses import fields
 from functools import cache
 from textwrap import dedent
 from typing import TYPE_CHECKING
@@ -22,48 +23,97 @@ if TYPE_CHECKING:
 HEAD = """\
 # Solvers
 
-Written by `make docs` from the adapters in `solvers/`; change those, not this file.
+**Which solvers are there, and which one do I choose?** `make docs` writes this page
+from the adapters in `solvers/`, together with the notes on [our
+solvers](solvers-own.md) and on [libraries](solvers-libraries.md).
 
-Every solver is asked for the same thing: `tol`, the relative KKT accuracy of the
-non-dimensional QP. How each one maps that to its own stopping test is said below. What
-it then claims is recorded beside our own verdict and never believed.
+Every solver is asked for the same accuracy: `tol`, the relative KKT accuracy of the
+non-dimensional QP. The notes explain how each solver translates it to its own stopping
+test. The claim of a solver is recorded beside our verdict and never trusted
+([comparison policy](fair-play.md)).
 
-`mortarbench test-solver NAME` runs the conformance suite on any of them, and on one of
-your own with `--plugin FILE.py`. A solver whose library is missing declines, and names
-the command that installs it; `make setup` installs all of them (the extra `fleet`).
+| your QP | try first |
+| --- | --- |
+| bounds and equality rows only, such as a dual | `smalbe` |
+| the same, dense, a few hundred unknowns or fewer | `smalbe-direct` |
+| inequality rows, such as a primal form | `piqp`, `clarabel` |
+| inequality rows, small and dense | `daqp` |
+| bodies in subdomains (P is an operator) | `smalbe`; without contact `feti` |
+| load steps and other sequences | *yes* in the column "sequences" |
 
-Whether units, order, scaled or repeated rows, an offset or a mirror change what each
-answers is measured in [weaknesses.md](weaknesses.md).
+`mortarbench test-solver NAME` runs the conformance suite on any of them, and on your
+own solver with `--plugin FILE.py`. A solver whose library is missing declines, and
+names the command that installs it; `make setup` installs all of them (the extra
+`fleet`).
+
+How units, order, scaled or repeated rows, an offset or a mirror change the answers is
+measured in [weaknesses.md](weaknesses.md).
+"""
+OURS = """\
+# Our solvers
+
+Written by `make docs` from `solvers/`; change the docstrings there, not this file.
+[Solvers](solvers.md) lists all.
+"""
+LIBRARIES = """\
+# Solvers of libraries
+
+Written by `make docs` from `solvers/adapters/`; change the docstrings there, not this
+file. [Solvers](solvers.md) lists all, with the interfaces `qpsolvers:NAME` and
+`cvxpy:NAME`.
 """
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """List what there is, one line each or as one JSON array."""
+    """Print problems, solvers or suites, one line each or as one JSON array."""
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
             raise InputError("--markdown is for list solvers only")
         print(solvers_page(registries.solvers), end="")
         return 0
-    found = {
+    functions = {
         "problems": listing.problems,
         "solvers": listing.solvers,
         "suites": listing.suites,
     }
-    rows = found[options.what](registries=registries)
+    rows = functions[options.what](registries=registries)
     print(json.dumps(list(rows)) if options.json else rows)
     return 0
 
 
 def solvers_page(solvers: Mapping[str, Solver]) -> str:
     """Describe the solvers of a registry in Markdown, one section per class."""
+    return "\n".join([HEAD, *_overview(solvers), *_sections(solvers).values()])
+
+
+def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
+    """Describe the solvers of a registry on several pages, by the names of their files.
+
+    The first page has the table and the solvers with a backend of their own choice; the
+    others have the sections of our solvers and of those of libraries.
+    """
+    pages: dict[str, list[str]] = {
+        "solvers.md": [HEAD, *_overview(solvers)],
+        "solvers-own.md": [OURS],
+        "solvers-libraries.md": [LIBRARIES],
+    }
+    for kind, section in _sections(solvers).items():
+        facts = listing.about(next(s for s in solvers.values() if type(s) is kind))
+        if any(f.name == "backend" and f.default == "" for f in fields(kind)):
+            pages["solvers.md"].append(section)
+        elif facts and facts.package:
+            pages["solvers-libraries.md"].append(section)
+        else:
+            pages["solvers-own.md"].append(section)
+    return {name: "\n".join(parts) for name, parts in pages.items()}
+
+
+def _sections(solvers: Mapping[str, Solver]) -> dict[type, str]:
     groups: dict[type, list[str]] = {}
     for name, solver in solvers.items():
         groups.setdefault(type(solver), []).append(name)
-    parts = [HEAD, *_overview(solvers)]
-    for kind, names in groups.items():
-        parts.append(_section(kind, names, solvers))
-    return "\n".join(parts)
+    return {kind: _section(kind, names, solvers) for kind, names in groups.items()}
 
 
 def _overview(solvers: Mapping[str, Solver]) -> Iterator[str]:
@@ -101,15 +151,14 @@ def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str
 
 
 def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
-    """Tabulate the options: a column of values per name in the registry."""
+    """Return the table of options, with a column of values per name of a solver."""
     columns = {name: options_of(solvers[name]) for name in names}
     options = list(columns[names[0]])
     if not options:
         return []
-    known: dict[str, str] = {}
+    meanings: dict[str, str] = {}
     for base in kind.__mro__:
-        known = {**_own_meanings(base), **known}
-    meanings = known
+        meanings = {**_own_meanings(base), **meanings}
     heads = [f"`{name}`" for name in names]
     lines = [
         f"| option | {' | '.join(heads)} | |",

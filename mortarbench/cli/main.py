@@ -1,6 +1,6 @@
-"""The command line: options, exit codes, and which function does what.
+"""Command line: commands with their options, and exit codes.
 
-Exit codes: 0 done; 1 done, and the answer is no; 2 the input was wrong, one line on
+Exit codes: 0 done; 1 done, and the answer is no; 2 wrong input, with one line on
 stderr; 3 a fault of ours, with a traceback; 129 hung up (SIGHUP), 130 interrupted, 143
 terminated (SIGTERM).
 """
@@ -31,34 +31,36 @@ _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser for which a bad command line is bad input like any other: one line."""
+    """Parser that raises `InputError`, with one line, for a wrong command line."""
 
     def error(self, message: str) -> NoReturn:
         usage = " ".join(self.format_usage().split())
         stop = " " if message.endswith("?") else "; "
-        raise InputError(f"{message}{stop}{usage}; {self.prog} --help tells more")
+        raise InputError(f"{message}{stop}{usage}; see {self.prog} --help")
 
     def parse_known_args(  # type: ignore[override]  # argparse overloads it
         self,
         args: Sequence[str] | None = None,
         namespace: argparse.Namespace | None = None,
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the options of a command, after naming one that it does not have.
+        """Parse the options of a command, after refusing unknown ones.
 
-        argparse would miss a required option before it saw the misspelt one.
+        argparse would first complain about a required option that is missing, perhaps
+        because it is misspelt.
         """
         if self._subparsers is None:  # a command
-            known = [name for name in self._option_string_actions if len(name) > 2]
+            options = [name for name in self._option_string_actions if len(name) > 2]
             for text in takewhile(lambda text: text != "--", args or ()):
                 name = text.partition("=")[0]
-                if text.startswith("--") and name not in known:
-                    near = get_close_matches(name, known, n=1)
+                if text.startswith("--") and name not in options:
+                    near = get_close_matches(name, options, n=1)
                     hint = f"; did you mean {near[0]}?" if near else ""
                     self.error(f"unknown argument {name!r}{hint}")
         return super().parse_known_args(args, namespace)
 
     def exit(self, status: int = 0, message: str | None = None) -> NoReturn:
-        """End after a help text, while a reader that has gone is no surprise."""
+        """Exit after a help text."""
+        # flush here, where `main` handles a reader that has closed the pipe
         print(end="", flush=True)
         super().exit(status, message)
 
@@ -72,22 +74,22 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
     try:
         return _run(registries, argv)
     except InputError as e:
-        return _complain(str(e))
+        return _print_error(str(e))
     except KeyboardInterrupt:
         goes_on = "; the same command continues" if argv[:1] == ["run"] else ""
-        _complain(f"interrupted{goes_on}")
+        _print_error(f"interrupted{goes_on}")
         return 130
-    except BrokenPipeError:  # as of `mortarbench list solvers | head -1`
-        _print_no_more()
+    except BrokenPipeError:  # e.g. `mortarbench list solvers | head -1`
+        _discard_output()
         return 0
     except OSError as e:
-        # late: a help text needs no files
+        # imported here because a help text needs no files
         from mortarbench.harness.files.durable import FULL
 
         if e.filename is not None:
-            return _complain(_remedied(e, Path(os.fsdecode(e.filename))))
+            return _print_error(_file_error(e, Path(os.fsdecode(e.filename))))
         if e.errno in FULL:
-            return _complain(f"a file could not be written: {e.strerror}")
+            return _print_error(f"a file could not be written: {e.strerror}")
         traceback.print_exc()
         return 3
     except Exception:
@@ -97,7 +99,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
 
 def _run(registries: Registries, argv: Sequence[str]) -> int:
     registries = installed(registries)
-    if argv[:1] in (["worker"], ["ranks"], ["generator"]):  # how runs start processes
+    if argv[:1] in (["worker"], ["ranks"], ["generator"]):  # processes of a run
         defer_parts_of_numpy()
         from mortarbench import processes
 
@@ -107,7 +109,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         }  # fmt: skip
         return starts[argv[0]](registries, argv[1:])
     for argument in takewhile(lambda text: text != "--", argv):
-        if re.fullmatch(r"--[\w-]+=--", argument):  # argparse would drop the value
+        if re.fullmatch(r"--[\w-]+=--", argument):  # argparse drops this value
             option = argument.removesuffix("=--")
             raise InputError(f"{argument}: -- is no value; expected {option}=VALUE")
     options, left = _parser().parse_known_args(argv)
@@ -118,32 +120,34 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         try:
             code = run(registries, options)
         except TerminatedError:
-            if argv[:1] != ["run"]:  # which says that it can be continued
-                _complain("terminated")
+            if argv[:1] != ["run"]:  # `run` has its own message: it can be continued
+                _print_error("terminated")
             raise
-        print(end="", flush=True)  # here, where a reader that has gone is no surprise
+        # flush here, where `main` handles a reader that has closed the pipe
+        print(end="", flush=True)
     return code
 
 
-def _remedied(e: OSError, path: Path) -> str:
-    """Say what is wrong with a file, and what would be right where that is plain."""
+def _file_error(e: OSError, path: Path) -> str:
+    """Return the message for an error of a file, with its remedy if there is one."""
     if isinstance(e, FileExistsError | NotADirectoryError):
         path = next((p for p in (path, *path.parents) if p.is_file()), path)
         return f"{path}: a file is where a folder is needed; move the file away"
     return f"{path}: {e.strerror}"
 
 
-def _complain(message: str) -> int:
-    """Say in one line what is wrong, and return the exit code of wrong input."""
-    with suppress(OSError):  # nobody reads it
+def _print_error(message: str) -> int:
+    """Print an error in one line; return the exit code of wrong input."""
+    with suppress(OSError):  # stderr may be closed
         print(f"mortarbench: {one_line(message)}", file=sys.stderr, flush=True)
     return 2
 
 
 def _open_standard_streams() -> None:
-    """Open /dev/null where a standard stream is closed.
+    """Open /dev/null for standard streams that are closed.
 
-    Its number would else be that of the next file, into which libraries would print.
+    Otherwise the next file would get the number of the stream, and libraries would
+    print into it.
     """
     while (fd := os.open(os.devnull, os.O_RDWR)) < len(_STREAMS):
         os.set_inheritable(fd, True)
@@ -153,8 +157,8 @@ def _open_standard_streams() -> None:
             setattr(sys, name, os.fdopen(fd, mode, closefd=False))
 
 
-def _print_no_more() -> None:
-    """Make the last flush of the streams, when Python ends, succeed."""
+def _discard_output() -> None:
+    """Redirect the streams to /dev/null, so that the flush at exit does not fail."""
     for stream in filter(None, (sys.stdout, sys.stderr)):
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
@@ -167,7 +171,7 @@ _STREAMS = {
 
 
 class _Version(argparse.Action):
-    """Prints the version that is installed, which only then is looked up."""
+    """Action that looks up the installed version and prints it."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: object) -> NoReturn:
         from importlib.metadata import version
@@ -177,15 +181,15 @@ class _Version(argparse.Action):
 
 
 class _Option(NamedTuple):
-    """One argument of a command: an option, or a position where it has no dashes."""
+    """Argument of a command: an option, or positional if its name has no dashes."""
 
-    names: str  #: separated by spaces
-    metavar: str  #: empty: a flag, or one of `choices`
-    what: str  #: its help
-    settings: Mapping[str, Any] = {}  #: of argparse, beside those of the metavar
+    names: str  #: names, separated by spaces
+    metavar: str  #: empty: a flag, or an argument with `choices`
+    what: str  #: help text
+    settings: Mapping[str, Any] = {}  #: further settings of argparse
 
     def add_to(self, command: argparse._ActionsContainer) -> None:
-        """Declare it to argparse."""
+        """Add the argument to a parser of argparse."""
         settings: dict[str, Any] = {"help": self.what, **self.settings}
         if self.metavar:
             kind = _KINDS.get(self.metavar)
@@ -202,7 +206,7 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-#: types of arguments, by their metavar; others are texts
+#: types of arguments by their metavar; the others are strings
 _KINDS: Mapping[str, Callable[[str], Any]] = {
     "DIR": Path, "DIR2": Path, "FILE.npz|mat|parquet|qps": Path,
     "FILE.png|pdf|svg": Path, "FILE.vtu": Path, "[LABEL=]FILE.py": PluginFile.of,
@@ -214,16 +218,16 @@ _MARKDOWN = "--markdown"
 _PLUGIN = _Option(
     "--plugin",
     "[LABEL=]FILE.py",
-    "load solvers or problems of your own from a file; may be repeated; solvers of "
-    "LABEL=FILE.py are called LABEL:NAME",
+    "load your own solvers or problems from a file; may be repeated; solvers of "
+    "LABEL=FILE.py are named LABEL:NAME",
     _SEVERAL,
 )
 _CASE = _Option(
-    "case", "CASE", "FAMILY/key=value/…/FORM, as beam-ring/Nr=4/Nh=3/dual; see "
-    "docs/cases.md",
+    "case", "CASE", "FAMILY/key=value/…/FORM, for example beam-ring/Nr=4/Nh=3/dual; "
+    "see docs/cases.md",
 )  # fmt: skip
-_RESULTS = _Option("folder", "DIR", "a result folder, as `run` writes it")
-_INSTEAD = "for each measurement, instead of the suite's"
+_RESULTS = _Option("folder", "DIR", "result folder of `run`")
+_INSTEAD = "limit of each measurement, in place of the suite's"
 
 
 def _option(what: str) -> _Option:
@@ -231,30 +235,30 @@ def _option(what: str) -> _Option:
 
 
 class _Command(NamedTuple):
-    """One command: its module in `mortarbench.cli`, help, and arguments."""
+    """Command: its module in `mortarbench.cli`, help and arguments."""
 
     module: str
-    what: str
+    what: str  #: help text
     options: Sequence[_Option]
-    more: str = ""  #: behind `what` in its own help
-    excluding: Sequence[_Option] = ()  #: of which one can be given
+    more: str = ""  #: continues the help text in the command's own help
+    excluding: Sequence[_Option] = ()  #: options that exclude each other
 
 
 _COMMANDS = {
     "list": _Command(
         "list_",
-        "show which problems, solvers or suites there are",
+        "list the available problems, solvers or suites",
         [
-            _Option("what", "", "what to show",
+            _Option("what", "", "what to list",
                     {"choices": ("problems", "solvers", "suites")}),
-            _Option(_MARKDOWN, "", "solvers: all about them, as in docs/"),
+            _Option(_MARKDOWN, "", "solvers: print docs/solvers.md"),
             _PLUGIN,
             _JSON,
         ],
     ),
     "run": _Command(
         "run",
-        "measure what a suite asks for, and write a report on it",
+        "measure a suite and write a report on the results",
         [
             _Option("suite", "SUITE.toml", "a file, or a name of `list suites`"),
             _Option("--out", "DIR", "result folder; default: out/NAME-OF-SUITE",
@@ -264,46 +268,46 @@ _COMMANDS = {
             _Option("--case", "PATTERN",
                     "measure only these cases, e.g. '*/dual'; may be repeated",
                     _SEVERAL),
-            _option("an option of every solver that has it; several values are "
-                    "measured each"),
+            _option("set an option of every solver that has it; with several values, "
+                    "measure each of them"),
             _PLUGIN,
-            _Option("--repeats", "N", "instead of the suite's"),
+            _Option("--repeats", "N", "number of repeats, in place of the suite's"),
             _Option("--time-limit", "SECONDS", _INSTEAD),
             _Option("--memory-limit", "MIB", _INSTEAD),
-            _Option("--fresh", "", "delete first what the folder holds"),
+            _Option("--fresh", "", "delete the contents of the folder first"),
             _Option("--dask", "ADDRESS|local", "measure on the workers of a Dask "
                     "scheduler, or on several processes of this machine; see "
                     "docs/cluster.md"),
-            _Option("--strict", "", "exit with 1 where a claim is refuted or a solver "
+            _Option("--strict", "", "exit with 1 if a claim is refuted or a solver "
                     "failed"),
-            _Option("--quiet", "", "print only warnings and what could not be "
-                    "measured"),
+            _Option("--quiet", "", "print only warnings and missing measurements"),
             _JSON,
         ],
-        "Results go to a folder. The same command continues a run that was "
-        "interrupted, and measures nothing twice.",
+        "Results are stored in a folder. The same command continues an interrupted "
+        "run and repeats no measurement.",
     ),
     "solve": _Command(
         "solve",
-        "run one solver on one case once, and judge its answer",
+        "run one solver on one case once and verify its answer",
         [
             _CASE,
             _Option("--solver", "NAME", "a name of `list solvers`",
                     {"required": True}),
-            _Option("--tol", "T", "relative accuracy that the solver is asked for; "
-                    "default: 1e-8", {"default": 1e-8}),
-            _option("an option of the solver, instead of its default"),
-            _Option("--mpi --ranks", "N", "solve on N processes of MPI; a case with "
-                    "feti, form dual; default: 1", {"default": 1}),
+            _Option("--tol", "T", "requested relative accuracy; default: 1e-8",
+                    {"default": 1e-8}),
+            _option("set an option of the solver"),
+            _Option("--mpi --ranks", "N", "solve on N MPI processes, for cases of form "
+                    "dual with feti; default: 1", {"default": 1}),
             _Option("--plot", "FILE.png|pdf|svg", "draw the deformed bodies with their "
                     "stresses, and each contact enlarged"),
-            _Option("--scale", "S", "multiply the displacement in the picture; "
-                    "default: 1 where it can be seen, else a round factor that the "
+            _Option("--scale", "S", "factor of the displacements in the picture; "
+                    "default: 1 if they are visible, else a round factor that the "
                     "picture states; above 1, bodies in contact may seem to overlap"),
-            _Option("--vtu", "FILE.vtu", "write them for ParaView, and a CSV along "
-                    "each contact; FILE.pvd: all load steps up to this one"),
-            _Option("--mesh-error", "", "estimate the error of the mesh, too, from "
-                    "finer ones (at most a minute)"),
+            _Option("--vtu", "FILE.vtu", "write the deformed bodies for ParaView, and "
+                    "a CSV file along each contact; FILE.pvd: all load steps up to "
+                    "this one"),
+            _Option("--mesh-error", "", "also estimate the discretisation error, from "
+                    "finer meshes (at most a minute)"),
             _PLUGIN,
             _JSON,
         ],
@@ -314,18 +318,18 @@ _COMMANDS = {
         "write the QP of a case to a file for other programs",
         [
             _CASE,
-            _Option("file", "FILE.npz|mat|parquet|qps", "for NumPy, MATLAB and "
-                    "Octave, qpbenchmark, or what reads QPS"),
+            _Option("file", "FILE.npz|mat|parquet|qps", "file for NumPy, for MATLAB "
+                    "and Octave, for qpbenchmark, or for programs that read QPS"),
             _PLUGIN,
         ],
     ),
     "validate": _Command(
         "validate",
-        "check the answers in a result folder against each other and the truth",
+        "compare the answers in a result folder with each other and with references",
         [
             _RESULTS,
-            _Option("--budget", "SECONDS", "time to spend on finer meshes, which tell "
-                    "how large the errors of the meshes are; default: 300",
+            _Option("--budget", "SECONDS", "time for finer meshes, from which "
+                    "discretisation errors are estimated; default: 300",
                     {"default": 300.0}),
             _PLUGIN,
             _JSON,
@@ -334,86 +338,84 @@ _COMMANDS = {
     ),
     "report": _Command(
         "report",
-        "write the report on a result folder, or on what changed between several",
+        "write the report on a result folder, or on the changes between several",
         [
             _RESULTS,
-            _Option("others", "DIR2", "what changed from DIR to DIR2, and to each "
-                    "further one, into DIR2/report/against-DIR", {"nargs": "*"}),
-            _Option("--format", ",".join(FORMATS), "what to write; default: all",
+            _Option("others", "DIR2", "report the changes from DIR to DIR2, and to "
+                    "each further folder, in DIR2/report/against-DIR",
+                    {"nargs": "*"}),
+            _Option("--format", ",".join(FORMATS), "formats to write; default: all",
                     {"default": ",".join(FORMATS)}),
-            _Option("--factor", "F", "call an answer verified if every residual is "
+            _Option("--factor", "F", "an answer is verified if every residual is "
                     "within F times the tolerance; default: 10"),
             _Option("--pool-forms", "", "compare solvers over the cases of all forms "
-                    "together (means, ranks and profiles); otherwise each form is "
-                    "compared apart"),
-            _Option("--fail-on", ",".join(GATES), "exit with 1 where a verdict became "
-                    "worse, or a solver slower beyond chance, from DIR to DIR2"),
-            _Option("--verbose", "", "print the path of every file that was written, "
-                    "not of the page alone"),
+                    "together (means, ranks and profiles) instead of form by form"),
+            _Option("--fail-on", ",".join(GATES), "exit with 1 if from DIR to DIR2 a "
+                    "verdict became worse, or a solver significantly slower"),
+            _Option("--verbose", "", "print the paths of all files written, not only "
+                    "of the page"),
             _JSON,
         ],
     ),
     "replay": _Command(
         "replay",
-        "repeat one stored measurement, and compare",
+        "repeat one stored measurement and compare it with the old one",
         [
             _RESULTS,
-            _Option("run_id", "RUN_ID", "which measurement: the run_id of a journal "
-                    "line, or its first digits; a report shows it where one points at "
-                    "a number"),
+            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its first "
+                    "digits; a report shows it when one points at a number"),
             _PLUGIN,
             _JSON,
         ],
     ),
     "merge": _Command(
         "merge",
-        "make one result folder of several",
+        "merge several result folders into one",
         [
-            _Option("folders", "DIR", "result folders, each as `run` or `merge` writes "
-                    "it", {"nargs": "+"}),
-            _Option("--out", "DIR", "a new folder, or one that was merged before, "
-                    "which is added to", {"type": _folder, "required": True}),
+            _Option("folders", "DIR", "result folders of `run` or `merge`",
+                    {"nargs": "+"}),
+            _Option("--out", "DIR", "a new folder, or one of an earlier merge, to "
+                    "which results are added", {"type": _folder, "required": True}),
         ],
-        "A measurement that several of them hold is taken once; environments stay "
-        "apart.",
+        "Duplicate measurements are stored once; environments are kept separate.",
     ),
     "test-solver": _Command(
         "test_solver",
-        "check whether a solver keeps the contract, on QPs with known solutions",
+        "run the conformance suite on solvers: QPs with known solutions",
         [
             _Option("solver", "NAME", "a solver, or a pattern such as 'p*'",
                     {"nargs": "+"}),
             _PLUGIN,
         ],
         excluding=[
-            _Option(_MARKDOWN, "", "show only what equivalent formulations change, as "
-                    "docs/weaknesses.md"),
+            _Option(_MARKDOWN, "", "print only the effects of equivalent formulations, "
+                    "as in docs/weaknesses.md"),
             _JSON,
         ],
     ),
     "paper": _Command(
         "paper",
-        "make every figure and table of the paper again",
+        "reproduce all figures and tables of the paper",
         [
-            _Option("--out", "DIR", "where to write them; default: out/paper",
+            _Option("--out", "DIR", "folder for the results; default: out/paper",
                     {"default": Path("out/paper")}),
-            _Option("--quick", "", "fewer sizes and repeats: a minute or so"),
+            _Option("--quick", "", "fewer sizes and repeats, about a minute"),
         ],
     ),
     "doctor": _Command(
         "doctor",
-        "say whether this machine is fit for measuring times, and what to change",
+        "check whether this machine is fit for measuring times",
         [_JSON],
     ),
     "new": _Command(
         "new",
-        "write a solver, a problem or a suite to start from",
+        "write a template of a solver, a problem or a suite",
         [
-            _Option("kind", "", "what to write",
+            _Option("kind", "", "kind of the template",
                     {"choices": ("solver", "problem", "suite")}),
-            _Option("name", "NAME", "the file is NAME.py, of a suite NAME.toml"),
+            _Option("name", "NAME", "the file is NAME.py, or NAME.toml for a suite"),
         ],
-        "The file passes its checks as it is. Nothing is written over.",
+        "The file passes its checks as it is. Existing files are not overwritten.",
     ),
 }  # fmt: skip
 
@@ -421,28 +423,28 @@ _COMMANDS = {
 def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="mortarbench",
-        description="Compare QP solvers on elastic contact problems. To begin with: "
+        description="Compare QP solvers on elastic contact problems. To start: "
         "mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver smalbe; then "
         "mortarbench run demo.",
-        epilog="mortarbench COMMAND --help tells the options of a command.",
+        epilog="mortarbench COMMAND --help shows the options of a command.",
         allow_abbrev=False,
     )
     parser.add_argument(
-        "--version", action=_Version, nargs=0, help="print the version, and end"
+        "--version", action=_Version, nargs=0, help="print the version and exit"
     )
-    found = parser.add_subparsers(
+    commands = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_Parser
     )
-    for name, of in _COMMANDS.items():
-        text = f"{of.what[0].upper()}{of.what[1:]}.{of.more and f' {of.more}'}"
-        command = found.add_parser(
-            name, help=of.what, description=text, allow_abbrev=False
+    for name, spec in _COMMANDS.items():
+        text = f"{spec.what[0].upper()}{spec.what[1:]}.{spec.more and f' {spec.more}'}"
+        command = commands.add_parser(
+            name, help=spec.what, description=text, allow_abbrev=False
         )
-        command.set_defaults(module=f"mortarbench.cli.{of.module}", parser=command)
-        for option in of.options:
+        command.set_defaults(module=f"mortarbench.cli.{spec.module}", parser=command)
+        for option in spec.options:
             option.add_to(command)
-        if of.excluding:
+        if spec.excluding:
             group = command.add_mutually_exclusive_group()
-            for option in of.excluding:
+            for option in spec.excluding:
                 option.add_to(group)
     return parser

@@ -1,4 +1,4 @@
-"""The command `new`: a solver, a problem or a suite to start from."""
+"""The command `new`: write a template of a solver, a problem or a suite."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mortarbench.registries import Registries
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-#: what to do with the file first
+#: first command to try with the new file
 _NEXT = {
     "solver": "mortarbench test-solver {0} --plugin {0}.py",
     "problem": "mortarbench solve {0}/primal --solver clarabel --plugin {0}.py",
@@ -21,7 +21,7 @@ _NEXT = {
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Write NAME.py or NAME.toml into this folder, unless there is one."""
+    """Write NAME.py or NAME.toml into the working directory, unless it exists."""
     kind, name = options.kind, options.name
     if not _NAME.fullmatch(name):
         raise InputError(

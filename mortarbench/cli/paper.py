@@ -1,4 +1,4 @@
-"""The command `paper`: every figure and table of the paper."""
+"""The command `paper`: reproduce all figures and tables of the paper."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mortarbench.registries import Registries
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Reference
 
-#: suites whose figures the paper does not have, and what is left of them when quick
+#: suites with results that the paper does not have, and their reduction for --quick
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
         "cases": ("*/Nr=4/*", "*/Nr=8/*", "*/Nr=15/*", "*/Nr=30/*dual*"),
@@ -30,7 +30,7 @@ BEYOND: Mapping[str, Mapping[str, Any]] = {
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure what the paper's figures and tables show, and write them."""
+    """Measure and write the figures and tables of the paper."""
     try:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
@@ -38,23 +38,23 @@ def run(registries: Registries, options: Namespace) -> int:
             f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
         ) from None
     with report_full_disk(options.out):
-        written = measured_paper(registries, options.out, options.quick, say)
+        written = measure_and_write(registries, options.out, options.quick, say)
     print(*(file for file in written if file.suffix == ".html"), sep="\n")
     return 0
 
 
-def measured_paper(
+def measure_and_write(
     registries: Registries, out: Path, quick: bool, say: Callable[[str], None]
 ) -> list[Path]:
-    """Measure what the paper's figures and tables show, and write them.
+    """Measure and write the figures and tables of the paper; return the files.
 
     quick : fewer sizes and repeats
-    say : is told what happens
+    say : called with a message at each stage
 
     Raises
     ------
     InputError
-        When the folder is in use, or no folder of such measurements.
+        If the folder is in use, or contains other files than such results.
 
     """
     from mortarbench.harness.files.experiment import save_experiment
@@ -86,6 +86,6 @@ def measured_paper(
 
 
 def _answer(registries: Registries, name: str) -> Reference:
-    """Solve with a solver of ours to the paper's accuracy, which it does not state."""
+    """Return the solve of one of our solvers, to 1e-8: the paper states no accuracy."""
     solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

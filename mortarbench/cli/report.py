@@ -1,4 +1,4 @@
-"""The command `report`: on a result folder, or on what changed between several."""
+"""The command `report`: report on a result folder, or on changes between several."""
 
 from __future__ import annotations
 
@@ -7,28 +7,28 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-from mortarbench.arguments import FORMATS, GATES, check_known, existing
+from mortarbench.arguments import FORMATS, GATES, check_names, check_result_folder
 from mortarbench.harness.checked import positive
 from mortarbench.harness.errors import InputError
 from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Write the report on a result folder, or what changed; 1 if it failed on that."""
+    """Write the report; return 1 if a condition of ``--fail-on`` is met."""
     formats = options.format.split(",")
-    check_known("format", formats, FORMATS, "--format")
+    check_names("format", formats, FORMATS, "--format")
     gates = options.fail_on.split(",") if options.fail_on is not None else []
-    check_known("gate", gates, GATES, "--fail-on")
+    check_names("gate", gates, GATES, "--fail-on")
     if gates and not options.others:
         raise InputError("--fail-on needs a second folder; expected report DIR DIR2")
     if options.factor is not None:
         positive("--factor", options.factor)
     for folder in (options.folder, *options.others):
-        existing(folder)
+        check_result_folder(folder)
     from mortarbench.harness.record import VERIFIED_FACTOR
     from mortarbench.reporting import report
 
-    found = report(
+    result = report(
         options.folder,
         *options.others,
         formats=formats,
@@ -38,16 +38,16 @@ def run(registries: Registries, options: Namespace) -> int:
         registries=registries,
     )
     if options.json:
-        print(json.dumps(found.to_dict(), allow_nan=False))
+        print(json.dumps(result.to_dict(), allow_nan=False))
     else:
-        shown = found.files if options.verbose else _main_paths(found.files)
-        failed = [f"failed on {', '.join(found.failed_on)}"] * bool(found.failed_on)
-        print(*found.said, *shown, *failed, sep="\n")
-    return 1 if found.failed_on else 0
+        paths = result.files if options.verbose else _main_paths(result.files)
+        failed = [f"failed on {', '.join(result.failed_on)}"] * bool(result.failed_on)
+        print(*result.said, *paths, *failed, sep="\n")
+    return 1 if result.failed_on else 0
 
 
 def _main_paths(files: Sequence[Path]) -> list[Path]:
-    """List the pages to open: HTML, else Markdown, else the folders of the files."""
+    """Return the pages to open: HTML, else Markdown, else the folders of the files."""
     for suffix in (".html", ".md"):
         if pages := [file for file in files if file.suffix == suffix]:
             return pages

@@ -1,4 +1,4 @@
-"""The command `run`: a suite, measured and reported on."""
+"""The command `run`: measure a suite and write its report."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from mortarbench.harness.errors import some
 from mortarbench.harness.files.durable import report_full_disk
-from mortarbench.harness.suite.solver_options import given_options
+from mortarbench.harness.suite.solver_options import parse_options
 from mortarbench.registries import Registries
 
 if TYPE_CHECKING:
@@ -18,20 +18,23 @@ if TYPE_CHECKING:
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure what the result folder lacks of a suite, and report.
+    """Measure the missing part of a suite and write the report.
 
-    1 if not all was measured; by ``--strict``, if not all was solved.
+    Return 1 if a measurement is missing or, with ``--strict``, if a claim is refuted or
+    a measurement ended without an answer.
     """
     registries = registries.with_files(options.plugin)
     path: Path = registries.suite_path(options.suite)
-    changed = given_options(options.option)
+    changed = parse_options(options.option)
 
     from mortarbench import results
-    from mortarbench.progress import quiet_on, shown_on
+    from mortarbench.progress import display_on, warnings_on
     from mortarbench.reporting import report
 
-    with quiet_on(sys.stderr) if options.quiet else shown_on(sys.stderr) as progress:
-        found = results.run(
+    with (
+        warnings_on(sys.stderr) if options.quiet else display_on(sys.stderr) as progress
+    ):
+        measured = results.run(
             path,
             out=options.out,
             solvers=options.solver,
@@ -46,34 +49,38 @@ def run(registries: Registries, options: Namespace) -> int:
             registries=registries,
         )
     if not options.json and not options.quiet:
-        print(found)
+        print(measured)
     pages: list[Path] = []
-    said: tuple[str, ...] = ()
-    if found.records:
-        with report_full_disk(found.folder):
-            written = report(found.folder, registries=registries)
+    statements: tuple[str, ...] = ()
+    if measured.records:
+        with report_full_disk(measured.folder):
+            written = report(measured.folder, registries=registries)
         pages = [file for file in written.files if file.suffix == ".html"]
-        said = written.said
-    failed = len(found.refuted) + len(found.failed) if options.strict else 0
+        statements = written.said
+    failed = len(measured.refuted) + len(measured.failed) if options.strict else 0
     if options.json:
-        print(json.dumps({**found.to_dict(), "pages": [*map(str, pages)]}))
+        print(json.dumps({**measured.to_dict(), "pages": [*map(str, pages)]}))
     else:
-        summary = found.shortfall if options.quiet else [*said, *pages]
-        for line in [*summary, *[_strict(found)] * bool(failed)]:
+        summary = measured.shortfall if options.quiet else [*statements, *pages]
+        for line in [*summary, *[_strict_failure(measured)] * bool(failed)]:
             print(line)
-    return 1 if found.shortfall or failed else 0
+    return 1 if measured.shortfall or failed else 0
 
 
-def _strict(found: Results) -> str:
-    """Say in a line why a strict run fails."""
+def _strict_failure(results: Results) -> str:
+    """Return the reason why a strict run fails, in a line."""
     counts = (
-        (found.refuted, "answer that refutes its claim", "answers that refute theirs"),
-        (found.failed, "measurement without an answer", "measurements without one"),
+        (
+            results.refuted,
+            "answer that refutes its claim",
+            "answers that refute theirs",
+        ),
+        (results.failed, "measurement without an answer", "measurements without one"),
     )
-    told = [
+    texts = [
         f"{len(records)} {one if len(records) == 1 else several} "
         f"({some(dict.fromkeys(f'{r.solver} on {r.case}' for r in records))})"
         for records, one, several in counts
         if records
     ]
-    return f"strict: {' and '.join(told)}"
+    return f"strict: {' and '.join(texts)}"

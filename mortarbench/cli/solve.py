@@ -1,4 +1,4 @@
-"""The command `solve`: one solver on one case, once."""
+"""The command `solve`: run one solver on one case."""
 
 from __future__ import annotations
 
@@ -9,7 +9,13 @@ from argparse import Namespace
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING
 
-from mortarbench.arguments import GRIDS, PICTURES, drawn_scale, tolerance, writable
+from mortarbench.arguments import (
+    GRIDS,
+    PICTURES,
+    check_output_file,
+    check_scale,
+    tolerance,
+)
 from mortarbench.harness.distributed.mpi import ranks_asked
 from mortarbench.harness.errors import InputError, say
 from mortarbench.harness.names import assemble, is_shared, parse
@@ -25,18 +31,18 @@ if TYPE_CHECKING:
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Measure one solver on one case, in a worker; 0 if we can verify its answer."""
+    """Run one solver on one case in a worker; return 0 if its answer is verified."""
     tolerance(options.tol, "--tol")
     if options.plot is not None:
-        writable(options.plot, PICTURES)
+        check_output_file(options.plot, PICTURES)
     if options.scale is not None:
-        drawn_scale(options.scale, "--scale")
+        check_scale(options.scale, "--scale")
     if options.plot is None and options.scale is not None:
         raise InputError(
             f"--scale {options.scale:g} without --plot; expected a picture"
         )
     if options.vtu is not None:
-        writable(options.vtu, GRIDS)
+        check_output_file(options.vtu, GRIDS)
     ranks_asked(options.mpi, "--mpi")
     registries = registries.with_files(options.plugin)
     parsed = parse(options.case, registries.families)
@@ -44,28 +50,29 @@ def run(registries: Registries, options: Namespace) -> int:
     changed = options_for(options.solver, options.option, registries.solvers)
 
     defer_parts_of_numpy()
-    from mortarbench.answer import answers_of
+    from mortarbench.answer import solver_session
     from mortarbench.case import Case
 
-    drawn = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
-    is_ours = registries.hold_own_code_only()
-    forks = is_ours and not _loads_from_here()
-    asked = answers_of(
+    pictures = [o for o in ("plot", "vtu") if getattr(options, o) is not None]
+    is_builtin = registries.hold_only_builtins()
+    forks = is_builtin and not _imports_from_working_directory()
+    session = solver_session(
         options.solver, registries, changed, forks=forks, ranks=options.mpi
     )
-    with asked as solved:
+    with session as solve:
         case = Case(id=parsed, registries=registries)
-        if drawn or options.mpi == 1 or not (is_ours and is_shared(parsed)):
-            _build(case, drawn)  # after the fork, which has no use for it
-        answer = solved(case, options.tol)
+        if pictures or options.mpi == 1 or not (is_builtin and is_shared(parsed)):
+            # after the fork, so that the worker does not carry the memory of the case
+            _build(case, pictures)
+        answer = solve(case, options.tol)
     _print(answer, options)
-    if drawn:
+    if pictures:
         _draw(answer, options)
     return 0 if answer.verdict.is_verified else 1
 
 
 def _print(answer: Answer, options: Namespace) -> None:
-    """Print the answer, and the error of the mesh where it was asked for."""
+    """Print the answer and, if requested, the discretisation error."""
     from mortarbench.harness.record import Verdict
 
     record = answer.record
@@ -81,23 +88,23 @@ def _print(answer: Answer, options: Namespace) -> None:
 
         if table := convergence(answer.history):
             print(f"\n{table}")
-            if words := legend(answer.history):
-                print(f"\n{words}")
+            if text := legend(answer.history):
+                print(f"\n{text}")
     if record.verdict is Verdict.DECLINED:
         say(f"{record.solver} declines {record.case}: {record.message}{_hint(answer)}")
 
 
-def _build(case: Case, drawn: Sequence[str]) -> None:
-    """Build the case, and say what is odd about it; see that it can be drawn."""
+def _build(case: Case, pictures: Sequence[str]) -> None:
+    """Build the case and print its remarks; raise if requested pictures need bodies."""
     for remark in case.remarks:
         say(remark)
-    if drawn and case.made.fields is None:
-        wanted = ", ".join(f"--{o}" for o in drawn)
-        raise InputError(f"{case.name} has no bodies to draw; leave out {wanted}")
+    if pictures and case.family_case.fields is None:
+        names = ", ".join(f"--{o}" for o in pictures)
+        raise InputError(f"{case.name} has no bodies to draw; leave out {names}")
 
 
 def _hint(answer: Answer) -> str:
-    """Name the dual of a case if its solver declines it for its inequality rows."""
+    """Return a hint to the dual form if inequality rows are the reason to decline."""
     case = answer.case
     if case.form != "primal" or "dual" not in case.id.family.forms:
         return ""
@@ -107,32 +114,32 @@ def _hint(answer: Answer) -> str:
     from mortarbench.harness.registry import resolve
     from mortarbench.harness.verify.measure import reason_to_decline
 
-    qp = case.made.qp
+    qp = case.family_case.qp
     n = qp.q.size
     without_rows = replace(qp, G=no_rows(n), h=qp.h[:0])
     like_dual = without_rows.with_bounds(0 * qp.q, 0 * qp.q + np.inf)
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        declined = reason_to_decline(
-            solver, like_dual
-        )  # bounds in place of inequality rows
-    except Exception:  # the family's or the solver's code: there is no hint then
+        # a QP with bounds in place of inequality rows stands for the dual
+        reason = reason_to_decline(solver, like_dual)
+    except Exception:  # code of a plug-in failed: no hint
         return ""
-    return "" if declined else f"; dualise inequality rows first: solve {dual}"
+    return "" if reason else f"; dualise inequality rows first: solve {dual}"
 
 
-def _loads_from_here() -> bool:
-    """Whether a library may have come from the working directory, and only from there.
+def _imports_from_working_directory() -> bool:
+    """Return True if libraries may have been imported from the working directory.
 
-    ``python -m`` looks there first. Workers do not, so they must not be forks then.
+    ``python -m`` looks there first, but workers do not (-P): a fork of this process
+    could run other libraries than a worker of a run.
     """
     first, *others = sys.path
     return first in ("", os.getcwd()) and first not in others
 
 
 def _draw(answer: Answer, options: Namespace) -> None:
-    """Write the pictures that were asked for."""
+    """Write the requested pictures."""
     if not answer.has_point:
         say(f"no picture: {answer.record.solver} returned no point")
         return

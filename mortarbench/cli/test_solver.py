@@ -1,4 +1,4 @@
-"""The command `test-solver`: the conformance suite on solvers."""
+"""The command `test-solver`: run the conformance suite on solvers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Run every check; 1 if one fails, or if a solver solved nothing at all."""
+    """Run all checks; return 1 if one fails or a solver solves no QP."""
     registries = registries.with_files(options.plugin)
     specs = [
         SolverSpec(name=name, label=name)
@@ -22,32 +22,34 @@ def run(registries: Registries, options: Namespace) -> int:
     ]
     for spec in specs:
         check_name(spec.name, registries.solvers)
-    from mortarbench.harness.conformance.conformance import CHECKS, KEEPS
+    from mortarbench.harness.conformance.conformance import CHECKS, INVARIANCE_PREFIX
     from mortarbench.harness.conformance.weaknesses import weaknesses_page
     from mortarbench.validation import test_solver
 
     for spec in specs:
         resolve(spec, registries.solvers)
-    checks = [c for c in CHECKS if c.startswith(KEEPS) or not options.markdown]
-    found = []
+    checks = [
+        c for c in CHECKS if c.startswith(INVARIANCE_PREFIX) or not options.markdown
+    ]
+    results = []
     for spec in specs:
-        found.append(test_solver(spec.name, checks=checks, registries=registries))
+        results.append(test_solver(spec.name, checks=checks, registries=registries))
         if not options.json and not options.markdown:
-            print(found[-1])
+            print(results[-1])
     if options.markdown:
-        print(weaknesses_page({one.solver: one.results for one in found}), end="")
+        print(weaknesses_page({one.solver: one.results for one in results}), end="")
         return 0
     if options.json:
-        print(json.dumps([row for one in found for row in one.to_dict()["checks"]]))
-    for one in found:
+        print(json.dumps([row for one in results for row in one.to_dict()["checks"]]))
+    for one in results:
         if one.objection:
             say(f"{one.solver} does not conform: it {one.objection}")
-    return 0 if all(one.conforms for one in found) else 1
+    return 0 if all(one.conforms for one in results) else 1
 
 
 def _named(pattern: str, solvers: Collection[str]) -> list[str]:
-    """List the solvers of a registry that a pattern means; a name means itself."""
+    """Return the solvers that match a pattern; the pattern itself if none does."""
     if "*" not in pattern or pattern in solvers:
         return [pattern]
-    found = [s for s in fnmatch.filter(solvers, pattern) if not s.endswith(":*")]
-    return found or [pattern]
+    matches = [s for s in fnmatch.filter(solvers, pattern) if not s.endswith(":*")]
+    return matches or [pattern]

@@ -2,9 +2,9 @@
 
     mortarbench solve NAME/n=100/primal --solver clarabel --plugin NAME.py
 
-It is called NAME in suites, and its cases NAME/key=value/…/FORM. Make the data of the
-QP of order one: tolerances then mean the same as elsewhere. The way back to physical
-units is `recover`, `quantities`, and energy = scale · objective + constant.
+Its name in suites is NAME, and its cases are NAME/key=value/…/FORM. Scale the data of
+the QP to order one: tolerances then mean the same as elsewhere. `recover`, `quantities`
+and energy = scale · objective + constant lead back to physical units.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Problem(Family):
     """A string on (0, 1) under a load of one, above a flat obstacle: u ≥ −depth."""
 
     name: str = "NAME"
-    #: every key of a case name with its default, in the order of names
+    #: keys of case names with their defaults, in the order of the names
     defaults: Mapping[str, Value] = field(
         default_factory=lambda: {"n": 50, "depth": 0.05}, hash=False
     )

@@ -3,13 +3,13 @@
     mortarbench test-solver NAME --plugin NAME.py
     mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver NAME --plugin NAME.py
 
-A solver is given the QP
+A solver receives the QP
 
     minimise ½xᵀPx + qᵀx   subject to   Ax = b,  Gx ≤ h,  lb ≤ x ≤ ub,
 
 in which absent constraints have no rows and absent bounds are ±inf. It returns x and
 multipliers with Px + q + Aᵀy + Gᵀz + z_box = 0, where z ≥ 0, and z_box is ≤ 0 at an
-active lb, ≥ 0 at an active ub. What it claims is checked, never believed.
+active lb, ≥ 0 at an active ub. The harness verifies every claim by itself.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from mortarbench.harness import (
 
 @dataclass(frozen=True)
 class Solver:
-    """A dense interior-point method: Mehrotra's predictor and corrector."""
+    """Dense interior-point method: Mehrotra's predictor and corrector."""
 
     max_iter: int = 100  #: every field is an option: --option max_iter=50
 
@@ -40,27 +40,27 @@ class Solver:
             raise ValueError(f"max_iter = {self.max_iter}; expected at least 1")
 
     def declines(self, qp: QP) -> str | None:
-        """Say why this solver cannot take `qp`, or None if it can."""
-        if reason := needs_matrices(qp):  # P may be an operator, known by its products
+        """Return the reason why this solver cannot take `qp`, or None if it can."""
+        if reason := needs_matrices(qp):  # P may be an operator without a matrix
             return reason
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP; the call that is returned solves it. Both are timed."""
+        """Convert the QP; the returned call solves it. Both are timed."""
         P, A, G = (M if isinstance(M, np.ndarray) else M.toarray()
                    for M in (qp.P, qp.A, qp.G))  # fmt: skip
-        # Gx ≤ h and the bounds that there are, as one system Cx ≤ d
+        # Gx ≤ h and the finite bounds, as one system Cx ≤ d
         up, low, eye = np.isfinite(qp.ub), np.isfinite(qp.lb), np.eye(qp.q.size)
         C = np.vstack([G, eye[up], -eye[low]])
         d = np.concatenate([qp.h, qp.ub[up], -qp.lb[low]])
 
         def answer(status: Status, x: Vector, y: Vector, z: Vector, k: int) -> Solution:
-            of_rows, of_ub, of_lb = np.split(z, [qp.h.size, qp.h.size + up.sum()])
+            z_rows, z_ub, z_lb = np.split(z, [qp.h.size, qp.h.size + up.sum()])
             z_box = np.zeros(qp.q.size)
-            z_box[up] += of_ub
-            z_box[low] -= of_lb
+            z_box[up] += z_ub
+            z_box[low] -= z_lb
             return Solution(
-                status=status, x=x, y=y, z=of_rows, z_box=z_box, iterations=k,
+                status=status, x=x, y=y, z=z_rows, z_box=z_box, iterations=k,
                 message="" if status is Status.SOLVED else f"{k} iterations, no end",
             )  # fmt: skip
 
@@ -79,20 +79,21 @@ class Solver:
 def iterates(
     P: Vector, q: Vector, A: Vector, b: Vector, C: Vector, d: Vector
 ) -> Iterator[tuple[Vector, Vector, Vector]]:
-    """Yield ever better x, y and z of the QP with Ax = b and Cx + s = d, s ≥ 0.
+    """Yield the iterates x, y, z for the QP with Ax = b and Cx + s = d, s ≥ 0.
 
     Reference: J. Nocedal, S. J. Wright, Numerical Optimization (2006), algorithm 16.4.
     """
     p = d.size
-    x, y = solved(P, A, C, np.ones(p), C.T @ d - q, b)
+    x, y = solve_kkt(P, A, C, np.ones(p), C.T @ d - q, b)
     gap = d - C @ x
-    s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)  # far inside, in any units
+    # start far inside; relative to |gap|, so that it is independent of units
+    s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)
     z = np.full(p, np.abs(q).max(initial=0.0) or 1.0)
 
     def newton(r_z: Vector) -> tuple[Vector, Vector, Vector, Vector]:
         """Solve Newton's equations, the last of which is z ds + s dz = −r_z."""
         r_x, r_y, r_s = P @ x + q + A.T @ y + C.T @ z, A @ x - b, C @ x + s - d
-        dx, dy = solved(P, A, C, z / s, C.T @ ((r_z - z * r_s) / s) - r_x, -r_y)
+        dx, dy = solve_kkt(P, A, C, z / s, C.T @ ((r_z - z * r_s) / s) - r_x, -r_y)
         ds = -r_s - C @ dx
         return dx, dy, ds, -(r_z + z * ds) / s
 
@@ -101,17 +102,17 @@ def iterates(
         dx, dy, ds, dz = newton(s * z)
         step = 1.0
         if p:
-            step = min(1.0, longest(s, ds), longest(z, dz))
+            step = min(1.0, max_step(s, ds), max_step(z, dz))
             sigma = ((s + step * ds) @ (z + step * dz) / (s @ z)) ** 3
             dx, dy, ds, dz = newton(s * z + ds * dz - sigma * (s @ z) / p)
-            step = min(1.0, 0.995 * longest(s, ds), 0.995 * longest(z, dz))
+            step = min(1.0, 0.995 * max_step(s, ds), 0.995 * max_step(z, dz))
         x, y, s, z = x + step * dx, y + step * dy, s + step * ds, z + step * dz
 
 
-def solved(
+def solve_kkt(
     P: Vector, A: Vector, C: Vector, weights: Vector, right: Vector, b: Vector
 ) -> tuple[Vector, Vector]:
-    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b; singular ones nearly."""
+    """Solve (P + Cᵀ diag(weights) C) x + Aᵀy = right, Ax = b, slightly regularised."""
     m, n = A.shape
     K = np.block([[P + C.T @ (weights[:, None] * C), A.T], [A, np.zeros((m, m))]])
     size = np.abs(P).max(initial=0.0) or 1.0
@@ -120,8 +121,8 @@ def solved(
     return x, y
 
 
-def longest(v: Vector, dv: Vector) -> float:
-    """Give the longest step, up to a hundred, that keeps v + step·dv ≥ 0."""
+def max_step(v: Vector, dv: Vector) -> float:
+    """Return the longest step, at most 100, that keeps v + step·dv ≥ 0."""
     return float((-v[dv < 0] / dv[dv < 0]).min(initial=100.0))
 
 

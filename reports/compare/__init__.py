@@ -1,1 +1,1 @@
-"""What changed between two result folders."""
+"""Comparison of two result folders: changes, conclusions and their pages."""

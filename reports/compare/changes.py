@@ -1,7 +1,7 @@
-"""What changed between two result folders, cell by cell and solver by solver.
+"""Changes between two result folders, cell by cell and solver by solver.
 
-A cell is one solver, driven in one mode, on one case at one tolerance. Its times before
-and after are of different sessions: two samples, that nothing pairs.
+A cell is one solver in one mode on one case at one tolerance. Its times before and
+after are two unpaired samples, because the folders are different sessions.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
-ALIKE = 1.5  #: an interval that excludes such a factor either way can tell "no change"
-FEWEST = 3  #: cells that an interval over cells needs
-_NEGLIGIBLE = 1e-12  #: energies below, of QPs with data of order one, are rounding
+ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] around 1 counts as "no change seen"
+FEWEST = 3  #: least number of cells for an interval over cells
+_NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
 
 #: case (of a QP from a file its digest), tolerance, solver with its mode
 Key = tuple[str, float, str]
@@ -32,7 +32,7 @@ Key = tuple[str, float, str]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Pair:
-    """A cell that both folders hold."""
+    """A cell that is in both folders."""
 
     before: Outcome
     after: Outcome
@@ -40,23 +40,23 @@ class Pair:
 
     @property
     def same_sizes(self) -> bool:
-        """Whether the QPs have equal numbers of variables and constraints."""
+        """True if the QPs have equal numbers of variables and constraints."""
         return self.before.first.sizes == self.after.first.sizes
 
     @property
     def same_qp(self) -> bool:
-        """Whether the QPs are equal bit for bit, as far as the journals say."""
+        """True if the QPs are bitwise equal, as far as the journals record digests."""
         digests = {r.qp for o in (self.before, self.after) for r in o.records}
         return self.same_sizes and len(digests - {None}) < 2
 
     @property
     def both_verified(self) -> bool:
-        """Whether both answers are right, so that anything of them is comparable."""
+        """True if both answers are verified and of equal size, hence comparable."""
         return self.before.verified and self.after.verified and self.same_sizes
 
     @cached_property
     def log(self) -> float | None:
-        """Mean logarithm of the times after less that of those before."""
+        """Mean logarithm of the times after minus that of the times before."""
         a, b = _seconds(self.after), _seconds(self.before)
         if not (self.both_verified and self.same_machine and a and b):
             return None
@@ -64,11 +64,9 @@ class Pair:
 
     @cached_property
     def ratio(self) -> Ratio | None:
-        """Time after over time before, Welch's interval; None below two repeats.
-
-        Welch's and not a bootstrap: resampling three to ten repeats finds a change
-        that is not there three to five times as often as one in twenty.
-        """
+        """Time after over time before with Welch's interval; None below two repeats."""
+        # Not a bootstrap: with three to ten repeats, resampling reports a spurious
+        # change three to five times as often as the nominal one in twenty.
         if self.log is None:
             return None
         return unpaired_ratio(_seconds(self.after), _seconds(self.before))
@@ -86,7 +84,7 @@ class Pair:
 
     @property
     def other_iterations(self) -> bool:
-        """Whether no repeat after took as many iterations as one before."""
+        """True if the ranges of iterations before and after do not overlap."""
         a, b = self.before.iterations, self.after.iterations
         return a is not None and b is not None and (a[1] < b[0] or b[1] < a[0])
 
@@ -110,20 +108,19 @@ class Pair:
 
     @property
     def may_differ(self) -> float:
-        """How far two verified energies may be apart: twice what both gaps allow.
-
-        A gap is relative to the largest energy, about twice the potential energy.
-        """
+        """Largest relative difference that two verified energies may have."""
+        # A gap is relative to the largest energy term, about twice the potential
+        # energy; hence the factor 2 on the sum of both tolerances.
         return 2 * (self.before.allowed + self.after.allowed)
 
     @property
     def other_answer(self) -> bool:
-        """Whether both answers are verified and yet differ."""
+        """True if both answers are verified and yet differ beyond the allowed gaps."""
         return self.answers is not None and self.answers[2] > self.may_differ
 
 
 class Mean(NamedTuple):
-    """A geometric mean of ratios over cells, with its interval if there is one."""
+    """Geometric mean of ratios over cells with its interval, which may be unbounded."""
 
     value: float
     low: float
@@ -133,14 +130,14 @@ class Mean(NamedTuple):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Comparison:
-    """Two result folders, and the cells that they share."""
+    """Two result folders and their common cells."""
 
     before: Evidence
     after: Evidence
     pairs: tuple[Pair, ...]
     only_before: tuple[Outcome, ...]
     only_after: tuple[Outcome, ...]
-    folders: int = 1  #: that are compared with the first one, this one included
+    folders: int = 1  #: number of folders compared with the first, this one included
 
     @property
     def worse(self) -> tuple[Pair, ...]:
@@ -149,7 +146,7 @@ class Comparison:
 
     @property
     def solvers(self) -> tuple[str, ...]:
-        """Labels of the solvers that both folders hold, in the order of the later."""
+        """Labels of the solvers in both folders, in the order of the later one."""
         present = {p.after.solver for p in self.pairs}
         return tuple(s for s in self.after.solvers if s in present)
 
@@ -166,7 +163,7 @@ class Comparison:
 def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
     """Pair the cells of two folders, in the order of the later one.
 
-    folders : that are compared with `before`, `after` included
+    folders : number of folders compared with `before`, `after` included
     """
     a, b = ({_key(o): o for o in e.flat} for e in (before, after))
     machines = hardware(before) | hardware(after)
@@ -195,27 +192,27 @@ def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
 
 
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
-    """Average how much more a solver's time changed than that of the others.
+    """Average the ratios of a solver relative to those of the other solvers.
 
-    Per case and tolerance its ratio is divided by the geometric mean of theirs: what
-    slows a whole run down cancels. None where no other solver has times on its cells.
+    On each case and tolerance, its ratio is divided by the geometric mean of theirs,
+    which cancels a slowdown of the whole run. None if no other solver has times there.
     """
     competing = (p for p in c.pairs if p.after.solver != solver)
     rivals = grouped(
         (p for p in competing if not p.after.first.role),
         lambda p: (p.after.case, p.after.tol),
     )
-    found = []
+    changes = []
     for p in c.of(solver):
         others = rivals.get((p.after.case, p.after.tol), ())
         logs = [other.log for other in others if other.log is not None]
         if p.log is not None and logs:
-            found.append((p, p.log - float(np.mean(logs))))
-    return _over_cells(found)
+            changes.append((p, p.log - float(np.mean(logs))))
+    return _over_cells(changes)
 
 
 def canary_ratio(pairs: Sequence[Pair]) -> Mean | None:
-    """Average the same of the canary, which is no solver: what the machine did."""
+    """Average the ratios of the canary, which show changes of the machine."""
 
     def log(p: Pair) -> float | None:
         sides = [
@@ -238,10 +235,10 @@ def _over_cells(changes: Iterable[tuple[Pair, float | None]]) -> Mean | None:
 def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     """Average logarithms of ratios over cells, with a bootstrap interval over cells.
 
-    A cell is resampled as a pair, before with after. Percentiles of n values lie too
-    near to the mean, by √((n−1)/n) and by normal instead of Student's tails; their
-    distances from it are multiplied by what is missing [1]_. The seed comes from the
-    names of the cells. Below three cells the interval is unbounded.
+    A cell is resampled as a pair, before with after. Percentile intervals of n values
+    are too narrow, by √((n−1)/n) and by normal instead of Student's tails; their
+    distances from the mean are multiplied by both factors [1]_. The names of the cells
+    seed the generator. Below three cells the interval is unbounded.
 
     References
     ----------
@@ -273,7 +270,7 @@ def side(interval: Ratio | Mean | None) -> int:
 
 
 def resolved(interval: Ratio | Mean) -> bool:
-    """Whether a change by a factor `ALIKE`, either way, would have been seen."""
+    """Return whether a change by the factor `ALIKE` or its inverse would be visible."""
     return side(interval) != 0 or 1 / ALIKE < interval.low <= interval.high < ALIKE
 
 

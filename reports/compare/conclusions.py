@@ -1,4 +1,4 @@
-"""What a comparison of two result folders comes to, in sentences."""
+"""Conclusions of a comparison of two result folders, in sentences."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mortarbench.reports.document.formatting import VERDICTS, fixed, plural
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-NAMED = 8  #: changes that are named; tables have all
+NAMED = 8  #: changes named in the text; the tables list all
 WORDS = ("slower", "faster", "no change seen", "not resolved")
 
 
@@ -29,42 +29,42 @@ _CONDITIONS = ("same_folder", "conditions", "residuals", "busy")
 
 
 def verdict_lines(c: Comparison) -> list[str]:
-    """Say in a few lines of plain text how the comparison ended."""
+    """Return the conclusions as a few lines of plain text."""
     if not c.pairs:
         return [TEXT("nothing", c)]
-    said = _said(c)
+    by_name = _named_sentences(c)
     means = [(solver, mean_ratio(c.of(solver))) for solver in c.solvers]
-    lines = [*(said[name] for name in (*_CONDITIONS, "times", "slower"))]
+    lines = [*(by_name[name] for name in (*_CONDITIONS, "times", "slower"))]
     lines += [
         f"  {solver}: {ratio_text(mean)} over {plural(mean.cells, 'cell')}, "
         f"{change_word(mean)}"
         for solver, mean in means
         if mean is not None
     ]
-    lines += [said["shared"], said["verdicts"], said["others"]]
+    lines += [by_name["shared"], by_name["verdicts"], by_name["others"]]
     return [*filter(None, lines), *(f"  {point}" for point in named(c))]
 
 
 def headline(c: Comparison) -> str:
-    """Say how the comparison ended in whole sentences, beside a table of ratios."""
+    """Return the conclusions as one paragraph, for use beside a table of ratios."""
     if not c.pairs:
         return TEXT("nothing", c)
-    said = _said(c)
+    by_name = _named_sentences(c)
     order = ("same_folder", "slower", "shared", "verdicts", "others", *_CONDITIONS[1:])
-    return " ".join(said[name] for name in order if said[name])
+    return " ".join(by_name[name] for name in order if by_name[name])
 
 
 def sentences(c: Comparison) -> tuple[str, ...]:
-    """Say how the conditions compare, and count what changed."""
+    """Return sentences on conditions, and counts of changes."""
     if not c.pairs:
         return (TEXT("nothing", c),)
-    said = _said(c)
-    lines = [said[name] for name in (*_CONDITIONS, "times", "slower", "shared")]
-    return (*filter(None, lines), f"{said['verdicts']} {said['others']}")
+    by_name = _named_sentences(c)
+    lines = [by_name[name] for name in (*_CONDITIONS, "times", "slower", "shared")]
+    return (*filter(None, lines), f"{by_name['verdicts']} {by_name['others']}")
 
 
-def _said(c: Comparison) -> dict[str, str]:
-    """Write all sentences on a comparison, by name; empty where one has no cause."""
+def _named_sentences(c: Comparison) -> dict[str, str]:
+    """Return all sentences on a comparison by name; empty strings do not apply."""
     keys = [key for key, *_ in environments(c.before, c.after)]
     schemas = [sorted({r.schema for r in e.records}) for e in (c.before, c.after)]
     loads = [
@@ -92,7 +92,7 @@ def _said(c: Comparison) -> dict[str, str]:
 
 
 def dates(c: Comparison) -> str:
-    """Say when and on which machine, which is named once if it is the same."""
+    """Return dates and machines of both folders; a common machine is named once."""
     (then, there), (now, here) = (
         dateline(e).split(" · ", 1) for e in (c.before, c.after)
     )
@@ -102,14 +102,14 @@ def dates(c: Comparison) -> str:
 
 
 def change_word(interval: Ratio | Mean) -> str:
-    """Say what an interval tells; "no change" only if it could have told one."""
+    """Describe a change; "no change seen" only if a change would have been visible."""
     if way := side(interval):
         return "slower" if way > 0 else "faster"
     return "no change seen" if resolved(interval) else "not resolved"
 
 
 def named(c: Comparison) -> list[str]:
-    """Name what became worse: verdicts, answers, then times, the largest first."""
+    """Name the deteriorations: verdicts, answers, then times, the largest first."""
     slower = [(p.ratio.low, p) for p in c.timed if p.ratio and p.change > 0]
     slower.sort(key=lambda each: each[0], reverse=True)
     worse = [("worse", p) for p in c.worse]
@@ -117,7 +117,7 @@ def named(c: Comparison) -> list[str]:
     worse += [("longer", p) for _, p in slower]
     points = [TEXT(macro, p) for macro, p in worse[:NAMED]]
     rest = len(worse) - NAMED
-    return [*points, f"and {rest} more, see the tables"] if rest > 0 else points
+    return [*points, f"and {rest} more (see the tables)"] if rest > 0 else points
 
 
 def cell_name(pair: Pair) -> str:

@@ -1,4 +1,4 @@
-"""Under which conditions two result folders were measured, and how they differ."""
+"""Conditions of the measurements in two result folders, and their differences."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from mortarbench.harness.results.folder import differences, environment_of
 from mortarbench.reports.data.environment import flatten
 from mortarbench.reports.data.evidence import Evidence
 
-#: parts of an environment that have to be equal for times to be comparable; the others
-#: (versions, source, plugins) are what a comparison is usually about
+#: parts of an environment that must be equal for times to be comparable; a comparison
+#: is usually about the others (versions, source, plugins)
 HARDWARE = ("machine", "threads", "cholmod")
 
 Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 
 
 def hardware(evidence: Evidence) -> dict[str, str]:
-    """Name by each digest of an environment what the times depend on besides the code.
+    """Map the digest of each environment to a text of its hardware parts.
 
-    A digest whose environment the folder does not hold names itself.
+    A digest without a stored environment is mapped to itself.
     """
     named = {}
     for digest in {r.environment for r in evidence.records}:
@@ -36,17 +36,17 @@ def hardware(evidence: Evidence) -> dict[str, str]:
 
 
 def machines_differ(before: Evidence, after: Evidence) -> bool:
-    """Whether not all measurements of both folders come from equal machines."""
+    """Return whether the measurements of both folders come from different machines."""
     return len({*hardware(before).values(), *hardware(after).values()}) > 1
 
 
 def environments(before: Evidence, after: Evidence) -> list[Difference]:
-    """List what differs between the two environments, as recorded."""
+    """List the recorded differences between the two environments."""
     return list(differences(before.environment, after.environment))
 
 
 def settings(before: Evidence, after: Evidence) -> list[Difference]:
-    """List what differs between the suites, their problems and solvers aside."""
+    """List the differences between the suites, except problems and solvers."""
     a, b = (
         {k: v for k, v in e.suite.items() if k not in ("problems", "solvers")}
         for e in (before, after)
@@ -55,7 +55,7 @@ def settings(before: Evidence, after: Evidence) -> list[Difference]:
 
 
 def options(before: Evidence, after: Evidence) -> list[Difference]:
-    """List the options in which solvers of one label differ, defaults resolved."""
+    """List the options, including defaults, in which solvers of one label differ."""
     a, b = ({r.solver: r.options for r in e.records} for e in (before, after))
     return [
         (f"{solver}.{key}", *values)

@@ -1,4 +1,4 @@
-"""The page on several result folders: each one against the first."""
+"""Page that compares several result folders with the first."""
 
 from __future__ import annotations
 
@@ -16,24 +16,22 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 
 
 def overview(found: Sequence[Comparison]) -> Page:
-    """Put the page together: what changed since the first folder, then all times.
+    """Compose the page: changes since the first folder, then all times.
 
     found : comparisons of one folder with each of several others
     """
     names = [clean(c.after.directory.resolve().name, 40) for c in found]
     first = clean(found[0].before.directory.resolve().name, 40)
     sections = (
-        Section.of(
-            "summary", f"What changed since {first}", _summary(found, first, names)
-        ),
+        Section.of("summary", f"Changes since {first}", _summary(found, first, names)),
         Section.of("times", "Times", _times(found, first, names)),
     )
     return Page(
         title=f"{clean(found[-1].after.name)}: {', '.join(names)} against {first}",
         dateline=dateline(found[-1].after),
         sections=tuple(s for s in sections if s is not None),
-        footer="Each folder has a page of its own on what changed since the first one, "
-        "in report/against-….",
+        footer="Each folder has its own page on the changes since the first one, in "
+        "report/against-….",
     )
 
 
@@ -50,8 +48,8 @@ def _summary(
     named = [*zip(names, found, strict=True)]
     yield from (Point(f"{name}: {headline(c)}") for name, c in named)
     yield Table.of(
-        f"Time over that in {first}, geometric mean over the cells that both hold "
-        f"verified, with its {COVERAGE:.0%} bootstrap interval over cells.",
+        f"Time relative to {first}: geometric mean over the cells that are verified in "
+        f"both, with its {COVERAGE:.0%} bootstrap interval over cells.",
         dict.fromkeys(s for c in found for s in c.solvers),
         (("solver", Cell.name), *((name, partial(mean, c)) for name, c in named)),
     )
@@ -70,7 +68,7 @@ def _times(
             return Cell(title="not measured")
         return time_cell(o, voided=not o.verified)
 
-    yield "Struck out: the answer was not verified, so its time is no result."
+    yield "Struck out: the answer was not verified, so its time does not count."
     yield Table.of(
         f"Median times with their intervals. {TIMED}",
         dict.fromkeys(key for of in answers for key in of),

@@ -1,4 +1,4 @@
-"""The page on two result folders: what changed, and under which conditions."""
+"""Page that compares two result folders: changes and conditions."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ TEXT = Sentences(__name__, cell_name=cell_name)
 
 
 def compose(c: Comparison) -> Page:
-    """Put the page together: conditions that differ first, then what changed."""
+    """Compose the page: summary, changes, then the conditions that differ."""
     names = [clean(e.directory.resolve().name, 40) for e in (c.before, c.after)]
     sections = (
         Section.of(name, title, list(write(c)) or ["None."])
@@ -72,7 +72,7 @@ def compose(c: Comparison) -> Page:
         )
     )
     return Page(
-        title=f"{clean(c.after.name)}: what changed from {names[0]} to {names[1]}",
+        title=f"{clean(c.after.name)}: changes from {names[0]} to {names[1]}",
         dateline=dates(c),
         sections=tuple(s for s in sections if s is not None),
         footer=TEXT("footer"),
@@ -213,7 +213,7 @@ def _unpaired(c: Comparison) -> Iterator[Part]:
         ("only", lambda each: Cell.words(each[0])),
         ("verdict", lambda each: verdict_cell(each[1])),
     )
-    return _listed("Cells without a partner.", alone, columns)
+    return _listed("Cells that are in one folder only.", alone, columns)
 
 
 _PAIR = answer_columns(lambda pair: pair.after)
@@ -222,17 +222,17 @@ _PAIR = answer_columns(lambda pair: pair.after)
 def _listed(
     caption: str, items: Sequence[Any], columns: Sequence[Column]
 ) -> Iterator[Table]:
-    """Tabulate what there is to list."""
+    """Yield a table of the items; none without items."""
     if items:
         yield explained(Table.of(caption, items, columns, text_columns=2))
 
 
 def conditions_that_differ(c: Comparison) -> Iterator[Part]:
-    """List environments, settings and options that differ, and QPs that changed."""
+    """Tabulate differences of environments, settings, options and QPs."""
     found = {
         "Environments, as recorded.": environments(c.before, c.after),
         "Settings of the suites.": settings(c.before, c.after),
-        "Options of solvers with one label.": options(c.before, c.after),
+        "Options of solvers with the same label.": options(c.before, c.after),
     }
     others = [p for p in c.pairs if not p.same_qp]
     yield from TEXT.parts("conditions", any(found.values()), others)

@@ -1,19 +1,19 @@
-"""Which solvers became slower, so surely that a CI may fail on it.
+"""Solvers that became slower, with enough certainty to fail a CI job.
 
-Two runs of the same code differ: the machine is faster or slower for a while, and not
-alike on every case. What is said here therefore has two intervals, and both must lie
-wholly above 1: that of the ratio itself, after over before, and that of the ratio
-relative to the other solvers of the same blocks, in which what slows all of them down
-cancels. Both are unpaired between the folders: they are different sessions.
+Two runs of the same code differ, because the speed of the machine varies in time and
+not equally for every case. A slowdown is therefore reported only if two intervals lie
+entirely above 1: that of the ratio after / before, and that of the ratio relative to
+the other solvers of the same blocks, in which a common slowdown cancels. Both are
+unpaired between the folders, which are different sessions.
 
-- A solver: mean of the logarithms over its cases, Student's interval over them, three
-  at least. How much a run differs from another one on a case is in that scatter.
-- A single cell: an error that is the larger one of Welch's over its repeats and of what
-  the cells scatter about the means of their solvers (1.4826 times the median distance,
-  which is the standard deviation of a normal law). It takes `CELLS` cells to know that.
+- Solver: mean of the logarithms over its cases, at least three, with Student's interval
+  over them. Their scatter includes the differences between runs on one case.
+- Single cell: its error is the larger of Welch's over the repeats and of the scatter of
+  the cells about the means of their solvers (1.4826 times the median distance, the
+  standard deviation of a normal law). That scatter needs `CELLS` cells.
 
-The intervals hold 95 % all together: half of the 5 % is for the solvers, half for the
-cells, and each half is shared out evenly (Bonferroni) [1]_.
+All intervals hold jointly with 95 %: half of the 5 % is for the solvers, half for the
+cells, and each half is divided evenly (Bonferroni) [1]_.
 
 References
 ----------
@@ -39,29 +39,29 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 
 Floats = NDArray[np.float64]
 
-CELLS = 8  #: that it takes to know how much they scatter
+CELLS = 8  #: least number of cells for an estimate of their scatter
 _NORMAL = 1.4826  #: standard deviation of a normal law over its median distance
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slower:
-    """A solver, or one cell of it, that takes longer after than before."""
+    """A solver, or one of its cells, that became slower."""
 
     solver: str
-    case: str = ""  #: empty: over its cases
+    case: str = ""  #: empty for a solver over its cases
     tol: float | None = None
     ratio: Ratio  #: of times, after over before; the interval is corrected
-    relative: Ratio  #: the same over that of the other solvers of its blocks
+    relative: Ratio  #: `ratio` over that of the other solvers in the same blocks
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regressions:
-    """What became slower, and how much was asked."""
+    """Slowdowns, and the number of tests behind them."""
 
     slower: tuple[Slower, ...]
-    solvers: int  #: that could be judged over their cases
-    cells: int  #: that could be judged one by one
-    why_not: str = ""  #: why nothing could be judged
+    solvers: int  #: number of solvers judged over their cases
+    cells: int  #: number of cells judged one by one
+    why_not: str = ""  #: reason if nothing could be judged
     unverified: tuple[str, ...] = ()  #: solvers without a verified answer in one folder
 
 
@@ -74,9 +74,9 @@ class _Change(NamedTuple):
 
 
 def regressions(c: Comparison) -> Regressions:
-    """Find what became slower from one folder to another.
+    """Find the solvers and cells that became slower from one folder to the other.
 
-    Where several folders are compared with one, the intervals of all hold together.
+    Where several folders are compared with one, all intervals hold jointly.
     """
     changes = _changes(c)
     by_solver = grouped(changes, lambda change: change.outcome.solver)
@@ -107,7 +107,7 @@ def regressions(c: Comparison) -> Regressions:
 
 
 def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
-    """Name the solvers that have no verified answer in so many of the two folders."""
+    """Describe solvers without a verified answer in that many of the two folders."""
     found = []
     for solver in c.solvers:
         pairs = [p for p in c.of(solver) if not p.after.first.role]
@@ -137,13 +137,14 @@ def _why_not(c: Comparison) -> str:
     if lacking := _unverified(c, folders=2):
         return "; ".join(lacking)
     return (
-        "no two solvers of both folders were measured in the same blocks, and one "
-        "alone is not told from the machine; add one that does not change"
+        "no two solvers of both folders were measured in the same blocks, and the "
+        "change of one alone may be due to the machine; add a solver that does not "
+        "change"
     )
 
 
 def _changes(c: Comparison) -> list[_Change]:
-    """Take the cells that have times in both folders, and other solvers beside them."""
+    """Return the changes of cells with times, and other solvers, in both folders."""
     timed = [p for p in c.timed if not p.after.first.role]
     rows = grouped(timed, lambda p: (p.after.case, p.after.tol, p.after.first.mode))
     found = []
@@ -165,7 +166,7 @@ def _logs(outcome: Outcome) -> Floats:
 
 
 def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
-    """Logarithms of time over the geometric mean of the others, block by block."""
+    """Return logarithms of time over the geometric mean of the others, by block."""
     times = [o.by_block for o in others]
     return np.array([
         np.log(seconds) - np.mean([np.log(of[block]) for of in times])
@@ -175,7 +176,7 @@ def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
 
 
 def _mean(logs: tuple[Floats, Floats]) -> float:
-    """Mean after less mean before."""
+    """Return the mean after minus the mean before."""
     return float(np.mean(logs[0]) - np.mean(logs[1]))
 
 

@@ -1,4 +1,4 @@
-"""Write what changed between two result folders."""
+"""Write the comparison of two or more result folders."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def write_comparison(
     Raises
     ------
     InputError
-        When one is no result folder, or holds no measurements.
+        When one is not a result folder, or has no measurements.
 
     """
-    _, said, written = write_comparisons(before, [after], formats, factor)
-    return said, written
+    _, lines, written = write_comparisons(before, [after], formats, factor)
+    return lines, written
 
 
 def _write(comparison: Comparison, formats: Sequence[str]) -> list[Path]:
@@ -70,8 +70,8 @@ def write_comparisons(
 ) -> tuple[list[Comparison], list[str], list[Path]]:
     """Compare several folders with the first one, each as `write_comparison` does.
 
-    Of more than one, LAST/report/since-NAME has a page on all, NAME being that of the
-    first.
+    For more than one, LAST/report/since-NAME has a page on all of them, NAME being that
+    of the first.
 
     Returns
     -------
@@ -80,23 +80,23 @@ def write_comparisons(
     Raises
     ------
     InputError
-        When one is no result folder, or holds no measurements.
+        When one is not a result folder, or has no measurements.
 
     """
     before = read_evidence(first, factor)
-    found = [
+    comparisons = [
         compare(before, read_evidence(other, factor), len(others)) for other in others
     ]
-    said, written = [], []
-    for c in found:
-        if len(found) > 1:
-            said.append(f"{c.before.directory} to {c.after.directory}:")
-        said += verdict_lines(c)
+    lines, written = [], []
+    for c in comparisons:
+        if len(comparisons) > 1:
+            lines.append(f"{c.before.directory} to {c.after.directory}:")
+        lines += verdict_lines(c)
         written += _write(c, formats)
-    if len(found) > 1 and RENDERED & set(formats):
+    if len(comparisons) > 1 and RENDERED & set(formats):
         target = others[-1] / "report" / f"since-{first.resolve().name}"
-        written = [*write_page(overview(found), target, formats), *written]
-    return found, said, written
+        written = [*write_page(overview(comparisons), target, formats), *written]
+    return comparisons, lines, written
 
 
 #: columns of a cell of one folder, by their names there: type, and the value
@@ -122,7 +122,7 @@ _BOTH: dict[str, tuple[str, Callable[[Pair], Any]]] = {
 
 
 def changes_frame(c: Comparison) -> pd.DataFrame:
-    """Make a row per cell of either folder, at full precision."""
+    """Return a row per cell of either folder, at full precision."""
 
     def row(
         before: Outcome | None, after: Outcome | None, **both: Any

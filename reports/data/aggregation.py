@@ -22,17 +22,17 @@ GATES = ("verified", "claimed")
 
 @dataclass(frozen=True, kw_only=True)
 class Convention:
-    """Choices by which times over cases become one number."""
+    """Choices in the averaging of times over cases."""
 
-    shift: float = 1.0  #: times that of the group
-    penalty: float = 3.0  #: an unsolved case is charged this many limits
-    gate: str = "verified"  #: or "claimed": the solver's word is taken
-    common: bool = False  #: only cases that all solved, see `common_cases`
+    shift: float = 1.0  #: in units of the shift of the group
+    penalty: float = 3.0  #: charge for an unsolved case, in time limits
+    gate: str = "verified"  #: or "claimed", which accepts the solver's claim
+    common: bool = False  #: use only cases solved by all, see `common_cases`
 
 
-USUAL = Convention()  #: what tiers and ratios are made with
+USUAL = Convention()  #: convention of tiers and ratios
 
-#: One thing changed at a time, by the name of its column.
+#: Conventions with one choice changed, by the name of their column.
 SINGLE = {
     "shift × 0.01": replace(USUAL, shift=0.01),
     "shift × 10": replace(USUAL, shift=10.0),
@@ -42,7 +42,7 @@ SINGLE = {
     "common": replace(USUAL, common=True),
 }
 
-_SAME = 1e-12  #: relative difference of means that are equal but for rounding
+_SAME = 1e-12  #: relative differences of means below this are rounding
 
 #: Every combination of shift, penalty and gate.
 EVERY = tuple(
@@ -52,10 +52,10 @@ EVERY = tuple(
 
 
 def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
-    """Shifted geometric means exp(mean log(t + s)) − s over the cases, by solver; s.
+    """Return shifted geometric means exp(mean log(t + s)) − s over cases, (solvers,) s.
 
-    An unsolved case counts as `penalty` times the limit. In `common` mode there is none
-    to charge, and solvers outside of the comparison have NaN.
+    An unsolved case counts as `penalty` times the limit. With `common` there are no
+    unsolved cases, and solvers outside of that comparison have NaN.
     """
     logs, shift = _logs(group, convention)
     if not convention.common:
@@ -68,13 +68,13 @@ def geometric_means(group: ComparisonGroup, convention: Convention) -> Array:
 
 
 def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Find the cases solved by every solver that solved at least half of them.
+    """Return the cases solved by every solver that solved at least half of them.
 
-    One solver that solves next to nothing would leave no case to compare the others on.
+    Otherwise one solver that solves almost nothing would leave no common case.
 
     Returns
     -------
-    cases, solvers : which of them
+    cases, solvers : masks
 
     """
     solvers = group.solved.mean(axis=0) >= 0.5
@@ -83,7 +83,7 @@ def common_cases(group: ComparisonGroup) -> tuple[NDArray[np.bool_], NDArray[np.
 
 
 def _logs(group: ComparisonGroup, convention: Convention) -> tuple[Array, float]:
-    """Logarithms of t + s, (cases, solvers), and s in seconds."""
+    """Return the logarithms of t + s, (cases, solvers), and s in seconds."""
     times = group.times if convention.gate == "verified" else group.claimed
     shift = convention.shift * group.shift
     charged = np.where(np.isinf(times), convention.penalty * group.horizon, times)
@@ -104,12 +104,12 @@ class Ranking:
 
     @cached_property
     def order(self) -> NDArray[np.int64]:
-        """Solvers from the smallest mean to the largest; equals as in the suite."""
+        """Indices of solvers by ascending mean; ties keep their order."""
         return np.argsort(self.means, kind="stable")
 
     @property
     def leader(self) -> int:
-        """The solver with the smallest mean."""
+        """Index of the solver with the smallest mean."""
         return int(self.order[0])
 
     @cached_property
@@ -119,30 +119,30 @@ class Ranking:
 
     @cached_property
     def ratios(self) -> tuple[Array, Array, Array]:
-        """Mean over that of the leader, on the same cases, and its 95 % interval."""
+        """Means relative to the leader, on the same cases, with 95 % intervals."""
         draws = self.draws / self.draws[:, [self.leader]]
         low, high = resampling.limits(draws, len(self.group.cases))
         return self.means / self.means[self.leader], low, high
 
     @cached_property
     def first(self) -> Array:
-        """(solvers,) share of the resamples in which the solver has the least mean."""
+        """(solvers,) share of the resamples in which a solver has the smallest mean."""
         return resampling.firsts(np.log(self.draws))
 
     @cached_property
     def faster(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) whether row is told to be faster than column."""
+        """(solvers, solvers) True where row is significantly faster than column."""
         logs, _ = _logs(self.group, USUAL)
-        faster = resampling.told_apart(logs, self.group.cases)
-        if self.group.apart.any():  # of different sessions: no pairs
+        faster = resampling.significantly_faster(logs, self.group.cases)
+        if self.group.apart.any():  # different sessions, hence no pairs
             faster = np.where(self.group.apart, self.group.faster, faster)
         return faster
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
-        """Ranks that a solver may have: after all told faster, before all told slower.
+        """Rank intervals: after all significantly faster, before all slower solvers.
 
-        Together these hold the true ranks with 95 % [1]_.
+        They jointly contain the true ranks with 95 % [1]_.
 
         References
         ----------
@@ -156,11 +156,11 @@ class Ranking:
 
     @cached_property
     def tiers(self) -> NDArray[np.int64]:
-        """(solvers,) tier from 1: the first whose head is not told to be faster.
+        """(solvers,) tiers from 1: the first whose head is not significantly faster.
 
-        The leader heads the first tier, and who fits into none heads the next. A mean
-        that is known badly, as it is with failures, may be in an earlier tier than a
-        smaller one.
+        The leader heads the first tier; a solver that fits into no tier heads a new
+        one. An uncertain mean (because of failures) may thus be in an earlier tier than
+        a smaller one.
         """
         tiers = np.zeros(len(self.group.solvers), dtype=np.int64)
         heads: list[int] = []
@@ -183,25 +183,25 @@ class Changed(NamedTuple):
     """Ranks under another convention."""
 
     ranks: Array  #: (solvers,) from 1, equal means have equal ranks; NaN: not compared
-    turned: NDArray[np.bool_]  #: (solvers, solvers) whether it turns their order
+    turned: NDArray[np.bool_]  #: (solvers, solvers) True where the order is reversed
 
 
 class Panel(NamedTuple):
     """Ranks of the solvers of a group under every convention."""
 
     usual: Array  #: (solvers,)
-    single: dict[str, Changed]  #: by the one thing that was changed
-    every: tuple[Changed, ...]
+    single: dict[str, Changed]  #: one choice changed, by its name
+    every: tuple[Changed, ...]  #: all combinations of shift, penalty and gate
 
     @property
     def turned(self) -> NDArray[np.bool_]:
-        """(solvers, solvers) whether any convention turns the usual order."""
+        """(solvers, solvers) True where some convention reverses the usual order."""
         changes = (*self.every, *self.single.values())
         return np.asarray(np.logical_or.reduce([c.turned for c in changes]))
 
 
 def panel(group: ComparisonGroup) -> Panel:
-    """Rank under the usual convention, with one thing changed, and with all."""
+    """Rank under the usual convention, with one choice changed, and combinations."""
     usual = geometric_means(group, USUAL)
 
     def changed(convention: Convention) -> Changed:
@@ -216,13 +216,13 @@ def panel(group: ComparisonGroup) -> Panel:
 
 
 def ranks(means: Array) -> Array:
-    """Rank from 1; means that are equal but for rounding share the smaller rank."""
-    ahead = (order_of(means) > 0).sum(axis=1)  # of how many others one is behind
+    """Rank from 1; means that are equal up to rounding share the smaller rank."""
+    ahead = (order_of(means) > 0).sum(axis=1)  # number of solvers with smaller means
     return np.where(np.isnan(means), np.nan, 1.0 + ahead)
 
 
 def order_of(means: Array) -> NDArray[np.int64]:
-    """(solvers, solvers) 1 where row is slower than column, −1 faster, else 0."""
+    """Compare means pairwise: (solvers, solvers) 1 where row is slower, −1 faster."""
     logs = np.log(means)
     gap = logs[:, None] - logs[None, :]
     return np.where(np.abs(gap) > _SAME, np.sign(gap), 0).astype(np.int64)

@@ -1,4 +1,4 @@
-"""Cells and tables made from outcomes, alike in every section."""
+"""Cells and tables of outcomes, shared by all sections."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import VERDICTS, clean, plural, span
 from mortarbench.reports.document.layout import Cell, Column, Table, sources
 
-#: after a verdict that a proven optimum decided against the residuals
+#: mark behind a verdict in which a proven optimum overruled the residuals
 BY_OPTIMUM = "⋆"
 
 
 def source(*outcomes: Outcome) -> str:
-    """Name the measurements behind a cell; `named` reads them back."""
+    """Return a title with the measurements behind a cell; `named` is the inverse."""
     return sources(r for o in outcomes for r in o.records)
 
 
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
-    """Show a verdict with symbol and words, and how many repeats it holds for.
+    """Return a cell of a verdict, with the number of repeats that have it.
 
-    message : of the solver, shown when pointed at
+    message : of the solver, shown on hovering
     """
     symbol, words = VERDICTS[outcome.verdict]
     if outcome.against_residuals:
@@ -41,7 +41,7 @@ def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
 
 
 def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
-    """Show iterations, or their range where repeats differ."""
+    """Return a cell of iterations, a range where repeats differ."""
     its, title = outcome.iterations, source(outcome)
     if its is None:
         return Cell(kind=kind, title=title)
@@ -49,21 +49,15 @@ def iterations_cell(outcome: Outcome, form: str = "{}", kind: str = "") -> Cell:
 
 
 def legend(rows: Iterable[Iterable[Cell]]) -> tuple[str, ...]:
-    """Explain the mark of a proven optimum as a note, if a verdict in a table has it.
-
-    rows : of the table
-    """
+    """Return a note on `BY_OPTIMUM` if a verdict in the rows of a table has it."""
     kinds = {verdict.value for verdict in VERDICTS}
     marked = any(c.kind in kinds and BY_OPTIMUM in c.text for row in rows for c in row)
-    note = (
-        f"{BY_OPTIMUM}: decided by the proven optimum of a small QP, against the "
-        "residuals."
-    )
+    note = f"{BY_OPTIMUM}: the proven optimum of a small QP overrules the residuals."
     return (note,) if marked else ()
 
 
 def explained(table: Table) -> Table:
-    """Add a note on the mark of a proven optimum, if a verdict in the table has it."""
+    """Append a note on `BY_OPTIMUM` if a verdict in the table has it."""
     return replace(table, notes=(*table.notes, *legend(table.rows)))
 
 
@@ -72,7 +66,7 @@ def answer_columns(
 ) -> tuple[Column, ...]:
     """Return the leading columns of tables of answers: case, solver and tolerance.
 
-    of : what has these of an item, itself if it does
+    of : returns the object of an item with these attributes; by default the item
     """
     return (
         ("case", lambda item: Cell.name(of(item).case)),
@@ -84,12 +78,12 @@ def answer_columns(
 def solver_columns(
     solvers: Iterable[str], cell: Callable[[str, Any], Cell]
 ) -> Iterator[Column]:
-    """Make a column per solver: its cells are those of the solver and an item."""
+    """Yield a column per solver, whose cells are functions of solver and item."""
     return ((clean(s, 40), partial(cell, s)) for s in solvers)
 
 
 def case_cells(outcome: Outcome | Mapping[str, Outcome]) -> tuple[Cell, Cell]:
-    """Make the two leading cells of a row: case and tolerance."""
+    """Return the two leading cells of a row: case and tolerance."""
     one = outcome if isinstance(outcome, Outcome) else next(iter(outcome.values()))
     return Cell.name(one.case), Cell.tolerance(one.tol)
 
@@ -99,7 +93,7 @@ def grid(
     caption: str,
     show: Callable[[Outcome, Mapping[str, Outcome]], Cell],
 ) -> Table:
-    """Make a table with a row per (case, tol) and a column per solver."""
+    """Return a table with a row per (case, tol) and a column per solver."""
     absent = Cell(title="not run")
     rows = tuple(
         (

@@ -17,12 +17,13 @@ from mortarbench.harness.running.pairs import ratio_of
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
-#: With fewer no two solvers can be told apart, see `reports.statistics.resampling`.
+#: Least number of cases of a comparison. With fewer no difference can be significant at
+#: 95 %: five of five signs agree by chance in 2 of 2⁵ sets of cases.
 CASES = 6
-POOLED = "all forms"  #: instead of a form, of a group that cases of every form are in
+POOLED = "all forms"  #: name, instead of a form, of a group with cases of all forms
 LARGEST_SHIFT = 10.0  #: s, the customary shift, which is too large for short times
 
-#: of repeats that all ran out of time, but for some that were verified before
+#: verdicts on the repeats of an outcome that counts as out of time
 _LATE = {v for v in Verdict if v is Verdict.TIME_LIMIT or v.is_verified}
 
 Times = NDArray[np.float64]
@@ -35,111 +36,117 @@ def _no_pairs() -> Pairs:
     return np.zeros((0, 0), dtype=bool)
 
 
-class Kind(NamedTuple):
+class GroupKey(NamedTuple):
     """Attributes that the cases of one group share."""
 
-    sweep: bool  #: of the tolerance asked for
+    sweep: bool  #: whether the tolerance is swept
     mode: str
     form: str
-    at: float  #: accuracy that answers are judged at
+    at: float  #: accuracy at which answers are judged
 
     @property
     def accuracy(self) -> str:
-        """Name the accuracy that all answers have in common."""
+        """Name of the common accuracy."""
         return f"{'accuracy' if self.sweep else 'tol'} {tolerance(self.at)}"
 
     @property
     def subject(self) -> str:
-        """Name the form, and the mode where it is not cold; empty without a form."""
+        """Name of the form, with the mode unless it is cold; may be empty."""
         parts = [clean(self.form, 24)] * bool(self.form)
         return ", ".join([*parts, *[clean(self.mode, 24)] * (self.mode != "cold")])
 
     @property
     def title(self) -> str:
-        """Name all of it."""
+        """Subject and accuracy."""
         return ", ".join(filter(None, (self.subject, self.accuracy)))
 
 
-Answers = Mapping[Kind, Mapping[str, Row]]  #: by what they have in common, and case
+Answers = Mapping[GroupKey, Mapping[str, Row]]  #: by group and case
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ComparisonGroup:
     """Cases of one form at one accuracy, and the solvers that were measured on each.
 
-    Null arms take no part. Times are medians of prepare + solve over the repeats; in a
-    sweep of tolerances, those of the cheapest answer that counts.
+    Null arms are left out. Times are medians of prepare + solve over the repeats; in a
+    sweep of tolerances, those of the fastest verified (or claimed) answer.
     """
 
-    kind: Kind
+    key: GroupKey
     cases: tuple[str, ...]
     solvers: tuple[str, ...]
     times: Times  #: (cases, solvers) s; inf unless every repeat was verified
-    claimed: Times  #: the same; inf unless every repeat was claimed to be solved, or is
-    #: rightly claimed to be infeasible
-    stopped: Times  #: s after which time ran out; NaN where that was not the end
-    limit: float  #: s per measurement; the longest one, where the suite has no limit
+    claimed: Times  #: (cases, solvers) s; inf unless every repeat claimed success, or
+    #: correctly claimed infeasibility
+    stopped: Times  #: (cases, solvers) s until the time limit; NaN for other endings
+    limit: float  #: s per measurement; without a limit, the longest measurement
     refused: tuple[str, ...] = ()  #: solvers that declined all cases
-    rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of them
-    forms: Mapping[str, int] = field(default_factory=dict)  #: cases of each, if pooled
-    incomplete: int = 0  #: cases left out, since some solver was not measured on them
+    rare: tuple[str, ...] = ()  #: solvers measured on fewer than half of the cases
+    forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
+    incomplete: int = 0  #: number of cases left out: not measured with every solver
     apart: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) whether two share no block on some case; none: all share."""
+    """(solvers, solvers) True if two share no block on some case; may be empty."""
     faster: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) of those, True if row is faster than column on every case."""
+    """(solvers, solvers) True if `apart` and row is faster than column on all cases."""
 
     @property
     def title(self) -> str:
         """Form and accuracy."""
-        return self.kind.title
+        return self.key.title
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Name what takes no part."""
+        """Notes on forms, and on solvers and cases that are left out."""
         counted = ", ".join(
             f"{clean(form, 24)} {plural(n, 'case')}" for form, n in self.forms.items()
         )
         pooled = (
-            f"Forms together: {counted}. A form that a solver declines is "
-            "unsolved by it."
+            f"Pooled forms: {counted}. Cases of a form that a solver declines count as "
+            "unsolved."
         )
-        refused = f"Declined all of them: {listing(self.refused, 6)}."
-        said = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
-        return said + self.unmeasured + self.sessions
+        refused = f"All cases declined by: {listing(self.refused, 6)}."
+        notes = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
+        return notes + self.unmeasured + self.sessions
 
     @property
     def unmeasured(self) -> tuple[str, ...]:
-        """Name what takes no part because it was not measured."""
-        rare = f"Measured on fewer than half of them: {listing(self.rare, 6)}."
-        left = f"Not measured by all, left out: {plural(self.incomplete, 'case')}."
-        return (rare,) * bool(self.rare) + (left,) * bool(self.incomplete)
+        """Notes on solvers and cases with missing measurements."""
+        notes = []
+        if self.rare:
+            rare = listing(self.rare, 6)
+            notes.append(f"Left out, measured on less than half of the cases: {rare}.")
+        if self.incomplete:
+            cases = plural(self.incomplete, "case")
+            notes.append(f"Left out, not measured with all solvers: {cases}.")
+        return tuple(notes)
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """Name solvers that were measured in different sessions."""
-        left = self.apart.copy()
+        """Note on solvers that were measured in different sessions."""
+        remaining = self.apart.copy()
         pairs = []
-        while left.any():
-            late = int(left.sum(axis=1).argmax())
-            others = [self.solvers[i] for i in np.flatnonzero(left[late])]
+        while remaining.any():
+            late = int(remaining.sum(axis=1).argmax())
+            others = [self.solvers[i] for i in np.flatnonzero(remaining[late])]
             pairs.append(f"{clean(self.solvers[late], 40)} with {listing(others, 4)}")
-            left[late] = left[:, late] = False
+            remaining[late] = remaining[:, late] = False
         if not pairs:
             return ()
         return (
-            "Measured in different sessions, not within blocks, and told apart only "
-            "where the unpaired interval excludes 1 on every case: "
+            "Measured in different sessions, without common blocks, so that a "
+            "difference is significant only if the unpaired interval excludes 1 on "
+            "every case: "
             f"{'; '.join(pairs)}.",
         )
 
     @property
     def comparable(self) -> bool:
-        """True if cases, solvers and answers suffice for a statement over cases."""
+        """True if cases, solvers and answers suffice for a comparison over cases."""
         return not self.lack
 
     @property
     def lack(self) -> str:
-        """The lack that prevents a statement over cases; empty without one."""
+        """Reason why there is no comparison over cases; empty if there is one."""
         if len(self.solvers) < 2:
             return plural(len(self.solvers), "solver")
         if len(self.cases) < CASES:
@@ -148,7 +155,7 @@ class ComparisonGroup:
 
     @cached_property
     def solved(self) -> NDArray[np.bool_]:
-        """(cases, solvers) whether verified."""
+        """(cases, solvers) True where verified."""
         return np.isfinite(self.times)
 
     @cached_property
@@ -159,7 +166,7 @@ class ComparisonGroup:
 
     @cached_property
     def horizon(self) -> float:
-        """The limit, or the longest time of an answer if that is longer; s."""
+        """Time limit, or the longest time of an answer if that is longer; s."""
         both = np.concatenate([self.times, self.claimed])
         return float(max(self.limit, both[np.isfinite(both)].max()))
 
@@ -167,9 +174,9 @@ class ComparisonGroup:
 def comparison_groups(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> tuple[ComparisonGroup, ...]:
-    """Group what was measured, as `all_groups`; groups of few cases are left out.
+    """Return the groups of `all_groups` that can be compared over cases.
 
-    At least `CASES` cases, two solvers and one verified answer make a group.
+    These have at least `CASES` cases, two solvers and one verified answer.
     """
     groups = all_groups(evidence, pool_forms=pool_forms)
     return tuple(group for group in groups if group.comparable)
@@ -178,47 +185,47 @@ def comparison_groups(
 def all_groups(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> tuple[ComparisonGroup, ...]:
-    """Group what was measured by form and accuracy, whatever can be said of it.
+    """Group the measurements by form, mode and accuracy.
 
-    Forms are apart, since the primal and the dual QP of one problem are two problems to
-    a solver; so are cold solves and sequences.
+    Forms are separate, since the primal and the dual QP of one problem are different
+    problems for a solver; so are cold solves and sequences.
 
-    pool_forms : put all forms into one group; each QP is still a case of its own
+    pool_forms : put all forms into one group, in which each QP remains a separate case
     """
     records = [r for r in evidence.records if not r.role]
     cells = _cells(evidence, pool_forms=pool_forms)
-    asked = evidence.suite.get("time_limit")
-    if isinstance(asked, int | float) and asked > 0:
-        limit = float(asked)
+    time_limit = evidence.suite.get("time_limit")
+    if isinstance(time_limit, int | float) and time_limit > 0:
+        limit = float(time_limit)
     else:  # the longest measurement
         every = (o for o in evidence.flat if not o.first.role)
         limit = max((t for t in map(_seconds, every) if t > 0), default=1.0)
-    found = [_group(kind, of, evidence.solvers, limit) for kind, of in cells.items()]
+    groups = [_group(key, of, evidence.solvers, limit) for key, of in cells.items()]
     if len({r.session for r in records}) > 1:
-        found = [_with_sessions(group, _answers(cells[group.kind])) for group in found]
+        groups = [_with_sessions(g, _answers(cells[g.key])) for g in groups]
     if pool_forms:
         form = {r.case: r.form for r in records}
-        found = [
+        groups = [
             replace(group, forms=Counter(form[case] for case in group.cases))
-            for group in found
+            for group in groups
         ]
-    return tuple(found)
+    return tuple(groups)
 
 
 def answers_of(evidence: Evidence, *, pool_forms: bool = False) -> Answers:
-    """Choose the answer of every solver to every case; null arms take no part."""
+    """Select the answer of every solver to every case; null arms are left out."""
     cells = _cells(evidence, pool_forms=pool_forms)
-    return {kind: _answers(rows) for kind, rows in cells.items()}
+    return {key: _answers(rows) for key, rows in cells.items()}
 
 
-def _cells(evidence: Evidence, *, pool_forms: bool) -> dict[Kind, Cells]:
-    """Group the outcomes of every solver on every case, those of a sweep together."""
-    found: dict[Kind, Cells] = {}
+def _cells(evidence: Evidence, *, pool_forms: bool) -> dict[GroupKey, Cells]:
+    """Group the outcomes by key, case and solver; a sweep of tolerances is one cell."""
+    cells: dict[GroupKey, Cells] = {}
     for o in evidence.flat:
         if not o.first.role:
-            cases = found.setdefault(kind_of(o.first, pool_forms=pool_forms), {})
+            cases = cells.setdefault(group_key(o.first, pool_forms=pool_forms), {})
             cases.setdefault(o.case, {}).setdefault(o.solver, []).append(o)
-    return found
+    return cells
 
 
 def _answers(cells: Cells) -> dict[str, Row]:
@@ -229,9 +236,9 @@ def _answers(cells: Cells) -> dict[str, Row]:
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Choose the answer of a solver on a case: of a sweep, the cheapest verified one.
+    """Select the answer of a solver to a case: of a sweep, the fastest verified one.
 
-    Where none is verified, that at the tightest tolerance.
+    If none is verified, select the answer at the tightest tolerance.
     """
     timed = [(t, -o.tol, o) for o in outcomes if (t := time_of(o)) is not None]
     if timed:
@@ -240,7 +247,7 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def time_of(outcome: Outcome) -> float | None:
-    """Median total time of a verified answer, s."""
+    """Return the median total time of a verified answer, s; None without one."""
     time = outcome.seconds("total") if outcome.verified else None
     return time.value if time is not None and time.value > 0 else None
 
@@ -266,29 +273,29 @@ def _with_sessions(group: ComparisonGroup, rows: Mapping[str, Row]) -> Compariso
     return replace(group, apart=apart, faster=faster)
 
 
-def kind_of(r: Record, *, pool_forms: bool = False) -> Kind:
-    """Return what a record has in common with those that it is compared with."""
+def group_key(r: Record, *, pool_forms: bool = False) -> GroupKey:
+    """Return the key of the group that a record belongs to."""
     form = POOLED if pool_forms else r.form
     swept = r.accuracy is not None
-    return Kind(swept, r.mode, form, r.tol if r.accuracy is None else r.accuracy)
+    return GroupKey(swept, r.mode, form, r.tol if r.accuracy is None else r.accuracy)
 
 
 def _seconds(outcome: Outcome) -> float:
-    """Median total time, s; NaN without one."""
+    """Return the median total time, s; NaN without one."""
     time = outcome.seconds("total")
     return np.nan if time is None else time.value
 
 
 def _group(
-    kind: Kind, cells: Cells, solvers: Sequence[str], limit: float
+    key: GroupKey, cells: Cells, solvers: Sequence[str], limit: float
 ) -> ComparisonGroup:
-    """Keep the solvers with at least half of the cases, and cases that they all had."""
+    """Form a group of the solvers with at least half of the cases."""
     present = np.array([*cells], dtype=object)
-    known = {solver for row in cells.values() for solver in row}
-    met = np.array([s for s in solvers if s in known], dtype=object)
-    matrices = np.full((4, len(present), len(met)), np.nan)
+    measured = {solver for row in cells.values() for solver in row}
+    labels = np.array([s for s in solvers if s in measured], dtype=object)
+    matrices = np.full((4, len(present), len(labels)), np.nan)
     for k, row in enumerate(cells.values()):
-        for i, solver in enumerate(met):
+        for i, solver in enumerate(labels):
             if solver in row:
                 matrices[:, k, i] = _cell(row[solver])
     times, claimed, stopped, declined = matrices
@@ -300,21 +307,21 @@ def _group(
     complete = seen[:, taken].all(axis=1)
     part = np.ix_(complete, taken)
     return ComparisonGroup(
-        kind=kind,
+        key=key,
         cases=tuple(present[complete]),
-        solvers=tuple(met[taken]),
+        solvers=tuple(labels[taken]),
         times=times[part],
         claimed=claimed[part],
         stopped=stopped[part],
         limit=limit,
-        refused=tuple(met[refused]),
-        rare=tuple(met[rare]),
+        refused=tuple(labels[refused]),
+        rare=tuple(labels[rare]),
         incomplete=int((~complete).sum()),
     )
 
 
 def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
-    """Return times, claimed and stopped of a group for one cell, and 1 if declined."""
+    """Return the entries of `times`, `claimed`, `stopped` of a cell; 1 if declined."""
     times = [(_seconds(o), o) for o in outcomes]
     verified = [t for t, o in times if o.verified and t > 0]
     claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]

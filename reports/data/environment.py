@@ -1,4 +1,4 @@
-"""Records of the machine and of the time of measurements."""
+"""Machine and date of the measurements."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ QUIET_LOAD = 0.5  #: load average above which a machine counts as busy
 
 
 def busy_with(evidence: Evidence) -> float | None:
-    """Load average when the measurements began; None if low, or not known."""
-    now = evidence.environment.get("now")
-    load = now.get("load") if isinstance(now, Mapping) else None
+    """Return the load average at the start of the run; None if low or unknown."""
+    state = evidence.environment.get("now")
+    load = state.get("load") if isinstance(state, Mapping) else None
     return load if isinstance(load, int | float) and load > QUIET_LOAD else None
 
 
 def dateline(evidence: Evidence) -> str:
-    """State time and machine of the measurements in one line."""
+    """Return date and machine of the measurements in one line."""
     days = sorted({r.started[:10] for r in evidence.records if r.started})
     when = " to ".join(dict.fromkeys((days[0], days[-1]))) if days else "date unknown"
     return f"{clean(when)} · {machine(evidence.environment)}"
 
 
 def machine(environment: Mapping[str, Any]) -> str:
-    """Name the machine in one line, from what environment.json says of it."""
+    """Describe the machine of environment.json in one line."""
     facts = environment.get("machine")
     if not isinstance(facts, Mapping):
         return "machine unknown"
@@ -41,7 +41,7 @@ def machine(environment: Mapping[str, Any]) -> str:
 
 
 def flatten(data: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    """List the leaves of nested plain data with dotted names."""
+    """Return the leaves of nested plain data with dotted names."""
     match data:
         case Mapping():
             items = [(str(k), v) for k, v in data.items()]

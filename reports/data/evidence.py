@@ -1,4 +1,4 @@
-"""The contents of a result folder, grouped as the report needs them."""
+"""The contents of a result folder, grouped for reports."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mortarbench.harness import InputError, Record, Verdict
 from mortarbench.harness.errors import say, some
 from mortarbench.harness.files.reading import read_json
 from mortarbench.harness.record import VERIFIED_FACTOR
-from mortarbench.harness.results.faults import Fault, left, read_faults
+from mortarbench.harness.results.faults import Fault, read_faults, remaining_faults
 from mortarbench.harness.results.folder import environment_of, times_compare
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.running.pairs import Block
@@ -22,13 +22,13 @@ from mortarbench.harness.suite.suite import read_stored
 from mortarbench.harness.verify.kkt import allowed, rejudged
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
-FROM_FILE = "file"  #: the family of QPs from files, whose cases are named by paths
-_MARKED = 6  #: digits of an environment, after the label of a solver
+FROM_FILE = "file"  #: family of QPs from files, whose case names are paths
+_MARK_DIGITS = 6  #: digits of an environment's digest behind the label of a solver
 RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
 
-#: Worst first: the verdict on several repeats is the worst of theirs.
+#: Verdicts, worst first: several repeats get the worst of their verdicts.
 SEVERITY = (
     Verdict.WRONG,
     Verdict.INACCURATE,
@@ -50,7 +50,7 @@ def _seconds(r: Record, phase: str) -> float | None:
 
 
 def _median(seconds: Iterable[float | None]) -> Interval | None:
-    """Take the median of the times that are known; None without any."""
+    """Return the median of the known times with its interval; None without any."""
     times = [t for t in seconds if t is not None]
     return median_interval(times) if times else None
 
@@ -60,41 +60,41 @@ class Outcome:
     """All repeats of one solver on one case at one tolerance."""
 
     records: tuple[Record, ...]  #: at least one
-    factor: float = VERIFIED_FACTOR  #: verified: every residual ≤ this times tol
+    factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
 
     @property
     def first(self) -> Record:
-        """The record that speaks for what the repeats share."""
+        """The first record, for the fields that all repeats share."""
         return self.records[0]
 
     @property
     def case(self) -> str:
-        """Canonical name."""
+        """Canonical name of the case."""
         return self.first.case
 
     @property
     def physical(self) -> str:
-        """The case without its form: primal and dual are one physical case."""
+        """Case name without the form: primal and dual are one physical case."""
         return self.case.removesuffix(f"/{self.first.form}")
 
     @property
     def tol(self) -> float:
-        """The accuracy asked for."""
+        """Tolerance given to the solver."""
         return self.first.tol
 
     @property
     def allowed(self) -> float:
-        """The largest residual that verification allows, as `harness.verify.kkt`."""
+        """Largest residual that verification allows, see `harness.verify.kkt`."""
         return allowed(self.first.judged_at, self.factor)
 
     @property
     def solver(self) -> str:
-        """Its label in the suite."""
+        """Label of the solver in the suite."""
         return self.first.solver
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The worst verdict among the repeats."""
+        """Worst verdict among the repeats."""
         return min((r.verdict for r in self.records), key=SEVERITY.index)
 
     @property
@@ -104,7 +104,7 @@ class Outcome:
 
     @cached_property
     def against_residuals(self) -> bool:
-        """True if a proven optimum decided otherwise than the residuals would."""
+        """True if a proven optimum overruled the residuals."""
         return any(
             r.decided_by == "reference"
             and r.verdict in (Verdict.VERIFIED, Verdict.INACCURATE, Verdict.WRONG)
@@ -116,27 +116,27 @@ class Outcome:
 
     @cached_property
     def claims(self) -> tuple[str, ...]:
-        """The solver's own verdicts, each once."""
+        """Distinct claims of the solver."""
         return tuple(dict.fromkeys(r.claimed for r in self.records if r.claimed))
 
     @property
     def run_ids(self) -> tuple[str, ...]:
-        """The measurements behind every number of this outcome."""
+        """Identifiers of the measurements behind this outcome."""
         return tuple(r.run_id for r in self.records)
 
     def largest(self, name: str) -> float | None:
-        """Worst value of a residual or bound over the repeats; None if one lacks it."""
+        """Return the largest value of a field; None if a repeat lacks it."""
         values = [getattr(r, name) for r in self.records]
         return None if None in values else float(max(values))
 
     @cached_property
     def worst(self) -> float | None:
-        """The largest of the four residuals; None if there is no finite one."""
+        """Largest of the four residuals; None if one is missing."""
         known = [v for name in RESIDUALS if (v := self.largest(name)) is not None]
         return max(known) if len(known) == len(RESIDUALS) else None
 
     def seconds(self, phase: str) -> Interval | None:
-        """Median of prepare, solve or total time over the repeats that have one."""
+        """Return the median prepare, solve or total time of the repeats with one."""
         return self._intervals[phase]
 
     @property
@@ -145,7 +145,7 @@ class Outcome:
         return self.seconds_by_block("total")
 
     def seconds_by_block(self, phase: str) -> dict[Block, float]:
-        """Return the seconds of one phase in each repeat that has them."""
+        """Return the seconds of one phase by block; repeats without are left out."""
         times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
         return {block: t for block, t in times.items() if t}
 
@@ -158,15 +158,13 @@ class Outcome:
 
     @cached_property
     def dualising(self) -> Interval | None:
-        """Median time of dualising over the builds of the case; None for primal ones.
-
-        All measurements of one build have the same.
-        """
+        """Median time of dualisation over builds of the case; None for primal forms."""
+        # a set, because all measurements of one build share its time
         return _median({r.dualise_seconds for r in self.records if r.dualise_seconds})
 
     @cached_property
     def with_dualising(self) -> Interval | None:
-        """Median total time, that of dualising included; None for primal forms."""
+        """Median total time including dualisation; None for primal forms."""
         return _median(
             r.total_seconds + r.dualise_seconds
             for r in self.records
@@ -180,18 +178,18 @@ class Outcome:
         return (min(its), max(its)) if its else None
 
     def counted(self, name: str) -> float | None:
-        """Mean of one of the solver's counts over the repeats; None if one lacks it."""
+        """Return the mean of one of the solver's counts; None if a repeat lacks it."""
         values = [v for r in self.records if (v := r.counts.get(name)) is not None]
         whole = len(values) == len(self.records)
         return float(sum(values) / len(values)) if whole else None
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results of the first repeat that has any."""
+        """Physical results of the first repeat with any."""
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:
-        """Sum of integer quantities, such as the rows of two kinds; None if absent."""
+        """Return the sum of integer quantities; None if one is absent."""
         values = [self.quantities.get(name) for name in names]
         return sum(values) if all(isinstance(v, int) for v in values) else None  # type: ignore[arg-type]
 
@@ -204,29 +202,29 @@ class Outcome:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Evidence:
-    """Everything that a report is made from."""
+    """All data of a report."""
 
     directory: Path
-    records: tuple[Record, ...]  #: in the order of the report
-    journal: tuple[Record, ...] = ()  #: as read, each line
+    records: tuple[Record, ...]  #: judged at `factor`, in the order of the report
+    journal: tuple[Record, ...] = ()  #: all lines as read
     environment: Mapping[str, Any] = field(default_factory=dict)
     suite: Mapping[str, Any] = field(default_factory=dict)
-    factor: float = VERIFIED_FACTOR  #: at which the records are judged
+    factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
     faults: tuple[
         Fault, ...
-    ] = ()  #: why measurements are missing, by no solver's fault
-    #: what follows the label of a solver in some environments, by their digests, where
-    #: a folder holds the same measurements of several
+    ] = ()  #: reasons of missing measurements that are not due to a solver
+    #: digest of an environment → mark behind the labels of its solvers, where a folder
+    #: has the same measurements from several environments
     marks: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
-        """The suite's name, or else the folder's."""
+        """Name of the suite, or else of the folder."""
         return str(self.suite.get("name", self.directory.resolve().name))
 
     @cached_property
     def solvers(self) -> tuple[str, ...]:
-        """Labels: the suite's order first, then the alphabet."""
+        """Labels of the solvers, in the order of the suite, then alphabetically."""
         present = {r.solver for r in self.records}
         listed = [_label(entry) for entry in self.suite.get("solvers", ())]
         ordered = [*dict.fromkeys(listed), *sorted(present - set(listed))]
@@ -262,8 +260,8 @@ def read_evidence(
 ) -> Evidence:
     """Read a result folder: journal, environment.json and suite.toml.
 
-    factor : verdicts are those at factor·tol; at 10 they are those of the journal
-    warn : of damaged lines and of records that contradict themselves
+    factor : judge at factor·tol; the verdicts of the journal are those at 10·tol
+    warn : called with warnings on damaged lines and self-contradictory records
 
     Raises
     ------
@@ -274,45 +272,50 @@ def read_evidence(
     records = read_journal(directory, warn)
     if not records:
         raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
-    _tell_contradicted(directory, records, warn)
+    _warn_of_contradictions(directory, records, warn)
     journal = tuple(records)
     environment = _environment(directory / "environment.json")
     suite = directory / "suite.toml"
-    records = _one_name_each(_in_like_environments(directory, records))
+    records = _one_name_per_qp(_unite_environments(directory, records))
     marks = _marks(records, str(environment.get("digest", "")))
     return Evidence(
         directory=directory,
         journal=journal,
-        records=arrange(_apart(r, factor, marks) for r in records),
+        records=arrange(_judged_and_labelled(r, factor, marks) for r in records),
         environment=environment,
         marks=marks,
         suite=read_stored(suite) if os.path.lexists(suite) else {},
         factor=factor,
-        faults=tuple(left(read_faults(directory), {r.run_id for r in records})),
+        faults=tuple(
+            remaining_faults(read_faults(directory), {r.run_id for r in records})
+        ),
     )
 
 
-def _in_like_environments(directory: Path, records: list[Record]) -> list[Record]:
+def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
     """Unite environments with comparable times under the digest of the first."""
-    known: dict[str, Mapping[str, Any]] = {}
-    of: dict[str, str] = {}
+    representatives: dict[str, Mapping[str, Any]] = {}
+    united: dict[str, str] = {}
     for digest in dict.fromkeys(r.environment for r in records):
-        of[digest] = digest
+        united[digest] = digest
         try:
-            found = environment_of(directory, digest)
-        except InputError:  # nothing is known of it
+            environment = environment_of(directory, digest)
+        except InputError:  # not stored: comparable with itself only
             continue
-        of[digest] = next((d for d in known if times_compare(known[d], found)), digest)
-        known.setdefault(of[digest], found)
+        united[digest] = next(
+            (d for d, e in representatives.items() if times_compare(e, environment)),
+            digest,
+        )
+        representatives.setdefault(united[digest], environment)
     return [
-        r if of[r.environment] == r.environment
-        else r.replace(environment=of[r.environment])
+        r if united[r.environment] == r.environment
+        else r.replace(environment=united[r.environment])
         for r in records
     ]  # fmt: skip
 
 
-def _one_name_each(records: list[Record]) -> list[Record]:
-    """Rename a QP that lies in several files after the first of them."""
+def _one_name_per_qp(records: list[Record]) -> list[Record]:
+    """Rename the cases of equal QPs from several files after the first file."""
     first: dict[str, Record] = {}
     for r in records:
         if r.family == FROM_FILE and r.qp is not None:
@@ -324,10 +327,10 @@ def _one_name_each(records: list[Record]) -> list[Record]:
     ]  # fmt: skip
 
 
-def _tell_contradicted(
+def _warn_of_contradictions(
     directory: Path, records: Iterable[Record], warn: Callable[[str], None]
 ) -> None:
-    """Warn of records that say verified beside residuals that are too large for it."""
+    """Warn of verified records whose residuals are too large for that verdict."""
     wrong = []
     for r in records:
         names = ("optimum_error",) if r.decided_by == "reference" else RESIDUALS
@@ -338,27 +341,29 @@ def _tell_contradicted(
             wrong.append(r.run_id)
     if wrong:
         warn(
-            f"{directory}: verified, by their journal, with residuals above "
+            f"{directory}: journal says verified, but residuals exceed "
             f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
-            "that, and `validate` judges the points anew"
+            "such records; judge the points again with `validate`"
         )
 
 
 def _environment(path: Path) -> dict[str, Any]:
-    """Read what a run wrote of its machine; empty without a file."""
+    """Read environment.json; return an empty table without a file."""
     if not os.path.lexists(path):
         return {}
     table = read_json(path, _AS_WRITTEN)
     if not isinstance(table, dict):
-        raise InputError(f"{path}: no JSON object; expected {_AS_WRITTEN}")
+        raise InputError(f"{path}: not a JSON object; expected {_AS_WRITTEN}")
     return table
 
 
-def _apart(record: Record, factor: float, marks: Mapping[str, str]) -> Record:
-    """Judge at `factor`, and rename a solver whose measurements are others.
+def _judged_and_labelled(
+    record: Record, factor: float, marks: Mapping[str, str]
+) -> Record:
+    """Judge a record at `factor`, and append mode and environment to the solver.
 
-    That is where it drove a sequence instead of beginning cold, and in a further
-    environment of a folder that holds the same measurements of several.
+    The mode is appended unless it is cold, the environment where a folder has the same
+    measurements from several.
     """
     changes: dict[str, Any] = {}
     if factor != VERIFIED_FACTOR:
@@ -370,9 +375,9 @@ def _apart(record: Record, factor: float, marks: Mapping[str, str]) -> Record:
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
-    """Mark the environments, but one, in which the same was measured more than once.
+    """Return marks of environments that share measurements, except for one of them.
 
-    first : digest of the one that bears no mark, if it is among them
+    first : digest of the one without a mark, if it is among them
     """
     cells: dict[tuple[Any, ...], dict[str, None]] = {}
     for r in records:
@@ -380,7 +385,7 @@ def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
         cells.setdefault(cell, {})[r.environment] = None
     several = dict.fromkeys(e for of in cells.values() if len(of) > 1 for e in of)
     plain = first if first in several else next(iter(several), "")
-    return {e: f" @{e[:_MARKED]}" for e in several if e != plain}
+    return {e: f" @{e[:_MARK_DIGITS]}" for e in several if e != plain}
 
 
 def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
@@ -395,20 +400,18 @@ def case_set(outcomes: Iterable[Outcome], noun: str = "case") -> str:
 
 
 def shared(outcomes: Iterable[Outcome]) -> str:
-    """Name forms, tolerances and cases of some answers, as a figure states them."""
-    known = list(outcomes)
-    forms = sorted({o.first.form for o in known} - {""})
-    tols = sorted({o.tol for o in known}, reverse=True)
+    """Name forms, tolerances and cases of some answers, for the title of a figure."""
+    answers = list(outcomes)
+    forms = sorted({o.first.form for o in answers} - {""})
+    tols = sorted({o.tol for o in answers}, reverse=True)
     ends = dict.fromkeys(f"{tol:g}" for tol in (tols[0], tols[-1]))
     parts = [" and ".join(forms)] * bool(forms)
-    return ", ".join([*parts, f"tol {' to '.join(ends)}", case_set(known)])
+    return ", ".join([*parts, f"tol {' to '.join(ends)}", case_set(answers)])
 
 
 def arrange(records: Iterable[Record]) -> tuple[Record, ...]:
-    """Order by case, tolerance and repeat; of equal run_ids the last one counts.
-
-    Those of a journal are distinct, those of several folders may not be.
-    """
+    """Sort by case, tolerance and repeat; of equal run_ids the last one is kept."""
+    # run_ids of one journal are distinct, those of several folders may not be
     latest = {r.run_id: r for r in records}
     return tuple(sorted(latest.values(), key=_position))
 
@@ -422,7 +425,7 @@ def _position(r: Record) -> tuple[Any, ...]:
 
 
 def _label(entry: Any) -> str:
-    """Label of one entry of the suite's list of solvers."""
+    """Return the label of one entry of the suite's list of solvers."""
     if isinstance(entry, Mapping):
         return str(entry.get("label", entry.get("name", "")))
     return str(entry)

@@ -1,14 +1,15 @@
-"""The fastest solver at equal verified accuracy, per form, and how sure that is.
+"""The fastest solver at equal verified accuracy, per form, and its significance.
 
-A solver competes if all of its answers are verified: on every case of the group that
-anybody solved. The first has the smallest geometric mean of times. It is called the
-fastest only if each other competitor is slower:
+A solver competes if its answers to all cases of the group that any solver solved are
+verified. The first one has the smallest geometric mean of times. It is called the
+fastest only if every other competitor is significantly slower:
 
-- over `CASES` cases or more, if the interval of the ratio over the cases excludes 1;
+- over at least `CASES` cases, if the interval of the ratio over the cases excludes 1;
 - over fewer cases, if on each of them the interval of the ratio within blocks does.
 
-Every interval covers 95 % by itself. A wrong name takes a wrong interval of the first
-and its equal, so that the name needs no correction for the number of solvers [1]_.
+Every interval has 95 % coverage by itself. If some competitor is not slower, its own
+interval must be wrong before the first is called the fastest; this intersection-union
+test needs no correction for the number of solvers [1]_.
 
 References
 ----------
@@ -33,7 +34,7 @@ from mortarbench.reports.data.comparison_groups import (
     CASES,
     Answers,
     ComparisonGroup,
-    Kind,
+    GroupKey,
     Row,
     time_of,
 )
@@ -42,10 +43,10 @@ from mortarbench.reports.statistics.resampling import symmetric_interval
 
 
 class Finding(Enum):
-    """Conclusions on the fastest solver of a group, or reasons why there are none."""
+    """Conclusions on the fastest solver of a group, or the reason why none is named."""
 
     FASTEST = "one solver is faster than all others"
-    TIE = "the first is not told apart from all others"
+    TIE = "the first is not significantly faster than all others"
     DIVIDED = "on few cases, different solvers are fastest"
     ONE_BLOCK = "few cases, and too few blocks for an interval"
     ENVIRONMENTS = "times of different environments are not compared"
@@ -58,16 +59,16 @@ class Finding(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class Competitor:
-    """A solver of a comparison, and its times over those of the first."""
+    """A solver of a comparison, and its times relative to those of the first."""
 
     solver: str
     outcomes: Mapping[str, Outcome]  #: by case
-    compared: tuple[str, ...] = ()  #: cases that it and the first solved
-    slower: bool = False  #: slower than the first beyond chance
+    compared: tuple[str, ...] = ()  #: cases solved by it and the first
+    slower: bool = False  #: significantly slower than the first
     ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
     by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
-    form: str = ""  #: of the QPs, where forms compete with each other
-    apart: bool = False  #: not measured in the blocks of the first on some case
+    form: str = ""  #: of the QPs, in comparisons of forms
+    apart: bool = False  #: on some case not measured in the blocks of the first
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -78,45 +79,45 @@ class Competitor:
 
     @property
     def closest(self) -> Ratio | None:
-        """The ratio; over a few cases, the smallest of theirs."""
+        """The ratio over the cases, or the smallest ratio of few cases."""
         few = min(self.by_case.values(), key=lambda r: r.value, default=None)
         return few if self.ratio is None else self.ratio
 
 
 @dataclass(frozen=True, kw_only=True)
 class FastestSolver:
-    """The solvers of one form at one accuracy: who was fastest, or why no one is named.
+    """Comparison of the solvers of one form at one accuracy.
 
-    Competitors are in the order of their ratios; behind them are those that were not
-    verified on every case. Cases are those that all were measured on and one solved.
+    Competitors are sorted by their ratios. Cases are those on which all solvers were
+    measured and that at least one solved.
     """
 
-    kind: Kind
+    key: GroupKey
     finding: Finding
     cases: tuple[str, ...]
     competitors: tuple[Competitor, ...]
     others: tuple[Competitor, ...]  #: not verified on every case
-    over_cases: bool  #: the ratios are over cases; else within blocks
-    unsolved: int  #: cases that nobody solved
-    notes: tuple[str, ...]  #: what was not measured
+    over_cases: bool  #: ratios are over cases, else within blocks
+    unsolved: int  #: cases without a verified answer
+    notes: tuple[str, ...]  #: missing measurements, different sessions
 
     @property
     def first(self) -> Competitor:
-        """The competitor with the smallest geometric mean; there has to be one."""
+        """The competitor with the smallest geometric mean; requires a competitor."""
         return self.competitors[0]
 
     @property
     def tied(self) -> tuple[Competitor, ...]:
-        """The others that are not slower than the first beyond chance."""
+        """The other competitors that are not significantly slower than the first."""
         return tuple(c for c in self.competitors[1:] if not c.slower)
 
     @property
     def following(self) -> Competitor | None:
-        """The next that is slower beyond chance; None without one."""
+        """The next significantly slower competitor; None without one."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return per case the fastest and those whose interval does not exclude it."""
+        """Return, by case, the fastest and all whose ratio to it may be 1."""
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]
@@ -133,7 +134,7 @@ class Unverified(NamedTuple):
     solver: str
     verdict: Verdict
     answers: tuple[Outcome, ...]
-    of: int  #: how many the solver gave, or declined to give
+    of: int  #: number of all answers of the solver, declined ones included
 
 
 def fastest_solvers(
@@ -141,13 +142,13 @@ def fastest_solvers(
 ) -> tuple[FastestSolver, ...]:
     """Find the fastest solver of every group."""
     return tuple(
-        _fastest(group, {case: answers[group.kind][case] for case in group.cases})
+        _fastest(group, {case: answers[group.key][case] for case in group.cases})
         for group in groups
     )
 
 
 def unverified(rows: Iterable[Row]) -> list[Unverified]:
-    """Count what was not verified, by solver and verdict; most failures first."""
+    """Collect unverified answers by solver and verdict, most frequent first."""
     answered = Counter[str]()
     failed: dict[tuple[str, Verdict], list[Outcome]] = {}
     for row in rows:
@@ -171,7 +172,7 @@ def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
         for case, row in rows.items()
         if any(time_of(row[s]) is not None for s in group.solvers)
     }
-    # of the cases of a sequence that ended early too few may be left
+    # a sequence that ended early may leave too few solved cases
     over_cases = group.comparable and len(solved) >= CASES
     entered = [
         Competitor(solver=s, outcomes={case: row[s] for case, row in solved.items()})
@@ -187,7 +188,7 @@ def _fastest(group: ComparisonGroup, rows: Mapping[str, Row]) -> FastestSolver:
         full[1:] = sorted(compared, key=_geometric_mean)
         others = [_compared(c, first, group, over_cases) for c in others]
     return FastestSolver(
-        kind=group.kind,
+        key=group.key,
         finding=_finding(group, solved, full, over_cases=over_cases),
         cases=tuple(solved),
         competitors=tuple(full),
@@ -207,11 +208,10 @@ def _compared(
 ) -> Competitor:
     """Compare with the first on the cases that both solved, in one environment.
 
-    That is by the blocks of each case that both were measured in. Over cases it is by
-    Student's interval, widened to that of flipped signs: Student's presumes logarithms
-    that scatter normally, the other one that they scatter alike to both sides. Neither
-    presumption is safe for six cases, so both must hold 1 out before two solvers count
-    as different.
+    On each case, the ratio is that of the blocks in which both were measured. Over
+    cases, Student's interval is widened to that of flipped signs. Student's assumes
+    normal logarithms, the other one symmetric ones; neither assumption is safe for six
+    cases, so both intervals must exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]
     if len(both) < len(c.verified):
@@ -221,12 +221,12 @@ def _compared(
         for case in both
     }
     by_case = {case: ratio for case, ratio in paired.items() if ratio is not None}
-    within = replace(c, compared=tuple(both), by_case=by_case)
+    on_cases = replace(c, compared=tuple(both), by_case=by_case)
     if not over_cases:
         every = len(by_case) == len(c.outcomes)
         slower = every and all(ratio.low > 1 for ratio in by_case.values())
         only = by_case.get(both[0]) if len(both) == len(c.outcomes) == 1 else None
-        return replace(within, ratio=only, slower=slower)
+        return replace(on_cases, ratio=only, slower=slower)
     mine, its = (
         {i: time_of(one.outcomes[case]) or 0.0 for i, case in enumerate(both)}
         for one in (c, first)
@@ -237,15 +237,15 @@ def _compared(
         low, high = map(float, np.exp(symmetric_interval(logs, both)))
         ratio = ratio._replace(low=min(ratio.low, low), high=max(ratio.high, high))
     slower, apart = ratio is not None and ratio.low > 1, False
-    if group.apart.any():  # of different sessions: no pairs
+    if group.apart.any():  # different sessions, hence no pairs
         one, other = (group.solvers.index(s.solver) for s in (first, c))
         apart = bool(group.apart[one, other])
         slower = slower and (not apart or bool(group.faster[one, other]))
-    return replace(within, ratio=ratio, slower=slower, apart=apart)
+    return replace(on_cases, ratio=ratio, slower=slower, apart=apart)
 
 
 def _mixed(a: Competitor, b: Competitor, case: str) -> bool:
-    """Return whether compared times of two solvers come from different environments."""
+    """Return whether the compared times come from different environments."""
     mine, its = (
         {(r.session, r.repeat): r.environment for r in one.outcomes[case].records}
         for one in (a, b)

@@ -1,4 +1,4 @@
-"""The histories that a report shows, and numbers derived from them."""
+"""Histories of iterations that a report shows, and quantities derived from them."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 
 MOST = 4  #: cases that are drawn
 
-#: in words; the rule of `chosen`
+#: the selection rule of `chosen` in words
 RULE = (
-    "Of each family and form, the case with most variables for which a history was "
-    "kept is drawn, at its last load step and tightest tolerance, with all solvers "
-    f"that kept one; of more than {MOST} such cases, the {MOST} largest."
+    "For each family and form, the largest case with a stored history is drawn, at its "
+    "last load step and tightest tolerance, with all solvers that stored one; at most "
+    f"the {MOST} largest of these cases are shown."
 )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SolverRun:
-    """The path of one solver through one case, by its own account, row by row."""
+    """History of one solver on one case as it reported it, row by row."""
 
     outcome: Outcome
-    record: Record  #: the repeat that this is the history of
+    record: Record  #: the repeat with this history
     history: History  #: at least one row
 
     @property
@@ -40,7 +40,7 @@ class SolverRun:
         return int(next(iter(self.history.values())).size)
 
     def numbers(self, name: str) -> Vector | None:
-        """(rows,) of one column, NaN where not finite; None if no number is."""
+        """Return a column (rows,), NaN where not finite; None without finite values."""
         values = self.history.get(name, np.zeros(0))
         if values.dtype.kind not in "if" or not np.isfinite(values).any():
             return None
@@ -48,13 +48,13 @@ class SolverRun:
 
     @cached_property
     def products(self) -> Vector | None:
-        """(rows,) products with P so far; None unless all are known."""
+        """(rows,) cumulative products with P; None unless all are known."""
         values = self.numbers("products")
         return values if values is not None and np.isfinite(values).all() else None
 
     @cached_property
     def gradient(self) -> Vector | None:
-        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
+        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over the first one."""
         phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:
             return None
@@ -70,17 +70,17 @@ class SolverRun:
 
     @property
     def two_sided(self) -> Vector | None:
-        """(rows,) number of active bounds of components between two: rows that slip."""
+        """(rows,) number of active bounds of two-sided components: slipping rows."""
         return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:
-        """Mark the steps of that kind, (rows,)."""
+        """Return a mask (rows,) of the steps of one kind."""
         kinds = self.history.get("step", np.full(self.rows, ""))
         return np.asarray(kinds.astype(str) == kind, dtype=bool)
 
     @cached_property
     def outer_ends(self) -> NDArray[np.bool_]:
-        """(rows,) whether an outer iteration ends there; nowhere if there is one."""
+        """(rows,) True where an outer iteration ends; False if there is only one."""
         outer = self.numbers("outer")
         if outer is None or np.all(outer == outer[0]):
             return np.zeros(self.rows, dtype=bool)
@@ -89,18 +89,18 @@ class SolverRun:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaseHistories:
-    """The runs through one case at one tolerance, drawn over one axis of work."""
+    """Histories on one case at one tolerance, drawn over one axis of work."""
 
     runs: tuple[SolverRun, ...]  #: at least one, in the order of the suite
-    solvers: tuple[str, ...]  #: all of the report: each looks the same in all figures
+    solvers: tuple[str, ...]  #: all of the report, in the order of their looks
 
     @property
     def counted(self) -> bool:
-        """True if all runs can be drawn over products; else over iterations."""
+        """True if the axis of work is products with P; False for iterations."""
         return all(c.products is not None for c in self.runs)
 
     def work(self, run: SolverRun) -> Vector:
-        """(rows,) products or iterations, counted from one."""
+        """Return the work (rows,) in products or iterations, counted from one."""
         products = run.products if self.counted else None
         return np.arange(1.0, run.rows + 1) if products is None else products
 
@@ -110,21 +110,21 @@ class CaseHistories:
 
 
 def chosen(evidence: Evidence) -> list[CaseHistories]:
-    """Choose the cases to draw by `RULE`."""
+    """Select the cases to draw by `RULE`."""
     ordered = sorted(evidence.outcomes.values(), key=_importance, reverse=True)
-    found: dict[tuple[str, str], CaseHistories] = {}
+    selected: dict[tuple[str, str], CaseHistories] = {}
     for row in ordered:
         one = next(iter(row.values())).first
         key = (one.family, one.form)
-        if len(found) == MOST:
+        if len(selected) == MOST:
             break
-        if key not in found and (runs := tuple(_runs(evidence, row))):
-            found[key] = CaseHistories(runs=runs, solvers=evidence.solvers)
-    return list(found.values())
+        if key not in selected and (runs := tuple(_runs(evidence, row))):
+            selected[key] = CaseHistories(runs=runs, solvers=evidence.solvers)
+    return list(selected.values())
 
 
 def unread(evidence: Evidence) -> list[str]:
-    """Name the files that should hold a history, but cannot be read."""
+    """Return messages on stored histories that cannot be read."""
     lost = []
     for outcome in evidence.flat:
         for record in outcome.records:
@@ -137,12 +137,14 @@ def unread(evidence: Evidence) -> list[str]:
 
 
 def _runs(evidence: Evidence, row: Mapping[str, Outcome]) -> Iterator[SolverRun]:
-    """Yield the first stored history of each solver, as far as it can be read."""
+    """Yield the first readable history of each solver."""
     for outcome in row.values():
         for record in outcome.records:
             history: History = {}
             if record.vectors is not None:
-                with suppress(InputError):  # the journal alone must do
+                with suppress(
+                    InputError
+                ):  # vectors/ may be missing: the journal suffices
                     history = load_history(evidence.directory, record.vectors)
             if history and next(iter(history.values())).size:
                 yield SolverRun(outcome=outcome, record=record, history=history)

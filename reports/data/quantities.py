@@ -1,4 +1,4 @@
-"""Physical quantities of answers: how far they agree, and the digits that are known."""
+"""Physical quantities of answers: agreement between solvers, and significant digits."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mortarbench.reports.document.formatting import clean, significant, span
 from mortarbench.reports.document.layout import Cell
 
 SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
-_CONTACTS, _PRESSURE = "contacts", "largest_pressure"  #: per pair, and what of it
+_CONTACTS, _PRESSURE = "contacts", "largest_pressure"  #: per pair, and its scalar
 _UNITS = {
     "energy": "J/m",
     "tip": "m",
@@ -24,11 +24,11 @@ _UNITS = {
     "max_von_mises": "Pa",
     "p_max": "Pa",
     "half_width": "m",
-    _CONTACTS: "Pa",  # of what tables show of them
+    _CONTACTS: "Pa",  # tables show the largest pressure of each pair
 }
-_STRESS = "max_von_mises"  #: what elastic bodies have, and no other family
-MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: a stress depends on the mesh first of all
-_MOST = 7  #: digits of all others
+_STRESS = "max_von_mises"  #: only elastic bodies have it
+MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: stresses depend strongly on the mesh
+_MOST = 7  #: most digits of other quantities
 _COMPONENTS = "xyz"
 
 
@@ -36,25 +36,25 @@ class Leaf(NamedTuple):
     """One scalar of the quantities."""
 
     value: Any
-    scale: float  #: its size, of a component that of its vector
+    scale: float  #: its absolute value; for a component, the largest of its vector
 
 
 Leaves = dict[tuple[str, ...], Leaf]  #: by path
 
 
 def elastic(outcome: Outcome) -> bool:
-    """Return whether quantities are in SI units, as those of elastic bodies are."""
+    """Return whether quantities are in SI units, which only elastic bodies have."""
     return _STRESS in outcome.quantities
 
 
 def unit(outcome: Outcome, name: str) -> str:
-    """Name the unit of a quantity; empty where it is a bare number."""
-    found = _UNITS.get(name, "") if elastic(outcome) else ""
-    return found.removesuffix("/m") if in_space(outcome.quantities) else found
+    """Return the unit of a quantity; empty for a plain number."""
+    plane = _UNITS.get(name, "") if elastic(outcome) else ""
+    return plane.removesuffix("/m") if in_space(outcome.quantities) else plane
 
 
 def known_digits(doubt: float, most: int) -> int:
-    """Count the digits on which answers agree, and one more; at least 1.
+    """Return the number of digits on which answers agree, plus one; from 1 to `most`.
 
     doubt : relative difference of the answers
     """
@@ -64,15 +64,15 @@ def known_digits(doubt: float, most: int) -> int:
 
 
 def leaves(outcome: Outcome, *, sizes: bool) -> Leaves:
-    """List every scalar by its path, vectors by component, in their order."""
-    found: Leaves = {}
+    """Return every scalar by its path, vectors by component, in their order."""
+    scalars: Leaves = {}
     for name, value in outcome.quantities.items():
         if (name in SIZES) is sizes:
-            found |= _flat((str(name),), value)
-    # of each contact pair a table has room for one scalar
+            scalars |= _flat((str(name),), value)
+    # a table has room for one scalar of each contact pair
     return {
         path: leaf
-        for path, leaf in found.items()
+        for path, leaf in scalars.items()
         if path[0] != _CONTACTS or len(path) == 1 or path[-1] == _PRESSURE
     }
 
@@ -95,7 +95,7 @@ def _flat(path: tuple[str, ...], value: object) -> dict[tuple[str, ...], Leaf]:
 
 
 def head(path: tuple[str, ...], outcomes: Sequence[Outcome]) -> str:
-    """Name a column: words, and the unit where all rows have it."""
+    """Return the heading of a column, with the unit if all rows share it."""
     words = clean(" ".join(path).replace("_", " "), 40).replace("mises", "Mises")
     units = {unit(o, path[0]) for o in outcomes}
     (only,) = units if len(units) == 1 else ("",)
@@ -105,10 +105,10 @@ def head(path: tuple[str, ...], outcomes: Sequence[Outcome]) -> str:
 def quantity(
     path: tuple[str, ...], best: Outcome, leaf: Leaf | None, peers: Sequence[Leaves]
 ) -> Cell:
-    """Print what the best answer says, in so many digits as all answers bear out.
+    """Return a cell of the best answer, with as many digits as all answers support.
 
-    leaf : of the best answer, if it has one there
-    peers : all leaves of each answer
+    leaf : scalar of the best answer, if it has one at `path`
+    peers : leaves of all answers
     """
     if leaf is None or leaf.value is None or isinstance(leaf.value, bool):
         return Cell()
@@ -130,7 +130,7 @@ def quantity(
 
 
 def _rounded(leaf: Leaf, digits: int) -> str:
-    """Print a number; of a component, no digits that its vector does not have."""
+    """Print a number; a component has no smaller digits than its vector."""
     if not leaf.value or not math.isfinite(leaf.value):
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))
@@ -151,27 +151,27 @@ class Spread(NamedTuple):
 
     @property
     def digits(self) -> int:
-        """Number of common digits of the energies, plus one; of one answer, by tol."""
+        """Digits of the printed energy; for a single answer those of its tolerance."""
         doubt = self.answers[0].tol if self.relative is None else self.relative
         return known_digits(doubt, MOST_DIGITS["energy"])
 
 
 def spreads(outcomes: Iterable[Outcome]) -> list[Spread]:
-    """Compare energies pairwise per physical case and tolerance.
+    """Compare energies pairwise by physical case and tolerance.
 
-    No answer serves as the reference of the others: each is set against each, across
-    solvers and across primal and dual forms.
+    Answers are compared across solvers and across primal and dual forms; none serves as
+    the reference.
     """
     groups: dict[tuple[str, float], list[Outcome]] = {}
     for o in outcomes:
         if o.verified and o.energy is not None:
             groups.setdefault((o.physical, o.tol), []).append(o)
-    found = []
+    result = []
     for group in groups.values():
         apart = ((_difference(*pair), pair) for pair in combinations(group, 2))
         widest = max(apart, key=itemgetter(0), default=(None, None))
-        found.append(Spread(tuple(group), *widest))
-    return found
+        result.append(Spread(tuple(group), *widest))
+    return result
 
 
 def _difference(a: Outcome, b: Outcome) -> float:
@@ -180,7 +180,7 @@ def _difference(a: Outcome, b: Outcome) -> float:
 
 
 def best_of(answers: Sequence[Outcome]) -> Outcome:
-    """Take the answer with the smallest worst residual; names break ties."""
+    """Return the answer with the smallest worst residual; names break ties."""
     return min(
         answers,
         key=lambda o: (math.inf if o.worst is None else o.worst, o.case, o.solver),

@@ -1,9 +1,9 @@
-"""One solve on several numbers of ranks: strong and weak scaling, as measured.
+"""Measured strong and weak scaling of one solve over the number of ranks.
 
 Strong scaling is one case on more ranks. Weak scaling is a case that grows with the
-ranks, so that each has as much. Both are reported for preparing and solving apart, and
-compared with copies: what so many independent solves reach that run at the same time on
-the same machine, whose memory they share as ranks do.
+ranks, so that the work of each rank stays the same. Both are reported separately for
+preparation and solve, and compared with copies: as many simultaneous independent solves
+on the same machine, which share its memory as ranks do.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mortarbench.harness import Record
 from mortarbench.harness.registry import COPIES
 from mortarbench.harness.running.pairs import paired_ratio, unpaired_ratio
 from mortarbench.reports.data.evidence import Evidence, Outcome
-from mortarbench.reports.data.size_series import alike, sized
+from mortarbench.reports.data.size_series import by_series, sized
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.cost_model import (
     Communication,
@@ -30,13 +30,13 @@ from mortarbench.reports.statistics.cost_model import (
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 
 PHASES = ("prepare", "solve")
-ALIKE = 0.05  #: dofs of a rank may differ by that much, relatively, in weak scaling
+ALIKE = 0.05  #: largest relative difference of the dofs of a rank in weak scaling
 
 
 class Part(NamedTuple):
     """Seconds, counts or memory of ranks: medians over the repeats."""
 
-    mean: float  #: of the ranks
+    mean: float  #: over the ranks
     largest: float
 
 
@@ -45,11 +45,11 @@ class _Scaling:
     """Verified answers of one solver on several numbers of ranks."""
 
     solver: str  #: its label on one rank
-    copies: Mapping[int, Outcome]  #: by number, of so many independent solves at once
-    cpus: int | None  #: that the machine has, if known
+    copies: Mapping[int, Outcome]  #: simultaneous independent solves, by their number
+    cpus: int | None  #: number of CPUs of the machine, if known
 
     def crowded(self, ranks: int) -> bool:
-        """Return whether ranks shared CPUs: such times do not extend to others."""
+        """Return whether ranks shared CPUs; the model ignores such times."""
         return self.cpus is not None and ranks > self.cpus
 
 
@@ -69,30 +69,30 @@ class StrongSeries(_Scaling):
 
     @property
     def several(self) -> tuple[int, ...]:
-        """The numbers of ranks above one."""
+        """Numbers of ranks above one."""
         return tuple(self.answers)[1:]
 
     def speed_up(self, ranks: int, phase: str) -> Interval | None:
-        """Compare one rank with several: t(1)/t(N)."""
+        """Return the speed-up t(1)/t(N)."""
         return _ratio(self.answers[1], self.answers[ranks], phase)
 
     def efficiency(self, ranks: int, phase: str) -> Interval | None:
-        """Return the part of N-fold speed that is reached: t(1)/(N·t(N))."""
+        """Return the efficiency t(1)/(N·t(N))."""
         return _ratio(self.answers[1], self.answers[ranks], phase, 1 / ranks)
 
     def reach(self, ranks: int, phase: str) -> Interval | None:
-        """Return what copies reach together, in solves of one: N·t(1)/t(copies)."""
+        """Return the joint speed-up of N copies, N·t(1)/t(copies)."""
         return _ratio(self.answers[1], self.copies.get(ranks), phase, ranks)
 
     def against_copies(self, ranks: int, phase: str) -> Interval | None:
-        """Return the part of the reach of copies: t(copies)/(N·t(N))."""
+        """Return the speed-up relative to that of copies, t(copies)/(N·t(N))."""
         return _ratio(self.copies.get(ranks), self.answers[ranks], phase, 1 / ranks)
 
     @cached_property
     def model(self) -> CostModel | None:
-        """Model the solve; None where the records of ranks do not say what they sent.
+        """Cost model of the solve; None where records lack the messages of ranks.
 
-        Ranks that shared CPUs are left out.
+        Runs in which ranks shared CPUs are left out.
         """
         seconds, copies = (
             {
@@ -105,57 +105,57 @@ class StrongSeries(_Scaling):
         if len(seconds) < 2 or 1 not in seconds:
             return None
         sent = map(_communication, self.answers[max(seconds)].records)
-        known = [c for c in sent if c is not None]
+        communication = [c for c in sent if c is not None]
         copies = {n: of for n, of in copies.items() if n in seconds}
-        return cost_model(seconds, copies, known) if known else None
+        return cost_model(seconds, copies, communication) if communication else None
 
     @property
     def most(self) -> int | None:
-        """Count the subdomains, at most one rank for each; None if unknown."""
+        """Number of subdomains, the most ranks that can share them; None if unknown."""
         return self.answers[1].size("subdomains")
 
 
 class Member(NamedTuple):
-    """One case of a weak series, on so many ranks."""
+    """One case of a weak series, with its number of ranks."""
 
     ranks: int
     dofs: int
     answer: Outcome
 
     def growth(self, first: Member) -> float:
-        """Relate the dofs of a rank to those of the first case on one rank."""
+        """Return the dofs per rank relative to the first case on one rank."""
         return self.dofs / (self.ranks * first.dofs)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class WeakSeries(_Scaling):
-    """Verified answers of one solver, each on ranks that have equally many dofs.
+    """Verified answers of one solver with equally many dofs per rank.
 
     Copies are those of the first case.
     """
 
-    title: str  #: family, parameters held, solver, tolerance
-    members: tuple[Member, ...]  #: by ranks; the first is on one
+    title: str  #: family, fixed parameters, solver, tolerance
+    members: tuple[Member, ...]  #: by ranks, ascending; the first has one
 
     def efficiency(self, member: Member, phase: str) -> Interval | None:
-        """Compare with the first case on one rank: t(1)/t(N), 1 at best."""
+        """Return the efficiency t(1)/t(N) relative to the first case; ideally 1."""
         return _ratio(self.members[0].answer, member.answer, phase, paired=False)
 
     def against_copies(self, member: Member, phase: str) -> Interval | None:
-        """Compare with as many copies of the first case at once: t(copies)/t(N)."""
+        """Return t(copies)/t(N), for as many simultaneous copies of the first case."""
         return _ratio(self.copies.get(member.ranks), member.answer, phase, paired=False)
 
 
 def strong_series(evidence: Evidence) -> list[StrongSeries]:
-    """Find the cases that a solver was verified on with one rank and with several."""
-    found = []
+    """Return the cases on which a solver was verified on one rank and on several."""
+    series = []
     for (case, tol), row in evidence.outcomes.items():
         by_role: dict[str, dict[str, dict[int, Outcome]]] = {"": {}, COPIES: {}}
         for o in row.values():
             if o.verified and o.first.role in by_role:
-                of = by_role[o.first.role].setdefault(base_label(o), {})
-                of[o.first.ranks] = o
-        found += [
+                by_ranks = by_role[o.first.role].setdefault(base_label(o), {})
+                by_ranks[o.first.ranks] = o
+        series += [
             StrongSeries(
                 case=case,
                 tol=tol,
@@ -167,16 +167,16 @@ def strong_series(evidence: Evidence) -> list[StrongSeries]:
             for solver, answers in by_role[""].items()
             if 1 in answers and len(answers) > 1
         ]
-    return found
+    return series
 
 
 def weak_series(evidence: Evidence) -> list[WeakSeries]:
-    """Find cases that grow with the ranks: equally many dofs for each, within 5 %.
+    """Return the series of cases with equally many dofs per rank, within 5 %.
 
-    Other parameters are held, as in series of sizes (`size_series`).
+    Other parameters are fixed, as in series of sizes (`size_series`).
     """
-    found = []
-    for key, of in alike(sized(evidence), base_label).items():
+    series = []
+    for key, of in by_series(sized(evidence), base_label).items():
         members = [Member(o.first.ranks, n, o) for n, o in of if not o.first.role]
         alone = [m for m in members if m.ranks == 1]
         for first in sorted(alone, key=lambda m: m.dofs):
@@ -185,7 +185,7 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
                 if m.ranks > 1 and abs(m.growth(first) - 1) <= ALIKE:
                     by_ranks.setdefault(m.ranks, []).append(m)
             if len(by_ranks) > 1:
-                found.append(
+                series.append(
                     WeakSeries(
                         title=key.title,
                         solver=key.solver,
@@ -201,7 +201,7 @@ def weak_series(evidence: Evidence) -> list[WeakSeries]:
                         },
                     )
                 )
-    return found
+    return series
 
 
 def base_label(o: Outcome) -> str:
@@ -219,10 +219,10 @@ def _ratio(
     *,
     paired: bool = True,
 ) -> Interval | None:
-    """Compare times of a with those of b; from one run each, without an interval.
+    """Return the ratio of the times of a and b; single runs give no interval.
 
     factor : multiplies the ratio
-    paired : whether blocks of the same name ran next to each other
+    paired : True if blocks of the same name were measured one after the other
     """
     if a is None or b is None:
         return None
@@ -239,34 +239,34 @@ def _ratio(
 
 
 def rank_parts(o: Outcome) -> dict[str, Part]:
-    """Return the seconds that ranks spent on each part of the solve, by name."""
+    """Return the seconds of the ranks in each part of the solve, by name."""
     return _parts(r.rank_seconds for r in o.records)
 
 
 def rank_counts(o: Outcome) -> dict[str, Part]:
-    """Count what ranks sent in the solve: reductions, messages and bytes."""
+    """Return the reductions, messages and bytes of the ranks in the solve."""
     return _parts(r.rank_counts for r in o.records)
 
 
 def rank_memory(o: Outcome) -> Part | None:
-    """Return the peak memory of a rank, MiB."""
+    """Return the peak memory of the ranks, MiB; None if unknown."""
     ends = ("mean", "largest")
     peaks = [
         [r.reported.get(f"rank_peak_mib_{end}") for end in ends] for r in o.records
     ]
-    known = [of for of in peaks if all(isinstance(v, int | float) for v in of)]
-    if not known:
+    numbers = [of for of in peaks if all(isinstance(v, int | float) for v in of)]
+    if not numbers:
         return None
-    mean, largest = np.median(np.array(known, dtype=float), axis=0)
+    mean, largest = np.median(np.array(numbers, dtype=float), axis=0)
     return Part(float(mean), float(largest))
 
 
 def _parts(tables: Iterable[Mapping[str, Any]]) -> dict[str, Part]:
-    known = [table for table in tables if table]
+    filled = [table for table in tables if table]
     return {
-        name: Part(*(float(median(t[name][end] for t in known)) for end in (0, 1)))
-        for name in (known[0] if known else ())
-        if all(name in t for t in known)
+        name: Part(*(float(median(t[name][end] for t in filled)) for end in (0, 1)))
+        for name in (filled[0] if filled else ())
+        if all(name in t for t in filled)
     }
 
 

@@ -1,4 +1,4 @@
-"""Cases that differ in size only, and how time and iterations grow along them."""
+"""Series of cases that differ in size only, and their growth of time and iterations."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
-SIZES = 3  #: fewer different sizes make no table
+SIZES = 3  #: least number of different sizes of a series
 
 Sized = tuple[int, Outcome]
 
@@ -20,17 +20,17 @@ Sized = tuple[int, Outcome]
 class SizeSeries:
     """Cases that differ in size only, and the verified answers on each."""
 
-    title: str  #: family, the parameters held, form, tolerance
+    title: str  #: family, fixed parameters, form, tolerance
     solvers: tuple[str, ...]
     sizes: tuple[tuple[int, int | None, dict[str, Outcome]], ...]  #: n, m, by solver
 
     @property
     def answers(self) -> int:
-        """Number of verified answers that it rests on."""
+        """Number of verified answers in the series."""
         return sum(len(row) for _, _, row in self.sizes)
 
     def curve(self, solver: str, against: str = "n") -> list[Sized]:
-        """Sizes n or m, smallest first, and verified answers of one solver."""
+        """Return sizes n or m, ascending, with the verified answers of one solver."""
         return [
             (size, row[solver])
             for n, m, row in self.sizes
@@ -48,7 +48,7 @@ class SizeSeries:
         return _law((s, i and sum(i) / 2) for s, i in counted)
 
     def counts(self, solver: str) -> tuple[str, ...]:
-        """Name the counts that one solver reports on every size."""
+        """Return the names of the counts that one solver reports on every size."""
         named = [list(o.first.counts) for _, o in self.curve(solver)]
         return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
 
@@ -58,26 +58,26 @@ class SizeSeries:
 
 
 def _law(points: Iterable[tuple[int, float | None]]) -> PowerLaw | None:
-    """Fit a power law to the points that are known and positive."""
-    kept = [(n, v) for n, v in points if n > 0 and v is not None and v > 0]
-    if len({n for n, _ in kept}) < SIZES:
+    """Fit a power law to the known positive values; None with fewer than `SIZES`."""
+    positive = [(n, v) for n, v in points if n > 0 and v is not None and v > 0]
+    if len({n for n, _ in positive}) < SIZES:
         return None
-    return power_law(*zip(*kept, strict=True))
+    return power_law(*zip(*positive, strict=True))
 
 
-class Alike(NamedTuple):
-    """Attributes that cases of different size have in common."""
+class SeriesKey(NamedTuple):
+    """Attributes that the cases of one series of sizes share."""
 
     family: str
-    held: tuple[tuple[str, Any], ...]  #: parameters
+    fixed: tuple[tuple[str, Any], ...]  #: parameters
     form: str
     tol: float
     solver: str  #: empty where solvers are compared
 
     @property
     def title(self) -> str:
-        """All of it in one line."""
-        keys = [f"{k}={v}" for k, v in self.held]
+        """All attributes in one line."""
+        keys = [f"{k}={v}" for k, v in self.fixed]
         name = clean(
             "/".join([self.family, *keys, *([self.form] if self.form else [])])
         )
@@ -86,44 +86,44 @@ class Alike(NamedTuple):
 
 
 def sized(evidence: Evidence) -> list[Sized]:
-    """List verified answers whose number of dofs is known."""
+    """Return verified answers with their number of dofs, where it is known."""
     return [(n, o) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
 
 
-def alike(
+def by_series(
     answers: Iterable[Sized], solver: Callable[[Outcome], str] = lambda o: ""
-) -> dict[Alike, list[Sized]]:
+) -> dict[SeriesKey, list[Sized]]:
     """Group answers to cases that differ in size only.
 
-    A key of the case name is held fixed if cases of a family differ in it at equal size
-    (the load step, say); the others are what makes a case larger.
+    A parameter is fixed within a series if cases of equal size differ in it (the load
+    step, for example); the other parameters determine the size.
     """
     answers = list(answers)
     seen: dict[tuple[str, str, int], set[Any]] = {}
     for n, o in answers:
         for key, value in o.first.params.items():
             seen.setdefault((o.first.family, key, n), set()).add(value)
-    held: dict[str, dict[str, None]] = {}
+    fixed: dict[str, dict[str, None]] = {}
     for (family, key, _), values in seen.items():
         if len(values) > 1:
-            held.setdefault(family, {})[key] = None
-    groups: dict[Alike, list[Sized]] = {}
+            fixed.setdefault(family, {})[key] = None
+    groups: dict[SeriesKey, list[Sized]] = {}
     for n, o in answers:
         r = o.first
-        kept = tuple((k, r.params.get(k)) for k in held.get(r.family, ()))
-        same = Alike(r.family, kept, r.form, o.tol, solver(o))
-        groups.setdefault(same, []).append((n, o))
+        shared = tuple((k, r.params.get(k)) for k in fixed.get(r.family, ()))
+        series = SeriesKey(r.family, shared, r.form, o.tol, solver(o))
+        groups.setdefault(series, []).append((n, o))
     return groups
 
 
 def size_series(evidence: Evidence) -> list[SizeSeries]:
-    """Find the cases that form a series of at least three sizes.
+    """Return the series of at least three sizes.
 
-    n is the number of dofs, m the rows of equalities and contact.
+    n is the number of dofs, m that of the rows of equalities and contact.
     """
-    found = []
+    series = []
     answers = [(n, o) for n, o in sized(evidence) if o.first.role != COPIES]
-    for key, of in alike(answers).items():
+    for key, of in by_series(answers).items():
         sizes: dict[int, dict[str, Outcome]] = {}
         for n, o in of:
             sizes.setdefault(n, {})[o.solver] = o
@@ -134,15 +134,15 @@ def size_series(evidence: Evidence) -> list[SizeSeries]:
         ]
         if len(sizes) >= SIZES:
             solvers = tuple(s for s in evidence.solvers if s in present)
-            found.append(
+            series.append(
                 SizeSeries(title=key.title, solvers=solvers, sizes=tuple(rows))
             )
-    return found
+    return series
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Sweep:
-    """Cases that differ in one key only, and one solver's verified answers on each."""
+    """Verified answers of one solver to cases that differ in one key only."""
 
     title: str  #: family, other parameters, form, tolerance
     solver: str
@@ -150,7 +150,7 @@ class Sweep:
 
 
 def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
-    """Find where one key alone takes at least three positive values."""
+    """Return the sweeps in which one key takes at least three positive values."""
     groups: dict[tuple[Any, ...], dict[int, Outcome]] = {}
     for o in evidence.flat:
         params = dict(o.first.params)
@@ -165,8 +165,8 @@ def sweeps(evidence: Evidence, key: str) -> list[Sweep]:
         Sweep(
             title=f"{clean(case)}, tol {tolerance(tol)}",
             solver=solver,
-            answers=tuple(sorted(found.items())),
+            answers=tuple(sorted(answers.items())),
         )
-        for (case, _, tol, solver), found in groups.items()
-        if len(found) >= SIZES
+        for (case, _, tol, solver), answers in groups.items()
+        if len(answers) >= SIZES
     ]

@@ -1,13 +1,12 @@
-"""Time at matched error: what a solver needs for an answer that is proven so good.
+"""Time at equal error: the time of a solver for an answer of given certified accuracy.
 
 A sweep of its tolerance gives a solver's points (certified error, time). Between them
-the time is interpolated linearly in the logarithms, after isotonic regression: a better
-answer does not take less time [1]_. Nothing is extrapolated.
+the time is interpolated linearly in the logarithms, after isotonic regression, because
+a better answer does not take less time [1]_. Nothing is extrapolated.
 
-A point counts if the solver itself handed the answer over as solved, and a certificate
-bounds its error. The claim is not believed; it tells what ended the solve, the solver's
-own test at this tolerance and no limit of ours. Residuals that refute the claim at the
-tolerance do not matter here: the error is a fact.
+A point counts if the solver claimed success and a certificate bounds its error. The
+claim is not trusted; it shows that the solver's own test ended the solve, not a limit.
+Residuals that refute the claim do not matter here, since the error is certified.
 
 References
 ----------
@@ -31,7 +30,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import limits
 
 RESAMPLES = 400
-SMALLEST = 1e-17  #: errors below, zero among them, count as this
+SMALLEST = 1e-17  #: lower bound of errors, so that zero has a logarithm
 
 Floats = NDArray[np.float64]
 
@@ -39,8 +38,8 @@ Floats = NDArray[np.float64]
 class TimeAtAccuracy(NamedTuple):
     """The time at one error; see `time_at_accuracy`."""
 
-    kind: str  #: "between", "looser" (the loosest is better already), "not reached"
-    time: Interval | None  #: s; of "looser", that of the loosest: it takes at most that
+    kind: str  #: "between", "looser" (the loosest is already better), "not reached"
+    time: Interval | None  #: s; for "looser" the time at the loosest, an upper bound
 
 
 def counts(outcome: Outcome) -> bool:
@@ -55,10 +54,10 @@ def counts(outcome: Outcome) -> bool:
 
 
 def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccuracy:
-    """Interpolate the time of answers that are proven to be within `error`.
+    """Interpolate the time of answers with a certified error of at most `error`.
 
-    The interval is a bootstrap over the repeats of each tolerance, seeded by the names
-    of the measurements, as wide as few repeats demand; a single one has none.
+    The interval is a bootstrap over the repeats of each tolerance, seeded by run_ids
+    and widened for few repeats (see `resampling.limits`); one repeat has none.
 
     outcomes : of one solver on one case, at all tolerances
     """
@@ -86,16 +85,16 @@ def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccurac
 
 
 def times_at(error: float, errors: Floats, times: Floats) -> Floats:
-    """Interpolate monotone in logarithms, between the smallest and the largest error.
+    """Interpolate monotonically in logarithms, between smallest and largest error.
 
     Parameters
     ----------
-    errors : (k,) positive; equal errors are one point, their times' geometric mean
-    times : (…, k) s, positive: any number of curves
+    errors : (k,) positive; equal ones are merged, with the geometric mean of times
+    times : (…, k) s, positive; any number of curves
 
     Returns
     -------
-    (…,) s, of each curve at `error`
+    (…,) times of the curves at `error`, s
 
     """
     places, point, weights = np.unique(
@@ -109,12 +108,12 @@ def times_at(error: float, errors: Floats, times: Floats) -> Floats:
 
 
 def isotonic(y: Floats, weights: NDArray[np.integer]) -> Floats:
-    """Fit what does not fall, by weighted least squares: the max-min formula of [1]_.
+    """Fit nondecreasing values by weighted least squares: the max-min formula of [1]_.
 
-    The fit at i is the largest, over where a stretch that holds i begins, of the
-    smallest mean of such stretches, over where they end.
+    The fit at i is the maximum over start ≤ i of the minimum over end ≥ i of the
+    weighted mean of y from start to end.
 
-    y : (…, k); each (k,) is fitted by itself
+    y : (…, k); each (k,) is fitted separately
     weights : (k,) positive
     """
     before = np.cumsum([0, *weights])
@@ -131,7 +130,7 @@ def isotonic(y: Floats, weights: NDArray[np.integer]) -> Floats:
 
 
 def _medians(times: Floats, outcome: Outcome) -> Floats:
-    """Draw medians of repeats with replacement; the same for the same measurements."""
+    """Draw medians of resampled repeats, with a generator seeded by the run_ids."""
     names = "\n".join(outcome.run_ids).encode("utf-8", "replace")
     seed = int(hex_digest([names], 16), 16)
     chosen = np.random.default_rng(seed).choice(times, (RESAMPLES, times.size))

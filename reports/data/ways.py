@@ -1,8 +1,8 @@
-"""Ways from the mesh to a verified answer: a form of the problem and a solver for it.
+"""Ways from the mesh to a verified answer: combinations of a form and a solver.
 
-The primal and the dual QP of one problem are two problems to a solver, but one to a
-reader who has a mesh. Ways are compared by the seconds of dualising, which only dual
-forms need, plus those of preparing and solving; assembling is the same for all.
+The primal and the dual QP of one problem are different problems for a solver, but a
+user with a mesh may choose either. Ways are compared by the time of dualisation, which
+only dual forms need, plus preparation and solve; assembly is the same for all.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mortarbench.reports.data.fastest import (
     fastest_solvers,
 )
 
-PRIMAL = "primal"  #: the form that nothing has to be dualised for
+PRIMAL = "primal"  #: the form without dualisation
 
 
 class Way(NamedTuple):
@@ -32,24 +32,23 @@ class Way(NamedTuple):
 
     @property
     def label(self) -> str:
-        """Name both; no two ways share a label."""
+        """Solver and form; unique among ways."""
         return f"{self.solver} on the {self.form} form"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Ways:
-    """The comparison of all ways, at each accuracy."""
+    """Comparison of all ways at each accuracy."""
 
-    found: tuple[FastestSolver, ...] = ()  #: tightest accuracy first, cold solves first
+    comparisons: tuple[FastestSolver, ...] = ()  #: cold solves, tight accuracies first
     uncharged: int = 0  #: problems left out: their dual forms lack `dualise_seconds`
 
 
 def compare_ways(evidence: Evidence) -> Ways:
-    """Compare the ways to the same problems, dualising charged.
+    """Compare the ways to solve the same problems, including dualisation.
 
-    A problem takes part if it was measured in several forms, or if dualising is charged
-    to its only one; elsewhere a way is a solver, and the comparison of solvers says
-    the same.
+    A problem takes part if it was measured in several forms, or if its only form has a
+    time of dualisation; for others the comparison of solvers is equivalent.
     """
     problems: dict[str, list[Record]] = {}
     for r in evidence.records:
@@ -60,14 +59,14 @@ def compare_ways(evidence: Evidence) -> Ways:
         for name, records in problems.items()
         if len({r.form for r in records}) > 1 or any(r.dualise_seconds for r in records)
     }
-    known = {
+    timed = {
         name: records
         for name, records in differing.items()
-        if all(map(_is_charged, records))
+        if all(map(_has_all_times, records))
     }
     ways = {
         Way(r.solver, r.form).label: Way(r.solver, r.form)
-        for records in known.values()
+        for records in timed.values()
         for r in records
     }
     charged = replace(
@@ -80,7 +79,7 @@ def compare_ways(evidence: Evidence) -> Ways:
                 if r.total_seconds is None
                 else r.total_seconds + (r.dualise_seconds or 0.0),
             )
-            for name, records in known.items()
+            for name, records in timed.items()
             for r in records
         ),
         suite={
@@ -93,21 +92,21 @@ def compare_ways(evidence: Evidence) -> Ways:
     groups = all_groups(charged, pool_forms=True)
     answers = answers_of(charged, pool_forms=True)
 
-    def named(competitors: Iterable[Competitor]) -> tuple[Competitor, ...]:
+    def with_forms(competitors: Iterable[Competitor]) -> tuple[Competitor, ...]:
         return tuple(replace(c, **ways[c.solver]._asdict()) for c in competitors)
 
-    found = [
-        replace(f, competitors=named(f.competitors), others=named(f.others))
+    comparisons = [
+        replace(f, competitors=with_forms(f.competitors), others=with_forms(f.others))
         for f in fastest_solvers(answers, groups)
         if f.finding is not Finding.ALONE
     ]
-    found.sort(key=lambda f: (f.kind.mode != "cold", f.kind.mode, f.kind.at))
-    return Ways(found=tuple(found), uncharged=len(differing) - len(known))
+    comparisons.sort(key=lambda f: (f.key.mode != "cold", f.key.mode, f.key.at))
+    return Ways(comparisons=tuple(comparisons), uncharged=len(differing) - len(timed))
 
 
-def _is_charged(r: Record) -> bool:
-    """Return whether the seconds from the mesh to the answer are known, or not needed.
+def _has_all_times(r: Record) -> bool:
+    """Return whether a record has the time of dualisation, or needs none.
 
-    Journals of older versions and cases emitted by ranks lack those of dualising.
+    Journals of older versions and cases emitted by ranks lack it.
     """
     return r.form == PRIMAL or r.total_seconds is None or r.dualise_seconds is not None

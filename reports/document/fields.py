@@ -1,6 +1,6 @@
-"""Figures of bodies, to scale, as data: meshes, colours of a field, arrows.
+"""Figures of bodies to scale, as data: meshes, coloured fields, arrows.
 
-They are drawn into files only; a page embeds the drawing as it is.
+They are drawn to files only; a page embeds the drawing.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ Points = NDArray[np.float64]  #: (n, 2)
 
 @dataclass(frozen=True, kw_only=True)
 class ColourScale:
-    """Values as colours, and the bar that explains them."""
+    """Colour map of a range of values, with the label of its bar."""
 
     colours: str  #: a colour map of matplotlib
     low: float
     high: float
     label: str = ""
-    unit: float = 1.0  #: value that the bar numbers as 1
-    beyond: Literal["neither", "max", "both"] = "neither"  #: where values are clipped
+    unit: float = 1.0  #: value labelled 1 on the bar
+    beyond: Literal["neither", "max", "both"] = "neither"  #: ends with clipped values
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ColourField:
-    """Values at nodes, as colours, linear within triangles."""
+    """Nodal values as colours, linear within triangles."""
 
     points: Points
     triangles: NDArray[np.int64]  #: (t, 3)
@@ -49,7 +49,7 @@ class Polygons:
     edge: str = "none"
     width: float = 0.0  #: of the edge, points
     hatch: str = ""
-    cased: bool = False  #: whether the edge is set off by white from what lies below
+    cased: bool = False  #: True for a white outline around the edge
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -65,7 +65,7 @@ class Strokes:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Path:
-    """A line or marks through points."""
+    """A line or marks at points."""
 
     points: Points
     look: Look
@@ -73,18 +73,18 @@ class Path:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Vectors:
-    """Arrows of a vector field, lengths in units of the axes."""
+    """Arrows of a vector field, with lengths in units of the axes."""
 
     feet: Points
     vectors: Points
     colour: str
-    width: float  #: as a part of that of the panel
+    width: float  #: of the shafts, relative to the panel
     cased: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
 class Arrow:
-    """One arrow with a head as matplotlib names it."""
+    """One arrow with a head named as in matplotlib."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -121,10 +121,10 @@ class FieldPanel:
     title: str = ""
     xlabel: str = ""
     ylabel: str = ""
-    unit: float = 1.0  #: length that the axes number as 1
-    numbered: tuple[bool, bool] = (True, True)  #: ticks of x and of y
+    unit: float = 1.0  #: length labelled 1 on the axes
+    numbered: tuple[bool, bool] = (True, True)  #: tick labels of x and y
     axes: Literal["lines", "frame", "none"] = "lines"
-    scale: ColourScale | None = None  #: explained by a bar below the panel
+    scale: ColourScale | None = None  #: shown as a bar below the panel
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -135,12 +135,12 @@ class FieldFigure:
     height: float  #: inches
     width: float = WIDTH
     columns: int = 1
-    heights: Numbers = (1.0,)  #: of the rows, relative
-    scale: ColourScale | None = None  #: of all panels, explained by a bar beside them
+    heights: Numbers = (1.0,)  #: relative heights of the rows
+    scale: ColourScale | None = None  #: of all panels, shown as a bar beside them
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Lower left and upper right corner around bodies, with a margin."""
+    """Return lower left and upper right corner around bodies, with a margin."""
     points = np.vstack(bodies)
     low, high = points.min(axis=0), points.max(axis=0)
     pad = MARGIN * (high - low)

@@ -1,8 +1,8 @@
-"""A figure as data: panels of points, intervals, areas and texts, which renderers draw.
+"""Figures as data: panels of points, intervals, areas and texts.
 
-A `Figure` is made of curves; files and the interactive page show the same one
-(`reports.render.drawing`, `reports.render.plots`). A `FieldFigure` shows bodies to
-scale; only files are made of it, and a page embeds their drawing.
+A `Figure` contains curves; it is drawn to files (`reports.render.drawing`) and by the
+interactive page (`reports.render.plots`). A `FieldFigure` shows bodies to scale; it is
+drawn to files only, and a page embeds the drawing.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ Limits = tuple[float, float]
 Runs = tuple[tuple[str, ...], ...]
 Direction = Literal["x", "y"]
 
-INK = "#20242a"  #: text and axes; a page replaces it by its own text colour
+INK = "#20242a"  #: colour of text and axes; a page replaces it by its text colour
 WIDTH = 6.9  #: of a figure, inches
-#: Between the ends of a logarithmic axis that follows its points: on a shorter one, 19
-#: to 22 iterations would look like growth.
+#: Least ratio of the ends of an automatic logarithmic axis: on a shorter axis, 19 to 22
+#: iterations would look like growth.
 SPAN = 10.0
-MARGIN = 0.05  #: beyond the points, as a part of what they take
+MARGIN = 0.05  #: between points and ends of an axis, relative to the range of points
 
 
 @dataclass(frozen=True, kw_only=True)
 class Look:
-    """How a line and its marks look; widths and sizes in points."""
+    """Look of a line and its marks; widths and sizes in points."""
 
     colour: str
-    marker: str = ""  #: one of "o s ^ D v P X < > x + * _ |", or none
-    dash: Numbers | None = ()  #: dashes and gaps in line widths; None: no line at all
+    marker: str = ""  #: one of "o s ^ D v P X < > x + * _ |", or empty for none
+    dash: Numbers | None = ()  #: dashes and gaps in line widths; None for no line
     width: float = 1.1
     size: float = 4.5  #: of marks
     edge: float = 1.0  #: width of the outline of marks
-    fill: str = ""  #: colour within marks, "none" for hollow ones; empty: `colour`
+    fill: str = ""  #: colour within marks, "none" for hollow ones, empty for `colour`
     opacity: float = 1.0
 
 
@@ -62,27 +62,27 @@ class Series:
     y: Numbers
     look: Look
     intervals: Intervals | None = None
-    step: bool = False  #: the value holds until the next point
-    few: bool = False  #: mark a few points only
+    step: bool = False  #: step function, constant until the next point
+    few: bool = False  #: draw marks at a few points only
     clipped: bool = True  #: at the edge of the panel
-    solver: str = ""  #: whose points these are; empty: nobody's
-    runs: Runs = ()  #: run_ids behind each point, or behind all of them (one entry)
+    solver: str = ""  #: solver of the points; empty for none
+    runs: Runs = ()  #: run_ids behind each point, or one entry for all points
 
     def __post_init__(self) -> None:
         ends = (
             () if self.intervals is None else (self.intervals.low, self.intervals.high)
         )
         if any(len(values) != len(self.x) for values in (self.y, *ends)):
-            raise ValueError("the coordinates of a series differ in number")
+            raise ValueError("the coordinates of a series differ in length")
         if len(self.runs) not in (0, 1, len(self.x)):
             raise ValueError(
-                f"{len(self.x)} points have {len(self.runs)} lists of runs"
+                f"got {len(self.runs)} lists of runs for {len(self.x)} points"
             )
 
 
 @dataclass(frozen=True, kw_only=True)
 class Area:
-    """What lies between two curves over the same x."""
+    """Area between two curves over the same x."""
 
     x: Numbers
     low: Numbers
@@ -101,7 +101,7 @@ class Segments:
     colour: str
     width: float = 0.8
     solver: str = ""
-    runs: Runs = ()  #: as of a series
+    runs: Runs = ()  #: run_ids behind each stroke, or one entry for all
 
 
 Mark = Series | Area | Segments
@@ -109,7 +109,7 @@ Mark = Series | Area | Segments
 
 @dataclass(frozen=True, kw_only=True)
 class Rule:
-    """A line across the panel where one coordinate has a value."""
+    """A line across the panel at one value of a coordinate."""
 
     axis: Direction
     at: float
@@ -120,12 +120,12 @@ class Rule:
 class Text:
     """A remark within a panel."""
 
-    text: str  #: formulas as matplotlib reads them: $n^2$
+    text: str  #: with mathtext formulas of matplotlib: $n^2$
     place: tuple[float, float]
     inside: tuple[bool, bool] = (
         False,
         False,
-    )  #: whether `place` is a part of the panel
+    )  #: True if `place` is relative to the panel, for x and y
     offset: tuple[float, float] = (0.0, 0.0)  #: points
     align: tuple[str, str] = ("left", "center")  #: as matplotlib names it
     size: float = 8.5
@@ -137,29 +137,29 @@ class Axis:
 
     label: str = ""
     log: bool = False
-    low: float | None = None  #: ends; None: a little beyond what is shown
+    low: float | None = None  #: ends; None for slightly beyond the points
     high: float | None = None
-    ticks: tuple[tuple[float, str], ...] | None = None  #: with names; None: numbers
-    most: int | None = None  #: numbers along it, about
-    integers: bool = False  #: numbers are whole
-    plain: bool = False  #: numbers without powers of ten
-    span: float = SPAN  #: least factor between the ends of a logarithmic axis
-    numbered: bool = True  #: whether ticks have their names
-    marked: bool = True  #: whether ticks have their strokes
+    ticks: tuple[tuple[float, str], ...] | None = None  #: with labels; None: automatic
+    most: int | None = None  #: approximate number of automatic ticks
+    integers: bool = False  #: ticks are integers
+    plain: bool = False  #: tick labels without powers of ten
+    span: float = SPAN  #: least ratio of the ends of a logarithmic axis
+    numbered: bool = True  #: ticks have labels
+    marked: bool = True  #: ticks have strokes
     line: bool = True
-    shared: str = ""  #: axes of the same name have the same ends
+    shared: str = ""  #: axes with the same name have the same ends
 
     @property
     def bare(self) -> bool:
-        """Whether it has no ticks at all."""
+        """True if the axis has no ticks."""
         return self.ticks == ()
 
 
 def categories(names: Sequence[str], **how: Any) -> Axis:
-    """Make an axis of names from top to bottom: the k-th is at −k."""
+    """Return an axis of names from top to bottom, the k-th at −k."""
     ticks = tuple((-float(k), name) for k, name in enumerate(names))
-    given = {"low": 0.4 - max(len(names), 1), "high": 0.6, "ticks": ticks}
-    return Axis(**{**given, "marked": False, **how})
+    defaults = {"low": 0.4 - max(len(names), 1), "high": 0.6, "ticks": ticks}
+    return Axis(**{**defaults, "marked": False, **how})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -168,23 +168,25 @@ class Key:
 
     label: str
     look: Look
-    solver: str = ""  #: that it stands for; a page hides and shows it by its key
+    solver: str = ""  #: solver that the entry shows and hides on a page
 
 
 @dataclass(frozen=True, kw_only=True)
 class Legend:
-    """The keys of a panel, of a row or of all of the figure."""
+    """Legend of a panel, of a row or of the whole figure."""
 
     keys: tuple[Key, ...]
     title: str = ""
     columns: int = 1
-    place: Literal["below", "right", "upper left"] = "below"  #: the last within a panel
+    place: Literal["below", "right", "upper left"] = (
+        "below"  #: the last is within a panel
+    )
     size: float = 9.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ColourBar:
-    """What colours of lines mean: the steps 1, 2, 3 and so on."""
+    """Legend of lines coloured by step: 1, 2, 3 and so on."""
 
     label: str
     colours: tuple[str, ...]
@@ -192,7 +194,7 @@ class ColourBar:
 
 @dataclass(frozen=True, kw_only=True)
 class Panel:
-    """Axes, and what is drawn in them, back to front; rules lie behind."""
+    """Axes with their contents, drawn back to front; rules are behind the marks."""
 
     x: Axis
     y: Axis
@@ -203,7 +205,7 @@ class Panel:
     legend: Legend | None = None
     bar: ColourBar | None = None
     grid: Literal["both", "x", "y", "none"] = "both"
-    span: int = 1  #: columns that it takes
+    span: int = 1  #: number of columns
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,13 +219,13 @@ class Row:
 
 @dataclass(frozen=True, kw_only=True)
 class Figure:
-    """A figure of curves: all that is needed to draw it, and where it comes from."""
+    """A figure of curves, with the measurements behind its points."""
 
     rows: tuple[Row, ...]
     height: float  #: inches
     width: float = WIDTH
     legend: Legend | None = None
-    title: str = ""  #: form, tolerance and cases, where no panel names them
+    title: str = ""  #: form, tolerance and cases, if no panel names them
 
     @property
     def panels(self) -> tuple[Panel, ...]:
@@ -232,23 +234,23 @@ class Figure:
 
     @property
     def columns(self) -> int:
-        """Columns of the grid that the panels lie in."""
+        """Number of columns of the grid of panels."""
         return max(sum(panel.span for panel in row.panels) for row in self.rows)
 
 
 def numbers(values: ArrayLike) -> Numbers:
-    """Make plain numbers of an array or a sequence."""
+    """Convert an array or a sequence to a tuple of floats."""
     return tuple(np.asarray(values, dtype=float).tolist())
 
 
 def in_rows(panels: Sequence[Panel], columns: int) -> tuple[Row, ...]:
-    """Put panels into rows of equal height."""
+    """Arrange panels in rows of equal height."""
     starts = range(0, len(panels), columns)
     return tuple(Row(panels=tuple(panels[i : i + columns])) for i in starts)
 
 
 def fitted(figure: Figure) -> Figure:
-    """Give both ends to every axis, so that all that is drawn is within."""
+    """Determine both ends of every axis, so that they contain all marks."""
     rows = tuple(
         replace(row, panels=tuple(_fitted(p, figure.panels) for p in row.panels))
         for row in figure.rows
@@ -268,9 +270,9 @@ def _fitted(panel: Panel, panels: Iterable[Panel]) -> Panel:
 
 
 def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
-    """Find the ends of an axis that panels share: as given, or beyond the points.
+    """Return the ends of an axis shared by panels: those set, or beyond the points.
 
-    Where there is one value only, it is in the middle; without any, there are some.
+    A single value is centred; without values a default range is used.
     """
     axis: Axis = getattr(panels[0], direction)
     shown = [v for panel in panels for v in _values(panel, direction) if isfinite(v)]
@@ -294,7 +296,7 @@ def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
 
 
 def _values(panel: Panel, direction: Direction) -> Iterator[float]:
-    """All coordinates in one direction."""
+    """Yield all coordinates of a panel in one direction."""
     across = direction == "x"
     for mark in panel.marks:
         match mark:

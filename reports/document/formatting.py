@@ -1,4 +1,4 @@
-"""Numbers and names as the report prints them: plain text, escaped by the renderers."""
+"""Formats of numbers and names in reports: plain text, escaped by the renderers."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.files.csvfile import inert
 from mortarbench.reports.statistics.intervals import Interval, PowerLaw
 
-ABSENT = "–"  #: what was not or cannot be measured
+ABSENT = "–"  #: a value that was not or cannot be measured
 
-#: What a time is, wherever times are shown.
+#: definition of a time, stated wherever times are shown
 TIMED = (
-    "Times are those of the solver, from the QP that it is handed: assembling, "
-    "linearising and, for dual forms, dualising come before and are not in them."
+    "Times are solver times, from the assembled QP on: assembly, linearisation and, "
+    "for dual forms, dualisation are not included."
 )
 
-#: Symbol and words of every verdict: colour alone says nothing to many readers.
+#: Symbol and words of every verdict, since many readers cannot see its colour.
 VERDICTS = {
     Verdict.VERIFIED: ("✓", "verified"),
     Verdict.VERIFIED_INFEASIBLE: ("✓", "verified infeasible"),
@@ -35,14 +35,14 @@ VERDICTS = {
     Verdict.DECLINED: ("○", "declined"),
 }
 
-#: What a solver did that was not verified, after its name.
+#: Predicates for solvers without a verified answer.
 ENDINGS = {
-    Verdict.INACCURATE: "claimed solved but inaccurate",
-    Verdict.WRONG: "claimed solved but wrong",
-    Verdict.INFEASIBLE_CLAIM: "claimed infeasible",
-    Verdict.ITERATION_LIMIT: "ended at the iteration limit",
-    Verdict.TIME_LIMIT: "ended at the time limit",
-    Verdict.MEMORY_LIMIT: "ended at the memory limit",
+    Verdict.INACCURATE: "claimed success but was inaccurate",
+    Verdict.WRONG: "claimed success but was wrong",
+    Verdict.INFEASIBLE_CLAIM: "claimed infeasibility",
+    Verdict.ITERATION_LIMIT: "reached the iteration limit",
+    Verdict.TIME_LIMIT: "reached the time limit",
+    Verdict.MEMORY_LIMIT: "reached the memory limit",
     Verdict.CRASHED: "crashed",
     Verdict.FAILED: "failed",
 }
@@ -57,11 +57,11 @@ _UNITS = ((1.0, "s"), (1e-3, "ms"), (1e-6, "µs"))
 
 @lru_cache(1 << 16)
 def clean(text: str, limit: int = 96) -> str:
-    """Make foreign text fit for a table: one line, no control characters, not longer.
+    """Sanitise foreign text for a table: one line of at most `limit` characters.
 
-    The middle is left out of what is too long, since names differ at their ends. A
-    letter keeps two accents; one that has no letter to stand on gets a circle. What a
-    spreadsheet would take for a formula, pasted there, gets an apostrophe.
+    Control characters are replaced. Long texts lose their middle, since names differ
+    at their ends. A letter keeps at most two accents; an accent without a letter gets
+    a circle. Text that a spreadsheet would read as a formula gets an apostrophe.
     """
     line = inert(" ".join(text.split()))
     if not line.isascii() or not line.isprintable():
@@ -79,24 +79,24 @@ def clean(text: str, limit: int = 96) -> str:
 
 
 def plain_value(value: object, limit: int = 96) -> str:
-    """Print a value of plain data: a number as it is, anything else as `clean` does."""
+    """Print a value of plain data: a number as it is, other values through `clean`."""
     return str(value) if isinstance(value, int | float) else clean(str(value), limit)
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print `digits` significant digits, no more; no exponent if that is short."""
+    """Print with `digits` significant digits, without an exponent if that is short."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:
         return "0"
     exponent = math.floor(math.log10(abs(value)))
-    if -3 <= exponent < digits:  # beyond, zeros would pose as digits
+    if -3 <= exponent < digits:  # trailing zeros would look significant
         return f"{value:.{max(digits - 1 - exponent, 0)}f}"
     return _short(f"{value:.{digits - 1}e}")
 
 
 def power(value: float | None) -> str:
-    """Print an order of magnitude with two digits: 3.2e-9, 1.4, 0.25."""
+    """Print with two significant digits: 3.2e-9, 1.4, 0.25."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if 0.095 <= abs(value) < 9.95:
@@ -105,13 +105,13 @@ def power(value: float | None) -> str:
 
 
 def _short(text: str) -> str:
-    """Write an exponent as one does: 1e-08 becomes 1e-8."""
+    """Remove leading zeros of an exponent: 1e-08 becomes 1e-8."""
     mantissa, _, exponent = text.partition("e")
     return f"{mantissa}e{int(exponent)}"
 
 
 def tolerance(value: float) -> str:
-    """Print a tolerance as one writes it: 1e-8."""
+    """Print a tolerance in short form: 1e-8."""
     mantissa, _, exponent = f"{value:.6e}".partition("e")
     return _short(f"{float(mantissa):g}e{exponent}")
 
@@ -119,9 +119,8 @@ def tolerance(value: float) -> str:
 def seconds(interval: Interval | None) -> str:
     """Print a time with its uncertainty: "12.3 ms [11.9, 14.0]".
 
-    Both ends are printed to the digit of the median, which has as many digits as tell
-    the ends apart, and at least three. A single run has no uncertainty that one could
-    know, and the text says so.
+    Both ends have the decimals of the median, which are enough to distinguish the ends
+    and to show three digits. A single run has no interval; the text says "1 run".
     """
     if interval is None:
         return ABSENT
@@ -129,21 +128,21 @@ def seconds(interval: Interval | None) -> str:
     scaled = interval.value / unit
     exponent = math.floor(math.log10(scaled)) if scaled > 0 else 0
     low, high = interval.low / unit, interval.high / unit
-    decimals = _telling(low, high, max(2 - exponent, 0))
+    decimals = _distinguishing_decimals(low, high, max(2 - exponent, 0))
     ends = f"{low:.{decimals}f}, {high:.{decimals}f}"
     shown = ends if interval.samples > 1 else "1 run"
     return f"{scaled:.{decimals}f} {name} [{shown}]"
 
 
-def _telling(low: float, high: float, decimals: int) -> int:
-    """Find how many decimals tell two numbers apart; as given where none do."""
+def _distinguishing_decimals(low: float, high: float, decimals: int) -> int:
+    """Return the fewest decimals, from `decimals` on, that distinguish two numbers."""
     further = range(decimals, decimals + 7)
     return next((d for d in further if f"{low:.{d}f}" != f"{high:.{d}f}"), decimals)
 
 
 def exponent(fit: PowerLaw) -> str:
     """Print the exponent of a power law with its 95 % interval."""
-    d = _telling(fit.low, fit.high, 2)
+    d = _distinguishing_decimals(fit.low, fit.high, 2)
     p, low, high = (round(v, d) + 0.0 for v in (fit.exponent, fit.low, fit.high))
     return f"{p:.{d}f} [{low:.{d}f}, {high:.{d}f}]"
 
@@ -154,12 +153,12 @@ def bracketed(value: float, low: float, high: float) -> str:
 
 
 def estimate(of: Sequence[float]) -> str:
-    """Print a value and its interval, the first three of what describes an estimate."""
+    """Print an estimate and its interval, its first three items."""
     return bracketed(*of[:3])
 
 
 def fixed(of: Sequence[float], digits: int = 3) -> str:
-    """Print a value and its interval with so many decimals each."""
+    """Print a value and its interval with `digits` decimals each."""
     value, low, high = (f"{v + 0.0:.{digits}f}" for v in of[:3])
     return f"{value} [{low}, {high}]"
 

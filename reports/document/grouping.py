@@ -1,4 +1,4 @@
-"""Group what a page lists."""
+"""Grouping of items by name."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Name = TypeVar("Name")
 def grouped(
     items: Iterable[Item], name: Callable[[Item], Name]
 ) -> dict[Name, list[Item]]:
-    """Collect items of one name; names and items keep their order."""
+    """Group items by name; names and items keep their order."""
     groups: dict[Name, list[Item]] = {}
     for item in items:
         groups.setdefault(name(item), []).append(item)

@@ -1,4 +1,4 @@
-"""The report as data: sections of prose, tables and figures; renderers do the rest."""
+"""Pages as data: sections of prose, tables and figures, which renderers format."""
 
 from __future__ import annotations
 
@@ -19,91 +19,91 @@ from mortarbench.reports.document.formatting import (
 )
 from mortarbench.reports.statistics.intervals import Interval
 
-_RUN = "run "  #: before the run_ids in a title
+_RUN = "run "  #: prefix of the run_ids in a title
 
 
 @dataclass(frozen=True, kw_only=True)
 class Cell:
-    """One entry of a table: plain text and what it means, never markup."""
+    """One entry of a table: plain text with its meaning, without markup."""
 
     text: str = ABSENT
-    symbol: str = ""  #: before the text, where the medium has it
+    symbol: str = ""  #: before the text, if the format supports it
     after: str = ""  #: small print behind the text
-    kind: str = ""  #: a verdict, "best", "tied", "void" (not to be compared) or "total"
-    title: str = ""  #: shown when pointed at; run_ids as `source` names them are links
-    value: float | None = None  #: what to sort by; the text, if None
+    kind: str = ""  #: a verdict, "best", "tied", "void" (not comparable) or "total"
+    title: str = ""  #: shown on hovering; run_ids in the form of `source` become links
+    value: float | None = None  #: sort key; None to sort by text
 
     @classmethod
     def name(cls, name: str) -> Cell:
-        """Show a name that may be long; all of it appears when pointed at."""
+        """Return a cell of a possibly long name, shown in full on hovering."""
         shown = clean(name)
         return cls(text=shown, title="" if shown == name else clean(name, 2000))
 
     @classmethod
     def label(cls, text: str, limit: int = 40, title: str = "") -> Cell:
-        """Show foreign text in one line of at most `limit` characters."""
+        """Return a cell of foreign text in one line of at most `limit` characters."""
         return cls(text=clean(text, limit), title=title)
 
     @classmethod
     def words(cls, text: str, title: str = "") -> Cell:
-        """Show words in a column of words."""
+        """Return a cell of words, which is aligned to the left."""
         return cls(text=text, kind="words", title=title)
 
     @classmethod
     def number(cls, value: Any, show: Callable[[Any], str] = str, **more: Any) -> Cell:
-        """Show a number, or an interval by its value; "–" for None.
+        """Return a cell of a number or of an estimate with its value; "–" for None.
 
-        show : formats it, as the functions of `reports.document.formatting` do
+        show : formatter, such as those of `reports.document.formatting`
         """
         text = ABSENT if value is None else show(value)
         return cls(text=text, value=getattr(value, "value", value), **more)
 
     @classmethod
     def time(cls, interval: Interval | None, **more: str) -> Cell:
-        """Show a time with its uncertainty."""
+        """Return a cell of a time with its interval."""
         return cls.number(interval, seconds, **more)
 
     @classmethod
     def ratio(cls, ratio: Any, **more: str) -> Cell:
-        """Show an estimate with its interval."""
+        """Return a cell of an estimate with its interval."""
         return cls.number(ratio, estimate, **more)
 
     @classmethod
     def power(cls, value: float | None, **more: str) -> Cell:
-        """Show an order of magnitude."""
+        """Return a cell of a number with two significant digits."""
         return cls.number(value, power, **more)
 
     @classmethod
     def tolerance(cls, tol: float) -> Cell:
-        """Show a tolerance."""
+        """Return a cell of a tolerance."""
         return cls.number(tol, tolerance)
 
 
-Column = tuple[str, Callable[[Any], Cell]]  #: its head, and the cell of an item
+Column = tuple[str, Callable[[Any], Cell]]  #: heading, and the cell of an item
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """A table in the booktabs manner."""
+    """A table with caption, headings, rows and notes."""
 
     caption: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Cell, ...], ...]
-    text_columns: int = 1  #: how many columns from the left hold names, not numbers
-    notes: tuple[str, ...] = ()  #: what must be known to read it; after the caption
-    solver: str = ""  #: the only one that it is about: a reader may hide both
+    text_columns: int = 1  #: number of leading columns with names instead of numbers
+    notes: tuple[str, ...] = ()  #: explanations, printed after the caption
+    solver: str = ""  #: for tables on one solver, which are hidden with it
 
     @classmethod
     def of(
         cls, caption: str, items: Iterable[Any], columns: Iterable[Column], **more: Any
     ) -> Table:
-        """Make a row of every item."""
+        """Return a table with one row per item."""
         heads, cells = zip(*columns, strict=True)
         rows = tuple(tuple(cell(item) for cell in cells) for item in items)
         return cls(caption=caption, columns=heads, rows=rows, **more)
 
     def wordy(self, column: int) -> bool:
-        """Whether a column holds words, which begin at the left, not numbers."""
+        """Return whether a column contains words, which are aligned to the left."""
         first = self.rows[0][column].kind if self.rows else ""
         return column < self.text_columns or first == "words"
 
@@ -115,9 +115,9 @@ class Table:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Picture:
-    """A figure, its file name without ending, and its caption.
+    """A figure with its caption and the stem of its files.
 
-    The page draws curves so that one can zoom; bodies it shows as the file does.
+    The page draws figures of curves itself, with zoom; figures of bodies are embedded.
     """
 
     name: str
@@ -127,21 +127,21 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Statement:
-    """What is said of one subject before all evidence, in whole sentences."""
+    """Conclusions on one subject in whole sentences, which precede the evidence."""
 
     subject: str
     claims: tuple[str, ...]
-    remarks: tuple[str, ...] = ()  #: what must be known besides
-    evidence: tuple[str, ...] = ()  #: names of the sections that the claims rest on
+    remarks: tuple[str, ...] = ()  #: qualifications
+    evidence: tuple[str, ...] = ()  #: names of the sections that support the claims
 
     @property
     def lines(self) -> list[str]:
-        """Subject and sentences as plain text, a line each."""
+        """All sentences as plain text, one per line, with the subject."""
         return [f"{self.subject}: {text}" for text in (*self.claims, *self.remarks)]
 
 
 class Point(str):
-    """An entry of a list, where other strings are paragraphs."""
+    """An entry of a list; other strings are paragraphs."""
 
     __slots__ = ()
 
@@ -163,7 +163,7 @@ class Section:
 
     @classmethod
     def of(cls, name: str, title: str, parts: Iterable[Part]) -> Section | None:
-        """Sort parts by their type; None where there are no parts."""
+        """Build a section from parts of any type; None without parts."""
         kinds: dict[type, list[Any]] = {}
         for part in parts:
             kinds.setdefault(type(part), []).append(part)
@@ -181,34 +181,34 @@ class Section:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Page:
-    """The whole report, what a reader came for first."""
+    """A whole page."""
 
     title: str
     dateline: str
     sections: tuple[Section, ...]
-    footer: str = ""  #: where the numbers are, if not in a result folder
-    records: tuple[Record, ...] = ()  #: the measurements that its numbers come from
-    solvers: tuple[str, ...] = ()  #: of these, in the order of their looks in figures
+    footer: str = ""  #: location of the numbers; empty for a result folder
+    records: tuple[Record, ...] = ()  #: measurements behind the numbers
+    solvers: tuple[str, ...] = ()  #: labels, in the order of their looks in figures
 
     def sections_of(self, statement: Statement) -> list[Section]:
-        """List the sections that a statement rests on, as far as the page has them."""
+        """Return the sections of the page that support a statement."""
         return [s for s in self.sections if s.name in statement.evidence]
 
 
 def sources(records: Iterable[Record]) -> str:
-    """Name measurements one by one; empty if there are none."""
+    """Return a title that names measurements; empty without any."""
     names = ", ".join(short(r.run_id) for r in records)
     return _RUN + names if names else ""
 
 
 def named(title: str) -> list[str]:
-    """List the run_ids, as `short` prints them, that `source` put into a title."""
+    """Return the run_ids in a title, shortened by `short`; inverse of `sources`."""
     before, run, names = title.rpartition(_RUN)
     at_end = run and (not before or before.endswith(" "))
     return names.split(", ") if at_end else []
 
 
 def short(run_id: str) -> str:
-    """Print a run_id; ours are short, those of a foreign journal may not be."""
+    """Print a run_id, sanitised if it does not have the form of ours."""
     is_ours = len(run_id) <= 40 and run_id.isascii() and run_id.isalnum()
     return run_id if is_ours else clean(run_id, 40)

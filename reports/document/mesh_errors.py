@@ -1,4 +1,4 @@
-"""What finer meshes told of the error of each mesh."""
+"""Table of discretisation errors, estimated on finer meshes."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from mortarbench.reports.document.formatting import ABSENT, clean, power
 from mortarbench.reports.document.layout import Cell, Table
 
 
-def mesh_table(found: Sequence[Discretisation]) -> Table:
-    """List the error of every mesh, or why it is not known."""
+def mesh_table(meshes: Sequence[Discretisation]) -> Table:
+    """Tabulate the error of every mesh, or the reason why it is unknown."""
 
     def unknowns(d: Discretisation, level: int) -> Cell:
         known = len(d.levels) > level
@@ -23,16 +23,16 @@ def mesh_table(found: Sequence[Discretisation]) -> Table:
     def note(d: Discretisation) -> Cell:
         text = {
             "limit": "; ".join(
-                filter(None, ["against the limit of fine meshes", d.note])
+                filter(None, ["relative to the limit of fine meshes", d.note])
             ),
-            "change": f"to the next mesh only: {d.note}",
-            "rounding": "the mesh holds the solution; what rounding hides",
+            "change": f"change to the next mesh only: {d.note}",
+            "rounding": "the mesh represents the solution exactly, up to rounding",
         }.get(d.kind, d.note)
         return Cell.words(clean(text, 200))
 
     return Table.of(
-        "Errors of the meshes: relative, in the energy norm.",
-        found,
+        "Discretisation errors: relative, in the energy norm.",
+        meshes,
         (
             ("physical case", lambda d: Cell.name(d.case)),
             ("unknowns", lambda d: unknowns(d, 0)),
@@ -42,8 +42,8 @@ def mesh_table(found: Sequence[Discretisation]) -> Table:
             ("note", note),
         ),
         notes=(
-            "From the solutions on meshes with every cell halved once and twice; the "
-            "reference solve found them, no solver under test. Rate: of the error, "
-            "like h to that power.",
+            "Estimated from reference solutions on meshes with every cell halved once "
+            "and twice; no solver under test is involved. Rate: exponent of h in the "
+            "error.",
         ),
     )

@@ -1,9 +1,9 @@
-"""Sentences of pages, from the Jinja template beside the module that needs them.
+"""Sentences of pages, from the Jinja template beside each module.
 
-A template NAME.j2 belongs to the module NAME.py. It holds macros: each writes a
-sentence, a caption or several paragraphs, and takes numbers and names as they are: the
-formats of `reports.document.formatting` are filters. Text is plain; renderers escape
-it.
+The template NAME.j2 belongs to the module NAME.py. Each of its macros writes a
+sentence, a caption or several paragraphs of plain text, which renderers escape. Macros
+take unformatted numbers and names; the formats of `reports.document.formatting` are
+filters.
 """
 
 from __future__ import annotations
@@ -29,19 +29,21 @@ _SPACE = re.compile(r"[ \n]+")
 
 @cache
 def environment() -> Environment:
-    """Return the settings of all templates, with formats as filters."""
-    made = Environment(undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    made.filters |= {name: getattr(formatting, name) for name in _FORMATS}
-    made.filters["format"] = format
-    made.globals |= {"COVERAGE": f"{COVERAGE:.0%}", "TIMED": formatting.TIMED}
-    return made
+    """Return the common environment of all templates, with formats as filters."""
+    common = Environment(
+        undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    common.filters |= {name: getattr(formatting, name) for name in _FORMATS}
+    common.filters["format"] = format
+    common.globals |= {"COVERAGE": f"{COVERAGE:.0%}", "TIMED": formatting.TIMED}
+    return common
 
 
 class Sentences:
     """The macros of a template.
 
-    module : full name of the module that the template lies beside
-    names : what all macros know besides their arguments
+    module : full name of the module beside the template
+    names : further names that all macros may use
     """
 
     def __init__(self, module: str, **names: Any) -> None:
@@ -55,12 +57,12 @@ class Sentences:
         return environment().from_string(text, self._names).module
 
     def __call__(self, macro: str, *args: Any, **values: Any) -> str:
-        """Return what a macro writes, in one line."""
+        """Return the text of a macro in one line."""
         write: Callable[..., str] = getattr(self._macros, macro)
         return _SPACE.sub(" ", write(*args, **values)).strip()
 
     def parts(self, macro: str, *args: Any, **values: Any) -> list[str]:
-        """Return the paragraphs of a macro; those that begin with a dash are points."""
+        """Return the paragraphs of a macro; those with a leading dash are points."""
         write: Callable[..., str] = getattr(self._macros, macro)
         texts = re.split(r"\n\s*\n", write(*args, **values).strip())
         lines = [_SPACE.sub(" ", text).strip() for text in texts if text]

@@ -36,15 +36,15 @@ _COUNTS = ("iterations", "iterations_min", "iterations_max", "n", "m")
 def csv_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Make every table by the name of its file; empty ones are left out.
+    """Return every nonempty table by the name of its file.
 
-    measurements: one row per journal line. outcomes: the repeats of one solver on one
-    case together, every time a median with its interval. energies, scaling: as in the
+    measurements: one row per journal line. outcomes: one row per case, tolerance and
+    solver, with medians of times and their intervals. energies, scaling: as in the
     report. contests, means: see `comparison_tables`.
 
     pool_forms : compare the cases of all forms together
     """
-    found = {
+    tables = {
         "measurements": _measurements(evidence.records),
         "outcomes": pd.DataFrame(map(_outcome, evidence.flat)),
         "energies": pd.DataFrame(
@@ -63,8 +63,8 @@ def csv_tables(
             for solver in series.solvers
         ),
     }
-    found |= comparison_tables(evidence, pool_forms=pool_forms)
-    return {name: _counted(frame) for name, frame in found.items() if len(frame)}
+    tables |= comparison_tables(evidence, pool_forms=pool_forms)
+    return {name: _counted(frame) for name, frame in tables.items() if len(frame)}
 
 
 def frame_csv(frame: pd.DataFrame) -> str:
@@ -74,13 +74,13 @@ def frame_csv(frame: pd.DataFrame) -> str:
 
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:
-    """Keep counts integers where some are missing."""
+    """Convert counts with missing values to nullable integers."""
     counts = [name for name in _COUNTS if name in frame]
     return frame.astype(dict.fromkeys(counts, "Int64"))
 
 
 def _measurements(records: Sequence[Record]) -> pd.DataFrame:
-    """Tabulate the fields of records, a column each; nested ones are JSON text."""
+    """Tabulate the fields of records, one column each; nested values are JSON text."""
     columns = {
         name: [getattr(r, f.name) for r in records] for name, f in JOURNAL.items()
     }
@@ -139,23 +139,23 @@ def _law(series: SizeSeries, solver: str) -> dict[str, Any]:
 def comparison_tables(
     evidence: Evidence, *, pool_forms: bool = False
 ) -> dict[str, pd.DataFrame]:
-    """Make the tables of all groups of cases.
+    """Return the tables of all groups of cases.
 
     contests: a row per case and solver with its time and its ratio to the best, both
-    infinite for a failure; profiles are their distributions. means: a row per solver
-    and convention, with intervals and tiers where they are made, at the usual one.
+    infinite for a failure; profiles are the distributions of these ratios. means: a row
+    per solver and convention; the usual convention has intervals and tiers.
     """
-    found = comparison_groups(evidence, pool_forms=pool_forms)
+    groups = comparison_groups(evidence, pool_forms=pool_forms)
     return {
-        "contests": pd.concat([pd.DataFrame(), *map(_cells, found)]),
+        "contests": pd.concat([pd.DataFrame(), *map(_cells, groups)]),
         "means": pd.DataFrame(
-            [row for each in map(ranking_of, found) for row in _means(each)]
+            [row for each in map(ranking_of, groups) for row in _means(each)]
         ),
     }
 
 
 def _cells(group: ComparisonGroup) -> pd.DataFrame:
-    """One row per case and solver."""
+    """Return one row per case and solver."""
     cases, solvers = len(group.cases), len(group.solvers)
     return pd.DataFrame(
         {
@@ -171,7 +171,7 @@ def _cells(group: ComparisonGroup) -> pd.DataFrame:
 
 
 def _means(ranking: Ranking) -> list[dict[str, Any]]:
-    """One row per convention and solver."""
+    """Return one row per convention and solver."""
     group = ranking.group
     usual: dict[str, Any] = dict(zip(("low", "high"), ranking.intervals, strict=True))
     names = ("ratio", "ratio_low", "ratio_high")
@@ -192,5 +192,5 @@ def _means(ranking: Ranking) -> list[dict[str, Any]]:
 
 
 def _spelt(names: Sequence[str]) -> list[str]:
-    """Spell out lone surrogates, which no column of text can hold."""
+    """Escape lone surrogates, which text columns cannot contain."""
     return [name.encode(errors="backslashreplace").decode() for name in names]

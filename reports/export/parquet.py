@@ -1,4 +1,4 @@
-"""The journal as a table with typed columns, for pandas, R, DuckDB and the like."""
+"""The journal as a Parquet table with typed columns, for pandas, R, DuckDB etc."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _TYPES = {"int": pa.int64(), "float": pa.float64()}  #: anything else is text
 
 
 def write_records(path: Path, records: Sequence[Record]) -> Path:
-    """Write one row per journal line, a column per field; equal records, equal bytes.
+    """Write one row per journal line and one column per field.
 
-    The type of a column is that of the field, never guessed from the values, so that
-    the tables of several result folders can be put under one another. What is nested
-    (params, options, counts, quantities, …) differs between families and solvers, and
-    is JSON text.
+    The type of a column is that of the field, not inferred from the values, so that
+    tables of several result folders can be concatenated. Nested values (params,
+    options, counts, quantities, …) are JSON text, since they differ between families
+    and solvers. Equal records give equal bytes.
     """
     table = pa.table({
         name: _column([getattr(r, f.name) for r in records], str(f.type))
@@ -37,7 +37,7 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
 
 
 def _column(values: Sequence[Any], annotation: str) -> Any:
-    """Store as in the journal: what is not finite is null, what is nested is text."""
+    """Return a column as in the journal: null if not finite, JSON text if nested."""
     kind = _TYPES.get(annotation.removesuffix(" | None"), pa.string())
     if kind is _TYPES["float"]:
         array = pa.array(values, kind)
@@ -46,16 +46,16 @@ def _column(values: Sequence[Any], annotation: str) -> Any:
 
 
 def texts(values: Iterable[Any]) -> list[str | None]:
-    """Write every value as text, what is nested as JSON; equal objects once."""
-    known: dict[int, str] = {}  # by identity: a journal's records share their tables
+    """Convert values to text, nested ones to JSON; shared objects only once."""
+    json_of: dict[int, str] = {}  # by identity: records of a journal share objects
 
     def text(value: Any) -> str | None:
         if value is None or type(value) is str:
             return value
         if not isinstance(value, Mapping | list):
-            return str(value)  # a verdict, plainly
-        if id(value) not in known:
-            known[id(value)] = json.dumps(finite(value), ensure_ascii=False)
-        return known[id(value)]
+            return str(value)  # a verdict
+        if id(value) not in json_of:
+            json_of[id(value)] = json.dumps(finite(value), ensure_ascii=False)
+        return json_of[id(value)]
 
     return list(map(text, values))

@@ -1,6 +1,6 @@
 """Deformed states for ParaView: one .vtu file, or a .pvd series of them.
 
-Beside every .vtu there is a CSV along each contact of the state.
+Every .vtu is accompanied by a CSV along each contact of the state.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from mortarbench.harness.files.csvfile import csv_text
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.plugin import SLIDING
 
-#: a node is in contact where its force exceeds this · the largest; of pairs with
-#: friction, where it sticks or slips
+#: a node is in contact if its force exceeds this times the largest force or, with
+#: friction, if it sticks or slips
 IN_CONTACT = 1e-6
-STATES = ("open", "stick", "slip", SLIDING)  #: of friction, as VTU files number them
-#: of several sides at a node, the last of these states is written
+STATES = ("open", "stick", "slip", SLIDING)  #: of friction, numbered in VTU files
+#: by increasing priority, for nodes on several contact sides
 _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
 
@@ -34,8 +34,8 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
     Point data: displacement (m), contact_force (N/m in the plane, N in space; on slave
     nodes, else 0), in_contact (0 or 1), pressure (Pa, on slave nodes, else 0), gap (m,
     on slave nodes that face a master, else NaN, which ParaView leaves out) and the
-    nodal fields; cell data: body, and subdomain of torn bodies. Triangles come before
-    quadrilaterals. *Warp By Vector* in ParaView takes vectors of three components only.
+    nodal fields; cell data: body, and subdomain of decomposed bodies. Triangles come
+    before quadrilaterals. *Warp By Vector* in ParaView needs three components.
 
     Returns the files written: the .vtu, and a CSV for each contact.
 
@@ -80,7 +80,7 @@ def write_vtu(fields: Fields, path: Path) -> list[Path]:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Name the file in the message of a write that fails."""
+    """Raise InputError with the name of the file if writing fails."""
     try:
         yield
     except OSError as e:
@@ -88,9 +88,9 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
-    """Put pressures and gaps at the nodes (N,); of several, the tightest.
+    """Return pressure and gap at the nodes (N,); of several sides, the tightest.
 
-    With friction the shear, too, and the place of a node's state in `STATES`.
+    With friction also the shear traction and the index of each state in `STATES`.
     """
     if not sides:
         return {}
@@ -104,16 +104,16 @@ def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
             shear[side.nodes] += side.shear
             states = map(str, np.asarray(side.friction))
             np.maximum.at(weight, side.nodes, [_BY_WEIGHT.index(s) for s in states])
-    found = {"pressure": pressure, "gap": gap}
+    nodal = {"pressure": pressure, "gap": gap}
     if any(side.friction is not None for side in sides):
         state = np.array([float(STATES.index(name)) for name in _BY_WEIGHT])[weight]
-        found |= {"shear": shear, "friction": state}
-    return found
+        nodal |= {"shear": shear, "friction": state}
+    return nodal
 
 
 def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
-    """Write one contact as a table, a row per node along the slave side."""
-    # fit for a file: letters, digits and dashes
+    """Write a CSV of one contact, with a row per node along the slave side."""
+    # names of pairs come from users: keep letters, digits and dashes
     name = "-".join(re.findall(r"\w+", side.name)) or "contact"
     path = vtu.with_name(f"{vtu.stem}-{name}.csv")
     points = fields.points[side.nodes]
@@ -131,22 +131,22 @@ def _write_side(fields: Fields, side: ContactSide, vtu: Path) -> Path:
         "shear_Pa": side.shear,
         "friction": side.friction,
     }
-    known = {head: v.tolist() for head, v in columns.items() if v is not None}
-    rows = zip(*(map(_known, values) for values in known.values()), strict=True)
+    present = {head: v.tolist() for head, v in columns.items() if v is not None}
+    rows = zip(*(map(_without_nan, v) for v in present.values()), strict=True)
     with _named(path), replacing(path) as file:
-        file.write(csv_text([*known], rows).encode())
+        file.write(csv_text([*present], rows).encode())
     return path
 
 
-def _known(value: float | str) -> float | str | None:
-    """Replace a NaN, where there is no such number, by None."""
+def _without_nan(value: float | str) -> float | str | None:
+    """Replace NaN by None."""
     return None if value != value else value
 
 
 def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Path]:
-    """Write states and their times as path.pvd and, next to it, the files of each.
+    """Write states with their times as path.pvd, and the files of each beside it.
 
-    Returns the files written, the .pvd first; ParaView opens that one.
+    Returns the files written, the .pvd first, which is the one to open in ParaView.
 
     Raises
     ------
@@ -169,5 +169,5 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
 
 
 def _in_space(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Append components 0 to vectors (N, dim) until there are three."""
+    """Pad vectors (N, dim) with zeros to three components."""
     return np.pad(vectors, ((0, 0), (0, 3 - vectors.shape[1])))

@@ -94,7 +94,7 @@ def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
         marks=tuple(marks),
         rules=(Rule(axis="x", at=1.0, look=_ALIKE),) if _has_reference(f) else (),
         texts=tuple(texts),
-        title=f"{legible(f.kind.title)}, {legible(_cases(f), 44)}",
+        title=f"{legible(f.key.title)}, {legible(_cases(f), 44)}",
         grid="x",
     )
 

@@ -1,1 +1,1 @@
-"""Renderers: a page as HTML, Markdown and LaTeX, and its figures as files."""
+"""Renderers of pages as HTML, Markdown and LaTeX, and of figures as files."""

@@ -86,9 +86,9 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "pdf.fonttype": 42,
 }
-_VAST = 100.0  #: decades of an axis, which only answers out of all bounds need
-_GAP = 0.03  #: between a legend and the curves below it, of the height of the axes
-_FRONT = 2.0  #: height of the first mark; each next one lies a little higher
+_VAST = 100.0  #: decades of an axis, reached only by diverged answers
+_GAP = 0.03  #: between a legend and the curves below it, relative to the axes height
+_FRONT = 2.0  #: zorder of the first mark; each further one is slightly higher
 _PLACES: dict[str, Any] = {
     "below": "outside lower center",
     "right": "outside right upper",
@@ -96,16 +96,18 @@ _PLACES: dict[str, Any] = {
 }
 
 _CASING = 1.6  #: width of the white around arrows and frames, points
-_LETTER_CASING = 3.2  #: the strokes of a letter do not show white between them
+_LETTER_CASING = 3.2  #: the same around letters, wide enough to fill their inside
 
 
 def draw_curves(figure: Figure) -> Canvas:
-    """Draw a figure; it is laid out when it is printed."""
+    """Draw a figure; the layout is computed on printing."""
     whole = fitted(figure)
     heights = [row.height for row in whole.rows]
     with rc_context(STYLE):
         canvas = Canvas(figsize=(whole.width, whole.height))
-        if any(row.legend for row in whole.rows):  # each has a part of its own
+        if any(
+            row.legend for row in whole.rows
+        ):  # a legend of a row needs its own subfigure
             parts = canvas.subfigures(
                 len(heights), 1, height_ratios=heights, squeeze=False
             )[:, 0]
@@ -133,7 +135,7 @@ def draw_curves(figure: Figure) -> Canvas:
 
 
 def _uncover(canvas: Canvas) -> None:
-    """Raise the upper ends of axes until no curve lies behind a legend within them."""
+    """Raise the upper limits of axes until no curve lies behind their legends."""
     canvas.draw_without_rendering()
     for axes in canvas.axes:
         legend = axes.get_legend()
@@ -157,7 +159,7 @@ def _uncover(canvas: Canvas) -> None:
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:
-    """Draw a panel, whose axes have both ends, into axes."""
+    """Draw a panel with known axis limits into axes."""
     axes.set(
         xscale="log" if panel.x.log else "linear",
         yscale="log" if panel.y.log else "linear",
@@ -186,7 +188,7 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
 
 def _axis(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
     """Set label and ticks."""
-    if axis.bare:  # a strip, whose label stands beside it
+    if axis.bare:  # a strip: its label stands at the side
         ticked.set_label_text(axis.label, rotation=0, ha="right", va="center", size=8.5)
     else:
         ticked.set_label_text(axis.label)
@@ -202,13 +204,13 @@ def _axis(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
 
 
 def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
-    """Choose ticks so that their labels leave each other room."""
+    """Choose ticks whose labels do not overlap."""
     assert axis.low is not None
     assert axis.high is not None
     low, high = log10(axis.low), log10(axis.high)
     decades = high - low
     ticked.set_minor_formatter(NullFormatter())
-    if decades > _VAST:  # matplotlib looks for ticks beyond the ends, up to infinity
+    if decades > _VAST:  # matplotlib would search ticks beyond the ends, up to infinity
         exponents = range(ceil(low), ceil(high), ceil(decades / 6))
         ticked.set_major_locator(FixedLocator([10.0**k for k in exponents]))
         ticked.set_minor_locator(NullLocator())
@@ -226,7 +228,7 @@ def _log_ticks(axis: Axis, ticked: TickedAxis, *, across: bool) -> None:
 
 
 def _line(look: Look) -> dict[str, Any]:
-    """Translate the look of a line for matplotlib."""
+    """Convert the look of a line to arguments of matplotlib."""
     style: Any = "none" if look.dash is None else (0, look.dash) if look.dash else "-"
     return {
         "color": look.colour, "linestyle": style, "linewidth": look.width,
@@ -235,7 +237,7 @@ def _line(look: Look) -> dict[str, Any]:
 
 
 def look_of(look: Look) -> dict[str, Any]:
-    """Translate the look of a line and of its marks."""
+    """Convert the look of a line and its marks to arguments of matplotlib."""
     return {
         **_line(look), "marker": look.marker or "none", "markersize": look.size,
         "markerfacecolor": look.fill or look.colour, "markeredgewidth": look.edge,
@@ -278,7 +280,7 @@ def _series(axes: Axes, series: Series, height: float) -> None:
 
 
 def _text(axes: Axes, text: Text) -> None:
-    """Put a remark beside its point; beyond the axes there is none, as on the page."""
+    """Annotate a point; matplotlib omits annotations of points beyond the axes."""
     x, y = ("axes fraction" if part else "data" for part in text.inside)
     axes.annotate(
         text.text, text.place, xycoords=x if x == y else (x, y), xytext=text.offset,
@@ -308,22 +310,22 @@ def _bar(axes: Axes, bar: ColourBar) -> None:
 
 
 def draw_fields(figure: FieldFigure) -> Canvas:
-    """Draw a figure of bodies; it is laid out when it is printed."""
+    """Draw a figure of bodies; the layout is computed on printing."""
     with rc_context(STYLE):
         canvas = Canvas(figsize=(figure.width, figure.height))
         grid = canvas.add_gridspec(
             len(figure.heights), figure.columns, height_ratios=figure.heights
         )
-        made = []
+        drawn = []
         for i, panel in enumerate(figure.panels):
             axes = canvas.add_subplot(grid[divmod(i, figure.columns)])
             _field_panel(axes, panel)
-            made.append(axes)
+            drawn.append(axes)
             if panel.scale:
                 _field_bar(canvas, panel.scale, axes, orientation="horizontal",
                            aspect=30, fraction=0.06, pad=0.02)  # fmt: skip
         if figure.scale:
-            _field_bar(canvas, figure.scale, made, aspect=32, fraction=0.04, pad=0.015)
+            _field_bar(canvas, figure.scale, drawn, aspect=32, fraction=0.04, pad=0.015)
     return canvas
 
 
@@ -396,7 +398,7 @@ def _cased(width: float, cased: bool) -> list[patheffects.AbstractPathEffect]:
 
 
 def _in_units(unit: float) -> Callable[[float, float], str]:
-    """Write numbers of an axis in multiples of `unit`."""
+    """Return a formatter of numbers in multiples of `unit`."""
     return lambda v, _: f"{v / unit:.4g}".replace("-", "−")
 
 

@@ -1,4 +1,4 @@
-"""What the script of the page reads: tables, plots and measurements as compact JSON."""
+"""Data for the script of the page: tables, plots and measurements as compact JSON."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from mortarbench.reports.document.layout import Cell, Page, Table, named, short
 from mortarbench.reports.figures.style import look
 from mortarbench.reports.render.plots import Data, panels
 
-Rows = Mapping[str, int]  #: run_id, as titles have it → position among the records
+Rows = Mapping[str, int]  #: run_id in the short form of titles → index of the record
 
 
 def rows_of(records: Sequence[Record]) -> Rows:
-    """Map every run_id to its place in the order of the report."""
+    """Map every run_id to its index in the order of the report."""
     return {short(r.run_id): i for i, r in enumerate(records)}
 
 
 def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
-    """Serialise what the page needs at once; its measurements' details follow apart."""
+    """Serialise solvers, tables, plots and filter keys; `details` are separate."""
     looks = [(name, look(i)) for i, name in enumerate(page.solvers)]
     return script({
         "solvers": [
@@ -42,7 +42,7 @@ def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
 def details(records: Sequence[Record]) -> str:
     """Serialise every field of every measurement: columns, JSON, gzip, base64.
 
-    A column is a list of values, or, where few differ, these and their positions.
+    A column is a list of values or, where few are distinct, these and their indices.
     """
     lines = [_as_journalled(r) for r in records]
     columns = {name: [getattr(r, f.name) for r in lines] for name, f in JOURNAL.items()}
@@ -51,28 +51,26 @@ def details(records: Sequence[Record]) -> str:
 
 
 def _as_journalled(record: Record) -> Record:
-    """Undo the name that the report gives to a solver that drove a sequence."""
+    """Remove the suffix that the report gives to a solver that drove a sequence."""
     mode = f" ({record.mode})"
-    named_apart = record.mode != "cold" and record.solver.endswith(mode)
+    suffixed = record.mode != "cold" and record.solver.endswith(mode)
     return (
-        record.replace(solver=record.solver.removesuffix(mode))
-        if named_apart
-        else record
+        record.replace(solver=record.solver.removesuffix(mode)) if suffixed else record
     )
 
 
 def script(content: Any) -> str:
-    """Write JSON that can stand in a <script>: no tag, comment or line end in it."""
+    """Serialise as JSON that is safe within <script>: no tag, comment or line end."""
     text = strict(content)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def strict(content: Any) -> str:
-    """Write JSON in ASCII; NaN and inf become null, as in the journal."""
+    """Serialise as ASCII JSON; NaN and inf become null, as in the journal."""
     write = partial(json.dumps, allow_nan=False, separators=(",", ":"))
     try:
         return write(content)
-    except ValueError:  # rare, and looking for them takes longer than writing
+    except ValueError:  # rare: searching for NaN first would cost more than writing
         return write(finite(content))
 
 
@@ -88,7 +86,7 @@ def plots(page: Page, rows: Rows) -> dict[str, list[Data]]:
 
 
 def _numbered(panel: Data, rows: Rows) -> Data:
-    """Replace run_ids by their positions."""
+    """Replace run_ids by indices of records."""
     traces = [
         {**t, "runs": [spans(map(short, ids), rows) for ids in t.get("runs", ())]}
         for t in panel["traces"]
@@ -97,7 +95,7 @@ def _numbered(panel: Data, rows: Rows) -> Data:
 
 
 def table(t: Table, rows: Rows) -> Data:
-    """Give heads, cells, and the solver that the whole table is about."""
+    """Return headings, cells, and the solver of a table on one solver."""
     return {
         "columns": list(t.columns),
         "words": t.text_columns,
@@ -107,9 +105,9 @@ def table(t: Table, rows: Rows) -> Data:
 
 
 def cell(c: Cell, rows: Rows) -> Any:
-    """Text alone if there is no more; else all fields, without those empty at the end.
+    """Return the text of a plain cell, or else all fields up to the last nonempty one.
 
-    The last field lists the measurements in pairs: the first, and how many.
+    The last field packs the measurements, see `spans`.
     """
     value = None if c.value is None else float(f"{c.value:.9g}")
     runs = runs_of(c, rows)
@@ -121,12 +119,12 @@ def cell(c: Cell, rows: Rows) -> Any:
 
 
 def runs_of(c: Cell, rows: Rows) -> list[int]:
-    """Find the measurements that a cell names."""
+    """Return the packed indices of the measurements that a cell names."""
     return spans(named(c.title), rows)
 
 
 def spans(ids: Iterable[str], rows: Rows) -> list[int]:
-    """Pack positions of known measurements in pairs: the first, and how many."""
+    """Pack indices of known measurements into pairs (first, count)."""
     packed: list[int] = []
     for at in (rows[i] for i in ids if i in rows):
         if packed and at == packed[-2] + packed[-1]:
@@ -137,7 +135,7 @@ def spans(ids: Iterable[str], rows: Rows) -> list[int]:
 
 
 def _keys(records: Sequence[Record]) -> Data:
-    """Give what one filters by, and the run_ids that links name."""
+    """Return the columns that filters use, and the run_ids that links name."""
     shown: dict[str, Callable[[Record], str]] = {
         "case": lambda r: clean(r.case),
         "tol": lambda r: tolerance(r.tol),
@@ -154,8 +152,10 @@ def _coded(values: Sequence[str]) -> Data:
 
 
 def _column(values: Sequence[Any]) -> Any:
-    """Code a column if that shortens it; 1 and 1.0 and True are different."""
-    tables = {id(v): v for v in values if type(v) in (dict, list)}  # many share one
+    """Encode a column by distinct values if that is shorter; 1, 1.0 and True differ."""
+    tables = {
+        id(v): v for v in values if type(v) in (dict, list)
+    }  # many records share one
     known = {place: json.dumps(v) for place, v in tables.items()}
     keys = [known.get(id(v)) or (type(v), v) for v in values]
     first = dict(zip(reversed(keys), reversed(values), strict=True))

@@ -13,12 +13,12 @@ _FORMULA = re.compile(r"\\\((.*?)\\\)", re.DOTALL)
 
 
 def split(text: str) -> list[str]:
-    """Split prose into text and formulas, which alternate; text comes first."""
+    """Split prose into alternating text and formulas, text first."""
     return _FORMULA.split(text)
 
 
 def mathml(tex: str, *, display: bool = False) -> str:
-    r"""Convert one formula to MathML Core, which browsers show without a script.
+    r"""Convert one formula to MathML Core, which browsers render without a script.
 
     Parameters
     ----------
@@ -28,10 +28,10 @@ def mathml(tex: str, *, display: bool = False) -> str:
     Raises
     ------
     ValueError
-        When a command is unknown or a brace is missing, so that nothing is lost.
+        When a command is unknown or a brace is missing.
 
     """
-    from math_core import LatexError  # late: only pages with formulas need it
+    from math_core import LatexError  # imported here: only pages with formulas need it
 
     if display and r"\tag{" in tex and r"\begin{" not in tex:
         tex = rf"\begin{{equation}}{tex}\end{{equation}}"

@@ -1,4 +1,4 @@
-"""The report as one HTML file that needs no network, and can reach none."""
+"""The report as one HTML file that needs no network and cannot reach one."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from mortarbench.reports.render.embedded import (
 from mortarbench.reports.render.formulas import mathml, split
 from mortarbench.reports.render.svg import Svg, inline
 
-FIRST = 50  #: rows of a table that are in the page as written; its script has all
+FIRST = 50  #: rows of a table in the HTML itself; the script has the others
 SCRIPTS = ("base", "tables", "marks", "chart", "plots", "runs")
 _NUMBER = re.compile(r"\b\d[\d.]*e-\d+\b")
 _LEFTWARDS = re.compile(r"[\u0590-\u08ff\ufb1d-\ufdff\ufe70-\ufefc]+")
@@ -35,13 +35,13 @@ _RUN_ID = re.compile(r"\b[0-9a-f]{12}\b")
 def html(page: Page, drawings: Mapping[str, Svg] | None = None) -> str:
     """Render the whole report; all text is escaped, figures are inline.
 
-    The policy in its head lets a browser run the one script that we wrote, known by
-    its hash, and fetch nothing.
+    The content security policy of the page allows the one embedded script, by its
+    hash, and forbids every request.
 
-    drawings : of the figures, by name, where they are drawn already
+    drawings : figures that are already drawn, by name
     """
     rows = rows_of(page.records)
-    found = plots(page, rows)
+    curves = plots(page, rows)
     code = "\n".join(_asset(f"{name}.js") for name in SCRIPTS)
     environment = Environment(
         autoescape=True,
@@ -50,17 +50,17 @@ def html(page: Page, drawings: Mapping[str, Svg] | None = None) -> str:
         lstrip_blocks=True,
     )
     environment.filters["breakable"] = breakable
-    environment.filters["told"] = partial(told, rows=rows)
+    environment.filters["prose"] = partial(prose, rows=rows)
     environment.filters["drawn"] = partial(drawn, drawings=drawings or {})
     environment.filters["link"] = partial(link, page=page, rows=rows)
     return environment.from_string(_asset("page.html.j2")).render(
         page=page,
         first=FIRST,
-        plots=list(found),
+        plots=list(curves),
         policy=_policy(code),
         style=Markup(_asset("page.css")),
         code=Markup(code),
-        data=Markup(data(page, list(found.values()), rows)),
+        data=Markup(data(page, list(curves.values()), rows)),
         details=Markup(details(page.records)),
     )
 
@@ -82,15 +82,15 @@ def _policy(code: str) -> str:
 def breakable(text: str) -> Markup:
     """Allow a line break after every slash of a case name, and none within 1e-8.
 
-    What is written from right to left is isolated, so that it turns nothing around it.
+    Right-to-left text is isolated, so that it does not reorder the text around it.
     """
-    parts = str(Markup("/<wbr>").join(text.split("/")))  # which escapes them
+    parts = str(Markup("/<wbr>").join(text.split("/")))  # join escapes the parts
     kept = _NUMBER.sub(r'<span class="nb">\g<0></span>', parts)
     return Markup(_LEFTWARDS.sub(r"<bdi>\g<0></bdi>", kept))
 
 
-def told(text: str, rows: Rows) -> Markup:
-    """Typeset formulas of prose, break the rest as names may be, link its run_ids."""
+def prose(text: str, rows: Rows) -> Markup:
+    """Render prose: formulas as MathML, breakable names, and links of run_ids."""
 
     def linked(match: re.Match[str]) -> str:
         run_id = match[0]
@@ -101,13 +101,13 @@ def told(text: str, rows: Rows) -> Markup:
     for i in range(1, len(parts), 2):
         try:
             parts[i] = mathml(parts[i])
-        except ValueError:  # a name of a foreign folder that is no formula
+        except ValueError:  # a name of a foreign folder, not a formula
             parts[i] = str(breakable(rf"\({parts[i]}\)"))
     return Markup("".join(parts))
 
 
 def link(cell: Cell, page: Page, rows: Rows) -> Markup:
-    """Write the attributes of a link to the measurements of a cell; empty if none."""
+    """Return the attributes of a link to the measurements of a cell; empty if none."""
     runs = runs_of(cell, rows)
     if not runs:
         return Markup("")
@@ -116,11 +116,11 @@ def link(cell: Cell, page: Page, rows: Rows) -> Markup:
 
 
 def drawn(picture: Picture, drawings: Mapping[str, Svg]) -> Markup:
-    """Embed a figure; its text was made by us from names that `legible` has cleaned."""
+    """Embed a figure as SVG; its labels are already sanitised by `legible`."""
     svg = drawings.get(picture.name)
     if svg is None:
         from mortarbench.reports.render.saving import (
-            draw_svg,  # late: it loads matplotlib
+            draw_svg,  # imported here because it loads matplotlib
         )
 
         svg = draw_svg(picture.figure)

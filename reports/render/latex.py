@@ -21,11 +21,11 @@ _SPECIAL = {
     "⋆": r"$\star$", "\0": "{}",
 }  # fmt: skip
 
-#: text that needs no escape
+#: text that needs no escaping
 _PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
 
 
-#: rows of a float; a longer table is broken over pages, since a float cannot be
+#: most rows of a float; longer tables use longtable, since floats do not break
 ROWS = 36
 
 
@@ -105,10 +105,10 @@ def _cell(cell: Cell) -> str:
 
 
 def escaped(text: str) -> str:
-    """Escape for text mode; what the oldest font encoding lacks is named, not printed.
+    """Escape for text mode; characters missing in OT1 become their code points.
 
-    A leading bracket is braced: after a row's end TeX would read an optional argument.
-    So are hyphens in a row, which TeX would join to dashes.
+    A leading bracket is braced, because TeX would read it as an optional argument
+    after the end of a row. Consecutive hyphens are separated, or TeX would join them.
     """
     if _PLAIN.fullmatch(text):  # most cells of a large report
         return text

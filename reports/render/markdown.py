@@ -10,7 +10,7 @@ from mortarbench.reports.render.formulas import split
 _MARKUP = re.compile(r"([\\`*_\[\]|~#$@])")
 _LINK = re.compile(r"(:)(?=//)|(?<=www)(\.)", re.IGNORECASE)
 _LIST = re.compile(r"^(\d*)([-+.)])(?=\s)")
-#: what has none of all these, as most cells of a large report, stays as it is
+#: anything that needs escaping; most cells of a large report have nothing
 _ANY = re.compile(r"[&<>\\`*_\[\]|~#$@]|://|www\.|^\d*[-+.)]\s", re.IGNORECASE)
 
 
@@ -37,7 +37,7 @@ def _section(section: Section, page: Page) -> list[str]:
 
 
 def _prose(text: str) -> str:
-    """Escape prose around its formulas, which Markdown has between dollars."""
+    """Escape prose except its formulas, which Markdown sets between dollars."""
     parts = split(text)
     parts[::2] = map(escaped, parts[::2])
     parts[1::2] = [f"${tex}$" for tex in parts[1::2]]
@@ -45,17 +45,17 @@ def _prose(text: str) -> str:
 
 
 def _statement(statement: Statement, page: Page) -> str:
-    """Write a paragraph that ends in links to its evidence."""
+    """Render a statement as a paragraph that ends with links to its evidence."""
     links = [f"[{s.title}](#{_anchor(s.title)})" for s in page.sections_of(statement)]
-    told = map(escaped, (*statement.claims, *statement.remarks))
+    texts = map(escaped, (*statement.claims, *statement.remarks))
     evidence = f"Evidence: {', '.join(links)}." if links else ""
     return " ".join(
-        filter(None, (f"**{escaped(statement.subject)}.**", *told, evidence))
+        filter(None, (f"**{escaped(statement.subject)}.**", *texts, evidence))
     )
 
 
 def _anchor(title: str) -> str:
-    """Name the anchor that Markdown makes of a heading."""
+    """Return the anchor that Markdown generates for a heading."""
     return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
@@ -76,7 +76,7 @@ def _cell(cell: Cell) -> str:
 
 
 def escaped(text: str) -> str:
-    """Escape what Markdown or HTML would read as markup, or make a link or list of."""
+    """Escape text that Markdown or HTML would read as markup, a link or a list."""
     if not _ANY.search(text):
         return text
     safe = text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -1,6 +1,6 @@
-"""Figures of curves as the page's script draws them: plain data for JSON.
+"""Figures of curves as plain data for the script of the page.
 
-Labels hold formulas as matplotlib reads them; the page shows them as plain text.
+Labels contain mathtext formulas of matplotlib; the page shows them as plain text.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mortarbench.reports.document.figure import (
 
 Data = dict[str, Any]
 
-MOST = 4000  #: points of a line; of more, each stretch shows its least and largest
+MOST = 4000  #: most points of a line; longer lines keep extremes of short stretches
 _NAMED = {
     "lambda": "λ", "sigma": "σ", "tau": "τ", "rho": "ρ", "mu": "µ", "nu": "ν",
     "alpha": "α", "kappa": "κ", "Gamma": "Γ", "times": "×", "cdot": "·",
@@ -43,7 +43,7 @@ _LOWERED = str.maketrans("0123456789kij", "₀₁₂₃₄₅₆₇₈₉ₖᵢ�
 
 
 def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
-    """List the panels of a figure.
+    """Return the panels of a figure.
 
     solvers : name → position on the page
     """
@@ -51,20 +51,20 @@ def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
     heights = [row.height for row in whole.rows]
     legends = [row.legend for row in whole.rows if row.legend]
     common = _legend([whole.legend, *legends] if whole.legend else legends, solvers)
-    made: list[Data] = []
+    parts: list[Data] = []
     groups: dict[str, int] = {}
     for row in whole.rows:
         for panel in row.panels:
-            own = panel.x.shared or f"\0{len(made)}"  # alone
-            made.append({
+            own = panel.x.shared or f"\0{len(parts)}"  # a unique name: not shared
+            parts.append({
                 **_panel(panel, solvers),
                 "height": round(whole.height * row.height / sum(heights), 2),
                 "share": groups.setdefault(own, len(groups)),
                 "columns": whole.columns,
             })  # fmt: skip
-    made[0]["common"] = common
-    made[0]["heading"] = plain(whole.title)
-    return made
+    parts[0]["common"] = common
+    parts[0]["heading"] = plain(whole.title)
+    return parts
 
 
 def _panel(panel: Panel, solvers: Mapping[str, int]) -> Data:
@@ -138,7 +138,7 @@ def _line(series: Series) -> Data:
 
 
 def _thinned(y: Numbers) -> list[int]:
-    """Choose the least and largest of every stretch of a long line, and its ends."""
+    """Select the extremes of every stretch of a long line, and its ends."""
     count = len(y)
     if count <= MOST:
         return list(range(count))
@@ -179,12 +179,12 @@ def _segments(ends: Sequence[Numbers], name: str, width: float, runs: Runs) -> D
 
 
 def _outline(area: Area) -> Iterator[float]:
-    """Go around an area: along its upper end, and back along the lower."""
+    """Yield the outline of an area: along its upper curve, and back along the lower."""
     for values, direction in ((area.high, 1), (area.low, -1)):
         points = list(zip(area.x, values, strict=True))
         if area.step:  # each value holds until the next point
-            held = [((x, y0), (x, y)) for (_, y0), (x, y) in pairwise(points)]
-            points[1:] = [point for two in held for point in two]
+            stairs = [((x, y0), (x, y)) for (_, y0), (x, y) in pairwise(points)]
+            points[1:] = [point for step in stairs for point in step]
         for point in points[::direction]:
             yield from point
 
@@ -203,7 +203,7 @@ def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
 
 
 def look_of(look: Look) -> Data:
-    """Translate the look of a line and of its marks, lengths in px or points."""
+    """Describe the look of a line and of its marks, lengths in px or points."""
     dash = look.dash
     return {
         "colour": colour(look.colour),
@@ -219,19 +219,19 @@ def look_of(look: Look) -> Data:
 
 
 def colour(name: str) -> str:
-    """Name a colour as SVG does; ink is that of the text around."""
+    """Return a colour for SVG; ink becomes the colour of the surrounding text."""
     return "currentColor" if name == INK else name
 
 
 def rounded(values: Any, digits: int = 6) -> list[float | None]:
-    """Round for the page; what is not finite has no place in JSON."""
+    """Round to significant digits; None for values that are not finite."""
     return [float(f"{v:.{digits}g}") if isfinite(v) else None for v in values]
 
 
 def plain(text: str) -> str:
-    r"""Read mathtext as text: "degrees of freedom $n$" loses its dollars.
+    r"""Convert mathtext to plain text: "degrees of freedom $n$" loses its dollars.
 
-    An escaped dollar is one, as `reports.figures.style.legible` writes it.
+    An escaped dollar, as written by `reports.figures.style.legible`, becomes a dollar.
     """
     parts = re.split(r"(?<!\\)\$", text)
     shown = [_formula(p) if i % 2 else p for i, p in enumerate(parts)]

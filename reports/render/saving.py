@@ -1,4 +1,4 @@
-"""Figures as files, the same bytes every time: what loads matplotlib."""
+"""Figures as files with reproducible bytes; importing this module loads matplotlib."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mortarbench.reports.render.svg import PAPER, Svg
 
 ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
 _METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}
-#: The style once all is in place: no figure gets a layout engine again.
+#: style for printing a figure that is laid out: without a layout engine
 _LAID_OUT: Any = STYLE | {"figure.constrained_layout.use": False}
 
 
@@ -32,7 +32,7 @@ def draw(figure: Figure | FieldFigure) -> Canvas:
 
 
 def save(figure: Figure | FieldFigure, path: Path) -> None:
-    """Write a figure in the format of the file's ending, the same bytes every time.
+    """Write a figure in the format of the file's ending, with reproducible bytes.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def save_all(
     paths : list
         The files, in the order of `ENDINGS`.
     svg : Svg
-        What is in the SVG file.
+        Content of the SVG file.
 
     """
     canvas = draw(figure)
@@ -100,11 +100,9 @@ def _print(canvas: Canvas, box: Bbox, target: Path | StringIO, **how: Any) -> No
 
 
 def _placed(canvas: Canvas) -> Bbox:
-    """Place axes and legends, once for every format, and bound what is drawn, inches.
-
-    Without a layout engine, which matplotlib would run again before each format, a
-    format costs one drawing instead of two.
-    """
+    """Lay out axes and legends once for all formats, and return their bounding box."""
+    # matplotlib would run the layout engine again before each format, which costs a
+    # second drawing; hence it is executed here and then removed.
     with rc_context(STYLE):
         if (engine := canvas.get_layout_engine()) is not None:
             engine.execute(canvas)

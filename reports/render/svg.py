@@ -1,4 +1,4 @@
-"""An SVG drawing, as part of a page."""
+"""SVG drawings as parts of a page."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ PAPER = "#ffffff"
 
 @dataclass(frozen=True)
 class Svg:
-    """The text of an SVG file on paper, cut to what is drawn."""
+    """Text of an SVG file with a paper background, cropped to the drawing."""
 
     text: str
     frame: tuple[float, float, float, float]
-    """Left, top, width and height of the whole figure in it, points."""
+    """Left, top, width and height of the uncropped figure, points."""
 
 
 def inline(svg: Svg, name: str) -> str:
-    """Make an <svg> element that takes its ink from the page around it.
+    """Return an <svg> element whose text and axes take the text colour of the page.
 
-    It is the drawing of the figure's file, without the paper and framed by the whole
-    figure. Identifiers get the prefix `name`, so that several figures fit in one page.
+    It is the drawing of the file without the paper, with the frame of the uncropped
+    figure. Identifiers get the prefix `name`, since they must be unique in a page.
     """
     text = re.sub(r"<(metadata|style)\b.*?</\1>", "", svg.text, flags=re.DOTALL)
     left, top, width, height = svg.frame

@@ -1,4 +1,4 @@
-"""Put a page into files."""
+"""Write pages, text and figures to files."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from mortarbench.reports.render.latex import latex
 from mortarbench.reports.render.markdown import markdown
 from mortarbench.reports.render.svg import Svg
 
-_NUMBERED = re.compile(r"[a-z]+-\d+\.(pdf|svg|png)")  #: files of figures in a series
-RENDERED = frozenset({"html", "md", "tex"})  #: formats that show a page
+_NUMBERED = re.compile(r"[a-z]+-\d+\.(pdf|svg|png)")  #: files of numbered figures
+RENDERED = frozenset({"html", "md", "tex"})  #: formats that contain a page
 
 
 def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]:
-    """Write a page in those of the formats that show one, and its figures.
+    """Write a page in the `RENDERED` ones of the formats, and its figures.
 
     html: index.html. md: report.md. tex: tables/SECTION.tex. Figures go to figures/.
     """
@@ -41,7 +41,7 @@ def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]
 
 
 def write_text(path: Path, text: str) -> Path:
-    """Write a file whole or not at all; folders are made."""
+    """Write a file atomically; missing folders are created."""
     replace_file(path, text.encode())
     return path
 
@@ -54,10 +54,12 @@ def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Sv
     paths : list
         The files.
     drawings : mapping
-        Name → what is in the SVG file.
+        Name → content of the SVG file.
 
     """
-    from mortarbench.reports.render.saving import save_all  # late: it loads matplotlib
+    from mortarbench.reports.render.saving import (
+        save_all,
+    )  # imported here because it loads matplotlib
 
     folder = target / "figures"
     folder.mkdir(parents=True, exist_ok=True)
@@ -71,7 +73,7 @@ def write_figures(page: Page, target: Path) -> tuple[list[Path], Mapping[str, Sv
 
 
 def _remove_numbered(folder: Path, keep: Collection[Path]) -> None:
-    """Delete figures of an earlier report of which this one has fewer, as scaling-2."""
+    """Delete numbered figures (such as scaling-2) that only an earlier report had."""
     for path in folder.iterdir():
         if _NUMBERED.fullmatch(path.name) and path not in keep:
             path.unlink()

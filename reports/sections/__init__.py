@@ -1,7 +1,7 @@
 """The sections of a report: each registers itself, with its place among the others.
 
-A module NAME.py holds sections that belong together, and NAME.j2 their sentences. A new
-section is a generator of its parts under `@section`, in any module of this room.
+A module NAME.py contains related sections, and NAME.j2 their sentences. A new section
+is a generator of its parts, decorated with `@section`, in any module of this package.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from mortarbench.reports.document.layout import Part, Section
 
 
 class Analysis:
-    """The evidence of a folder, and what several sections compute from it.
+    """The evidence of a folder, and results that several sections share.
 
-    pool_forms : means, ranks and profiles are over the cases of all forms together
+    pool_forms : compute means, ranks and profiles over the cases of all forms together
     """
 
     def __init__(self, evidence: Evidence, *, pool_forms: bool = False) -> None:
@@ -48,12 +48,12 @@ class Analysis:
 
     @cached_property
     def pooled(self) -> tuple[ComparisonGroup, ...]:
-        """The same with the cases of all forms together."""
+        """Groups of cases whose times are compared, all forms pooled."""
         return tuple(all_groups(self.evidence, pool_forms=True))
 
     @property
     def groups(self) -> tuple[ComparisonGroup, ...]:
-        """Groups that means, ranks and profiles are over."""
+        """Groups of cases that means, ranks and profiles are computed over."""
         return self.pooled if self.pool_forms else self.forms
 
     @cached_property
@@ -94,11 +94,11 @@ APPENDIX = 90  #: place of conditions and definitions
 def section(
     place: float, name: str, title: str | Callable[[Analysis], str], needs: str = ""
 ) -> Callable[[Write], Callable[[Analysis], Section | None]]:
-    """Register a generator of the parts of a section; without parts there is none.
+    """Register a generator of the parts of a section; one without parts is left out.
 
     place : position in the report, in increasing order
     name : anchor, and stem of the section's files
-    needs : its title and the measurements that it takes, for reports without it
+    needs : title and required measurements, listed by reports that lack the section
     """
 
     def register(write: Write) -> Callable[[Analysis], Section | None]:
@@ -114,12 +114,12 @@ def section(
 
 
 def sections(analysis: Analysis) -> Iterator[Section]:
-    """Compose all sections; before the appendix, list those that the report lacks."""
+    """Compose all sections; before the appendix, list those without measurements."""
     missing: list[str] = []
     for entry in _entries():
         if entry.place >= APPENDIX and missing:
             prose = (
-                "Sections for which there are no measurements, and what they need.",
+                "These sections are missing because measurements for them are missing.",
             )
             title = "Not in this report"
             yield Section(name="absent", title=title, prose=prose, points=(*missing,))
@@ -133,8 +133,8 @@ def sections(analysis: Analysis) -> Iterator[Section]:
 
 def opening(analysis: Analysis) -> list[Section]:
     """Compose the sections that answer the reader's question; the rest is evidence."""
-    found = [e.compose(analysis) for e in _entries() if e.place < EVIDENCE]
-    return [one for one in found if one is not None]
+    composed = [e.compose(analysis) for e in _entries() if e.place < EVIDENCE]
+    return [one for one in composed if one is not None]
 
 
 def _entries() -> list[_Entry]:

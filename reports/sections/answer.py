@@ -1,4 +1,4 @@
-"""What a reader came for: per form, who was fastest and by how much, and who failed.
+"""Opening of the report: the fastest solver of each form, its lead, and the failures.
 
 A suite of one solver opens with the growth of its iterations, with condition numbers
 and speed-up on ranks.
@@ -42,32 +42,32 @@ from mortarbench.reports.sections.scaling import iteration_growth, per_decade
 from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps, places
 from mortarbench.reports.statistics.growth import Trend
 
-ACCURACIES = 3  #: per form that have a sentence; of more, the ends and the middle
-FAILURES = 3  #: per form that are told one by one
-FIRST_ROWS = 8  #: of the first figure, which a phone shows below the first sentence
-REPEATS = 9  #: that are recommended where fewer left a tie
-MOST_TOLD = 4  #: series of sizes that have a sentence of their own
-_FROM_MESH = "From the mesh to a verified answer, dualising charged: "
+ACCURACIES = 3  #: sentences per form; of more accuracies, the ends and the middle
+FAILURES = 3  #: failures per form that are described one by one
+FIRST_ROWS = 8  #: rows of the first figure: a phone shows it below the first sentence
+REPEATS = 9  #: least number of repeats recommended to resolve a tie
+MOST_SERIES = 4  #: series of sizes with a sentence of their own
+_FROM_MESH = "From the mesh to a verified answer, including dualisation: "
 _TRENDS = {
     Trend.FLAT: "stay flat",
     Trend.GROWS: "grow",
     Trend.FALLS: "fall",
-    Trend.UNDECIDED: "are neither flat nor growing for sure",
+    Trend.UNDECIDED: "show no clear trend",
 }
 
 
 def _title(a: Analysis) -> str:
-    if a.ways.found:
+    if a.ways.comparisons:
         return "From mesh to answer"
-    return "What was found" if any(own_results(a)) else "Who was fastest"
+    return "Results" if any(own_results(a)) else "Fastest solver"
 
 
 @section(1, "answer", _title)
 def answer(a: Analysis) -> Iterator[Part]:
-    """Name the best way over all forms, or the best solver of each form."""
-    if a.ways.found:
-        found = _by_subject(a.ways.found)
-        for subject, mine in found.items():
+    """Name the fastest way over all forms, or the fastest solver of each form."""
+    if a.ways.comparisons:
+        comparisons = _by_subject(a.ways.comparisons)
+        for subject, mine in comparisons.items():
             remarks = (*_faster_elsewhere(mine[0]), *_reservations(mine))
             yield Statement(
                 subject=subject,
@@ -78,7 +78,7 @@ def answer(a: Analysis) -> Iterator[Part]:
                 evidence=("forms", "verdicts", "times"),
             )
         yield from _picture(
-            "answer", [mine[0] for mine in found.values()][:1], a, FIRST_ROWS
+            "answer", [mine[0] for mine in comparisons.values()][:1], a, FIRST_ROWS
         )
     else:
         yield from _form_statements(a)
@@ -89,24 +89,24 @@ def answer(a: Analysis) -> Iterator[Part]:
     yield from TEXT.parts("cautions", a.ways.uncharged, machines, busy)
 
 
-@section(2, "forms", "Form by form: the solver alone")
+@section(2, "forms", "Solver times, form by form")
 def forms(a: Analysis) -> Iterator[Part]:
-    """Compare the solvers of each form, where the first section compares ways."""
-    if a.ways.found:
+    """Compare the solvers of each form, if the first section compares ways."""
+    if a.ways.comparisons:
         yield from _form_statements(a)
         yield TIMED
         yield from _picture("forms", shown(a.fastest), a, SOLVERS)
-    del a.ways  # copies of all records
+    del a.ways  # its copies of all records take memory
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Write a sentence on behind a colon; some begin with a name."""
+    """Write a sentence in lower case, as after a colon, unless a name begins it."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
 
 def shown(found: Sequence[FastestSolver]) -> list[FastestSolver]:
-    """Choose what is drawn: of every form the tightest accuracy, the first few."""
+    """Select the first few forms to draw, each at its tightest accuracy."""
     return [mine[0] for mine in _by_subject(found).values()][:PANELS]
 
 
@@ -128,28 +128,29 @@ def _picture(
 
 def _by_subject(found: Sequence[FastestSolver]) -> dict[str, list[FastestSolver]]:
     """Group by form and mode, cold solves first; tightest accuracy first."""
-    order = sorted(found, key=lambda f: (f.kind.mode != "cold", f.kind.mode))
+    order = sorted(found, key=lambda f: (f.key.mode != "cold", f.key.mode))
     grouped: dict[str, list[FastestSolver]] = {}
     for f in order:
-        grouped.setdefault(f.kind.subject or "all forms", []).append(f)
-    return {s: sorted(fs, key=lambda f: f.kind.at) for s, fs in grouped.items()}
+        grouped.setdefault(f.key.subject or "all forms", []).append(f)
+    return {s: sorted(fs, key=lambda f: f.key.at) for s, fs in grouped.items()}
 
 
 def _selected(found: list[FastestSolver]) -> list[FastestSolver]:
-    """Choose the ends and the middle of many accuracies."""
+    """Select the ends and the middle of many accuracies."""
     if len(found) <= ACCURACIES:
         return found
     return [found[0], found[len(found) // 2], found[-1]]
 
 
 def _form_statements(a: Analysis) -> Iterator[Statement]:
-    """Make a statement for every form, cold solves and sequences apart.
+    """Yield a statement for every form, cold solves and sequences separately.
 
-    Results of the only solver come first, and replace that there is nothing to compare.
+    Results of a single solver come first and replace the statement that there is no
+    other solver to compare with.
     """
     own = [part for part in own_results(a) if isinstance(part, Statement)]
     yield from own
-    alone = {f.kind.subject for f in a.fastest if f.finding is Finding.ALONE}
+    alone = {f.key.subject for f in a.fastest if f.finding is Finding.ALONE}
     certified = certified_sweeps(a.evidence)
     for subject, found in _by_subject(a.fastest).items():
         statement = _statement(subject, found, a, certified)
@@ -160,8 +161,8 @@ def _form_statements(a: Analysis) -> Iterator[Statement]:
 def _statement(
     subject: str, found: list[FastestSolver], a: Analysis, certified: Sweeps
 ) -> Statement:
-    told = _selected(found)
-    answers = [a.answers[f.kind] for f in found]
+    selected = _selected(found)
+    answers = [a.answers[f.key] for f in found]
     ended = unverified(row for of in answers for row in of.values())
     failed = [one for one in ended if one.verdict is not Verdict.DECLINED]
     declined = [one for one in ended if one.verdict is Verdict.DECLINED]
@@ -177,22 +178,22 @@ def _statement(
     ]
     evidence = {"verdicts", *["accuracy"] * bool(at_error)}
     for f in found:
-        evidence |= {"accuracy"} if f.kind.sweep else set()
+        evidence |= {"accuracy"} if f.key.sweep else set()
         evidence |= {"means", "ranking"} if f.over_cases else {"times", "ratios"}
     remarks = (
         *_faster_elsewhere(found[0]),
         TEXT("failed", failed, "case" if len(found) == 1 else "answer"),
         TEXT("declined", declined),
         *_reservations(found),
-        f"{len(found) - len(told)} more tolerances are in the evidence."
-        if len(told) < len(found)
+        f"{len(found) - len(selected)} more tolerances are in the evidence."
+        if len(selected) < len(found)
         else "",
     )
     return Statement(
         subject=subject,
         claims=(
             *[TEXT("at_error", len(swept), at_error)] * bool(at_error),
-            *map(claim, told),
+            *map(claim, selected),
         ),
         remarks=tuple(filter(None, remarks)),
         evidence=tuple(sorted(evidence)),
@@ -200,7 +201,7 @@ def _statement(
 
 
 def claim(f: FastestSolver) -> str:
-    """Say in one sentence who was fastest, or why no one is named."""
+    """Return one sentence that names the fastest solver, or the reason why none is."""
     return TEXT("claim", f)
 
 
@@ -210,7 +211,7 @@ def _name(c: Competitor) -> str:
 
 
 def _named(competitors: Iterable[Competitor], most: int = 4) -> str:
-    """Enumerate names as a sentence does, the first few of them."""
+    """Enumerate the first few names as in a sentence."""
     names = list(map(_name, competitors))
     if len(names) > most:
         return listing(names, most)
@@ -218,7 +219,7 @@ def _named(competitors: Iterable[Competitor], most: int = 4) -> str:
 
 
 def _forms(f: FastestSolver) -> list[str]:
-    """List the forms that compete; empty where solvers of one form do."""
+    """Return the forms that compete; empty in a comparison of solvers of one form."""
     every = (*f.competitors, *f.others)
     return list(dict.fromkeys(c.form for c in every if c.form))
 
@@ -226,7 +227,7 @@ def _forms(f: FastestSolver) -> list[str]:
 def _next_behind(
     f: FastestSolver,
 ) -> tuple[Competitor | None, list[tuple[str, Competitor | None]]]:
-    """Find the next that is told to be slower, and the best of every other form."""
+    """Return the next significantly slower one, and the best of every other form."""
     slower = [c for c in f.competitors[1:] if c.slower and c.closest]
     following = slower[0] if slower else None
     named = {c.form for c in (f.first, *f.tied, *slower[:1])}
@@ -253,7 +254,7 @@ def _repeats(f: FastestSolver) -> str:
 
 
 def _roughly(f: FastestSolver) -> str:
-    """Compare with the next, and the best of other forms, where intervals lack."""
+    """Compare the first with the next and other forms, where intervals are missing."""
 
     def ratio(c: Competitor) -> str:
         logs = [
@@ -264,23 +265,23 @@ def _roughly(f: FastestSolver) -> str:
         return significant(float(np.exp(np.mean(logs))), 2)
 
     following = f.competitors[1]
-    said = [f"next is {_name(following)}, about {ratio(following)} times as long"]
+    ratios = [f"next: {_name(following)}, about {ratio(following)} times as long"]
     for form in _forms(f):
         best = next((c for c in f.competitors if c.form == form), None)
         if best is not None and best not in (f.first, following):
             name = f"the best on the {clean(form, 24)} form, {clean(best.solver, 40)}"
-            said.append(f"{name}, about {ratio(best)}")
-    return f"({'; '.join(said)})"
+            ratios.append(f"{name}, about {ratio(best)} times as long")
+    return f"({'; '.join(ratios)})"
 
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
-    """Name who was faster than the first, but was not verified on every case."""
+    """Name entrants faster than the first that were not verified on every case."""
     faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 
 
 def _shared(f: FastestSolver) -> str:
-    """Count on how many cases each solver was fastest, and which ones tie."""
+    """Count the cases on which each solver was fastest, and the ties."""
     count = Counter(
         _name(front[0]) if len(front) == 1 else f"a tie of {_named(front, 2)}"
         for front in f.fronts().values()
@@ -289,7 +290,7 @@ def _shared(f: FastestSolver) -> str:
 
 
 def _best_at(swept: Sweeps, error: float) -> str:
-    """Count on how many cases each solver is the fastest at one certified error."""
+    """Count the cases on which each solver is the fastest at one certified error."""
     count: Counter[str] = Counter()
     for row in swept.values():
         times = {
@@ -303,26 +304,26 @@ def _best_at(swept: Sweeps, error: float) -> str:
         if len(best) == 1 and rivals > 1:
             tied = "tied" in kinds.values()
             count["a tie" if tied else clean(best[0], 40)] += 1
-    return ", ".join(f"{who} on {n}" for who, n in count.most_common(4))
+    return ", ".join(f"{name} on {n}" for name, n in count.most_common(4))
 
 
 def _reason(one: Unverified) -> str:
-    """Give what refutes a claim and what is allowed, or else the solver's words."""
+    """Return the refuting residual and its limit, or the message of a failed solver."""
     if one.verdict in (Verdict.CRASHED, Verdict.FAILED):
         return clean(one.answers[0].first.message, 60)
     if one.verdict not in (Verdict.INACCURATE, Verdict.WRONG):
         return ""
     off = [(e, o) for o in one.answers if (e := o.largest("optimum_error")) is not None]
-    known = off or [(e, o) for o in one.answers if (e := o.worst) is not None]
-    if not known:
+    errors = off or [(e, o) for o in one.answers if (e := o.worst) is not None]
+    if not errors:
         return ""
-    error, worst = max(known, key=lambda each: each[0])
-    what = "off the proven optimum by" if off else "residual"
-    return f"{what} {power(error)}, allowed {power(worst.allowed)}"
+    error, worst = max(errors, key=lambda each: each[0])
+    quantity = "distance from the proven optimum" if off else "residual"
+    return f"{quantity} {power(error)}, allowed {power(worst.allowed)}"
 
 
 def _reservations(found: Sequence[FastestSolver]) -> list[str]:
-    """Say what the claims of one form do not cover."""
+    """List the limitations of the claims on one form."""
     named = (Finding.FASTEST, Finding.TIE, Finding.DIVIDED)
     few = any(f.finding in named and not f.over_cases for f in found)
     unsolved = max((f.unsolved for f in found if f.cases), default=0)
@@ -334,9 +335,9 @@ def _reservations(found: Sequence[FastestSolver]) -> list[str]:
 
 
 def own_results(a: Analysis) -> Iterator[Statement | Picture]:
-    """Tell the growth of iterations, condition numbers and speed-up on ranks.
+    """Summarise growth of iterations, condition numbers and speed-up on ranks.
 
-    Of a suite of one solver; nothing where solvers are compared.
+    Applies to suites of one solver; yields nothing where solvers are compared.
     """
     firsts = (o.first for o in a.evidence.flat)
     cold = {r.solver for r in firsts if not r.role and r.ranks == 1}
@@ -374,13 +375,13 @@ def _growth(solver: str, sizes: Sequence[SizeSeries]) -> Iterator[str]:
     reach = [n for curve in curves for n, _ in curve]
     yield TEXT("growth", solver, reach, [i for of in counts for i in of], trends)
     if len(fits) > 1:
-        told = [*zip(fits, curves, counts, strict=True)][:MOST_TOLD]
-        for (s, fit), curve, its in told:
+        described = [*zip(fits, curves, counts, strict=True)][:MOST_SERIES]
+        for (s, fit), curve, its in described:
             yield TEXT("growth_of", s.title, curve, its, per_decade(fit))
 
 
 def _own_claims(solver: str, a: Analysis) -> Iterator[str]:
-    """Give growth, condition numbers, iterations against H/h, and speed-up."""
+    """Yield growth, condition numbers, iterations against H/h, and speed-up."""
     yield from _growth(solver, a.sizes)
     for series in a.sizes:
         curve = [(float(n), o) for n, o in series.curve(solver)]

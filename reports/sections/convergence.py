@@ -1,4 +1,4 @@
-"""The section on how solvers got there: which cases, which figures, what they show."""
+"""Section on convergence histories: choice of cases, figures and captions."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TEXT = Sentences(__name__, FLOOR=FLOOR, RULE=RULE)
 
 @section(
     54, "convergence", "Convergence",
-    "Convergence: no solver kept a history of its iterations. Those with an option "
-    "history do where a suite sets it to true.",
+    "Convergence: no solver stored a history of its iterations. Solvers with an option "
+    "history do so where the suite sets it to true.",
 )  # fmt: skip
 def convergence(a: Analysis) -> Iterator[Part]:
-    """Draw the cases that `RULE` chooses; nothing where no solver kept a history."""
+    """Draw the cases that `RULE` selects; empty where no solver stored a history."""
     pictures = []
     for i, c in enumerate(chosen(a.evidence), 1):
         facts = {

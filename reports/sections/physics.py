@@ -41,7 +41,7 @@ TEXT = Sentences(__name__, PERCENTILE=PERCENTILE, SCALE=SCALE)
     "Agreement of energies: no verified answer has an energy.",
 )  # fmt: skip
 def agreement(a: Analysis) -> Iterator[Part]:
-    """Show how closely verified answers agree; nothing where no case has an energy."""
+    """Compare the energies of verified answers; empty where no case has an energy."""
     found = spreads(a.evidence.flat)
     if not found:
         return
@@ -75,14 +75,14 @@ def agreement(a: Analysis) -> Iterator[Part]:
             (
                 "between",
                 lambda s: Cell.words(
-                    " and ".join(map(_who, s.pair or ())) or "nothing to compare with"
+                    " and ".join(map(_solver_and_form, s.pair or ())) or "single answer"
                 ),
             ),
         ),
     )
 
 
-def _who(outcome: Outcome) -> str:
+def _solver_and_form(outcome: Outcome) -> str:
     form = outcome.first.form
     return clean(f"{outcome.solver} on {form}" if form else outcome.solver, 60)
 
@@ -115,8 +115,10 @@ def _quantities(
         own = leaves(best, sizes=sizes)
         peers = [leaves(o, sizes=sizes) for o in answers if o.tol == best.tol]
         cells = [quantity(path, best, own.get(path), peers) for path in paths]
-        which = f"{_who(best)}, {power(best.worst)} at tol {tolerance(best.tol)}"
-        answer = [Cell.words(which, title=source(best))] * (not sizes)
+        accuracy = f"{power(best.worst)} at tol {tolerance(best.tol)}"
+        answer = [
+            Cell.words(f"{_solver_and_form(best)}, {accuracy}", title=source(best))
+        ] * (not sizes)
         rows.append((Cell.name(best.physical), *cells, *answer))
     heads = (head(path, outcomes) for path in paths)
     yield Table(
@@ -131,22 +133,22 @@ def _quantities(
 
 @section(
     82, "deformed", "Deformed bodies",
-    "Deformed bodies: no verified answer has bodies to draw.",
+    "Deformed bodies: no verified answer has plane bodies to draw.",
 )  # fmt: skip
 def deformed(a: Analysis) -> Iterator[Part]:
-    """Draw the largest verified case; nothing where no deformed state was stored."""
+    """Draw the largest verified case; empty where no deformed state was stored."""
     directory = a.evidence.directory
     chosen = max(_drawable(a), key=_importance, default=None)
     if chosen is None:
         return
     try:
         fields = load_fields(directory, chosen.first.fields or "")
-        if len(fields.cells):  # else half planes only
+        if len(fields.cells):  # rigid half planes alone have no cells
             figure = deformed_figure(fields)
             scale, limits = automatic_scale(fields), clipped_at(fields)
             caption = TEXT("deformed", chosen, scale, limits)
             yield Picture(name="deformed", caption=caption, figure=figure)
-    except InputError as e:  # the journal alone must do
+    except InputError as e:  # vectors/ may be missing: the journal suffices
         missing = str(e).removeprefix(f"{directory}{os.sep}")
         yield TEXT("missing", chosen.case, missing)
 
@@ -156,12 +158,12 @@ def deformed(a: Analysis) -> Iterator[Part]:
     "Tractions along the contact: no verified answer has a contact side.",
 )  # fmt: skip
 def tractions(a: Analysis) -> Iterator[Part]:
-    """Draw tractions along contacts, of each family those of the largest case."""
+    """Draw the tractions along the contacts of the largest case of each family."""
     for family, mine in grouped(_drawable(a), lambda o: o.first.family).items():
         chosen = max(reversed(mine), key=_importance)
         try:
             fields = load_fields(a.evidence.directory, chosen.first.fields or "")
-        except InputError:  # `deformed` says so
+        except InputError:  # reported by the section `deformed`
             continue
         if (figure := traction_figure(fields)) is not None:
             rough = any(side.friction is not None for side in fields.contacts)
@@ -171,7 +173,7 @@ def tractions(a: Analysis) -> Iterator[Part]:
 
 
 def _drawable(a: Analysis) -> list[Outcome]:
-    """List what has a stored state in the plane; ParaView shows those in space."""
+    """Return verified answers with a stored plane state; spatial ones are not drawn."""
     return [
         o for o in a.evidence.flat
         if o.verified and o.first.fields and not in_space(o.quantities)

@@ -1,4 +1,4 @@
-"""Times over cases: means, ranks, what they depend on, and profiles."""
+"""Times over cases: means, ranks under several conventions, and profiles."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.profiles import performance_ratios, solved_within
 
 DRAWN = 4  #: groups whose profiles are drawn; all are tabulated
-FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the table of profiles
+FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the best time, columns of the table of profiles
 TEXT = Sentences(
     __name__, CASES=CASES, EVERY=EVERY, LARGEST_SHIFT=LARGEST_SHIFT,
     PENALTIES=PENALTIES, SHIFTS=SHIFTS, USUAL=USUAL,
@@ -51,7 +51,7 @@ TEXT = Sentences(
 
 
 def not_compared(a: Analysis) -> list[str]:
-    """Name the groups that are not compared over cases, and what they lack."""
+    """List the groups that are not compared over cases, and the reasons."""
     lacking = [group for group in a.groups if not group.comparable]
     if not lacking:
         return []
@@ -89,14 +89,18 @@ def _means_table(ranking: Ranking) -> Table:
     def common_ratio(i: int) -> Cell:
         value = float(common[i] / common[leader])
         if np.isnan(value):
-            return Cell(title="too few cases that all solved")
+            return Cell(title="too few cases solved by all")
         return Cell.number(value, significant)
 
     def restricted(i: int) -> Cell:
-        found = restricted_mean(group.times[:, i], group.stopped[:, i], group.horizon)
-        censored = [f"{found.stopped} out of time"] * bool(found.stopped)
-        censored += [f"{found.never} never"] * bool(found.never)
-        return Cell.time(found.mean, after=", ".join(censored))
+        censored_mean = restricted_mean(
+            group.times[:, i], group.stopped[:, i], group.horizon
+        )
+        censored = [f"{censored_mean.stopped} out of time"] * bool(
+            censored_mean.stopped
+        )
+        censored += [f"{censored_mean.never} never"] * bool(censored_mean.never)
+        return Cell.time(censored_mean.mean, after=", ".join(censored))
 
     return Table.of(
         TEXT("means_caption", group, rows.sum(), (~columns).sum()),
@@ -125,24 +129,24 @@ def _means_table(ranking: Ranking) -> Table:
 
 
 def _share(p: float) -> str:
-    """Print a share of the draws without claiming what they cannot show."""
+    """Print a share of the draws, with no more digits than 2000 draws support."""
     return "0" if p == 0 else "< 0.01" if p < 0.01 else f"{p:.2f}"
 
 
 def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
-    """Compare with the leader on the cases that both solved; nothing is charged."""
+    """Compare with the leader on the cases that both solved, without any charge."""
     mine, its = (
         {p: float(t) for p, t in enumerate(group.times[:, s]) if np.isfinite(t)}
         for s in (i, leader)
     )
     ratio = paired_ratio(mine, its)
     if ratio is None or ratio.pairs < CASES:
-        return Cell(title=f"fewer than {CASES} cases that both solved")
+        return Cell(title=f"fewer than {CASES} cases solved by both")
     session = ", other session" * bool(group.apart.any() and group.apart[i, leader])
     return Cell.ratio(ratio, after=f"n = {ratio.pairs}{session}")
 
 
-@section(42, "ranking", "What ranks depend on")
+@section(42, "ranking", "Dependence of the ranks on conventions")
 def ranking(a: Analysis) -> Iterator[Part]:
     """Tabulate the ranks of every group under changed conventions."""
     if a.rankings:
@@ -151,9 +155,10 @@ def ranking(a: Analysis) -> Iterator[Part]:
     for one in a.rankings:
         ranked = panel(one.group)
         upper = np.triu(np.ones_like(ranked.turned), 1)
-        told = (one.faster | one.faster.T) & upper
+        separated = (one.faster | one.faster.T) & upper
         turned = ranked.turned & upper
-        counts = int(one.tiers.max()), told.sum(), turned.sum(), (turned & told).sum()
+        both = turned & separated
+        counts = int(one.tiers.max()), separated.sum(), turned.sum(), both.sum()
         yield from TEXT.parts("order", one.group, *counts)
         yield _panel_table(one, ranked)
 
@@ -161,7 +166,7 @@ def ranking(a: Analysis) -> Iterator[Part]:
 def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     def changed(one: Changed, i: int) -> Cell:
         if np.isnan(one.ranks[i]):
-            return Cell(title="takes no part in the comparison")
+            return Cell(title="not part of this comparison")
         return Cell.number(
             float(one.ranks[i]), "{:.0f}".format,
             kind="over" if one.turned[i].any() else "",
@@ -172,9 +177,9 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
         return _range(min(found), max(found))
 
     def reading(i: int) -> Cell:
-        told = ranking.faster[i] | ranking.faster[:, i]
+        separated = ranking.faster[i] | ranking.faster[:, i]
         low, high = ranking.spans[i]
-        return Cell.words(_reading(ranked.turned[i], told, sure=low == high))
+        return Cell.words(_reading(ranked.turned[i], separated, unique=low == high))
 
     return Table.of(
         TEXT("panel_caption", ranking.group),
@@ -183,7 +188,7 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
             ("solver", lambda i: Cell.name(ranking.group.solvers[i])),
             ("tier", lambda i: Cell.number(int(ranking.tiers[i]))),
             ("rank", lambda i: Cell.number(int(ranked.usual[i]))),
-            ("inside the noise", lambda i: _range(*ranking.spans[i])),
+            ("rank interval", lambda i: _range(*ranking.spans[i])),
             *((name, partial(changed, one)) for name, one in ranked.single.items()),
             ("all", every),
             ("reading", reading),
@@ -191,13 +196,21 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
     )
 
 
-def _reading(turned: NDArray[np.bool_], told: NDArray[np.bool_], *, sure: bool) -> str:
-    """Say what the rank of a solver is worth; sure: it can have no other."""
-    if (turned & told).any():
+def _reading(
+    turned: NDArray[np.bool_], separated: NDArray[np.bool_], *, unique: bool
+) -> str:
+    """Describe the reliability of the rank of one solver.
+
+    turned : (solvers,) whether some convention reverses the order relative to another
+    separated : (solvers,) whether the difference from another is significant
+    unique : the rank interval is a single rank
+    """
+    if (turned & separated).any():
         return "depends on the convention"
     if turned.any():
-        return "turns inside the noise"
-    return "the same under all" if sure else "the same under all, inside the noise"
+        return "reversed, not significantly"
+    robust = "same under all conventions"
+    return robust if unique else f"{robust}, not significant"
 
 
 def _range(low: int, high: int) -> Cell:
@@ -214,10 +227,10 @@ def profiles(a: Analysis) -> Iterator[Part]:
     solvers = a.evidence.solvers
     for k, ranking in enumerate(a.rankings[:DRAWN], 1):
         rows = rows_of(ranking, solvers)
-        behind = len(ranking.group.solvers) - sum(map(len, rows))
+        slower = len(ranking.group.solvers) - sum(map(len, rows))
         yield Picture(
             name=f"profiles-{k}",
-            caption=TEXT("drawn", ranking.group, len(rows), behind, banded(ranking)),
+            caption=TEXT("drawn", ranking.group, len(rows), slower, banded(ranking)),
             figure=profile_figure(ranking, solvers),
         )
         if len(ranking.group.solvers) > 2:

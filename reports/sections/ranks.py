@@ -35,10 +35,10 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.cost_model import CostModel
 from mortarbench.reports.statistics.intervals import Interval
 
-MOST_DRAWN = 4  #: series of a figure; all are tabulated
-MISFIT = 0.2  #: of a model that is not asked about more ranks
-PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: ranks that the model is asked about
-_CROWDED = "more ranks than CPUs: they took turns"
+MOST_DRAWN = 4  #: series in a figure; all are tabulated
+MISFIT = 0.2  #: largest relative misfit of a model that is used to predict
+PREDICTED = (4, 8, 16, 32, 64, 128, 256)  #: numbers of ranks to predict
+_CROWDED = "more ranks than CPUs: ranks shared CPUs"
 TEXT = Sentences(__name__, ALIKE=ALIKE, MISFIT=MISFIT, MOST_DRAWN=MOST_DRAWN)
 
 #: a series, a number of ranks, and the answer on them
@@ -49,8 +49,8 @@ _SERIES = ("case", "solver", "tol")
 
 @section(
     66, "ranks", "One solve on several ranks",
-    "One solve on several ranks: nothing was verified on one rank and on several; "
-    "ranks = [1, 2] in the suite (see suites/ranks.toml).",
+    "One solve on several ranks: no case was verified both on one rank and on "
+    "several; set ranks = [1, 2] in the suite (see suites/ranks.toml).",
 )  # fmt: skip
 def ranks(a: Analysis) -> Iterator[layout.Part]:
     """Tabulate and draw solves on several ranks."""
@@ -148,7 +148,7 @@ def _weak_table(series: WeakSeries) -> Table:
 
 
 def _part_tables(solves: Sequence[Solve]) -> Iterator[Table]:
-    """Tabulate what ranks spent, sent and held; nothing where no record says so."""
+    """Tabulate time, messages and memory of the ranks, as far as records have them."""
     parts = [rank_parts(o) for *_, o in solves]
     counts = [rank_counts(o) for *_, o in solves]
     if any(parts):
@@ -197,11 +197,11 @@ def _part(part: Part | None, o: Outcome) -> Cell:
 def _model_tables(
     modelled: Sequence[StrongSeries], asked: Sequence[StrongSeries]
 ) -> Iterator[Table]:
-    """Tabulate the terms of models, and what those that fit predict."""
+    """Tabulate the terms of the models, and the predictions of those that fit."""
 
     def row(s: StrongSeries, m: CostModel) -> tuple[Cell, ...]:
         runs = source(*(s.answers[n] for n in m.measured))
-        terms = (m.work, m.alike, m.slowdown, *m.communication)
+        terms = (m.work, m.repeated, m.slowdown, *m.communication)
         return (
             *_series(s),
             Cell(text=", ".join(map(str, m.measured)), title=runs),
@@ -215,7 +215,7 @@ def _model_tables(
             caption=TEXT("model_caption"),
             columns=(
                 *_SERIES, "fitted to ranks", "W, s", "C, s", "s", "reductions, s",
-                "messages, s", "bytes, s", "misfit", "half of N reached to N =",
+                "messages, s", "bytes, s", "misfit", "efficiency ≥ 1/2 up to N =",
             ),
             rows=tuple(row(s, s.model) for s in modelled if s.model is not None),
             text_columns=2,
@@ -225,7 +225,7 @@ def _model_tables(
     def prediction(n: int, s: StrongSeries) -> Cell:
         if s.model is None or n not in predicted(s):
             return Cell()
-        return _ratio(s.model.speed_up(n), "model, not measured", "quiet")
+        return _ratio(s.model.speed_up(n), "predicted, not measured", "quiet")
 
     if asked:
         beyond = sorted({n for s in asked for n in predicted(s)})
@@ -237,14 +237,14 @@ def _model_tables(
                 *((f"N = {n}", partial(prediction, n)) for n in beyond),
             ),
             text_columns=2,
-            notes=("There are no more ranks than subdomains.",),
+            notes=("The number of subdomains limits the number of ranks.",),
         )
 
 
 def predicted(s: StrongSeries) -> tuple[int, ...]:
-    """List the ranks beyond the measured ones that the model is asked about.
+    """Return the numbers of ranks, beyond the measured ones, to predict.
 
-    Empty where it does not even fit the measured ones.
+    Empty if the model misfits the measured times by more than `MISFIT`.
     """
     assert s.model is not None
     if s.model.misfit > MISFIT:
@@ -258,15 +258,15 @@ def _pictures(
     weak: Sequence[WeakSeries],
     asked: Sequence[StrongSeries],
 ) -> Iterator[Picture]:
-    told = [(s, n) for s in strong for n in s.several if rank_parts(s.answers[n])]
+    timed = [(s, n) for s in strong for n in s.several if rank_parts(s.answers[n])]
     shown = [(s, predicted(s)) for s in asked[:MOST_DRAWN]]
     drawn: tuple[tuple[str, Sequence[object], Callable[[], Figure]], ...] = (
         ("strong", strong, lambda: strong_figure(strong[:MOST_DRAWN])),
-        ("parts", told, lambda: parts_figure(told[: 3 * MOST_DRAWN])),
+        ("parts", timed, lambda: parts_figure(timed[: 3 * MOST_DRAWN])),
         ("weak", weak, lambda: weak_figure(weak[:MOST_DRAWN])),
         ("model", asked, lambda: model_figure(shown)),
     )
-    for name, found, draw in drawn:
-        if found:
-            caption = TEXT(name, len(found))
+    for name, shown_series, draw in drawn:
+        if shown_series:
+            caption = TEXT(name, len(shown_series))
             yield Picture(name=f"ranks-{name}", caption=caption, figure=draw())

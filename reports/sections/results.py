@@ -24,7 +24,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.profiles import share
 
 TEXT = Sentences(__name__)
-#: (claimed to be solved, verified) and what that is called
+#: (claimed to be solved, verified) → heading of the column
 KINDS = {
     (True, True): "claimed, verified",
     (True, False): "claimed, refuted",
@@ -33,9 +33,9 @@ KINDS = {
 }
 
 
-@section(16, "tally", "Claims and verdicts, counted")
+@section(16, "tally", "Claims and verdicts: counts")
 def claim_counts(a: Analysis) -> Iterator[Part]:
-    """Count, for every solver, what it claimed and what was found."""
+    """Count the answers of every solver by claim and verdict."""
     count: dict[str, Counter[tuple[bool, bool]]] = defaultdict(Counter)
     for o in a.evidence.flat:
         if o.verdict is not Verdict.DECLINED:
@@ -46,12 +46,12 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
         n = count[solver][kind]
         return Cell.number(n, kind="over" if n and kind == (True, False) else "")
 
-    def held(solver: str) -> Cell:
+    def confirmed(solver: str) -> Cell:
         right, wrong = count[solver][True, True], count[solver][True, False]
         if not right + wrong:
             return Cell()
-        found = [float(part) for part in share(right, right + wrong)]
-        return Cell(text=fixed(found, 2), value=found[0])
+        estimate = [float(part) for part in share(right, right + wrong)]
+        return Cell(text=fixed(estimate, 2), value=estimate[0])
 
     yield from TEXT.parts("claim_counts")
     yield Table.of(
@@ -60,14 +60,14 @@ def claim_counts(a: Analysis) -> Iterator[Part]:
         (
             ("solver", Cell.name),
             *((name, partial(counted, kind)) for kind, name in KINDS.items()),
-            ("claims that hold", held),
+            ("claims that hold", confirmed),
         ),
     )
 
 
-@section(18, "verdicts", "Claimed against verified")
+@section(18, "verdicts", "Claims and verdicts")
 def claims(a: Analysis) -> Iterator[Part]:
-    """Set what each solver claimed beside what we found, and list refuted claims."""
+    """Tabulate claims beside our verdicts, and list the refuted claims."""
     yield from TEXT.parts("claims")
     yield grid(a.evidence, "Verdicts and worst residuals.", _verdict)
     kinds = (Verdict.INACCURATE, Verdict.WRONG, Verdict.INFEASIBLE_CLAIM)
@@ -77,7 +77,7 @@ def claims(a: Analysis) -> Iterator[Part]:
             *answer_columns(),
             ("verdict", verdict_cell),
             ("evidence", _refutation),
-            ("its words", lambda o: Cell.label(o.first.message, 60)),
+            ("message of the solver", lambda o: Cell.label(o.first.message, 60)),
         )
         caption = TEXT("refuted_caption")
         yield explained(Table.of(caption, refuted, columns, text_columns=2))
@@ -86,13 +86,13 @@ def claims(a: Analysis) -> Iterator[Part]:
 def _refutation(outcome: Outcome) -> Cell:
     """Name the residual or the distance that refutes a claim."""
     values = {name: outcome.largest(name) for name in RESIDUALS}
-    known = {name: value for name, value in values.items() if value is not None}
+    errors = {name: value for name, value in values.items() if value is not None}
     if (error := outcome.largest("optimum_error")) is not None:
-        known = {"off the proven optimum by": error}
-    if not known:
+        errors = {"distance from the proven optimum": error}
+    if not errors:
         return Cell(text="no point", title=source(outcome))
-    name = max(known, key=lambda n: known[n])
-    text = f"{name} {power(known[name])} > {power(outcome.allowed)}"
+    name = max(errors, key=lambda n: errors[n])
+    text = f"{name} {power(errors[name])} > {power(outcome.allowed)}"
     return Cell(text=text, title=source(outcome))
 
 
@@ -110,7 +110,7 @@ def _verdict(outcome: Outcome, _row: Mapping[str, Outcome]) -> Cell:
 
 @section(50, "iterations", "Iterations and counts")
 def iterations(a: Analysis) -> Iterator[Part]:
-    """Show iterations, and a table per solver of what else it counts."""
+    """Tabulate iterations, and the further counts of each solver."""
     yield from TEXT.parts("iterations")
     caption = "Iterations, as each solver counts them."
     yield grid(a.evidence, caption, _iterations)
@@ -145,7 +145,7 @@ def _counts(outcome: Outcome, names: Iterable[str]) -> Iterator[Cell]:
 
 @section(56, "errors", "Errors")
 def errors(a: Analysis) -> Iterator[Part]:
-    """List the four residuals and, where there is one, the certified bound."""
+    """Tabulate the four residuals and, where there is one, the certified bound."""
     answers = [o for o in a.evidence.flat if o.worst is not None]
     bounded = any(o.largest("energy_bound") is not None for o in a.evidence.flat)
     yield from TEXT.parts("errors", answers, bounded)

@@ -29,19 +29,19 @@ from mortarbench.reports.statistics.growth import (
 )
 from mortarbench.reports.statistics.intervals import PowerLaw
 
-MOST_DRAWN = 8  #: pictures of counts; all are tabulated
-#: what is read before other counts; the rest in a solver's own order
+MOST_DRAWN = 8  #: figures of counts; all are tabulated
+#: counts listed first; the others follow in the order of the solver
 FIRST = ("P_products", "preconditioner_applies", "cg", "expansion", "proportioning")
 TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
 
 
 @section(
     60, "scaling", "Scaling",
-    "Scaling: no cases differ in size alone, in three sizes or more (see "
+    "Scaling: no cases differ in size only, with three or more sizes (see "
     "suites/scaling.toml).",
 )  # fmt: skip
 def scaling(a: Analysis) -> Iterator[Part]:
-    """Tabulate every series of sizes, and draw those with most answers."""
+    """Tabulate every series of sizes, and draw those with the most answers."""
     if a.sizes:
         yield from TEXT.parts("scaling")
     for series in a.sizes:
@@ -100,10 +100,10 @@ def _exponent(law: PowerLaw | None, runs: str) -> Cell:
 
 @section(
     62, "growth", "Do iterations grow?",
-    "Do iterations grow?: cases of four sizes or more are needed.",
+    "Do iterations grow?: cases of four or more sizes are needed.",
 )  # fmt: skip
 def growth(a: Analysis) -> Iterator[Part]:
-    """Test every series of at least four sizes."""
+    """Judge the growth of iterations in every series of at least four sizes."""
     tested = [series for series in a.sizes if len(series.sizes) >= SIZES]
     if tested:
         yield from TEXT.parts("growth")
@@ -122,7 +122,7 @@ def _growth_table(series: SizeSeries) -> Table:
         try:
             return Cell.time(fit.at(largest))
         except ValueError as e:
-            return Cell(text="refused", kind="quiet", title=f"{e}")
+            return Cell(text="no prediction", kind="quiet", title=f"{e}")
 
     return Table.of(
         TEXT("growth_caption", largest, series.title),
@@ -145,7 +145,7 @@ def iteration_growth(series: SizeSeries, solver: str) -> Growth | None:
 
 
 def _fit(points: Sequence[tuple[int, float]]) -> Growth | None:
-    """Fit what is positive; None with too few sizes."""
+    """Fit a power law to the positive values; None with too few sizes."""
     kept = [(n, v) for n, v in points if n > 0 and v > 0]
     if len({n for n, _ in kept}) < SIZES:
         return None
@@ -179,11 +179,11 @@ def per_decade(fit: Growth) -> str:
 
 @section(
     64, "steps", "Steps of each kind against size",
-    "Steps of each kind against size: no solver counts anything on three sizes or "
-    "more.",
+    "Steps of each kind against size: no solver reports counts on three or more "
+    "sizes.",
 )  # fmt: skip
 def steps(a: Analysis) -> Iterator[Part]:
-    """Tabulate and draw what solvers count, each kind apart, against n and H/h."""
+    """Tabulate and draw the counts of each solver, by kind, against n and H/h."""
     torn = sweeps(a.evidence, "feti")
     against_size = [
         (series, solver)

@@ -1,6 +1,6 @@
-"""What was solved and under which conditions, what the numbers mean, what they do not.
+"""Sections on cases, environment, definitions and limitations.
 
-Every case is listed with all of its parameters, and the sizes of its QP.
+Every case is listed with all of its parameters and the sizes of its QP.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ TEXT = Sentences(__name__)
 
 @section(14, "cases", "Cases")
 def cases(a: Analysis) -> Iterator[Part]:
-    """List every case, one table per family; records hold defaults with the rest."""
+    """Tabulate every case by family; records contain defaults as well."""
     yield from TEXT.parts("cases")
     found = [
-        # the first that built the QP, or else the last
+        # a declined or crashed build has no sizes
         (next((o for o in outcomes if o.first.sizes), outcomes[-1]), source(*outcomes))
         for outcomes in grouped(a.evidence.flat, lambda o: o.case).values()
     ]
@@ -36,7 +36,7 @@ def cases(a: Analysis) -> Iterator[Part]:
 
 
 def _table(family: str, found: Sequence[tuple[Outcome, str]]) -> Table:
-    """Make a column of every parameter that varies, and a note of the others."""
+    """Return a table with a column per varying parameter, the others in a note."""
     params = [o.first.params for o, _ in found]
     keys = dict.fromkeys(key for of in params for key in of)
     values = {key: {_parameter(key, each).text for each in found} for key in keys}
@@ -66,19 +66,19 @@ def _parameter(key: str, each: tuple[Outcome, str]) -> Cell:
 
 
 def _value(value: Any, limit: int, title: str = "") -> Cell:
-    """Show a value of plain data, sorted by if it is a number."""
+    """Return a cell of plain data; numbers are sorted by value."""
     number = float(value) if isinstance(value, int | float) else None
     return Cell(text=plain_value(value, limit), value=number, title=title)
 
 
 @section(92, "environment", "Environment and settings")
 def environment(a: Analysis) -> Iterator[Part]:
-    """List machine, versions and limits as recorded."""
+    """Tabulate settings, solver options and environment as recorded."""
     evidence = a.evidence
     tols = sorted({r.tol for r in evidence.records}, reverse=True)
     digests = sorted({r.environment for r in evidence.records if r.environment})
     limits = {
-        "tolerances asked for": ", ".join(map(tolerance, tols)),
+        "tolerances": ", ".join(map(tolerance, tols)),
         "verified if every residual ≤": f"{evidence.factor:g} × tolerance",
         "repeats, each prepared afresh": 1 + max(r.repeat for r in evidence.records),
         "time limit in s": evidence.suite.get("time_limit"),
@@ -92,7 +92,7 @@ def environment(a: Analysis) -> Iterator[Part]:
             [(k, v) for k, v in limits.items() if v not in (None, "")],
         ),
         (
-            "Options of the solvers, defaults resolved.",
+            "Options of the solvers, including defaults.",
             [
                 (f"{solver}.{key}", value)
                 for solver in evidence.solvers
@@ -130,5 +130,5 @@ def _plain(value: Any) -> str:
 
 @section(94, "definitions", "Definitions and limitations")
 def definitions(a: Analysis) -> Iterator[Part]:
-    """Define residuals, verdicts and energies, and say what the report cannot show."""
+    """Define residuals and verdicts, and state the limitations of the report."""
     yield from TEXT.parts("definitions", a.evidence.factor)

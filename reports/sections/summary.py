@@ -1,4 +1,4 @@
-"""What was measured, and which solvers do not reach what was asked."""
+"""Summary of the measurements, and the solvers that miss a tolerance."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ TEXT = Sentences(
 
 @section(12, "summary", "Summary")
 def summary(a: Analysis) -> Iterator[Part]:
-    """Say in a few sentences and one table how the comparison ended."""
+    """Summarise the measurements in a few sentences and one table."""
     evidence = a.evidence
     tried = [o for o in evidence.flat if o.verdict is not Verdict.DECLINED]
     yield from TEXT.parts(
         "prose",
         evidence,
-        made=_made(evidence),
+        made=_measurement_counts(evidence),
         cases=len({o.case for o in evidence.flat}),
         tols=sorted({o.tol for o in evidence.flat}, reverse=True),
         digests=sorted({r.environment for r in evidence.records}),
@@ -77,7 +77,7 @@ def summary(a: Analysis) -> Iterator[Part]:
 
 
 def _marks(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
-    """List the marks behind labels, their environments, and what differs there."""
+    """List the marks behind labels, their environments, and the differing keys."""
     found: list[tuple[str, str, list[str]]] = []
     for digest, mark in evidence.marks.items():
         try:
@@ -90,10 +90,10 @@ def _marks(evidence: Evidence) -> list[tuple[str, str, list[str]]]:
     return found
 
 
-def _made(evidence: Evidence) -> tuple[int, int, int, int]:
-    """Count the measurements made, of all, not made since declined, and missing.
+def _measurement_counts(evidence: Evidence) -> tuple[int, int, int, int]:
+    """Count the measurements: done, planned, declined and missing.
 
-    The journal holds one line for a case that a solver declined, whatever the repeats.
+    The journal has one line for a case that a solver declined, whatever the repeats.
     """
     made = sum(r.verdict is not Verdict.DECLINED for r in evidence.records)
     asked = evidence.suite.get("repeats")
@@ -107,7 +107,7 @@ def _made(evidence: Evidence) -> tuple[int, int, int, int]:
 
 
 def _cells(evidence: Evidence) -> int:
-    """Count what can be measured: cold solvers on cold cases, sequences on theirs."""
+    """Count the planned cells: cold solvers on cold cases, sequences on sequences."""
 
     def kind(r: Record) -> tuple[str, str]:
         return r.mode, evidence.marks.get(r.environment, "")
@@ -121,7 +121,7 @@ def _cells(evidence: Evidence) -> int:
 
 
 def sentences(evidence: Evidence, solver: str) -> list[str]:
-    """Say plainly where one solver does not reach the tolerance, one per tolerance."""
+    """Return one sentence per tolerance on the cases that a solver misses."""
     mine = [o for o in evidence.flat if o.solver == solver]
     tols = sorted({o.tol for o in mine}, reverse=True)
     return [_sentence(solver, tol, [o for o in mine if o.tol == tol]) for tol in tols]

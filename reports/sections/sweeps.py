@@ -1,4 +1,4 @@
-"""Time to accuracy: the tolerance asked for is swept, every answer is judged at one."""
+"""Time to accuracy: tolerances are swept, and all answers judged at one accuracy."""
 
 from __future__ import annotations
 
@@ -34,8 +34,8 @@ from mortarbench.reports.statistics.intervals import Interval
 
 TEXT = Sentences(__name__)
 _PANELS = 4  #: cases that are drawn; all are tabulated
-ERRORS = (1e-2, 1e-4, 1e-6)  #: certified, at which times are compared
-LEAST = 3  #: tolerances that make a sweep
+ERRORS = (1e-2, 1e-4, 1e-6)  #: certified errors at which times are compared
+LEAST = 3  #: fewest tolerances of a sweep
 
 Sweeps = Mapping[str, Mapping[str, Sequence[Outcome]]]  #: case → solver → by tolerance
 Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
@@ -43,8 +43,8 @@ Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
 
 @section(
     46, "accuracy", "Time to accuracy",
-    "Time to accuracy: it takes the key accuracy in the suite, or answers with a "
-    "certified error at three tolerances or more (see suites/accuracy.toml).",
+    "Time to accuracy: requires the key accuracy in the suite, or answers with a "
+    "certified error at three or more tolerances (see suites/accuracy.toml).",
 )  # fmt: skip
 def accuracy(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw every sweep: certified errors, or else the largest residual."""
@@ -106,7 +106,7 @@ def _present(
 def _cheapest_of(
     row: Mapping[str, Sequence[Outcome]],
 ) -> dict[str, tuple[Interval, Outcome]]:
-    """Choose the verified answer of each solver that took least."""
+    """Select the fastest verified answer of each solver."""
     timed = {
         s: [(t, o) for o in of if o.verified and (t := o.seconds("total"))]
         for s, of in row.items()
@@ -123,7 +123,7 @@ def _not_reached(tried: Sequence[Outcome], after: str = "") -> Cell:
 
 
 def certified_sweeps(evidence: Evidence) -> dict[str, dict[str, list[Outcome]]]:
-    """Collect the cases with certified errors at three tolerances or more."""
+    """Collect the cases with certified errors at three or more tolerances."""
     bounded = (o for o in evidence.flat if o.largest("energy_bound") is not None)
     tols = Counter(case for case, _ in {(o.case, o.tol) for o in bounded})
     swept = (o for o in evidence.flat if tols[o.case] >= LEAST)
@@ -140,7 +140,7 @@ def by_solver(
 
 
 def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
-    """Tabulate the times at matched certified errors."""
+    """Tabulate the times at equal certified errors."""
     times = {
         (case, error): {s: time_at_accuracy(of, error) for s, of in row.items()}
         for case, row in swept.items()
@@ -160,7 +160,7 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
         return _matched(times[key][solver], swept[key[0]][solver], kind)
 
     return Table.of(
-        "Total time at matched certified error: relative, in the energy norm.",
+        "Total time at equal certified relative error in the energy norm.",
         times,
         (
             ("case", lambda key: Cell.name(key[0])),
@@ -174,7 +174,8 @@ def time_at_accuracy_table(swept: Sweeps, solvers: Sequence[str]) -> Table:
 def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
     """Rank the times of a row: "best", "tied" or neither, by solver.
 
-    What is only bounded from above has no place in it, and then nothing is best.
+    A time that is only bounded from above is not ranked. It may be the smallest, so
+    no time of its row is then called the best.
     """
     known = {s: m.time for s, m in found.items() if m.kind == "between" and m.time}
     if not known:
@@ -193,12 +194,14 @@ def _matched(found: TimeAtAccuracy, tried: Sequence[Outcome], kind: str) -> Cell
     reached = [o for o in tried if counts(o)]
     if found.time is None:
         closest = min((o.largest("energy_bound") or 0.0 for o in reached), default=None)
-        return _not_reached(tried, f"at best {power(closest)}" if reached else "")
+        return _not_reached(
+            tried, f"smallest error {power(closest)}" if reached else ""
+        )
     runs = " ".join(i for o in reached for i in o.run_ids)
     looser = found.kind == "looser"
     return Cell(
         text=("≤ " if looser else "") + seconds(found.time),
-        after="below the loosest tolerance" if looser else "",
+        after="more accurate at the loosest tolerance" if looser else "",
         symbol="≈" if kind == "tied" else "",
         kind=kind,
         value=found.time.value,

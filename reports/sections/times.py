@@ -1,7 +1,7 @@
-"""Times of verified answers, their ratios, and how well they are known.
+"""Times of verified answers, their ratios, and their precision.
 
-What equal solvers differ by needs a null arm, and how the machine ran a canary in the
-records; journals from before have neither.
+The precision is measured by null arms (one solver under two labels) and by the canary
+of each record; journals of older versions have neither.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from mortarbench.harness import Record
 from mortarbench.harness.running.pairs import Ratio, paired_ratio, ratio_of
-from mortarbench.harness.suite.suite import NULL
+from mortarbench.harness.suite.suite import NULL_SUFFIX
 from mortarbench.reports.data.cells import (
     BY_OPTIMUM,
     case_cells,
@@ -38,7 +38,7 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.intervals import COVERAGE, median_interval
 
 TEXT = Sentences(__name__, LEAST=COVERAGE, BY_OPTIMUM=BY_OPTIMUM)
-_PARTS = 3  #: the canary's drift compares the last third with the first
+_PARTS = 3  #: the drift of the canary is from the first third to the last
 
 
 @section(20, "times", "Times")
@@ -67,7 +67,7 @@ def times(a: Analysis) -> Iterator[Part]:
 def _charged_table(
     charged: Sequence[Mapping[str, Outcome]], solvers: Sequence[str]
 ) -> Table:
-    """Charge dualising to dual forms, where it was measured; primal forms have none."""
+    """Tabulate total times of dual forms including dualisation, where it was timed."""
     rows = []
     for row in charged:
         one = next(o for o in row.values() if o.dualising is not None)
@@ -82,7 +82,7 @@ def _charged_table(
         )
         dualising = Cell.time(one.dualising, title=source(one))
         rows.append((*case_cells(row), dualising, *cells))
-    heads = ("case", "tol", "dualising", *(clean(s, 40) for s in solvers))
+    heads = ("case", "tol", "dualisation", *(clean(s, 40) for s in solvers))
     return Table(caption=TEXT("charged_caption"), columns=heads, rows=tuple(rows))
 
 
@@ -108,11 +108,11 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
 
 @section(
     22, "ratios", "Ratios within blocks",
-    "Ratios within blocks: every solver was measured once. repeats = 3 in the suite, "
-    "or --repeats 3, gives pairs of times to compare.",
+    "Ratios within blocks: every solver was measured once. Paired times need repeats, "
+    "such as repeats = 3 in the suite or --repeats 3.",
 )  # fmt: skip
 def ratios(a: Analysis) -> Iterator[Part]:
-    """Tabulate ratios to the fastest verified answer; nothing without repeats."""
+    """Tabulate ratios to the fastest verified answer; empty without repeats."""
     if not any(len(o.records) > 1 for o in a.evidence.flat):
         return
     fastest = {key: _fastest(row) for key, row in a.evidence.outcomes.items()}
@@ -130,15 +130,15 @@ def ratios(a: Analysis) -> Iterator[Part]:
             return Cell(title="not verified")
         if outcome is best:
             return Cell(text="1", value=1.0, kind="best", title=source(outcome))
-        found = ratio_of(outcome.by_block, best.by_block if best else {})
-        if found is None:
+        relative = ratio_of(outcome.by_block, best.by_block if best else {})
+        if relative is None:
             return Cell(title="fewer than two blocks in common")
-        tied = found.low <= 1 <= found.high
+        tied = relative.low <= 1 <= relative.high
         return Cell.number(
-            found,
+            relative,
             estimate,
             symbol="≈" if tied else "",
-            after="" if found.paired else "unpaired",
+            after="" if relative.paired else "unpaired",
             kind="tied" if tied and not outcome.first.role else "",
             title=source(outcome),
         )
@@ -148,7 +148,7 @@ def ratios(a: Analysis) -> Iterator[Part]:
 
 
 def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
-    """Find the smallest median of a verified answer; null arms do not compete."""
+    """Return the verified answer with the smallest median; null arms do not compete."""
     medians = {
         s: median(times)
         for s, o in row.items()
@@ -158,7 +158,7 @@ def _fastest(row: Mapping[str, Outcome]) -> Outcome | None:
 
 
 class _Twins(NamedTuple):
-    """One solver measured as two, and the ratio of their times by blocks."""
+    """One solver measured under two labels, and the ratio of the times by blocks."""
 
     twin: Outcome
     null: Outcome
@@ -170,16 +170,16 @@ class _Twins(NamedTuple):
 
 
 @section(
-    24, "precision", "How well the times are known",
-    "How well the times are known: the records hold no time of the canary, a fixed "
+    24, "precision", "Precision of the times",
+    "Precision of the times: the records have no times of the canary, a fixed "
     "computation before each measurement, and the suite has no null_arm.",
 )  # fmt: skip
 def precision(a: Analysis) -> Iterator[Part]:
-    """Tabulate null arms and canaries; nothing where the records have neither."""
+    """Tabulate null arms and canaries; empty where the records have neither."""
     if null := _null_ratios(a.evidence):
         width = median(each.ratio.half_width for each in null)
-        held = sum(each.equal for each in null)
-        yield from TEXT.parts("null_arm", held, len(null), width)
+        covering = sum(each.equal for each in null)
+        yield from TEXT.parts("null_arm", covering, len(null), width)
         yield Table.of(
             TEXT("null_caption"),
             null,
@@ -194,7 +194,7 @@ def precision(a: Analysis) -> Iterator[Part]:
                     lambda t: Cell.number(t.ratio.half_width, "{:.1%}".format),
                 ),
                 (
-                    "holds 1",
+                    "contains 1",
                     lambda t: (
                         Cell(text="yes") if t.equal else Cell(text="no", kind="over")
                     ),
@@ -211,21 +211,21 @@ def precision(a: Analysis) -> Iterator[Part]:
         yield from TEXT.parts("canary")
         yield Table(
             caption=TEXT("canary_caption"),
-            columns=("solver", "measurements", "canary", "nine tenths", "drift"),
+            columns=("solver", "measurements", "canary", "central 90 %", "drift"),
             rows=(*rows, tuple(total)),
         )
 
 
 def _null_ratios(evidence: Evidence) -> list[_Twins]:
-    """Pair every null arm with the solver that it repeats, by their blocks."""
-    found = []
+    """Pair every null arm with the solver that it repeats, by blocks."""
+    twins = []
     for row in evidence.outcomes.values():
         for null in (o for o in row.values() if o.first.role == "null"):
-            twin = row.get(null.solver.replace(NULL, "", 1))
+            twin = row.get(null.solver.replace(NULL_SUFFIX, "", 1))
             if twin is not None and null.verified and twin.verified:
                 ratio = paired_ratio(null.by_block, twin.by_block)
-                found += [_Twins(twin, null, ratio)] if ratio is not None else []
-    return found
+                twins += [_Twins(twin, null, ratio)] if ratio is not None else []
+    return twins
 
 
 def _canary_row(name: str, mine: Sequence[Record]) -> tuple[Cell, ...]:

@@ -1,4 +1,4 @@
-"""How much accuracy was worth paying for: solver errors beside those of the mesh."""
+"""Cost of accuracy: solver errors beside the discretisation errors of the meshes."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.sections.sweeps import by_solver
 
 TEXT = Sentences(__name__)
-_KNOWN = ("limit", "change")  #: kinds with an error to compare with
+_KNOWN = ("limit", "change")  #: kinds of discretisation errors with a value
 
 Meshes = Mapping[str, Discretisation]
 
 
 @section(
-    48, "worth", "How much accuracy was worth paying for",
-    "How much accuracy was worth paying for: the errors of the meshes are not known. "
-    '"mortarbench validate DIR" finds them, and a later report shows them.',
+    48, "worth", "How much accuracy is worth paying for",
+    "How much accuracy is worth paying for: the discretisation errors are unknown. "
+    '"mortarbench validate DIR" computes them for later reports.',
 )  # fmt: skip
 def value_of_accuracy(a: Analysis) -> Iterator[Part]:
-    """Set certified errors beside discretisation errors, where some are known."""
+    """Tabulate certified errors relative to discretisation errors, where known."""
     known = read_discretisation(a.evidence.directory)
     physical = dict.fromkeys(o.physical for o in a.evidence.flat)
     meshes = {name: known[name] for name in physical if name in known}
@@ -71,7 +71,7 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
 
     def price(solver: str, case: str) -> Cell:
         if (case, solver) not in ends:
-            text = "never enough" if solver in priced[case] else ABSENT
+            text = "never accurate enough" if solver in priced[case] else ABSENT
             return Cell(text=text, kind="quiet")
         enough, tightest = ends[case, solver]
         ratio = ratio_of(tightest.by_block, enough.by_block)
@@ -79,7 +79,7 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
         return Cell.time(times[case, solver][0], after=after, title=source(enough))
 
     yield Table.of(
-        "Certified error of the solver over the discretisation error.",
+        "Certified error of the solver relative to the discretisation error.",
         [
             (case, tol)
             for case, row in priced.items()
@@ -101,7 +101,7 @@ def value_of_accuracy(a: Analysis) -> Iterator[Part]:
 
 
 def share_of(outcome: Outcome, meshes: Meshes) -> float | None:
-    """Divide the certified error by the discretisation error, where both are known."""
+    """Return the certified error over the discretisation error; None if unknown."""
     bound, mesh = outcome.largest("energy_bound"), meshes.get(outcome.physical)
     if bound is None or mesh is None or mesh.kind not in _KNOWN or not mesh.error:
         return None
@@ -111,7 +111,7 @@ def share_of(outcome: Outcome, meshes: Meshes) -> float | None:
 def _ends(
     outcomes: Sequence[Outcome], meshes: Meshes
 ) -> tuple[Outcome, Outcome] | None:
-    """Pick the loosest tolerance that is accurate enough, and the tightest reached."""
+    """Select the loosest tolerance that is accurate enough, and the tightest one."""
     reached = [o for o in outcomes if counts(o)]
     enough = [o for o in reached if (share_of(o, meshes) or 0.0) <= SHARE]
     if not enough:

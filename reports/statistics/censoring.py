@@ -1,4 +1,4 @@
-"""Time limits as what they are: the answer would have come later, if ever.
+"""Restricted mean of times that are censored by a time limit.
 
 References
 ----------
@@ -21,29 +21,28 @@ Array = NDArray[np.float64]
 
 
 class Restricted(NamedTuple):
-    """The mean of min(t, horizon) over the cases, and how many times are known."""
+    """Mean of min(t, horizon) over the cases, with the numbers of endings."""
 
     mean: Interval  #: s
     solved: int
-    stopped: int  #: ran out of time: censored
-    never: int  #: ended without a verified answer, by themselves
+    stopped: int  #: stopped at the time limit: censored
+    never: int  #: ended by themselves without a verified answer
 
 
 def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     """Estimate the mean of min(t, horizon): ∫ S dt from 0 to the horizon.
 
-    S is the Kaplan-Meier estimate [1]_ of the share of cases that are unsolved at t.
-    Where time ran out the case is censored: all that is known is that t is later. An
-    answer that was refuted, a crash or an iteration limit is no matter of time: t is
-    infinite there. If time ran out at the horizon only, this is the plain mean of
-    min(t, horizon). The variance is that of [2]_, Σ (∫ₜᵢ S)²·dᵢ/(nᵢ(nᵢ − dᵢ)), times
-    n/(n − 1); the interval is Student's with n − 1 degrees of freedom, cut at 0 and at
-    the horizon.
+    S is the Kaplan-Meier estimate [1]_ of the share of cases that are unsolved at t. A
+    case that reached the time limit is censored: its t is known to be later. A refuted
+    answer, a crash and an iteration limit do not depend on time, so t is infinite. If
+    every time limit is at the horizon, this is the plain mean of min(t, horizon). The
+    variance is that of [2]_, Σ (∫ₜᵢ S)²·dᵢ/(nᵢ(nᵢ − dᵢ)), times n/(n − 1); the interval
+    is Student's with n − 1 degrees of freedom, truncated at 0 and at the horizon.
 
     Parameters
     ----------
-    times : (cases,) s; inf where there is no verified answer
-    stopped : (cases,) s after which time ran out; NaN where that was not the end
+    times : (cases,) s; inf without a verified answer
+    stopped : (cases,) s until the time limit; NaN for other endings
     horizon : s
 
     """
@@ -60,7 +59,7 @@ def restricted_mean(times: Array, stopped: Array, horizon: float) -> Restricted:
     areas = np.diff(np.append(0.0, knots)) * np.append(1.0, survival)
     mean = float(areas.sum())
     left = np.cumsum(areas[:0:-1])[::-1]  # ∫ of S from each knot to the horizon
-    rest = np.maximum(at_risk - solved, 1)  # left is 0 where nobody is at risk any more
+    rest = np.maximum(at_risk - solved, 1)  # `left` is 0 where no case is at risk
     variance = float((left**2 * solved / (at_risk * rest)).sum()) * n / (n - 1)
     half = student(n - 1) * variance**0.5
     low, high = max(mean - half, 0.0), min(mean + half, horizon)

@@ -2,25 +2,25 @@
 
     t(N) = s(N)·(W/N + C) + R·α_R(N) + M(N)·α + b·β
 
-W is the work that ranks share, in seconds of one rank, and C what each of them does
-alike or waits for (Amdahl [1]_). s says how much slower a rank works while the others
-do, too: copies of the job on one rank, run together, over the job alone. A rank of a
-shared job touches less memory than a copy, and may disturb the others less: so s is no
-more than leaves C ≥ 0, and no less than 1. The rest is communication [2]_: R reductions
-over all ranks, M messages and b bytes to neighbours, with the latencies α_R and α of a
-reduction and of a message, and β seconds for a byte.
+W is the work that the ranks share, in seconds of one rank, and C the work that each
+rank repeats or waits for (Amdahl [1]_). s is the slowdown of a rank while the others
+are busy: the time of simultaneous copies of the job on one rank over that of a single
+job. A rank of a shared job uses less memory than a copy, and may disturb the others
+less; therefore s is limited to the largest value that leaves C ≥ 0, but is at least 1.
+The rest is communication [2]_: R reductions over all ranks, M messages and b bytes to
+neighbours, with the latencies α_R and α of a reduction and of a message, and β seconds
+per byte.
 
-W and C are fitted to measured times, s and the latencies are measured, R, M and b are
-counted, all on the ranks that there were. Ranks that are faster than their number even
-with s = 1 are not fitted, and the misfit says so. Beyond the measured ranks, the model
-goes on:
+W and C are fitted to measured times, s and the latencies are measured, and R, M and b
+are counted, all on the ranks of the run. Superlinear speed-up even with s = 1 cannot be
+fitted and shows in the misfit. The model is extended beyond the measured ranks thus:
 
-- s stays: further ranks bring memory of their own, as those measured do;
+- s is constant: further ranks bring their own memory, like the measured ones;
 - α_R grows with ⌈log₂N⌉, the depth of a tree of ranks;
 - M grows with the neighbours of a rank, N − 1 and at most six: a planar graph has fewer
-  than three edges for each vertex (Euler);
-- b stays: half of a square borders on the other half along one side of it, an inner
-  sixteenth on its neighbours along four quarters of one.
+  than three edges per vertex (Euler);
+- b is constant: one half of a square touches the other half along one side, and an
+  inner sixteenth touches its neighbours along four quarters of a side.
 
 References
 ----------
@@ -43,22 +43,22 @@ from numpy.typing import ArrayLike, NDArray
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import DRAWS, limits
 
-NEIGHBOURS = 6  #: of a rank, at most, on the average of a planar graph
-MOST_RANKS = 2**20  #: that an efficiency is looked for at
+NEIGHBOURS = 6  #: bound of the average degree of a planar graph (Euler)
+MAX_RANKS = 2**20  #: end of the search of `CostModel.ranks_at`
 
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Communication:
-    """Messages of a rank in one solve on `ranks` ranks, and their speed."""
+    """Messages of a rank in one solve on `ranks` ranks, and their costs."""
 
     ranks: int  #: at least two
     reductions: float  #: over all ranks
     messages: float  #: to neighbours
     sent: float  #: bytes
-    reduction_seconds: float  #: of one number, over all ranks
-    message_seconds: float  #: of the shortest
+    reduction_seconds: float  #: for one number, over all ranks
+    message_seconds: float  #: for the shortest message
     seconds_per_byte: float
 
     @property
@@ -74,7 +74,7 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Return the factors by which the three grow on other ranks, (…, 3)."""
+    """Return the growth of reductions, messages and bytes on other ranks, (…, 3)."""
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)
@@ -83,24 +83,24 @@ def growth(ranks: ArrayLike, measured: int) -> Array:
 
 @dataclass(frozen=True, kw_only=True)
 class CostModel:
-    """The model of one solve, and other draws of it that the repeats allow for."""
+    """Cost model of one solve, with draws that represent the scatter of the repeats."""
 
     work: float  #: W, s
-    alike: float  #: C, s
-    slowdown: float  #: s on the most ranks measured
-    #: s, of reductions, messages and bytes on the most ranks measured
+    repeated: float  #: C, s
+    slowdown: float  #: s on the largest measured number of ranks
+    #: seconds of reductions, messages and bytes on the largest measured number of ranks
     communication: tuple[float, float, float]
     measured: tuple[int, ...]  #: ranks, ascending
     misfit: float  #: largest |t/t_measured − 1|
-    #: W, C, s and communication in every draw, (draws, 6); none where a number of ranks
-    #: was measured once
+    #: W, C, s and communication of every draw, (draws, 6); empty if some number of
+    #: ranks was measured once
     draws: Array
-    samples: int  #: fewest repeats
+    samples: int  #: smallest number of repeats
 
     def speed_up(self, ranks: int) -> Interval:
         """Predict t(1)/t(N) on more ranks than were measured, with its 95 % interval.
 
-        The interval is of the fit. It says nothing on whether the model holds there.
+        The interval is that of the fit; it does not cover errors of the model itself.
         """
         value = float(self._speed_up(ranks, self._own)[0])
         if not len(self.draws):
@@ -109,15 +109,17 @@ class CostModel:
         return Interval(value, float(low), float(high), COVERAGE, self.samples)
 
     def ranks_at(self, efficiency: float) -> int:
-        """Find the most ranks, a power of two, whose speed-up is so many times N."""
+        """Return the largest power of two N with speed-up of at least efficiency·N."""
         N = 2
-        while N < MOST_RANKS and self._speed_up(N, self._own)[0] >= efficiency * N:
+        while N < MAX_RANKS and self._speed_up(N, self._own)[0] >= efficiency * N:
             N *= 2
         return N // 2
 
     @property
     def _own(self) -> Array:
-        return np.array([[self.work, self.alike, self.slowdown, *self.communication]])
+        return np.array(
+            [[self.work, self.repeated, self.slowdown, *self.communication]]
+        )
 
     def _seconds(self, ranks: int, draws: Array) -> Array:
         W, C, s = draws.T[:3]
@@ -136,28 +138,28 @@ def cost_model(
 ) -> CostModel:
     """Fit W and C ≥ 0 to the times of one solve by least squares of relative errors.
 
-    Repeats are averaged by their logarithms. Draws resample the repeats of every number
-    of ranks, those of the copies, and what was found of the network in each.
+    Repeats are averaged in logarithms. Draws resample the repeats of every number of
+    ranks, those of the copies, and the communication of each.
 
     Parameters
     ----------
-    seconds : of every repeat, by ranks; one and others
-    copies : of so many copies of the job on one rank, run together, likewise: no less
-        than s; where there are none, s = 1
-    communication : of every repeat on the most ranks
+    seconds : times of every repeat, by ranks; one rank and others
+    copies : times of as many simultaneous copies of the job on one rank, an upper bound
+        of s; s = 1 where there are none
+    communication : one item per repeat on the largest number of ranks
 
     Raises
     ------
     ValueError
-        Without times on one rank and on several, or the communication on the most.
+        Without times on one rank and on several, or communication on the largest.
 
     """
     ranks = sorted(seconds)
     if len(ranks) < 2 or ranks[0] != 1:
         raise ValueError("a model of ranks needs times on one rank and on several")
     if not communication or {c.ranks for c in communication} != {ranks[-1]}:
-        raise ValueError(f"a model needs what {ranks[-1]} ranks have sent")
-    from scipy.optimize import nnls  # late: other reports begin without it
+        raise ValueError(f"a model needs the communication on {ranks[-1]} ranks")
+    from scipy.optimize import nnls  # imported here: slow, and few reports need it
 
     N = np.array(ranks, dtype=float)
     samples = min(len(of) for of in (*seconds.values(), *copies.values()))
@@ -171,28 +173,29 @@ def cost_model(
     spent = np.stack([c.seconds for c in communication])
     parts = np.stack([_geometric(of, rng, count) for of in spent.T], axis=1)
     sent = parts @ growth(N, ranks[-1]).T
-    with_none_alike = N * np.maximum(t - sent, 0.0) / t[:, :1]
-    slow = np.where(slow > with_none_alike, np.maximum(with_none_alike, 1.0), slow)
+    # C ≥ 0 and W + C = t(1) imply W/N + C ≥ t(1)/N, hence s ≤ N·(t − sent)/t(1)
+    bound = N * np.maximum(t - sent, 0.0) / t[:, :1]
+    slow = np.where(slow > bound, np.maximum(bound, 1.0), slow)
     y, scale = np.maximum(t - sent, 0.0) / slow, t / slow
     terms = np.column_stack([1 / N, np.ones_like(N)])
     fits = [nnls(terms / s[:, None], v / s)[0] for v, s in zip(y, scale, strict=True)]
-    work, alike = np.transpose(fits)
-    found = slow * (work[:, None] / N + alike[:, None]) + sent
+    work, repeated = np.transpose(fits)
+    fitted = slow * (work[:, None] / N + repeated[:, None]) + sent
     return CostModel(
         work=float(work[0]),
-        alike=float(alike[0]),
+        repeated=float(repeated[0]),
         slowdown=float(slow[0, -1]),
         communication=(float(parts[0, 0]), float(parts[0, 1]), float(parts[0, 2])),
         measured=tuple(ranks),
-        misfit=float(np.abs(found[0] / t[0] - 1).max()),
-        draws=np.column_stack([work, alike, slow[:, -1], parts])[1:],
+        misfit=float(np.abs(fitted[0] / t[0] - 1).max()),
+        draws=np.column_stack([work, repeated, slow[:, -1], parts])[1:],
         samples=samples,
     )
 
 
 def _geometric(values: ArrayLike, rng: np.random.Generator, count: int) -> Array:
-    """Average by logarithms: all values first, then `count` resamples of them."""
-    with np.errstate(divide="ignore"):  # nothing may have been sent
+    """Return geometric means of all values, then of `count` resamples, (1 + count,)."""
+    with np.errstate(divide="ignore"):  # zero where nothing was sent
         logs = np.log(np.asarray(values, dtype=float))
     drawn = rng.integers(logs.size, size=(count, logs.size))
     return np.asarray(np.exp(np.r_[logs.mean(), logs[drawn].mean(axis=1)]))

@@ -1,9 +1,9 @@
-"""Power laws fitted to few sizes: growth of practical size, and predictions.
+"""Power laws fitted to few sizes: practically relevant growth, and predictions.
 
-Growth is judged by its size: the 95 % interval of the factor 10ᵖ, by which values
-change where n becomes ten times as large, is compared with 1 ± `PRACTICAL`. A test of
-p ≤ 0 would call 19, 22, 22, 22, 22 growing, and would call growth without any
-importance detected as soon as the counts scatter little enough.
+Growth is judged by its magnitude: the 95 % interval of the factor 10ᵖ, the change of
+the values when n is multiplied by ten, is compared with 1 ± `PRACTICAL`. A test of
+p ≤ 0 would report 19, 22, 22, 22, 22 as growth, and would report irrelevant growth as
+significant whenever the counts scatter little.
 
 References
 ----------
@@ -26,17 +26,17 @@ from mortarbench.reports.statistics.intervals import (
     student,
 )
 
-SIZES = 4  #: fewer different sizes leave less than two degrees of freedom
-PRACTICAL = 0.10  #: relative change per decade of n that nobody need care about
-_ROUNDING = 1e-12  #: scatter of logarithms that is none
+SIZES = 4  #: least number of sizes: leaves two degrees of freedom
+PRACTICAL = 0.10  #: relative change per decade of n below which growth is irrelevant
+_ROUNDING = 1e-12  #: scatter of logarithms below this is rounding
 
 
 class Trend(Enum):
     """Conclusions that the interval of the change per decade allows."""
 
-    GROWS = "grow"  #: all of it above 1 + PRACTICAL
-    FLAT = "flat"  #: all of it within 1 ± PRACTICAL
-    FALLS = "fall"  #: all of it below 1 − PRACTICAL
+    GROWS = "grow"  #: interval above 1 + PRACTICAL
+    FLAT = "flat"  #: interval within 1 ± PRACTICAL
+    FALLS = "fall"  #: interval below 1 − PRACTICAL
     UNDECIDED = "not decided"
 
 
@@ -49,11 +49,11 @@ class Growth:
     high: float
     log_factor: float  #: log c
     scatter: float  #: standard deviation of log v about the line
-    sizes: tuple[float, ...]  #: n, that were measured
+    sizes: tuple[float, ...]  #: measured n
 
     @property
     def per_decade(self) -> tuple[float, float, float]:
-        """Relative change where n becomes ten times as large, and its interval."""
+        """Relative change when n is multiplied by ten, and its interval."""
         change, low, high = (
             float(np.expm1(p * np.log(10)))
             for p in (self.exponent, self.low, self.high)
@@ -79,7 +79,7 @@ class Growth:
         Raises
         ------
         ValueError
-            Outside of the measured range, where nothing supports the law.
+            Outside of the measured range, where no data support the law.
 
         """
         low, high = min(self.sizes), max(self.sizes)
@@ -99,7 +99,7 @@ class Growth:
 
 
 def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
-    """Fit v = c·nᵖ, with Student's interval of p of k − 2 degrees of freedom.
+    """Fit v = c·nᵖ, with Student's interval of p with k − 2 degrees of freedom.
 
     Parameters
     ----------
@@ -118,7 +118,7 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
     half = student(x.size - 2)
     error = (law.high - law.low) / 2 / half
-    if error * spread <= _ROUNDING:  # as of counts that are all the same
+    if error * spread <= _ROUNDING:  # equal counts
         error = 0.0
     p = law.exponent if abs(law.exponent) * spread > _ROUNDING else 0.0
     return Growth(

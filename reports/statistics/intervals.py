@@ -11,31 +11,31 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import bdtr, stdtrit
 
-COVERAGE = 0.95  #: asked for; a median of fewer than six samples cannot have it
+COVERAGE = 0.95  #: nominal; the median of fewer than six samples cannot reach it
 
 
 class Interval(NamedTuple):
-    """A median between two order statistics of the same samples."""
+    """An estimate with its interval; for a median, two order statistics."""
 
     value: float
     low: float
     high: float
-    coverage: float  #: probability that [low, high] holds the true median
+    coverage: float  #: probability that [low, high] contains the true value
     samples: int
 
 
 def student(freedom: float) -> float:
-    """Return the half-width, in standard errors, of Student's interval of 95 %."""
+    """Return the half-width of Student's 95 % interval in standard errors."""
     return float(stdtrit(freedom, 0.5 + COVERAGE / 2))
 
 
 def median_interval(samples: Sequence[float]) -> Interval:
-    """Take the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
+    """Return the median and its distribution-free interval [x₍ₖ₎, x₍ₙ₊₁₋ₖ₎].
 
     The interval misses the true median only if fewer than k of the n independent
     samples fall on one side of it, so it covers with probability 1 − 2·P(X < k) where
     X ~ Bin(n, ½), whatever the distribution [1]_. k is the largest with at least 95 %;
-    below six samples that is k = 1: the smallest and the largest, 1 − 2¹⁻ⁿ.
+    below six samples k = 1, from the smallest to the largest, with 1 − 2¹⁻ⁿ.
 
     References
     ----------
@@ -52,7 +52,7 @@ def median_interval(samples: Sequence[float]) -> Interval:
 
 @cache
 def _order(n: int) -> tuple[int, float]:
-    """Choose k for n samples, and say how often the interval covers."""
+    """Return k and the coverage of the interval for n samples."""
     k = np.arange(1, (n + 1) // 2 + 1)
     coverages = 1 - 2 * bdtr(k - 1, n, 0.5)
     best = max(int((coverages >= COVERAGE).sum()), 1)
@@ -65,12 +65,12 @@ class PowerLaw(NamedTuple):
     exponent: float
     low: float
     high: float
-    log_factor: float  #: sizes that differ little leave a factor that is no double
+    log_factor: float  #: log c; c itself overflows if the sizes differ little
     points: int
 
     @property
     def factor(self) -> float:
-        """The factor c of c·nᵖ; infinite where it exceeds all doubles."""
+        """The factor c of c·nᵖ; infinite if it overflows."""
         with np.errstate(over="ignore"):
             return float(np.exp(self.log_factor))
 
@@ -84,8 +84,8 @@ def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
 
     The interval of p is Student's with points − 2 degrees of freedom: exact if the
     logarithms scatter normally about the line, and it widens where the law does not
-    hold. A bootstrap over the three to ten sizes of a scaling suite covers far less
-    than it promises.
+    hold. A bootstrap over the three to ten sizes of a scaling suite would cover far
+    less than its nominal level.
 
     Parameters
     ----------

@@ -23,13 +23,13 @@ from scipy.special import betainccinv, betaincinv
 
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-POINTS = 200  #: of a curve; with more cases than that, the share at so many places
+POINTS = 200  #: most points of a curve; with more cases it is sampled
 
 Array = NDArray[np.float64]
 
 
 class Share(NamedTuple):
-    """Share of the cases, and its 95 % interval at each place by itself."""
+    """Share of the cases with its pointwise 95 % interval."""
 
     value: Array
     low: Array
@@ -37,17 +37,17 @@ class Share(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """A step function: `share` holds from `at` to the next."""
+    """Step function: `share` holds from each `at` to the next."""
 
     at: Array
     share: Share
 
 
 def performance_ratios(times: Array) -> Array:
-    """Ratios r = t/min t to the best solver of each case [1]_; inf for a failure.
+    """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
-    A case that nobody solved stays: its ratios are all infinite, so that no profile
-    reaches one. The profile of a solver is the share of cases with r ≤ τ.
+    A case without any solution is kept with infinite ratios, so that no profile reaches
+    one. The profile of a solver is the share of cases with r ≤ τ.
 
     Parameters
     ----------
@@ -59,13 +59,13 @@ def performance_ratios(times: Array) -> Array:
 
 
 def share(counts: ArrayLike, cases: int) -> Share:
-    """Interval of the share counts/cases, by the binomial law [4]_.
+    """Return the share counts/cases with its binomial interval [4]_.
 
-    Resampling the cases leaves the value at each one as it is, so that the resampled
-    share at a place is binomial: no draws are needed. Unlike a percentile interval,
-    this one has a width where all cases are solved, or none, and covers at least at
-    its rate.
+    Unlike a percentile interval, it has a positive width where all or no cases are
+    solved, and at least nominal coverage.
     """
+    # Resampling cases keeps the value of each, so the resampled share at a place is
+    # binomial and needs no draws.
     k = np.asarray(counts, dtype=float)
     tail = (1 - COVERAGE) / 2
     return Share(
@@ -78,7 +78,7 @@ def share(counts: ArrayLike, cases: int) -> Share:
 
 
 def solved_within(values: Array, places: ArrayLike) -> Share:
-    """Share of the cases with value ≤ place, at each place; inf is never within.
+    """Return the share of the cases with value ≤ place, for each finite place.
 
     values : (cases,) ratios for a performance profile, seconds for a data profile [2]_
     """
@@ -87,7 +87,7 @@ def solved_within(values: Array, places: ArrayLike) -> Share:
 
 
 def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
-    """Profile between two finite places, which are its ends."""
+    """Return the profile between two finite places."""
     inside = np.unique(values[(values > start) & (values < stop)])
     if inside.size > points:
         inside = np.geomspace(start, stop, points)[1:-1]

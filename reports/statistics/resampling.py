@@ -1,8 +1,8 @@
-"""The bootstrap over cases: what another draw of problems would have said.
+"""Bootstrap over cases, which estimates the results on other sets of problems.
 
-The resampled unit is the case, with the times of all solvers on it: solvers stay
-paired [1]_. What scatters within a case (noise of the clock) scatters between cases,
-too, so that the intervals contain it.
+The resampled unit is the case with the times of all solvers on it, so that solvers stay
+paired [1]_. Scatter within a case (such as noise of the clock) is also scatter between
+cases, so the intervals include it.
 
 References
 ----------
@@ -36,7 +36,7 @@ def weights(cases: Sequence[str]) -> Array:
 
     Returns
     -------
-    (draws, cases) how often each is drawn, over the number of cases: rows sum to one
+    (draws, cases) frequency of each case over the number of cases; rows sum to one
 
     """
     n = len(cases)
@@ -44,37 +44,38 @@ def weights(cases: Sequence[str]) -> Array:
 
 
 def limits(draws: Array, cases: int) -> tuple[Array, Array]:
-    """Take the 95 % interval of every column of (draws, …) statistics.
+    """Return the 95 % interval of every column of (draws, …) statistics.
 
-    Percentiles, expanded [2]_: a resample of n cases scatters by √((n−1)/n) too little
-    and with normal instead of Student's tails, so the quantile asked for is that of
-    −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. Order is kept: a transform of the
-    statistic transforms the interval.
+    Percentiles are expanded [2]_: the scatter of a resample of n cases is too small by
+    √((n−1)/n), with normal instead of Student's tails, so the quantile is that of
+    −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. A monotone transform of the statistic
+    transforms the interval likewise.
     """
     tail = float(ndtr(-np.sqrt(cases / (cases - 1)) * student(cases - 1)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
     return low, high
 
 
-def told_apart(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
-    """Determine which solvers are faster than which, jointly at 95 %.
+def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
+    """Determine the significantly faster solver of every pair, jointly at 95 %.
 
-    If two solvers are alike, their times on a case might as well be exchanged: the sign
-    of the difference of logarithms is a coin. The signs of whole cases are flipped, and
-    the statistics of a pair are compared with the largest over all pairs in every flip
-    [3]_. There are two: Σd/√Σd², which is Student's in other words, and the same of
-    signed ranks, which a few failures with a large penalty cannot blunt; it counts only
-    where it agrees with the mean. The better of the two is taken, in the flips as well,
-    so that among equal solvers, whatever their number, one set of cases in twenty tells
-    any pair apart. Below six cases none can: all signs agree in 2 of 2⁵.
+    If two solvers are equal, their times on a case are exchangeable: the sign of the
+    difference d of logarithms is random. The signs of whole cases are flipped, and the
+    statistics of a pair are compared with their maximum over all pairs in every flip
+    [3]_. There are two statistics: Σd/√Σd², equivalent to Student's t, and the same of
+    signed ranks, which a few failures with a large penalty cannot mask; it counts only
+    if it agrees with the sign of the mean. The more significant one is used, in the
+    flips as well. So among any number of equal solvers, at most one set of cases in
+    twenty has a significant pair. Fewer than six cases have none: all signs of five
+    agree in 2 of 2⁵ flips.
 
     Parameters
     ----------
-    logs : (cases, solvers) logarithms of what is averaged
+    logs : (cases, solvers) logarithms of the averaged times
 
     Returns
     -------
-    (solvers, solvers) whether row is told to be faster than column
+    (solvers, solvers) True where row is significantly faster than column
 
     """
     i, j = np.triu_indices(logs.shape[1], 1)
@@ -84,9 +85,9 @@ def told_apart(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
     tests = [_flipped(d, signs), _flipped(np.sign(d) * _ranks(abs(d)), signs)]
     slower = np.sign(d.mean(axis=0))
     agree = np.array([np.sign(observed) == slower for observed, _ in tests])
-    levels = np.array([_beaten(largest, np.abs(seen)) for seen, largest in tests])
-    in_flips = np.array([_beaten(largest, largest) for _, largest in tests])
-    level = _beaten(-in_flips.min(axis=0), -np.where(agree, levels, 1).min(axis=0))
+    levels = np.array([_p_values(largest, np.abs(seen)) for seen, largest in tests])
+    in_flips = np.array([_p_values(largest, largest) for _, largest in tests])
+    level = _p_values(-in_flips.min(axis=0), -np.where(agree, levels, 1).min(axis=0))
     apart = level <= 1 - COVERAGE
     faster = np.zeros((logs.shape[1], logs.shape[1]), dtype=bool)
     faster[i, j] = apart & (slower < 0)
@@ -95,13 +96,13 @@ def told_apart(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]:
 
 
 def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, float]:
-    """Return the 95 % interval of a mean that flipping the signs of values inverts to.
+    """Return the 95 % interval of a mean by inversion of the sign-flip test.
 
-    The means of all subsets of the values cut the line into pieces that hold the centre
-    of a symmetric distribution equally often [4]_; beyond `DRAWS` subsets, those that
-    are drawn. From six values the interval is that from the least to the largest.
+    The means of all subsets of the values divide the line into intervals that contain
+    the centre of a symmetric distribution with equal probability [4]_. Above `DRAWS`
+    subsets a random selection is used. For six values the interval is their range.
 
-    values : (cases,) at least six; fewer have no interval of 95 %
+    values : (cases,) at least six, since fewer have no 95 % interval
     """
     signs = _signs(cases)
     subsets = np.vstack([signs > 0, signs < 0]).astype(float)
@@ -112,9 +113,9 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
 
 
 def _signs(cases: Sequence[str]) -> Array:
-    """Patterns of signs, up to a common one: all of them, or else `DRAWS`.
+    """Return patterns of signs up to a common sign, all of them or else `DRAWS`.
 
-    The first is that of the data.
+    The first pattern is that of the data, all ones.
     """
     n = len(cases)
     if 2 ** (n - 1) <= DRAWS:
@@ -126,14 +127,14 @@ def _signs(cases: Sequence[str]) -> Array:
 
 
 def _flipped(scores: Array, signs: Array) -> tuple[Array, Array]:
-    """Statistic Σs/√Σs² of each pair, and the largest of all pairs in every flip."""
+    """Return Σs/√Σs² of each pair, and its maximum over the pairs in every flip."""
     size = np.sqrt((scores**2).sum(axis=0))
     unit = scores / np.where(size > 0, size, 1)
     return unit.sum(axis=0), np.abs(signs @ unit).max(axis=1, initial=0)
 
 
 def _ranks(values: Array) -> Array:
-    """Rank every column of (cases, pairs) values; equal ones share their mean rank."""
+    """Rank each column of (cases, pairs) values; equal values share the mean rank."""
     ranks = np.empty_like(values)
     for column, rank in zip(values.T, ranks.T, strict=True):
         order = np.sort(column)
@@ -142,14 +143,14 @@ def _ranks(values: Array) -> Array:
     return ranks
 
 
-def _beaten(values: Array, by: Array) -> Array:
-    """Share of the values that are at least as large, but for rounding."""
+def _p_values(values: Array, by: Array) -> Array:
+    """Return the shares of `values` that reach each of `by`, up to rounding."""
     below = np.searchsorted(np.sort(values), by - 1e-9)
     return np.asarray(1 - below / values.size)
 
 
 def firsts(draws: Array) -> Array:
-    """Share of the draws in which each solver has the smallest mean; ties share one.
+    """Return the share of the draws in which each solver is fastest; ties share one.
 
     draws : (draws, solvers)
     """
@@ -159,7 +160,7 @@ def firsts(draws: Array) -> Array:
 
 
 def _rng(cases: Sequence[str]) -> np.random.Generator:
-    """Seed by names, so that the same cases are drawn alike everywhere."""
+    """Return a generator seeded by the names, so that equal cases give equal draws."""
     return np.random.default_rng(
         crc32("\n".join(cases).encode(errors="backslashreplace"))
     )

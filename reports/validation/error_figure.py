@@ -1,4 +1,4 @@
-"""The certified error of every answer, a line of marks per solver."""
+"""Figure of the certified error of every answer, one row of marks per solver."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import tolerance
 from mortarbench.reports.figures.style import COLOURS, below, legible
 
-_SPREAD = 0.3  #: of the marks of a solver, up and down, so that none hides another
+_SPREAD = 0.3  #: vertical offset of marks within a row, so that none hides another
 _FLOOR = 1e-17  #: where errors of zero are drawn
 _LIMIT = Look(colour=INK, width=0.6, dash=(4, 2))
 
@@ -41,9 +41,9 @@ _KINDS: tuple[tuple[str, Callable[[Answer], bool], Look], ...] = (
 
 
 def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
-    """Draw the errors of the answers at one tolerance; None where none is known.
+    """Draw the errors of the answers at one tolerance; return None without any.
 
-    answers : as in the data of a cross-validation
+    answers : those of the data of `validate`
     """
     known = [a for a in answers if a["tol"] == tol and a["error"] is not None]
     if not known:
@@ -67,7 +67,7 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
     rules, texts = [], []
     for at, text in (
         (tol, f"t = {tolerance(tol)}"),
-        (known[0]["energy_allowed"], "√(20t), allowed"),
+        (known[0]["energy_allowed"], "√(20t), largest allowed"),
     ):
         rules.append(Rule(axis="x", at=at, look=_LIMIT))
         texts.append(

@@ -1,4 +1,4 @@
-"""The page of a cross-validation: what agrees, what does not, and who is off."""
+"""Page of a cross-validation: verdict, disagreements, errors and rules."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def write_validation(
 ) -> list[Path]:
     """Write DIR/report/validation.html and .md from the data of `validate`.
 
-    meshes : what finer meshes told, where they were solved
+    meshes : discretisation errors from finer meshes, where these were solved
     """
     page, target = compose(data, meshes), directory / "report"
     _, drawings = write_figures(page, target)
@@ -52,17 +52,17 @@ def write_validation(
 
 
 def compose(data: Data, meshes: Sequence[Discretisation] = ()) -> Page:
-    """Put the page together, verdict first."""
+    """Compose the page, verdict first."""
     sections = (
         Section.of(*each)
         for each in (
             ("verdict", "Verdict", _verdict(data)),
             ("disagreements", "Disagreements", _disagreements(data)),
             ("problems", "Problems", _problems(data)),
-            ("remarks", "What stands out", _remarks(data)),
+            ("remarks", "Outliers", _remarks(data)),
             ("discretisation", "Errors of the meshes", _discretisation(meshes)),
             ("left-out", "Not compared", _left_out(data)),
-            ("rules", "How it is decided", TEXT.parts("rules")),
+            ("rules", "Rules of the verdict", TEXT.parts("rules")),
         )
     )
     answers, solvers, cases, asked, pairs = (
@@ -103,19 +103,18 @@ def _verdict(data: Data) -> Iterator[Part]:
             _column("primal against dual", "primal_dual", power),
             *[_column("against smalbe", "from_ours", power)] * ours,
         ),
-        notes=(TEXT("last", ours),),
+        notes=(TEXT("last_columns", ours),),
     )
-    # the errors of all answers at the tightest tolerance
     answers = [a for p in data["problems"] for a in p["answers"]]
     tol = min((a["tol"] for a in answers), default=0.0)
     figure = error_figure(answers, tol)
-    if figure is not None:  # else all that was judged are claims without a point
+    if figure is not None:  # claims without a point have no error
         caption = TEXT("errors", tol)
         yield Picture(name="validation-errors", caption=caption, figure=figure)
 
 
 def _column(head: str, name: str = "", show: Callable[[Any], str] = str) -> Column:
-    """Show a number of an entry."""
+    """Return a column of a number."""
     return head, lambda d: Cell.number(d[name or head], show)
 
 
@@ -137,23 +136,23 @@ def _worst_case(d: Data) -> Cell:
 
 
 def _disagreements(data: Data) -> Iterator[Part]:
-    """List every refuted claim, and pairs apart without a culprit."""
+    """Tabulate refuted claims, and contradicting pairs of which neither is refuted."""
     if wrong := data["disagreements"]:
         yield Table.of(
-            "Refuted claims: what the solver said, and what is true.",
+            "Refuted claims, with our verdict and its reason.",
             wrong,
             (
                 *_CASE,
                 ("claimed", lambda d: Cell.words(clean(d["claimed"], 20))),
                 ("verdict", _judged),
                 _column("error", show=power),
-                ("why", lambda d: Cell.words(clean(TEXT("why", d), 400))),
+                ("reason", lambda d: Cell.words(clean(TEXT("why", d), 400))),
             ),
             text_columns=2,
         )
     if apart := data["unresolved"]:
         yield Table.of(
-            "Answers that contradict each other, neither refuted.",
+            "Pairs of answers that contradict each other, with neither refuted.",
             apart,
             (
                 ("problem", lambda d: Cell.name(d["problem"])),
@@ -166,9 +165,9 @@ def _disagreements(data: Data) -> Iterator[Part]:
         )
     if broken := data["contradictions"]:
         yield Table.of(
-            "Certificates that the reference contradicts: our fault.",
+            "Certificates contradicted by the reference, an error of this program.",
             broken,
-            (*_CASE, ("what", lambda d: Cell.words(clean(d["text"], 240)))),
+            (*_CASE, ("contradiction", lambda d: Cell.words(clean(d["text"], 240)))),
             text_columns=2,
         )
 
@@ -179,7 +178,7 @@ def _judged(d: Data) -> Cell:
 
 
 def _problems(data: Data) -> Iterator[Part]:
-    """List every problem with how far its answers lie apart."""
+    """Tabulate the largest distances between the answers to every problem."""
 
     def largest(name: str) -> Callable[[Data], Cell]:
         def cell(p: Data) -> Cell:
@@ -205,7 +204,8 @@ def _problems(data: Data) -> Iterator[Part]:
         return Cell.power(p["doubt"], after=truth)
 
     yield Table.of(
-        "Every problem: all pairs of answers, of each solver and form.",
+        "Largest distances between the answers to each problem, over all pairs of "
+        "solvers and forms.",
         data["problems"],
         (
             ("problem", lambda p: Cell.name(p["name"])),
@@ -223,7 +223,7 @@ def _problems(data: Data) -> Iterator[Part]:
 
 
 def _remarks(data: Data) -> Iterator[Part]:
-    """Say per solver how often it stands out, and where most."""
+    """Tabulate the outliers of each solver, with the worst of them."""
     grouped: dict[str, list[Data]] = {}
     for d in data["remarks"]:
         grouped.setdefault(d["solver"], []).append(d)
@@ -232,7 +232,8 @@ def _remarks(data: Data) -> Iterator[Part]:
             s: max(of, key=lambda d: d["error"] or 0.0) for s, of in grouped.items()
         }
         yield Table.of(
-            "Answers within what they claim that stand out from the others.",
+            "Answers within their claims, but far less accurate than those of other "
+            "solvers.",
             grouped,
             (
                 ("solver", Cell.label),
@@ -242,20 +243,20 @@ def _remarks(data: Data) -> Iterator[Part]:
                 ),
                 ("largest error", lambda s: Cell.power(worst[s]["error"])),
                 ("on", lambda s: Cell.words(clean(worst[s]["case"]))),
-                ("what", lambda s: Cell.words(clean(worst[s]["text"], 200))),
+                ("remark", lambda s: Cell.words(clean(worst[s]["text"], 200))),
             ),
         )
 
 
 def _discretisation(meshes: Sequence[Discretisation]) -> Iterator[Part]:
-    """List the errors of the meshes themselves, which certified errors add to."""
+    """Tabulate discretisation errors, which add to the certified errors."""
     if meshes:
         yield TEXT("discretisation")
         yield mesh_table(meshes)
 
 
 def _left_out(data: Data) -> Iterator[Part]:
-    """List what was asked and not answered, and what could not be judged."""
+    """Tabulate measurements without a claim, and answers that could not be judged."""
     for name, caption in (
         ("unanswered", "Measurements that ended without a claim."),
         ("not_validated", "Stored answers that could not be judged."),
@@ -269,8 +270,8 @@ def _left_out(data: Data) -> Iterator[Part]:
                 grouped.items(),
                 (
                     ("solver", lambda each: Cell.label(each[0][0])),
-                    ("times", lambda each: Cell.number(len(each[1]))),
-                    ("what", lambda each: Cell.words(clean(each[0][1], 240))),
+                    ("count", lambda each: Cell.number(len(each[1]))),
+                    ("reason", lambda each: Cell.words(clean(each[0][1], 240))),
                     ("on", lambda each: _cases(list(dict.fromkeys(each[1])))),
                 ),
             )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -15,15 +16,15 @@ from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_positive,
     csc,
     from_one_sided,
     objective_factor,
     one_sided,
-    positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PrimalInfeasible"  #: it comes with a certificate
+PRIMAL = "PrimalInfeasible"  #: the status that has a certificate
 CLAIMS = {
     "Solved": Status.SOLVED,
     "MaxIterations": Status.ITERATION_LIMIT,
@@ -37,13 +38,13 @@ CLAIMS = {
 class Clarabel:
     """https://clarabel.org, one thread.
 
-    Clarabel divides its residuals by max(1, size of their terms) and takes the gap as
-    closed when it is below tol absolutely *or* relative to max(1, |objective|): for a
-    QP with a small objective all that is absolute, and tol = 1e-6 leaves five digits
-    fewer at an energy of 1e-5. Multiplying the objective until ‖q‖∞ = 1e4 makes each
-    test the relative one where x is of order one, as in every QP emitted here, so that
-    tol is passed on as it is. (The steps hardly change: Clarabel equilibrates the
-    objective anyway.) In units that make x tiny, Clarabel may stop early.
+    Clarabel divides its residuals by max(1, size of their terms) and accepts a gap
+    below tol, absolute *or* relative to max(1, |objective|). For a QP with a small
+    objective these tests are absolute, and tol = 1e-6 loses five digits at an energy of
+    1e-5. With the objective scaled to ‖q‖∞ = 1e4 each test is the relative one if x is
+    of order one, as in every QP of this project, and tol is passed on unchanged. (The
+    steps hardly change, since Clarabel equilibrates the objective.) In units that make
+    x tiny, Clarabel may stop early.
 
     Equalities go to the zero cone; inequalities and finite bounds, one row each, to the
     nonnegative cone.
@@ -63,7 +64,7 @@ class Clarabel:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)
@@ -72,7 +73,7 @@ class Clarabel:
         return self._begin(qp, tol, presolve=True).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol, presolve=False))
+        return chain(partial(self._begin, presolve=False), tol)
 
     def _begin(self, qp: QP, tol: float, *, presolve: bool) -> Session:
         import clarabel
@@ -85,7 +86,7 @@ class Clarabel:
         settings.max_threads = 1
         settings.max_iter = self.max_iter
         settings.tol_feas = settings.tol_gap_abs = settings.tol_gap_rel = tol
-        settings.presolve_enable = presolve  # a presolved problem takes no updates
+        settings.presolve_enable = presolve  # presolved problems cannot be updated
         scale = objective_factor(qp)
         P = csc(triu(csc(qp.P))) * scale
         solver = clarabel.DefaultSolver(P, qp.q * scale, rows, rhs, cones, settings)

@@ -14,13 +14,13 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Matrix, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_positive,
     csc,
     dense,
     from_one_sided,
     needs_independent_rows,
     objective_factor,
     one_sided,
-    positive,
 )
 
 
@@ -29,9 +29,9 @@ class CVXOPT:
     """https://cvxopt.org, dense where P is dense, else sparse.
 
     CVXOPT divides the residuals by max(1, ‖q‖) and max(1, size of the right-hand
-    sides), 2-norms, and takes the gap as closed absolutely (abstol) or relative to the
+    sides), in 2-norms, and tests the gap in absolute terms (abstol) or relative to the
     objective (reltol). So feastol = reltol = tol, abstol is negligible, and the
-    objective is multiplied until ‖q‖∞ = 1e4, where the 1 no longer counts.
+    objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
     """
 
     max_iter: int = 200
@@ -45,16 +45,16 @@ class CVXOPT:
         "per iteration",
         phases="preparing converts only; solving does everything else",
         limits=(
-            "Equality rows that depend on each other end in an error or as 'unknown' "
-            "(conformance, shape 'redundant'): declined.",
-            "Bodies that only equality rows hold (an exactly singular P) end as "
+            "Dependent equality rows end in an error or as 'unknown' (conformance, "
+            "shape 'redundant'): declined.",
+            "Bodies supported by equality rows only (an exactly singular P) end as "
             "'unknown' after 2 iterations with its default KKT solver, 'chol2'; with "
             "'chol' or 'ldl' the same QP is solved (docs/weaknesses.md).",
         ),
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp) or needs_independent_rows(qp)
@@ -79,7 +79,7 @@ class CVXOPT:
             P, G, A = blocks
             try:
                 r = solvers.qp(P, q, G, h, A, b, options=options)
-            except (ValueError, ArithmeticError) as e:  # its own words for breakdown
+            except (ValueError, ArithmeticError) as e:  # breakdown of a factorisation
                 return Solution.without_point(qp, Status.FAILED, str(e))
             v = np.concatenate([np.ravel(r["y"]), np.ravel(r["z"])]) / scale
             done = r["iterations"] >= self.max_iter

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
-from mortarbench.solvers.common.backends import Call, adapter_files, why_not
+from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
@@ -24,13 +24,13 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-#: backend → how it is called; one that is not listed runs at cvxpy's defaults
+#: calls of backends; a backend that is not listed runs with cvxpy's defaults
 CALLS: Mapping[str, Call] = {
     "CLARABEL": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "DAQP": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
     "HIGHS": Call(
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
-        # HiGHS else adds 1e-7 to the Hessian and drops entries below 1e-9
+        # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
         {"qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1},
         size=1.0, tighter=1e-2, floor=1e-10,
     ),
@@ -47,12 +47,12 @@ CALLS: Mapping[str, Call] = {
     "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
 }  # fmt: skip
 
-CONIC = "cvxpy states a QP as a cone program for it, which costs half of the digits"
+CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
 LINEAR = "takes linear programs only"
-REFUSED: Mapping[str, str] = {
+DECLINED_BACKENDS: Mapping[str, str] = {
     "CVXOPT": CONIC, "ECOS": CONIC, "ECOS_BB": CONIC,
     "GLPK": LINEAR, "GLPK_MI": LINEAR, "SCIPY": LINEAR,
-    "PROXQP": "cvxpy cannot switch on its test of the duality gap; take proxqp",
+    "PROXQP": "cvxpy cannot enable its test of the duality gap; use proxqp",
 }  # fmt: skip
 
 CLAIMS = {
@@ -68,11 +68,11 @@ CLAIMS = {
 class CVXPY:
     """One backend of cvxpy; compilation is preparing, the backend's setup solving.
 
-    The tolerance goes to the backend's own keywords (`CALLS`), the relative one where
-    there are two; a backend that is not listed there runs at cvxpy's defaults. As in
-    the native adapters the objective is multiplied until ‖q‖∞ = 1e4, or 1 where the
-    backend's test is absolute (HIGHS, DAQP). What cvxpy would turn into a cone program
-    first, and ProxQP, whose test of the gap it cannot switch on, are declined.
+    The tolerance is passed by the backend's own keywords (`CALLS`), as the relative one
+    if there are two; a backend that is not listed there runs with cvxpy's defaults. As
+    in the native adapters the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the
+    backend's test is absolute (HIGHS, DAQP). Backends to which cvxpy passes a cone
+    program are declined, and ProxQP, whose test of the gap cvxpy cannot enable.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME
@@ -95,15 +95,15 @@ class CVXPY:
 
     @staticmethod
     def backends() -> tuple[str, ...]:
-        """List the names that the installed cvxpy knows, installed or not."""
+        """Return the names of all backends of cvxpy, installed or not."""
         return tuple(_files())
 
     def declines(self, qp: QP) -> str | None:
-        if reason := why_not("cvxpy", self.backend, _files()):
+        if reason := reason_unavailable("cvxpy", self.backend, _files()):
             return reason
         if self.backend == "SCS" and sum(qp.sizes.values()) == qp.q.size:
-            return "needs a constraint"
-        return REFUSED.get(self.backend) or needs_matrices(qp)
+            return "needs a row or a bound"
+        return DECLINED_BACKENDS.get(self.backend) or needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy
@@ -116,7 +116,7 @@ class CVXPY:
         )
 
         def solve() -> Solution:
-            with warnings.catch_warnings():  # they repeat the status
+            with warnings.catch_warnings():  # warnings repeat the status
                 warnings.simplefilter("ignore")
                 try:
                     raw = chain.solve_via_data(
@@ -143,7 +143,7 @@ def _files() -> dict[str, Path]:
 
 
 def _model(cvxpy: Any, qp: QP, scale: float) -> tuple[Any, Any, dict[str, Any]]:
-    """State `qp` in cvxpy with constant data, each block of constraints by name."""
+    """Return the cvxpy problem, its variable and its constraints by name."""
     x = cvxpy.Variable(qp.q.size)
     low, up = np.isfinite(qp.lb), np.isfinite(qp.ub)
     constraints = {}
@@ -155,7 +155,7 @@ def _model(cvxpy: Any, qp: QP, scale: float) -> tuple[Any, Any, dict[str, Any]]:
         constraints["low"] = x[np.flatnonzero(low)] >= qp.lb[low]
     if up.any():
         constraints["up"] = x[np.flatnonzero(up)] <= qp.ub[up]
-    # assume_PSD: no eigenvalues are computed to prove convexity
+    # assume_PSD: otherwise cvxpy computes eigenvalues of P to prove convexity
     energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
     objective = cvxpy.Minimize(0.5 * energy + (qp.q * scale) @ x)
     return cvxpy.Problem(objective, list(constraints.values())), x, constraints

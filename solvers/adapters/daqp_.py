@@ -15,12 +15,12 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector
 from mortarbench.solvers.common.conversion import (
+    check_positive,
     dense,
     needs_dense,
     objective_factor,
-    positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 CLAIMS = {
     1: Status.SOLVED,
@@ -29,28 +29,29 @@ CLAIMS = {
     -3: Status.INFEASIBLE,  # unbounded
     -4: Status.ITERATION_LIMIT,
 }  #: anything else is FAILED
-WORDS = {
+MESSAGES = {
     1: "optimal", 2: "soft optimal", -1: "infeasible", -2: "cycling", -3: "unbounded",
     -4: "iteration limit", -5: "nonconvex", -6: "overdetermined initial working set",
     -7: "time limit",
 }  # fmt: skip
-INFINITE = 1e30  #: DAQP's own infinity
-EQUALITY = 5  #: DAQP's mark of an equality
-TIGHTER = 1e-3  #: DAQP's tolerances relative to tol
-TIGHTEST = 1e-11  #: below, its proximal iterations stop early or cycle
+INFINITE = 1e30  #: DAQP's value for an absent bound
+EQUALITY = 5  #: DAQP's flag of an equality
+TOL_FACTOR = 1e-3  #: tolerances of DAQP relative to tol
+#: smallest tolerance for DAQP: with 1e-12 its proximal iterations stop early or cycle
+MIN_TOLERANCE = 1e-11
 
 
 @dataclass(frozen=True)
 class DAQP:
     """https://darnstrom.github.io/daqp, dense.
 
-    An active-set method ends at a vertex of the active-set search, where the KKT
-    conditions hold to rounding; primal_tol and dual_tol only say which violations and
-    multiplier signs count. Both are absolute, so the objective is multiplied until
-    ‖q‖∞ = 1 and both are tol/1000, at least 1e-11. A looser tol saves no steps.
+    An active-set method ends with an active set for which the KKT conditions hold to
+    rounding; primal_tol and dual_tol only decide which violations and multiplier signs
+    count. Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are
+    tol/1000, at least 1e-11. A looser tol saves no steps.
 
-    A Hessian whose Cholesky breaks down is treated by DAQP's own proximal-point
-    iterations (eps_prox < 0, its automatic choice).
+    If the Cholesky factorisation of the Hessian breaks down, DAQP runs its own
+    proximal-point iterations (eps_prox < 0, its automatic choice).
     """
 
     max_iter: int = 100_000
@@ -61,18 +62,18 @@ class DAQP:
         licence="MIT",
         package="daqp",
         linear_solver="its own dense LDLᵀ, updated as rows become active",
-        phases="preparing makes the dense matrices and factorises; solving iterates",
+        phases="preparing converts to dense matrices and factorises; solving iterates",
         sequence="`update` of vectors keeps the factor and the active set",
         limits=(
             "Longer than 20 s on the 4420 unknowns of beam-ring/Nr=12/Nh=6/primal "
             "(suites/fleet.toml).",
             "With tolerances of 1e-12 its proximal iterations end with residuals of "
-            "7e-7 on singular QPs, so 1e-11 is the least that it is given.",
+            "7e-7 on singular QPs, so its tolerances are at least 1e-11.",
         ),
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 3)
@@ -81,7 +82,7 @@ class DAQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import daqp
@@ -92,7 +93,7 @@ class DAQP:
         low, high = _sides(qp)
         sense = np.zeros(high.size, dtype=np.int32)
         sense[n : n + m] = EQUALITY
-        eps = max(tol * TIGHTER, TIGHTEST)
+        eps = max(tol * TOL_FACTOR, MIN_TOLERANCE)
         model = daqp.Model()
         model.settings = dict(
             primal_tol=eps, dual_tol=eps, iter_limit=self.max_iter, eps_prox=-1.0
@@ -102,14 +103,14 @@ class DAQP:
         def solve() -> Solution:
             x, _, flag, info = model.solve()
             status = CLAIMS.get(flag, Status.FAILED)
-            words = WORDS.get(flag, f"exit flag {flag}")
+            message = MESSAGES.get(flag, f"exit flag {flag}")
             if status is Status.INFEASIBLE:
-                return Solution.without_point(qp, status, words)
+                return Solution.without_point(qp, status, message)
             lam: Vector = np.array(info["lam"]) / scale
             return Solution(
                 status=status, x=np.array(x),
                 y=lam[n : n + m], z=lam[n + m :], z_box=lam[:n],
-                iterations=info["iterations"], message=words,
+                iterations=info["iterations"], message=message,
                 counts={"outer": info["nodes"]},
                 reported={
                     "linear_solver": "dense ldl, updated",
@@ -126,7 +127,7 @@ class DAQP:
 
 
 def _sides(qp: QP) -> tuple[Vector, Vector]:
-    """Stack bounds, equalities, inequalities, with DAQP's infinity."""
+    """Return low and high of bounds, equalities and inequalities, stacked."""
     no_low = np.full(qp.h.size, -INFINITE)
     low = np.concatenate([np.maximum(qp.lb, -INFINITE), qp.b, no_low])
     return low, np.concatenate([np.minimum(qp.ub, INFINITE), qp.b, qp.h])

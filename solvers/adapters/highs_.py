@@ -15,15 +15,15 @@ from scipy.sparse import csc_matrix, tril, vstack
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    check_choice,
+    check_positive,
     csc,
     needs_dense,
     objective_factor,
     on_present_bounds,
-    one_of,
-    positive,
 )
 
-PRIMAL = "kInfeasible"  #: it may come with a certificate
+PRIMAL = "kInfeasible"  #: the status that may have a certificate
 CLAIMS = {
     "kOptimal": Status.SOLVED,
     "kIterationLimit": Status.ITERATION_LIMIT,
@@ -32,23 +32,23 @@ CLAIMS = {
     "kUnbounded": Status.INFEASIBLE,
     "kUnboundedOrInfeasible": Status.INFEASIBLE,
 }  #: anything else is FAILED
-TIGHTEST = 1e-10  #: the smallest tolerance that HiGHS takes
-SMALLEST_ENTRY = 1e-12  #: entries below are dropped; the smallest limit it takes
+MIN_TOLERANCE = 1e-10  #: smallest tolerance that HiGHS accepts
+MIN_ENTRY = 1e-12  #: smallest threshold of dropped entries that HiGHS accepts
 
 
 @dataclass(frozen=True)
 class HiGHS:
-    """https://highs.dev, one thread: its active-set (qpasm) or interior-point (hipo).
+    """https://highs.dev, one thread: active set (qpasm) or interior point (hipo).
 
     HiGHS tests violations and multiplier signs in absolute terms. So the objective is
-    multiplied until ‖q‖∞ = 1, and all of its tolerances are tol/100, at least 1e-10,
-    the smallest that it takes; an active-set method loses little by that.
+    scaled to ‖q‖∞ = 1, and all tolerances are tol/100, at least 1e-10, the smallest
+    that HiGHS accepts. An active-set method takes few more steps for that.
 
-    Three habits of HiGHS are worked around: qpasm claims an optimum after 0 iterations
-    on QPs with bounds only, so these get a row that binds nothing; a hidden 1e-7 on
-    the Hessian's diagonal (qp_regularization_value) is set to 0, without which a
-    singular QP of order one is left with residuals of 1e-6 at any tolerance; and
-    entries below 1e-9 would be dropped (small_matrix_value), which is lowered to 1e-12.
+    Three properties of HiGHS are worked around. qpasm claims an optimum after 0
+    iterations on QPs with bounds only, so these get one free row. HiGHS adds 1e-7 to
+    the diagonal of the Hessian (qp_regularization_value), which leaves residuals of
+    1e-6 on a singular QP of order one at any tolerance; this is set to 0. Entries below
+    1e-9 would be dropped (small_matrix_value); the threshold is lowered to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -74,16 +74,16 @@ class HiGHS:
             "On QPs with bounds only and without the free row, HiGHS 1.15.1 claims an "
             "optimum after 0 iterations: a membrane of 225 nodes has a residual of 1 "
             "(conformance check 'finds where a membrane of 400 nodes touches').",
-            "Without highspy-extras, hipo fails and HiGHS runs qpasm in silence; the "
-            "adapter calls that a failure.",
-            "qpasm keeps a dense Hessian of the null space of the active rows and "
-            "declines where that would not fit.",
+            "Without highspy-extras HiGHS runs qpasm in place of hipo without notice; "
+            "the adapter reports a failure.",
+            "qpasm stores a dense Hessian on the null space of active rows; a QP is "
+            "declined if that would not fit.",
         ),
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("method", self.method, ("qpasm", "hipo"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("method", self.method, ("qpasm", "hipo"))
 
     def declines(self, qp: QP) -> str | None:
         return needs_dense(qp, 1) if self.method == "qpasm" else needs_matrices(qp)
@@ -106,22 +106,22 @@ class HiGHS:
             solver.run()
             info, name = solver.getInfo(), solver.getModelStatus().name
             status = CLAIMS.get(name, Status.FAILED)
-            found = solver.getSolution()
+            point = solver.getSolution()
             m, p = qp.b.size, qp.h.size
-            if status is Status.INFEASIBLE or not found.value_valid:
+            if status is Status.INFEASIBLE or not point.value_valid:
                 ray: dict[str, Vector] = {}
-                _, is_known, row = solver.getDualRay()
-                if name == PRIMAL and is_known and m + p:
+                _, has_ray, row = solver.getDualRay()
+                if name == PRIMAL and has_ray and m + p:
                     y, z = -row[:m], -row[m:]
                     ray = dict(y=y, z=z, z_box=-(qp.A.T @ y + qp.G.T @ z))
                 return Solution.without_point(qp, status, name, **ray)
-            row = -np.array(found.row_dual) / scale
-            z_box = -np.array(found.col_dual) / scale
+            row = -np.array(point.row_dual) / scale
+            z_box = -np.array(point.col_dual) / scale
             steps = {
                 "qpasm": info.qp_iteration_count, "hipo": info.ipm_iteration_count
             }  # fmt: skip
             return Solution(
-                status=status, x=np.array(found.col_value),
+                status=status, x=np.array(point.col_value),
                 y=row[:m], z=row[m : m + p], z_box=on_present_bounds(qp, z_box),
                 iterations=steps[self.method], message=name,
                 reported={
@@ -134,18 +134,18 @@ class HiGHS:
         return solve
 
     def _options(self, tol: float) -> dict[str, Any]:
-        eps = max(tol / 100, TIGHTEST)
+        eps = max(tol / 100, MIN_TOLERANCE)
         return {
             "output_flag": False, "threads": 1, "solver": self.method,
             "kkt_tolerance": eps, "ipm_optimality_tolerance": eps,
-            "qp_regularization_value": 0.0, "small_matrix_value": SMALLEST_ENTRY,
+            "qp_regularization_value": 0.0, "small_matrix_value": MIN_ENTRY,
             "qp_iteration_limit": self.max_iter, "ipm_iteration_limit": self.max_iter,
             "qp_nullspace_limit": 2**31 - 1,
         }  # fmt: skip
 
 
 def _model(highspy: Any, qp: QP, scale: float) -> Any:
-    """State `qp` as a HighsModel, with a free row where there is none."""
+    """Return `qp` as a HighsModel, with a free row if it has no rows."""
     n = qp.q.size
     rows = csc(vstack([csc(qp.A), csc(qp.G)]))
     low = np.concatenate([qp.b, np.full(qp.h.size, -np.inf)])

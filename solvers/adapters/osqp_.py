@@ -15,16 +15,16 @@ from scipy.sparse import triu
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_two_sided,
     objective_factor,
-    positive,
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, tightening
+from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
+PRIMAL = "OSQP_PRIMAL_INFEASIBLE"  #: the status that has a certificate
 CLAIMS = {
     "OSQP_SOLVED": Status.SOLVED,
     "OSQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
@@ -41,16 +41,15 @@ class OSQP:
 
     OSQP stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term). That is the harness's relative
-    test, so eps_rel = tol and eps_abs is negligible. It looks every 25 iterations only.
-    Bounds become rows of the identity, for variables that have one.
+    test, so eps_rel = tol and eps_abs is negligible. The test is evaluated every 25
+    iterations. Bounds become rows of the identity, one per bounded variable.
 
-    Polishing keeps its point, however much worse its dual residual is, where the old
-    one was below 1e-10 in absolute terms. So the objective is then multiplied until
-    ‖q‖∞ = 1e4.
+    If the dual residual before polishing was below 1e-10 in absolute terms, polishing
+    accepts any larger one. So with polishing the objective is scaled to ‖q‖∞ = 1e4.
     """
 
     max_iter: int = 1_000_000
-    polishing: bool = False  #: solve once more with the active rows as equalities
+    polishing: bool = False  #: solve again with the active rows as equalities
 
     about: ClassVar[About] = About(
         title="OSQP",
@@ -69,7 +68,7 @@ class OSQP:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)
@@ -78,8 +77,7 @@ class OSQP:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        prepare = self.tightening()
-        return lambda qp: prepare(qp, tol)
+        return chain(self._begin, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         return tightening(self._begin)

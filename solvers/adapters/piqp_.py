@@ -15,15 +15,15 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    as_stored,
+    check_choice,
+    check_positive,
     csc,
     dense,
     needs_dense,
     objective_factor,
-    one_of,
-    positive,
+    resolve_backend,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 PRIMAL = "PIQP_PRIMAL_INFEASIBLE"
 CLAIMS = {
@@ -40,7 +40,7 @@ class PIQP:
 
     PIQP stops when the max norms of the residuals and the duality gap are below eps_abs
     *or* below eps_rel·max(1, their largest term). So eps_abs is negligible, eps_rel =
-    tol, and the objective is multiplied until ‖q‖∞ = 1e4, where the 1 no longer counts.
+    tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has no effect.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -55,23 +55,23 @@ class PIQP:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("backend", self.backend, ("auto", "dense", "sparse"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
-        as_dense = as_stored(self.backend, qp) == "dense"
+        as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import piqp
 
-        is_dense = as_stored(self.backend, qp) == "dense"
+        is_dense = resolve_backend(self.backend, qp) == "dense"
         convert = (lambda M: np.asfortranarray(dense(M))) if is_dense else csc
         solver = piqp.DenseSolver() if is_dense else piqp.SparseSolver()
         s = solver.settings
@@ -90,7 +90,7 @@ class PIQP:
                 y=r.y / scale, z=r.z_u / scale, z_box=(r.z_bu - r.z_bl) / scale
             )
             if status is Status.INFEASIBLE:
-                # its multipliers diverge along a certificate
+                # the multipliers diverge along a certificate of infeasibility
                 ray = multipliers if info.status.name == PRIMAL else {}
                 return Solution.without_point(qp, status, info.status.name, **ray)
             return Solution(

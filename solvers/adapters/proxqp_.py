@@ -15,20 +15,20 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
-    as_stored,
-    boxed,
+    check_choice,
+    check_positive,
     csc,
     dense,
     from_two_sided,
+    has_bound,
     needs_dense,
     on_present_bounds,
-    one_of,
-    positive,
+    resolve_backend,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, tightening
+from mortarbench.solvers.common.sequence import Session, chain, tightening
 
-PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: it comes with a certificate
+PRIMAL = "PROXQP_PRIMAL_INFEASIBLE"  #: the status that has a certificate
 CLAIMS = {
     "PROXQP_SOLVED": Status.SOLVED,
     "PROXQP_MAX_ITER_REACHED": Status.ITERATION_LIMIT,
@@ -45,14 +45,15 @@ class ProxQP:
 
     ProxQP stops when the max norms of the primal and dual residuals are below
     eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The test of the duality gap, off by default, is on. No test of ProxQP looks
-    at the sign of the multipliers, and its default first guess, which takes every row
-    as an equality, often passes them all with negative ones (primal forms, tol ≥ 1e-4).
-    Starting from zero makes that rare, if not impossible, and takes fewer iterations.
+    eps_abs. The test of the duality gap, off by default, is on. ProxQP does not test
+    the sign of multipliers, and its default start, which takes every row as an
+    equality, often passes all tests with negative ones (primal forms, tol ≥ 1e-4). So
+    it starts from zero: negative multipliers become rare, if not impossible, and fewer
+    iterations are needed.
 
-    Certificates of infeasibility are tested in absolute terms: at the default 1e-4
-    ProxQP calls feasible QPs infeasible whose multipliers are of that size. At 1e-8 it
-    does not, but ends at the iteration limit where others find a certificate.
+    Certificates of infeasibility are tested in absolute terms: at the default 1e-4,
+    feasible QPs with multipliers of that size are claimed infeasible. At 1e-8 they are
+    not, but some infeasible QPs end at the iteration limit.
     """
 
     backend: Literal["auto", "dense", "sparse"] = "auto"  #: auto: as P is stored
@@ -69,29 +70,28 @@ class ProxQP:
         sequence="`update` of vectors keeps the equilibration; starts from the last "
         "point",
         limits=(
-            "No test looks at the sign of multipliers.",
+            "The sign of multipliers is not tested.",
             "At tol 1e-3 it claims points with residuals of 1e-2 to 2e-2 on duals with "
             "friction (greco/dual-bounds, beam-ring/steps=1/friction=tresca/bound=1e8/"
             "dual); at 1e-6 and 1e-9 all are verified.",
-            "No time limit of its own, and it keeps Python's lock: only the harness's "
-            "kill ends it.",
+            "It has no time limit and does not release Python's lock: only killing the "
+            "process ends it.",
         ),
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("backend", self.backend, ("auto", "dense", "sparse"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("backend", self.backend, ("auto", "dense", "sparse"))
 
     def declines(self, qp: QP) -> str | None:
-        as_dense = as_stored(self.backend, qp) == "dense"
+        as_dense = resolve_backend(self.backend, qp) == "dense"
         return needs_dense(qp, 4) if as_dense else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        prepare = self.tightening()
-        return lambda qp: prepare(qp, tol)
+        return chain(self._begin, tol)
 
     def tightening(self) -> Callable[[QP, float], Callable[[], Solution]]:
         return tightening(self._begin)
@@ -99,16 +99,16 @@ class ProxQP:
     def _begin(self, qp: QP, tol: float) -> Session:
         from proxsuite import proxqp
 
-        backend = as_stored(self.backend, qp)
+        backend = resolve_backend(self.backend, qp)
         form = _Dense(qp) if backend == "dense" else _Sparse(qp)
-        solver = form.made(proxqp)
+        solver = form.set_up_solver(proxqp)
         settings = solver.settings
         settings.eps_abs = settings.eps_duality_gap_abs = NEGLIGIBLE
         settings.check_duality_gap = settings.compute_timings = True
         settings.eps_primal_inf = settings.eps_dual_inf = CERTIFICATE
         settings.initial_guess = proxqp.NO_INITIAL_GUESS
         settings.max_iter = self.max_iter
-        warm: list[Solution] = []
+        starts: list[Solution] = []
 
         def tighten(tol: float) -> None:
             settings.eps_rel = settings.eps_duality_gap_rel = tol
@@ -116,10 +116,10 @@ class ProxQP:
         tighten(tol)
 
         def solve() -> Solution:
-            if warm:
+            if starts:
                 settings.initial_guess = proxqp.WARM_START
-                s = warm.pop()
-                solver.solve(s.x, s.y, form.stacked(s))
+                s = starts.pop()
+                solver.solve(s.x, s.y, form.inequality_multipliers(s))
             else:
                 solver.solve()
             r = solver.results
@@ -144,44 +144,46 @@ class ProxQP:
             settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT
             solver.update(g=new.q, b=new.b, **form.sides(new))
 
-        # the dense backend takes no multipliers of bounds to start from
-        no_start = isinstance(form, _Dense) and form.boxed
-        return Session(solve, update, None if no_start else warm.append, tighten)
+        # `solve` of the dense backend takes x, y and z, but no multipliers of bounds
+        takes_no_start = isinstance(form, _Dense) and form.has_box
+        return Session(
+            solve, update, None if takes_no_start else starts.append, tighten
+        )
 
 
 class _Dense:
-    """The dense backend, which knows bounds: multipliers of all n follow those of G."""
+    """Dense backend: takes bounds; n multipliers of bounds follow those of G."""
 
     def __init__(self, qp: QP) -> None:
-        self.qp, self.boxed = qp, bool(boxed(qp).any())
+        self.qp, self.has_box = qp, bool(has_bound(qp).any())
 
-    def made(self, proxqp: Any) -> Any:
+    def set_up_solver(self, proxqp: Any) -> Any:
         qp = self.qp
-        solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.boxed)
+        solver = proxqp.dense.QP(qp.q.size, qp.b.size, qp.h.size, self.has_box)
         P, A, G = dense(qp.P), dense(qp.A), dense(qp.G)
         solver.init(P, qp.q, A, qp.b, G, **self.sides(qp))
         return solver
 
     def sides(self, qp: QP) -> dict[str, Vector]:
-        box = {"l_box": qp.lb, "u_box": qp.ub} if self.boxed else {}
+        box = {"l_box": qp.lb, "u_box": qp.ub} if self.has_box else {}
         return {"l": np.full(qp.h.size, -np.inf), "u": qp.h, **box}
 
     def multipliers(self, v: Vector) -> dict[str, Any]:
         z, z_box = np.split(v, [self.qp.h.size])
-        z_box = z_box if self.boxed else np.zeros(self.qp.q.size)
+        z_box = z_box if self.has_box else np.zeros(self.qp.q.size)
         return {"z": z, "z_box": on_present_bounds(self.qp, z_box)}
 
-    def stacked(self, s: Solution) -> Vector:
-        return np.concatenate([s.z, s.z_box]) if self.boxed else s.z
+    def inequality_multipliers(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box]) if self.has_box else s.z
 
 
 class _Sparse:
-    """The sparse backend, where bounds are rows of the identity."""
+    """Sparse backend: takes no bounds; they become rows of the identity."""
 
     def __init__(self, qp: QP) -> None:
         self.qp = qp
 
-    def made(self, proxqp: Any) -> Any:
+    def set_up_solver(self, proxqp: Any) -> Any:
         qp = self.qp
         rows = csc(two_sided(qp)[0][qp.b.size :])
         solver = proxqp.sparse.QP(qp.q.size, qp.b.size, rows.shape[0])
@@ -196,5 +198,5 @@ class _Sparse:
         parts = from_two_sided(self.qp, np.concatenate([np.zeros(self.qp.b.size), v]))
         return {"z": parts["z"], "z_box": parts["z_box"]}
 
-    def stacked(self, s: Solution) -> Vector:
-        return np.concatenate([s.z, s.z_box[boxed(self.qp)]])
+    def inequality_multipliers(self, s: Solution) -> Vector:
+        return np.concatenate([s.z, s.z_box[has_bound(self.qp)]])

@@ -16,13 +16,13 @@ from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     DIVERGED,
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_one_sided,
     objective_factor,
     one_sided,
-    positive,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
 CLAIMS = {
     "QOCO_SOLVED": Status.SOLVED,
@@ -36,9 +36,9 @@ class QOCO:
 
     QOCO stops when the max norms of the residuals are below abstol + reltol·(their
     largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
-    negligible, reltol = tol, and the objective is multiplied until ‖q‖∞ = 1e4, where
-    the 1 no longer counts. QOCO has no certificates: on an unbounded QP its iterates
-    grow until every relative residual is small, which it calls solved; a claim with
+    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
+    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
+    every relative residual is small, which it claims as solved. So a claim with
     ‖x‖∞ > 1e12 counts as failed.
     """
 
@@ -51,7 +51,8 @@ class QOCO:
         package="qoco",
         linear_solver="QDLDL (sparse LDLᵀ), one factorisation per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
-        sequence="`update_vector_data` keeps the analysis; it cannot start warm",
+        sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
+        "takes no starting point",
         limits=(
             "No certificates of infeasibility; unbounded QPs are claimed solved with "
             "‖x‖∞ of 1e16 (conformance check 'unbounded'), which the adapter catches.",
@@ -59,7 +60,7 @@ class QOCO:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)
@@ -68,7 +69,7 @@ class QOCO:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qoco

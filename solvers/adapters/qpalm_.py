@@ -15,15 +15,15 @@ import numpy as np
 from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_positive,
     csc,
     from_two_sided,
-    positive,
     to_two_sided,
     two_sided,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = "PRIMAL_INFEASIBLE"  #: it comes with a certificate
+PRIMAL = "PRIMAL_INFEASIBLE"  #: the status that has a certificate
 CLAIMS = {
     "SOLVED": Status.SOLVED,
     "MAX_ITER_REACHED": Status.ITERATION_LIMIT,
@@ -31,7 +31,7 @@ CLAIMS = {
     PRIMAL: Status.INFEASIBLE,
     "DUAL_INFEASIBLE": Status.INFEASIBLE,
 }  #: anything else is FAILED
-INFINITE = 1e20  #: QPALM's own infinity
+INFINITE = 1e20  #: QPALM's value for an absent bound
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class QPALM:
     """https://kul-optec.github.io/QPALM.
 
     QPALM stops when the max norms of the primal and dual residuals are below eps_abs +
-    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. It has
-    no test of the duality gap. Bounds become rows of the identity.
+    eps_rel·(their largest term), hence eps_rel = tol and a negligible eps_abs. It does
+    not test the duality gap. Bounds become rows of the identity.
     """
 
     max_iter: int = 10_000
@@ -60,7 +60,7 @@ class QPALM:
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)
@@ -69,7 +69,7 @@ class QPALM:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import qpalm
@@ -83,11 +83,11 @@ class QPALM:
         settings.eps_rel_in = min(1.0, settings.eps_rel_in)
         settings.max_iter, settings.verbose = self.max_iter, 0
         solver = qpalm.Solver(data, settings)
-        warm: list[tuple[Vector, Vector]] = []
+        starts: list[tuple[Vector, Vector]] = []
 
         def solve() -> Solution:
-            if warm:
-                solver.warm_start(*warm.pop())
+            if starts:
+                solver.warm_start(*starts.pop())
             solver.solve(asynchronous=False)
             info = solver.info
             name = _name(qpalm, info.status_val)
@@ -114,10 +114,12 @@ class QPALM:
             solver.update_q(new.q)
             solver.update_bounds(low, high)
             if np.isfinite(solver.solution.x).all():
-                warm.append((np.array(solver.solution.x), np.array(solver.solution.y)))
+                starts.append(
+                    (np.array(solver.solution.x), np.array(solver.solution.y))
+                )
 
         def start(s: Solution) -> None:
-            warm.append((s.x, to_two_sided(qp, s)))
+            starts.append((s.x, to_two_sided(qp, s)))
 
         return Session(solve, update, start)
 

@@ -24,7 +24,7 @@ from mortarbench.harness import (
     Vector,
     needs_matrices,
 )
-from mortarbench.solvers.common.backends import Call, adapter_files, why_not
+from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
     csc,
@@ -35,17 +35,17 @@ from mortarbench.solvers.common.conversion import (
     on_present_bounds,
 )
 
-#: backend → how it is called; one that is not listed runs at its defaults
+#: calls of backends; a backend that is not listed runs with its defaults
 CALLS: Mapping[str, Call] = {
     "clarabel": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel"), {"max_threads": 1}),
     "cvxopt": Call(("feastol", "abstol", "reltol")),
     "daqp": Call(("primal_tol", "dual_tol"), size=1.0, tighter=1e-3, floor=1e-11),
     "highs": Call(
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
-        # HiGHS else adds 1e-7 to the Hessian and drops entries below 1e-9
+        # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
         {
             "qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1,
-            "qp_iteration_limit": 1_000_000,  # or it cycles for ever
+            "qp_iteration_limit": 1_000_000,  # without a limit it may cycle forever
         },
         size=1.0, tighter=1e-2, floor=1e-10,
     ),
@@ -72,13 +72,14 @@ CALLS: Mapping[str, Call] = {
 }  # fmt: skip
 
 #: backends that take dense matrices only
-DENSE_ONLY = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
-#: backends for which qpsolvers treats QPs without any constraint itself, wrongly
+DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
+#: backends for which qpsolvers solves unconstrained QPs by code of its own, which is
+#: wrong
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
-#: what the words of an unsuccessful status mean, the first that matches
-WORDS = (
+#: claims for the statuses of backends without a solution; the first match counts
+STATUS_PATTERNS = (
     (r"max(imum)?_?\W*iter", Status.ITERATION_LIMIT),
     (r"time", Status.TIME_LIMIT),
     (r"almost|inaccurate", Status.FAILED),
@@ -90,11 +91,11 @@ WORDS = (
 class QPSolvers:
     """One backend of qpsolvers; everything but the conversion is timed as solving.
 
-    The tolerance goes to the backend's own keywords (`CALLS`), the relative one where
-    there are two; a backend that is not listed there runs at its defaults. As in the
-    native adapters the objective is multiplied until ‖q‖∞ = 1e4, or 1 where the
-    backend's test is absolute (highs, daqp). Backends that take both get dense matrices
-    where P is dense. qpsolvers tells the iterations of some backends only.
+    The tolerance is passed by the backend's own keywords (`CALLS`), as the relative one
+    if there are two; a backend that is not listed there runs with its defaults. As in
+    the native adapters the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the backend's
+    test is absolute (highs, daqp). Backends for dense and sparse matrices get dense
+    ones if P is dense. qpsolvers reports the iterations of some backends only.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME
@@ -108,9 +109,9 @@ class QPSolvers:
         phases="preparing converts only; setup and factorisation of every backend are "
         "solving",
         limits=(
-            "qpsolvers treats QPs without any constraint itself for clarabel, qtqp and "
-            "scs, and calls a strictly convex one unbounded (conformance, shape "
-            "'unconstrained'); they are declined.",
+            "For clarabel, qtqp and scs qpsolvers solves unconstrained QPs by code of "
+            "its own, which claims that a strictly convex one is unbounded "
+            "(conformance, shape 'unconstrained'); they are declined.",
             "No iterations from clarabel, cvxopt, daqp, highs, quadprog and sip.",
             "ecos reaches half of the digits (dual residuals of 1e-5 at tol 1e-9, by "
             "the conformance suite) and pyqpmad gives wrong multipliers for fixed "
@@ -120,21 +121,21 @@ class QPSolvers:
 
     @staticmethod
     def backends() -> tuple[str, ...]:
-        """List the names that the installed qpsolvers knows, installed or not."""
+        """Return the names of all backends of qpsolvers, installed or not."""
         return tuple(_files())
 
     def declines(self, qp: QP) -> str | None:
-        if reason := why_not("qpsolvers", self.backend, _files()):
+        if reason := reason_unavailable("qpsolvers", self.backend, _files()):
             return reason
         rows_and_bounds = sum(qp.sizes.values()) - qp.q.size
         if not rows_and_bounds and self.backend in NEEDS_CONSTRAINT:
-            return "needs a constraint: qpsolvers treats QPs without one itself"
+            return "needs a row or a bound: qpsolvers solves QPs without one by itself"
         if self.backend == "qtqp" and rows_and_bounds == qp.b.size:
             return "needs an inequality row or a bound"
         needs_rank = self.backend in NEEDS_INDEPENDENT_ROWS
         if needs_rank and (reason := needs_independent_rows(qp)):
             return reason
-        dense_only = self.backend in DENSE_ONLY
+        dense_only = self.backend in DENSE_BACKENDS
         return needs_dense(qp, 4) if dense_only else needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
@@ -144,24 +145,24 @@ class QPSolvers:
         options, scale = call.options(tol), objective_factor(qp, call.size)
         takes_dense = self.backend in qpsolvers.dense_solvers
         as_dense = takes_dense and isinstance(qp.P, np.ndarray)
-        convert = dense if as_dense or self.backend in DENSE_ONLY else csc
+        convert = dense if as_dense or self.backend in DENSE_BACKENDS else csc
         problem = qpsolvers.Problem(**_arguments(qp, convert, scale))
-        if self.backend == "sip":  # it refuses what is not symmetric in the last bit
+        if self.backend == "sip":  # it refuses a P whose asymmetry is rounding
             problem.P = csc((problem.P + problem.P.T) / 2)
         if self.backend == "highs" and not qp.b.size + qp.h.size:
-            # with bounds only, HiGHS claims optima after 0 iterations
+            # with bounds only, HiGHS claims an optimum after 0 iterations
             problem.G, problem.h = convert(np.eye(1, qp.q.size)), np.array([np.inf])
 
         def solve() -> Solution:
-            with warnings.catch_warnings():  # they repeat the status
+            with warnings.catch_warnings():  # warnings repeat the status
                 warnings.simplefilter("ignore")
                 try:
-                    found = qpsolvers.solve_problem(problem, self.backend, **options)
+                    result = qpsolvers.solve_problem(problem, self.backend, **options)
                 except qpsolvers.exceptions.QPError as e:
                     definite = "not positive definite" in str(e)
                     status = Status.DECLINED if definite else Status.FAILED
                     return Solution.without_point(qp, status, str(e))
-            return _solution(qp, found, scale)
+            return _solution(qp, result, scale)
 
         return solve
 
@@ -173,7 +174,7 @@ def _files() -> dict[str, Path]:
 def _arguments(
     qp: QP, convert: Callable[[Matrix], Matrix], scale: float
 ) -> dict[str, Any]:
-    """Name the parts of `qp` that are there; qpsolvers takes None for absent ones."""
+    """Return the arguments of qpsolvers.Problem, without those for absent parts."""
     arguments = {"P": convert(qp.P) * scale, "q": qp.q * scale}
     if qp.h.size:
         arguments |= {"G": convert(qp.G), "h": qp.h.copy()}
@@ -185,23 +186,23 @@ def _arguments(
     return arguments
 
 
-def _solution(qp: QP, found: Any, scale: float) -> Solution:
-    """Convert a qpsolvers.Solution, in whose sign convention a QP is."""
-    info = found.extras.get("info", found.extras)
+def _solution(qp: QP, result: Any, scale: float) -> Solution:
+    """Convert a qpsolvers.Solution; its sign convention is that of `Solution`."""
+    info = result.extras.get("info", result.extras)
     info = info if isinstance(info, Mapping) else _attributes(info)
-    words = str(info.get("status", "found" if found.found else "not found"))
-    status = Status.SOLVED if found.found else _claim(words)
+    message = str(info.get("status", "found" if result.found else "not found"))
+    status = Status.SOLVED if result.found else _claim(message)
     if status is Status.INFEASIBLE:
-        return Solution.without_point(qp, status, words)
-    z_box = _vector(found.z_box, qp.q.size, absent=not qp.sizes["bounds"])
+        return Solution.without_point(qp, status, message)
+    z_box = _vector(result.z_box, qp.q.size, absent=not qp.sizes["bounds"])
     return Solution(
         status=status,
-        x=_vector(found.x, qp.q.size),
-        y=_vector(found.y, qp.b.size, absent=not qp.b.size) / scale,
-        z=_vector(found.z, qp.h.size, absent=not qp.h.size) / scale,
+        x=_vector(result.x, qp.q.size),
+        y=_vector(result.y, qp.b.size, absent=not qp.b.size) / scale,
+        z=_vector(result.z, qp.h.size, absent=not qp.h.size) / scale,
         z_box=on_present_bounds(qp, z_box) / scale,
         iterations=info.get("iter"),
-        message=words,
+        message=message,
         reported={"linear_solver": name}
         if (name := info.get("lin_sys_solver"))
         else {},
@@ -213,13 +214,13 @@ def _attributes(info: object) -> dict[str, Any]:
     return {name: getattr(info, name) for name in names if hasattr(info, name)}
 
 
-def _claim(words: str) -> Status:
-    matches = (s for w, s in WORDS if re.search(w, words, re.IGNORECASE))
+def _claim(message: str) -> Status:
+    matches = (s for w, s in STATUS_PATTERNS if re.search(w, message, re.IGNORECASE))
     return next(matches, Status.FAILED)
 
 
 def _vector(v: Any, size: int, *, absent: bool = False) -> Vector:
-    """Take a vector as it came; zeros for an absent block, NaN for a missing one."""
+    """Return `v` as a vector; zeros if its block is absent, NaN if `v` is missing."""
     if absent:
         return np.zeros(size)
     if v is None or np.size(v) != size:

@@ -23,20 +23,20 @@ from mortarbench.solvers.common.conversion import (
     one_sided,
 )
 
-SINGULAR = 1e-12  #: smallest pivot relative to the largest of a definite Hessian
+#: smallest pivot, relative to the largest, of a Hessian that counts as definite
+MIN_PIVOT = 1e-12
 
 
 @dataclass(frozen=True)
 class Quadprog:
     """https://github.com/quadprog/quadprog, dense, for positive definite Hessians.
 
-    quadprog has no tolerance: it ends, after finitely many changes of the active set,
-    where the KKT conditions hold to rounding. tol is not used.
+    quadprog has no tolerance, and `tol` is not used: after finitely many changes of the
+    active set the KKT conditions hold to rounding.
 
     A Hessian that is not positive definite, or whose smallest Cholesky pivot is below
-    1e-12 of the largest, is declined once the factorisation has shown it. So are
-    equality rows that depend on each other, beforehand: quadprog calls them
-    inconsistent.
+    1e-12 of the largest, is declined after its factorisation. Dependent equality rows
+    are declined before: quadprog claims that they are inconsistent.
     """
 
     about: ClassVar[About] = About(
@@ -66,7 +66,7 @@ class Quadprog:
         except LinAlgError:
             return lambda: _declined(qp, "P is not positive definite")
         pivots = np.diag(L) ** 2
-        if pivots.min() < SINGULAR * pivots.max():
+        if pivots.min() < MIN_PIVOT * pivots.max():
             return lambda: _declined(qp, "P is singular to working precision")
         inverse = solve_triangular(L, np.eye(len(L)), lower=True).T
         rows, rhs = one_sided(qp)

@@ -10,22 +10,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-import numpy as np
 from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
     NEGLIGIBLE,
+    check_choice,
+    check_positive,
+    conic_point,
     csc,
     from_one_sided,
-    one_of,
     one_sided,
-    positive,
-    to_one_sided,
 )
-from mortarbench.solvers.common.sequence import Session, in_sequence
+from mortarbench.solvers.common.sequence import Session, chain
 
-PRIMAL = -2  #: it comes with a certificate
+PRIMAL = -2  #: the status that has a certificate
 CLAIMS = {
     1: Status.SOLVED,
     2: Status.ITERATION_LIMIT,  # inaccurate, as at the limit
@@ -41,8 +40,8 @@ class SCS:
 
     SCS stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
-    negligible eps_abs. It looks every 25 iterations only. Equalities go to the zero
-    cone; inequalities and finite bounds, one row each, to the nonnegative cone.
+    negligible eps_abs. The test is evaluated every 25 iterations. Equalities go to the
+    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
@@ -57,23 +56,23 @@ class SCS:
         "of scale",
         phases="preparing equilibrates and factorises; solving iterates",
         sequence="`update` of vectors keeps the factor; starts from the last point",
-        limits=("Needs a row or a bound: it has no cone for none.",),
+        limits=("Needs a row or a bound: its cone must not be empty.",),
     )
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
+        check_positive(max_iter=self.max_iter)
+        check_choice("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
 
     def declines(self, qp: QP) -> str | None:
         if not any(qp.sizes[k] for k in ("equalities", "inequalities", "bounds")):
-            return "needs a constraint: it has no cone for none"
+            return "needs a row or a bound: its cone must not be empty"
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         return self._begin(qp, tol).solve
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        return in_sequence(lambda qp: self._begin(qp, tol))
+        return chain(self._begin, tol)
 
     def _begin(self, qp: QP, tol: float) -> Session:
         import scs
@@ -87,11 +86,11 @@ class SCS:
             eps_abs=NEGLIGIBLE, eps_rel=tol, eps_infeas=CERTIFICATE,
             max_iters=self.max_iter, verbose=False,
         )  # fmt: skip
-        warm: list[Solution] = []
+        starts: list[Solution] = []
 
         def solve() -> Solution:
-            point = warm.pop() if warm else None
-            x, y, s = _start(qp, point) if point else (None, None, None)
+            point = starts.pop() if starts else None
+            x, y, s = conic_point(qp, point) if point else (None, None, None)
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
             status = CLAIMS.get(info["status_val"], Status.FAILED)
@@ -116,9 +115,4 @@ class SCS:
         def update(new: QP) -> None:
             solver.update(b=one_sided(new)[1], c=new.q.copy())
 
-        return Session(solve, update, warm.append)
-
-
-def _start(qp: QP, s: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    rows, rhs = one_sided(qp)
-    return s.x.copy(), to_one_sided(qp, s), np.maximum(rhs - rows @ s.x, 0.0)
+        return Session(solve, update, starts.append)

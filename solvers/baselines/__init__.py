@@ -1,1 +1,1 @@
-"""In-house solvers to compare with: active sets, projected gradients, least squares."""
+"""In-house solvers for comparison: active sets, projected gradients, least squares."""

@@ -1,4 +1,4 @@
-"""The inner iterations of `pdas`: semismooth Newton for a fixed centre."""
+"""Inner iterations of `pdas`: semismooth Newton for a fixed proximal centre."""
 
 from __future__ import annotations
 
@@ -11,24 +11,25 @@ from numpy.typing import NDArray
 from scipy.sparse import diags_array
 
 from mortarbench.harness import QP, Matrix, Vector
-from mortarbench.solvers.baselines.face import Faces, Solve, faces
+from mortarbench.solvers.baselines.face import Faces, Solve, factoriser
 from mortarbench.solvers.common.conversion import csc, dense
 
-DELTA = 1e-9  #: δᵢ/Pᵢᵢ
-KAPPA = 1e4  #: ρ·aD⁻¹aᵀ
-PATIENCE = 10  #: changes of the active set that need not lessen what is wrong
-LEAST_SLACK = 1e-13  #: errors of signs and bounds below this are rounding
+DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
+KAPPA = 1e4  #: ρ·aD⁻¹aᵀ, penalty of a row a relative to the curvature along it
+#: changes of the active set, without fewer wrong constraints, before single exchanges
+PATIENCE = 10
+SIGN_ROUNDING = 1e-13  #: relative errors of signs and bounds below this are rounding
 
 
 class Active(NamedTuple):
-    """Which constraints are taken for equalities."""
+    """Active set: the constraints that the Newton system takes as equations."""
 
     side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 free
     rows: NDArray[np.bool_]  #: (p,) of G
 
 
 class Point(NamedTuple):
-    """A point with the multipliers of its rows."""
+    """Point with the multipliers of its rows."""
 
     x: Vector
     y: Vector
@@ -36,42 +37,42 @@ class Point(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The end of the inner iterations."""
+    """Result of the inner iterations."""
 
     active: Active
     solve: Solve
     at: Point
     gradient: Vector
-    settled: bool  #: False at the iteration limit
+    settled: bool  #: the active set no longer changes; False at the iteration limit
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A QP with the weights of its proximal terms."""
+    """QP with the weights of its proximal terms."""
 
     qp: QP
     A: Matrix
     G: Matrix
-    D: Vector  #: (n,) size of the curvature of each variable
+    D: Vector  #: (n,) diag P, with a typical value in place of zeros
     rho: Vector  #: (m,) of A
     sigma: Vector  #: (p,) of G
     faces: Faces
     counts: Counter[str]
 
     def gradient(self, at: Point, centre: Point) -> Vector:
-        """P x + δ(x − x_k) + q + Aᵀy + Gᵀz."""
+        """Return Px + δ(x − x_k) + q + Aᵀy + Gᵀz."""
         self.counts["P_products"] += 1
         force = self.qp.P @ at.x + self.A.T @ at.y + self.G.T @ at.z
         return np.asarray(force + self.qp.q + DELTA * self.D * (at.x - centre.x))
 
 
-def penalised(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
-    """Weigh the rows, ρ = κ/(a D⁻¹aᵀ); factorise what all faces share.
+def penalise(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
+    """Weight each row a by ρ = κ/(a D⁻¹aᵀ); factorise the part that faces share.
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When P is not positive semidefinite, and that shows already.
+        If P is not positive semidefinite and this factorisation already shows it.
 
     """
     store = dense if isinstance(qp.P, np.ndarray) else csc
@@ -85,23 +86,27 @@ def penalised(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
     unbounded = np.isinf(qp.lb) & np.isinf(qp.ub)
     if store is dense and unbounded.any() and not qp.h.size:
         counts["factorisations"] += 1
-    return Problem(qp, A, G, D, rho, sigma, faces(M, G, sigma, unbounded), counts)
+    return Problem(qp, A, G, D, rho, sigma, factoriser(M, G, sigma, unbounded), counts)
 
 
 def row_norms(M: Matrix, D: Vector) -> Vector:
-    """Return √(a D⁻¹aᵀ) of each row a, 1 of a zero row."""
+    """Return √(a D⁻¹aᵀ) for each row a of M; 1 for a zero row."""
     squares = np.asarray((M * M if isinstance(M, np.ndarray) else M.power(2)) @ (1 / D))
     return np.asarray(np.sqrt(np.where(squares > 0, squares, 1.0)))
 
 
-def settled(
+def solve_subproblem(
     problem: Problem,
     start: tuple[Active, Solve | None],
     centre: Point,
     slack: float,
     max_iter: int,
 ) -> Run:
-    """Change the active set until nothing is wrong with it (steps 1 and 2)."""
+    """Update the active set until it no longer changes (steps 1 and 2 of `pdas`).
+
+    start : active set and, if available, the solve of its factorised face
+    slack : relative errors of signs and bounds that are accepted
+    """
     active, solve = start
     fewest, patience = np.inf, PATIENCE
     while True:
@@ -110,8 +115,8 @@ def settled(
             solve = problem.faces(active.side == 0, active.rows)
         at, g, trial = _newton(problem, active, centre, solve)
         problem.counts["solves"] += 1
-        new = _predicted(
-            problem, active, Point(at.x, g, trial), max(slack, LEAST_SLACK)
+        new = _predict(
+            problem, active, Point(at.x, g, trial), max(slack, SIGN_ROUNDING)
         )
         changed = np.flatnonzero(
             np.concatenate([new.side != active.side, new.rows != active.rows])
@@ -123,7 +128,7 @@ def settled(
         fewest = min(fewest, changed.size)
         if patience < 0:
             problem.counts["exchanges"] += 1
-            new, changed = _exchanged(active, new, changed[-1]), changed[-1:]
+            new, changed = _exchange(active, new, changed[-1]), changed[-1:]
         problem.counts["set_changes"] += changed.size
         active, solve = new, None
 
@@ -131,7 +136,7 @@ def settled(
 def _newton(
     problem: Problem, active: Active, centre: Point, solve: Solve
 ) -> tuple[Point, Vector, Vector]:
-    """Solve in the face; also return the gradient and z_k + σ(Gx − h) of all rows."""
+    """Solve in the face; return the point, its gradient and z_k + σ(Gx − h)."""
     qp = problem.qp
 
     def evaluate(x: Vector) -> tuple[Point, Vector, Vector]:
@@ -145,11 +150,12 @@ def _newton(
     return evaluate(x - solve(g))
 
 
-def _predicted(problem: Problem, active: Active, at: Point, slack: float) -> Active:
-    """Drop what has a multiplier of the wrong sign, add what is violated.
+def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Active:
+    """Drop constraints with a multiplier of the wrong sign; add violated ones.
 
-    at : x, the gradient without the multipliers of bounds, and the trial multipliers of
-    all inequality rows; errors are measured in the unit √energy of √D·x
+    at : x, the gradient (in place of y) without the multipliers of bounds, and the
+        trial multipliers of all inequality rows. Errors are measured in √D·x, whose
+        unit is √energy, so that they do not depend on the units of the variables
     """
     qp, size = problem.qp, np.sqrt(problem.D)
     x_scale = slack * np.abs(size * np.clip(at.x, qp.lb, qp.ub)).max(initial=0.0)
@@ -166,8 +172,11 @@ def _predicted(problem: Problem, active: Active, at: Point, slack: float) -> Act
     return Active(new, rows)
 
 
-def _exchanged(active: Active, new: Active, index: int) -> Active:
-    """Change one constraint only."""
+def _exchange(active: Active, new: Active, index: int) -> Active:
+    """Return `active` with the constraint of this index taken from `new`.
+
+    index : below n, of a variable's bounds; n + i, of row i of G
+    """
     side, rows = active.side.copy(), active.rows.copy()
     if index < side.size:
         side[index] = new.side[index]

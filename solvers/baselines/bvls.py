@@ -24,20 +24,22 @@ from mortarbench.harness import (
     kkt_residuals,
     needs_matrices,
 )
-from mortarbench.solvers.common.conversion import dense, positive
+from mortarbench.solvers.common.conversion import check_positive, dense
 
-LARGEST = 5_000  #: components; P is made dense
-CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+MAX_COMPONENTS = 5_000  #: P is converted to a dense matrix
+CLAIM_FACTOR = (
+    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+)
 
 
 @dataclass(frozen=True)
 class BVLS:
     """scipy.optimize.nnls for lower bounds, lsq_linear(method="bvls") otherwise.
 
-    Both end with the exact active set, whatever `tol`, which bvls gets for its test of
-    optimality, and which bounds the KKT residuals that are claimed. Fixed variables are
-    taken out; the objective is scaled, since that test is absolute. scipy tells the
-    iterations of bvls, not those of nnls.
+    Both end with the exact active set. `tol` goes to the optimality test of bvls, and a
+    point is claimed solved if its KKT residuals are within 5·tol. Fixed variables are
+    eliminated; the objective is scaled, because the test of bvls is absolute. scipy
+    reports the iterations of bvls but not those of nnls.
     """
 
     max_iter: int = 10_000
@@ -47,19 +49,19 @@ class BVLS:
         method="active set: `nnls` and `lsq_linear` on a Cholesky factor",
         linear_solver="LAPACK, within scipy",
         phases="preparing factorises P",
-        limits=("`nnls` does not tell its iterations",),
+        limits=("`nnls` does not report its iterations",),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         if qp.b.size or qp.h.size:
             return "takes bounds only"
         if reason := needs_matrices(qp):
             return reason
-        if qp.q.size > LARGEST:
-            return f"makes P dense; takes at most {LARGEST} components"
+        if qp.q.size > MAX_COMPONENTS:
+            return f"converts P to dense; takes at most {MAX_COMPONENTS} components"
         try:
             cholesky(dense(qp.P), overwrite_a=True, check_finite=False)
         except LinAlgError:
@@ -79,10 +81,10 @@ class BVLS:
         def solve() -> Solution:
             x, side = base.copy(), np.full(base.size, -1)
             try:
-                found = _least_squares(L.T, rhs, box, tol, self.max_iter)
-            except RuntimeError as e:  # scipy's word for the iteration limit of nnls
+                result = _least_squares(L.T, rhs, box, tol, self.max_iter)
+            except RuntimeError as e:  # raised by nnls at its iteration limit
                 return Solution.without_point(qp, Status.ITERATION_LIMIT, str(e))
-            increment, side[moving], steps = found
+            increment, side[moving], steps = result
             x[moving] += increment
             return _point(qp, P, x, side, steps, tol)
 
@@ -92,7 +94,7 @@ class BVLS:
 def _least_squares(
     C: Vector, rhs: Vector, box: tuple[Vector, Vector], tol: float, limit: int
 ) -> tuple[Vector, Vector, int | None]:
-    """Minimise ‖Cx − rhs‖ in the box; x, side (−1, 0, 1) and iterations."""
+    """Minimise ‖Cx − rhs‖ in the box; return x, sides (−1, 0, 1) and iterations."""
     from scipy.optimize import lsq_linear, nnls
 
     if not rhs.size:
@@ -107,7 +109,10 @@ def _least_squares(
 def _point(
     qp: QP, P: Vector, x: Vector, side: Vector, steps: int | None, tol: float
 ) -> Solution:
-    """Solve once more in the face, directly; multipliers are gradients on bounds."""
+    """Return the point after a direct solve in its face.
+
+    The multipliers of active bounds are the components of −(Px + q).
+    """
     x = np.where(side < 0, qp.lb, np.where(side > 0, qp.ub, x))
     free = np.flatnonzero(side == 0)
     if free.size:
@@ -117,7 +122,7 @@ def _point(
         status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0), z_box=z_box,
         iterations=steps, message="converged",
     )  # fmt: skip
-    if kkt_residuals(qp, point).worst <= CLAIM * tol:
+    if kkt_residuals(qp, point).worst <= CLAIM_FACTOR * tol:
         return point
     message = "step limit, or no further progress in rounding"
     return replace(point, status=Status.ITERATION_LIMIT, message=message)

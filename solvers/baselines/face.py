@@ -4,9 +4,9 @@ In the face where the components F are free and the inequality rows R are active
 
     (M + G_RᵀρG_R)_FF dx_F = r_F
 
-is solved by a Cholesky factor; M is positive definite. Dense matrices are condensed
-beforehand onto the components E̅ that may leave the free set, which costs about one
-factorisation and leaves only the bounded components to the faces:
+is solved by a Cholesky factor; M is positive definite. A dense M is first condensed
+onto the bounded components E̅, where E are the components without bounds. That costs
+about one factorisation, and faces then factorise bounded components only:
 
     S = M_E̅E̅ − W ᵀW,   W = L⁻¹M_EE̅,   M_EE = LLᵀ.
 """
@@ -25,21 +25,22 @@ from sksparse.cholmod import cholesky as sparse_cholesky
 from mortarbench.harness import Matrix, Vector
 
 Mask = NDArray[np.bool_]
-Solve = Callable[[Vector], Vector]  #: r (n,) → dx (n,), zero off F; reads r_F only
-Faces = Callable[[Mask, Mask], Solve]  #: free components (n,), active rows (p,)
+Solve = Callable[[Vector], Vector]  #: r (n,) ↦ dx (n,), zero outside F; uses r_F only
+#: free components (n,), active rows (p,) ↦ solve of that face
+Faces = Callable[[Mask, Mask], Solve]
 
 
-def faces(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
-    """Set up; each call of the result factorises one face.
+def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:
+    """Return a function that factorises the system of one face.
 
     M : (n, n) dense or sparse, positive definite
-    G, rho : (p, n) inequality rows and their weights
-    always_free : (n,) components without bounds
+    G, rho : (p, n) inequality rows and (p,) their weights
+    always_free : (n,) mask of components without bounds
 
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When M is not positive definite; from the result, too.
+        If M is not positive definite; the returned function may raise them as well.
 
     """
     if not isinstance(M, np.ndarray):
@@ -80,14 +81,14 @@ def _condensed(M: Vector, always_free: Mask) -> Faces:
 
     def face(free: Mask, active: Mask) -> Solve:
         del active
-        kept = np.flatnonzero(free[rest])
-        factor, W_F = _factor(S[np.ix_(kept, kept)]), W[:, kept]
+        free_bounded = np.flatnonzero(free[rest])
+        factor, W_F = _factor(S[np.ix_(free_bounded, free_bounded)]), W[:, free_bounded]
 
         def solve(r: Vector) -> Vector:
             w = solve_triangular(L, r[E], lower=True, check_finite=False)
             dx = np.zeros(r.size)
-            dx[rest[kept]] = _solve(factor, r[rest[kept]] - w @ W_F)
-            w -= W_F @ dx[rest[kept]]
+            dx[rest[free_bounded]] = _solve(factor, r[rest[free_bounded]] - w @ W_F)
+            w -= W_F @ dx[rest[free_bounded]]
             dx[E] = solve_triangular(L, w, lower=True, trans="T", check_finite=False)
             return dx
 
@@ -104,7 +105,7 @@ def _solve(factor: Any, r: Vector) -> Vector:
     return np.asarray(cho_solve(factor, r, check_finite=False))
 
 
-def _spread(free: Mask, some: Vector) -> Vector:
+def _spread(free: Mask, values: Vector) -> Vector:
     dx = np.zeros(free.size)
-    dx[free] = some
+    dx[free] = values
     return dx

@@ -1,8 +1,9 @@
 """FETI: projected preconditioned conjugate gradients for equality rows only.
 
-Minimises ½xᵀFx − dᵀx subject to Gx = e, which for a dual of torn bodies is the linear
-problem without contact (Farhat and Roux 1991; Farhat, Mandel and Roux 1994, from where
-the steps are). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a preconditioner M:
+Minimises ½xᵀFx − dᵀx subject to Gx = e. For the dual of bodies decomposed into
+subdomains this is the linear problem without contact (Farhat and Roux 1991). The steps
+are those of Farhat, Mandel and Roux (1994). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a
+preconditioner M:
 
 1. x = QGᵀ(GQGᵀ)⁻¹e, r = d − Fx
 2. w = P_Qᵀr; done where ‖w‖ ≤ tol ‖w₀‖
@@ -10,8 +11,9 @@ the steps are). With P_Q = I − QGᵀ(GQGᵀ)⁻¹G and a preconditioner M:
 4. p = y − Σ pᵢ (yᵀFpᵢ)/(pᵢᵀFpᵢ) over all directions so far
 5. x ← x + αp, r ← r − αFp, α = pᵀw/pᵀFp; back to 2
 
-Any Q that is positive definite on Gᵀ serves. Q = I needs no more than G; Q = M
-(Klawonn and Widlund 2001) is what keeps the count where stiffnesses jump inside a body.
+Any Q that is positive definite on the range of Gᵀ is admissible. Q = I needs only G;
+Q = M (Klawonn and Widlund 2001) keeps the number of steps bounded if stiffnesses jump
+inside a body.
 """
 
 from __future__ import annotations
@@ -37,31 +39,38 @@ from mortarbench.harness import (
     too_large,
 )
 from mortarbench.harness.operators import Preconditioned, Product, SerialisableOperator
-from mortarbench.solvers.common.conversion import boxed, one_of, positive
+from mortarbench.solvers.common.conversion import (
+    check_choice,
+    check_positive,
+    has_bound,
+)
 
 Kind = Literal["auto", "none", "lumped", "dirichlet"]
 Scaling = Literal["stiffness", "multiplicity"]
 Weight = Literal["identity", "preconditioner"]
-CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
-TIGHTEST = 1e-4  #: factor of the tolerance at which they have had their chance
-PATIENCE = 100  #: steps in a row that need not halve ‖w‖
-LEFT = "no further progress: rounding, or the cost is unbounded"
-PIVOT = 1e-13  #: of the factor of GQGᵀ, relative to the largest: rows are dependent
-BATCH = 256  #: columns of Gᵀ that the preconditioner is applied to at a time
+CLAIM_FACTOR = (
+    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+)
+MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
+PATIENCE = 100  #: steps in a row without halving ‖w‖ before the solve gives up
+STAGNATED = "no further progress: rounding, or the objective is unbounded below"
+#: pivots of GQGᵀ below this, relative to the largest, mean dependent rows
+MIN_PIVOT = 1e-13
+BATCH = 256  #: columns of Gᵀ to which the preconditioner is applied at once
 
 
 @dataclass(frozen=True)
 class FETI:
-    """In-house FETI: projected preconditioned CG, all directions kept.
+    """In-house FETI: projected preconditioned CG that stores all directions.
 
-    `tol` bounds ‖P_Qᵀ(d − Fx)‖ relative to its first value, less where the KKT
-    residuals on the QP are not within 5·tol then; no other point is claimed solved.
-    Iterations are CG steps; all products with P are counted.
+    `tol` bounds ‖P_Qᵀ(d − Fx)‖ relative to its first value. If the KKT residuals on the
+    QP are then not within 5·tol, this bound is lowered; no other point is claimed
+    solved. Iterations are CG steps; all products with P are counted.
     """
 
-    preconditioner: Kind = "auto"  #: Dirichlet's where P offers it, else none
-    scaling: Scaling = "stiffness"  #: of the preconditioner where subdomains meet
-    Q: Weight = "identity"  #: of the projector
+    preconditioner: Kind = "auto"  #: "auto": Dirichlet's if P has one, else none
+    scaling: Scaling = "stiffness"  #: weights of copies of a node in the preconditioner
+    Q: Weight = "identity"  #: weight of the projector
     max_iter: int = 2000
 
     about: ClassVar[About] = About(
@@ -71,20 +80,20 @@ class FETI:
         phases="preparing factorises the coarse problem and sets up the preconditioner",
         limits=(
             "for linear problems: bounds and inequality rows are declined",
-            "keeps two vectors per iteration",
+            "stores two vectors per iteration",
         ),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
-        one_of("preconditioner", self.preconditioner, get_args(Kind))
-        one_of("scaling", self.scaling, get_args(Scaling))
-        one_of("Q", self.Q, get_args(Weight))
+        check_positive(max_iter=self.max_iter)
+        check_choice("preconditioner", self.preconditioner, get_args(Kind))
+        check_choice("scaling", self.scaling, get_args(Scaling))
+        check_choice("Q", self.Q, get_args(Weight))
 
     def declines(self, qp: QP) -> str | None:
-        if qp.h.size or boxed(qp).any():
+        if qp.h.size or has_bound(qp).any():
             return "takes equality rows only: it solves linear problems"
-        if offered(qp) is None:
+        if preconditioner_source(qp) is None:
             if self.preconditioner in ("lumped", "dirichlet"):
                 return f"P offers no preconditioner {self.preconditioner!r}"
             if self.Q == "preconditioner":
@@ -103,19 +112,19 @@ class FETI:
         except (CholmodNotPositiveDefiniteError, np.linalg.LinAlgError):
             message = "the equality rows depend on each other"
             return lambda: Solution.without_point(qp, Status.FAILED, message)
-        return lambda: _certified(_Task(qp, coarse, apply, counts), tol, self.max_iter)
+        return lambda: _solve(_Task(qp, coarse, apply, counts), tol, self.max_iter)
 
     def _preconditioner(self, qp: QP) -> Product | None:
-        """Make x ↦ Mx; None for M = I."""
-        operator = offered(qp)
+        """Return x ↦ Mx, or None for M = I."""
+        operator = preconditioner_source(qp)
         if operator is None or self.preconditioner == "none":
             return None
         kind = "dirichlet" if self.preconditioner == "auto" else self.preconditioner
         return operator.preconditioner(kind, self.scaling)
 
 
-def offered(qp: QP) -> Preconditioned | None:
-    """Give what P offers preconditioners by, if it does."""
+def preconditioner_source(qp: QP) -> Preconditioned | None:
+    """Return the operator of P that has preconditioners, or None."""
     if not isinstance(qp.P, SerialisableOperator):
         return None
     product = qp.P.build()
@@ -124,7 +133,7 @@ def offered(qp: QP) -> Preconditioned | None:
 
 @dataclass(frozen=True, eq=False)
 class _Coarse:
-    """The projector P_Q and its coarse problem GQGᵀ."""
+    """Projector P_Q with its coarse problem GQGᵀ."""
 
     G: csr_array  #: (r, m)
     QGT: Any  #: QGᵀ (m, r), sparse or dense
@@ -139,7 +148,7 @@ class _Coarse:
         return np.asarray(v - self.QGT @ self.solve(self.G @ v))
 
     def multipliers(self, r: Vector) -> Vector:
-        """Return the y for which Gᵀy is r less P_Qᵀr."""
+        """Return the y with Gᵀy = r − P_Qᵀr."""
         return self.solve(self.QGT.T @ r)
 
 
@@ -150,7 +159,7 @@ def _coarse(qp: QP, Q: Product | None) -> _Coarse:
     if Q is None:
         factor = cholesky(csc_matrix(G @ G.T))
         pivots = factor.D()
-        if pivots.min() <= PIVOT * pivots.max():
+        if pivots.min() <= MIN_PIVOT * pivots.max():
             raise np.linalg.LinAlgError
         return _Coarse(G, csr_array(G.T), lambda t: np.asarray(factor(t)))
     QGT = np.empty((G.shape[1], G.shape[0]))
@@ -188,14 +197,14 @@ class _State(NamedTuple):
 
 @dataclass(eq=False)
 class _Directions:
-    """All directions p so far with their products, F-orthonormal, row by row."""
+    """F-orthonormal directions p of all steps, with Fp, as rows of two arrays."""
 
     P: NDArray[np.float64]
     FP: NDArray[np.float64]
     count: int = 0
 
     def add(self, p: Vector, Fp: Vector) -> None:
-        """Append one; the room is doubled where it is full."""
+        """Append a direction; double the arrays if they are full."""
         if self.count == len(self.P):
             self.P, self.FP = (
                 np.vstack([M, np.empty_like(M)]) for M in (self.P, self.FP)
@@ -204,64 +213,67 @@ class _Directions:
         self.count += 1
 
     def conjugate(self, y: Vector) -> Vector:
-        """Make y F-orthogonal to all."""
+        """Return y made F-orthogonal to all directions."""
         P, FP = self.P[: self.count], self.FP[: self.count]
         return np.asarray(y - P.T @ (FP @ y))
 
 
-def _certified(task: _Task, tol: float, most: int) -> Solution:
-    """Tighten the tolerance until the KKT residuals agree."""
+def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
+    """Lower the bound of ‖w‖ until the KKT residuals are within 5·tol."""
     qp, tighter = task.qp, 1.0
     at = _state(task, task.coarse.feasible(qp.b))
     directions = _Directions(np.empty((16, qp.q.size)), np.empty((16, qp.q.size)))
     norms = [float(np.linalg.norm(at.w))]
     while True:
-        at, ended = _iterated(task, at, directions, norms, tighter * tol, most)
+        at, reason = _iterate(task, at, directions, norms, tighter * tol, max_iter)
         at = _state(task, at.x)
         norms[-1] = float(np.linalg.norm(at.w))
         task.counts.setdefault("steps_to_tol", len(norms) - 1)
         point = _point(task, at, norms)
         worst = kkt_residuals(qp, point).worst
-        if worst <= CLAIM * tol:
+        if worst <= CLAIM_FACTOR * tol:
             return point
-        tighter *= min(0.5, max(0.1, CLAIM * tol / worst))
-        if ended or tighter < TIGHTEST or not np.isfinite(worst):
-            return replace(point, status=Status.ITERATION_LIMIT, message=ended or LEFT)
+        tighter *= min(0.5, max(0.1, CLAIM_FACTOR * tol / worst))
+        if reason or tighter < MIN_TOL_FACTOR or not np.isfinite(worst):
+            return replace(
+                point, status=Status.ITERATION_LIMIT, message=reason or STAGNATED
+            )
 
 
-def _iterated(
+def _iterate(
     task: _Task, at: _State, directions: _Directions, norms: list[float],
-    accuracy: float, most: int,
+    accuracy: float, max_iter: int,
 ) -> tuple[_State, str]:  # fmt: skip
-    """Move until ‖w‖ ≤ accuracy ‖w₀‖; say why it ended before, if it did."""
-    least, waited = norms[-1], 0
+    """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; the text is the reason of an earlier end."""
+    least, stalled = norms[-1], 0
     while norms[-1] > accuracy * norms[0]:
-        if directions.count >= most:
+        if directions.count >= max_iter:
             return at, "step limit"
         step = _step(task, at, directions)
-        if step is None or waited == PATIENCE:
-            return at, LEFT
+        if step is None or stalled == PATIENCE:
+            return at, STAGNATED
         at = step
         norms.append(float(np.linalg.norm(at.w)))
-        waited = 0 if norms[-1] < least / 2 else waited + 1
+        stalled = 0 if norms[-1] < least / 2 else stalled + 1
         least = min(least, norms[-1])
     return at, ""
 
 
 def _state(task: _Task, x: Vector) -> _State:
-    """Compute the residual anew; it is projected twice, for y may be large."""
-    once = _projected(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
-    return _projected(task, *once)
+    """Return the state at x with the residual recomputed."""
+    # twice: the rounding of a large y in the first projection is removed by the second
+    once = _project(task, x, np.zeros(task.qp.b.size), -task.qp.q - task.product(x))
+    return _project(task, *once)
 
 
-def _projected(task: _Task, x: Vector, y: Vector, r: Vector) -> _State:
-    """Project the residual r of x and y by multipliers, which are added to y."""
+def _project(task: _Task, x: Vector, y: Vector, r: Vector) -> _State:
+    """Project the residual r; add the multipliers of the projection to y."""
     change = task.coarse.multipliers(r)
     return _State(x, y + change, np.asarray(r - task.qp.A.T @ change))
 
 
 def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
-    """Move once; None where there is no curvature along the direction."""
+    """Return the next state, or None if the curvature along the direction is ≤ 0."""
     p = directions.conjugate(task.preconditioned(at.w))
     Fp = task.product(p)
     curvature = float(p @ Fp)
@@ -271,7 +283,7 @@ def _step(task: _Task, at: _State, directions: _Directions) -> _State | None:
     p, Fp = p / size, Fp / size
     directions.add(p, Fp)
     alpha = float(p @ at.w)
-    return _projected(task, at.x + alpha * p, at.y, at.w - alpha * Fp)
+    return _project(task, at.x + alpha * p, at.y, at.w - alpha * Fp)
 
 
 def _point(task: _Task, at: _State, norms: list[float]) -> Solution:

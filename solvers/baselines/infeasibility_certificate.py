@@ -1,6 +1,6 @@
-"""Certificates that a QP has no solution, checked on its own data.
+"""Certificates that a QP has no solution, checked on the data of the QP.
 
-Differences of successive proximal iterates tend to them where there is one (Banjac et
+If there is one, differences of successive proximal iterates converge to it (Banjac et
 al., Infeasibility detection in the alternating direction method of multipliers for
 convex optimization, JOTA 183, 2019, for a method of the same family).
 """
@@ -11,15 +11,16 @@ import numpy as np
 
 from mortarbench.harness import QP, Matrix, Vector
 
-ROUNDING = 1e-10  #: of a sum, relative to the largest term that it could have
+ROUNDING = 1e-10  #: a sum is zero below this times the sum of its |terms|
 
 
-@np.errstate(over="ignore", invalid="ignore")  # iterates of such problems run away
-def contradicts(qp: QP, y: Vector, z: Vector) -> bool:
-    """Whether Ax = b and Gx ≤ h, weighted with y and z ≥ 0, exclude all of the box.
+@np.errstate(over="ignore", invalid="ignore")  # iterates of such problems diverge
+def proves_infeasible(qp: QP, y: Vector, z: Vector) -> bool:
+    """Return True if y and z ≥ 0 are a Farkas certificate of infeasibility.
 
     With v = Aᵀy + Gᵀz every feasible x has vᵀx ≤ bᵀy + hᵀz, while over the box
-    vᵀx is at least Σ vᵢ·(lbᵢ where vᵢ > 0, ubᵢ where vᵢ < 0) (the lemma of Farkas).
+    vᵀx ≥ Σ vᵢ·(lbᵢ if vᵢ > 0, ubᵢ if vᵢ < 0). The QP is infeasible if that sum exceeds
+    bᵀy + hᵀz (lemma of Farkas).
     """
     z = np.maximum(z, 0)
     v = _times(qp.A.T, y) + _times(qp.G.T, z)
@@ -29,27 +30,36 @@ def contradicts(qp: QP, y: Vector, z: Vector) -> bool:
     np.multiply(v, bound, out=terms, where=v != 0)
     most = qp.b @ y + qp.h @ z
     size = np.abs(qp.b) @ np.abs(y) + np.abs(qp.h) @ z + np.abs(terms).sum()
+    # an infinite term means that v points to an absent bound: no certificate
     return bool(np.isfinite(size) and terms.sum() - most > 1e-6 * size)
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def descends(qp: QP, v: Vector) -> bool:
-    """Whether the cost falls without end along v, which leaves no constraint.
+def proves_unbounded(qp: QP, v: Vector) -> bool:
+    """Return True if the objective is unbounded below along the feasible direction v.
 
-    Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, and v leads towards no bound. It says nothing of
-    whether there is a feasible point to start from.
+    That is Pv = 0, qᵀv < 0, Av = 0, Gv ≤ 0, and v points to no finite bound. A feasible
+    point need not exist.
     """
     if not v.any() or not np.isfinite(v).all():
         return False
     v = v / np.abs(v).max()
     v = np.where(np.abs(v) <= ROUNDING, 0.0, v)
-    flat = np.abs(_times(qp.P, v)).max() <= ROUNDING * np.abs(qp.P.diagonal()).max()
-    held = np.abs(_times(qp.A, v)) <= ROUNDING * _sizes(qp.A, np.ones(v.size))
-    inside = _times(qp.G, v) <= ROUNDING * _sizes(qp.G, np.ones(v.size))
-    off = (v >= 0) | np.isinf(qp.lb), (v <= 0) | np.isinf(qp.ub)
+    is_flat = np.abs(_times(qp.P, v)).max() <= ROUNDING * np.abs(qp.P.diagonal()).max()
+    equalities_hold = np.abs(_times(qp.A, v)) <= ROUNDING * _sizes(
+        qp.A, np.ones(v.size)
+    )
+    inequalities_hold = _times(qp.G, v) <= ROUNDING * _sizes(qp.G, np.ones(v.size))
+    bounds_allow = (v >= 0) | np.isinf(qp.lb), (v <= 0) | np.isinf(qp.ub)
     slope = float(qp.q @ v)
     falls = slope < -1e-6 * float(np.abs(qp.q) @ np.abs(v))
-    return bool(flat and held.all() and inside.all() and np.all(off) and falls)
+    return bool(
+        is_flat
+        and equalities_hold.all()
+        and inequalities_hold.all()
+        and np.all(bounds_allow)
+        and falls
+    )
 
 
 def _times(M: Matrix, v: Vector) -> Vector:

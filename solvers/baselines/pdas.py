@@ -1,30 +1,31 @@
 """Primal-dual active sets: semismooth Newton for bounds and rows.
 
 The standard method of the mortar literature (Hintermüller, Ito and Kunisch 2003, SIAM
-J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). Given which bounds
-and inequality rows are active, a linear system gives x and the multipliers; then
+J. Optim. 13; Hüeber and Wohlmuth 2005; the paper's reference [2]). For an
+active set of bounds and inequality rows, a linear system yields x and the multipliers;
+the next active set consists of
 
-    active ← active with the right sign of the multiplier, or violated
+    active constraints with the right sign of the multiplier, and violated ones,
 
-until nothing changes. Three things make it safe where that is not enough:
+until it no longer changes. Three measures handle QPs on which this fails:
 
 1. Proximal method of multipliers (Rockafellar 1976). The linear systems are those of
 
        ½xᵀPx + qᵀx + ½Σδᵢ(x − x_k)ᵢ²,  y = y_k + ρ(Ax − b),  z = z_k + ρ(Gx − h) on
        active rows,
 
-   so that every face can be solved: a singular P, repeated rows, more active rows than
-   free components. (x_k, y_k, z_k) moves to the solution whenever the active set has
-   settled; the factor of that face serves for the next solve. δᵢ = 1e-9·Pᵢᵢ is small
-   and ρ = 1e4/(a D⁻¹aᵀ), D = diag P, large, hence the first settled active set is
-   mostly the last. ρ grows where the residuals fall too slowly: a row that only stiff
-   variables are left to meet needs more.
+   so that every face has a solution even if P is singular, rows are repeated, or more
+   rows are active than components are free. Once the active set has settled, the centre
+   (x_k, y_k, z_k) moves to the solution, and the factor of that face is used again.
+   δᵢ = 1e-9·Pᵢᵢ is small and ρ = 1e4/(a D⁻¹aᵀ), D = diag P, is large; so the first
+   settled active set is usually the last. If the residuals fall too slowly, ρ grows: a
+   row whose free variables are all stiff needs a larger one.
 2. Block principal pivoting (Júdice and Pires 1994, Comput. Oper. Res. 21). After ten
-   changes of the active set that did not lessen the number of wrong constraints, only
-   the last wrong one changes, until that number is below its least (Murty's rule),
-   which ends since the systems of 1. are those of a strictly convex problem.
-3. Certificates: `solvers.baselines.infeasibility_certificate`, asked for the last move
-   of (x_k, y_k, z_k).
+   changes of the active set that did not reduce the number of wrong constraints, only
+   the last wrong one changes (Murty's rule), until that number is below its minimum so
+   far. This ends, because the systems of 1. belong to a strictly convex problem.
+3. Certificates of `solvers.baselines.infeasibility_certificate`, tested on the last
+   move of (x_k, y_k, z_k).
 """
 
 from __future__ import annotations
@@ -53,24 +54,28 @@ from mortarbench.solvers.baselines.active_set import (
     Point,
     Problem,
     Run,
-    penalised,
-    settled,
+    penalise,
+    solve_subproblem,
 )
 from mortarbench.solvers.baselines.infeasibility_certificate import (
-    contradicts,
-    descends,
+    proves_infeasible,
+    proves_unbounded,
 )
-from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.common.conversion import check_positive
 
-STIFFER = 100.0  #: factor of ρ where the residuals fall too slowly
-MOST_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ up to which it is used
-NO_PROGRESS = 10  #: moves of the centre that need not lessen the residuals
+#: factor of ρ when two moves of the centre have not halved the residuals. Without it
+#: 522 instead of 600 of 600 random QPs were solved
+RHO_GROWTH = 100.0
+MAX_KAPPA = 1e10  #: ρ·aD⁻¹aᵀ beyond which ρ no longer grows
+PATIENCE = 10  #: moves of the centre without halved residuals before the solve gives up
 NOT_POSITIVE = (np.linalg.LinAlgError, CholmodNotPositiveDefiniteError)
-CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
+CLAIM_FACTOR = (
+    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+)
 
 
 class Carry(NamedTuple):
-    """Where a run starts."""
+    """Start of a run: active set and proximal centre."""
 
     active: Active
     centre: Point
@@ -80,15 +85,15 @@ class Carry(NamedTuple):
 class PDAS:
     """In-house primal-dual active set method, by Cholesky factors of the faces.
 
-    `tol` bounds the KKT residuals as the harness measures them, on the QP as given; up
-    to 5·tol is claimed solved where rounding ends progress. Iterations are linear
-    solves; counted are factorisations (those of faces, plus one where unbounded
-    variables are condensed), changes of single constraints, one-at-a-time exchanges,
-    moves of the proximal centre and products with P.
+    `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
+    rounding ends the progress, up to 5·tol is claimed solved. Iterations are linear
+    solves. Counts are factorisations (one per face, plus one if unbounded variables are
+    condensed), changes of single constraints, one-at-a-time exchanges, moves of the
+    proximal centre, and products with P.
 
-    It starts from the point of the box nearest to zero: with no contact, in the primal
-    and in the dual. (On the duals of contact problems the start with all variables free
-    took between one solve fewer and seven more.)
+    It starts from the point of the box nearest to zero, which means no contact in the
+    primal and in the dual. (On the duals of contact problems, a start with all
+    variables free took between one solve fewer and seven more.)
     """
 
     max_iter: int = 5_000
@@ -97,32 +102,32 @@ class PDAS:
         title="PDAS (ours)", licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
-        phases="preparing forms the penalised matrix; solving factorises every face",
+        phases="preparing assembles the penalised matrix; solving factorises faces",
         sequence="active set and point",
         limits=(
-            "on one-dimensional obstacles the front moves a node a step: 323 solves "
-            "for 1000 nodes",
-            "sparse faces are analysed anew each time: 97 ms a factor at Nr = 30, Nh = "
-            "15 where 60 ms would do",
+            "on one-dimensional obstacles the contact front moves by one node a step: "
+            "323 solves for 1000 nodes",
+            "the symbolic analysis is repeated for every sparse face: 97 instead of 60 "
+            "ms a factor at Nr = 30, Nh = 15",
         ),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_iter=self.max_iter)
+        check_positive(max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        run = self._prepared(qp, tol, None)
+        run = self._set_up(qp, tol, None)
         return lambda: run()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Begin a sequence: each starts from the last active set and point."""
+        """Return the `prepare` of a sequence, started at the last point and set."""
         carry: Carry | None = None
 
         def prepare(qp: QP) -> Callable[[], Solution]:
-            run = self._prepared(qp, tol, carry)
+            run = self._set_up(qp, tol, carry)
 
             def solve() -> Solution:
                 nonlocal carry
@@ -133,13 +138,13 @@ class PDAS:
 
         return prepare
 
-    def _prepared(
+    def _set_up(
         self, qp: QP, tol: float, carry: Carry | None
     ) -> Callable[[], tuple[Solution, Carry | None]]:
         message = "P is not positive semidefinite"
         indefinite = Solution.without_point(qp, Status.FAILED, message)
         try:
-            problem = penalised(qp, Counter())
+            problem = penalise(qp, Counter())
         except NOT_POSITIVE:
             return lambda: (indefinite, None)
 
@@ -153,7 +158,7 @@ class PDAS:
 
 
 def _start(qp: QP, carry: Carry | None) -> Carry:
-    """Take over the last active set where it fits, else that of no contact."""
+    """Return the last active set and point if their sizes fit, else no contact."""
     if carry is not None and [v.size for v in carry.centre] == [
         qp.q.size, qp.b.size, qp.h.size,
     ]:  # fmt: skip
@@ -172,12 +177,12 @@ def _start(qp: QP, carry: Carry | None) -> Carry:
 def _proximal(
     problem: Problem, tol: float, start: Carry, max_iter: int
 ) -> tuple[Solution, Carry | None]:
-    """Move the centre until the KKT residuals are small."""
+    """Move the proximal centre until the KKT residuals are small."""
     qp, counts = problem.qp, problem.counts
     active, centre, solve = start.active, start.centre, None
-    slack, best, waited, kappa = 0.01 * tol, np.inf, 0, KAPPA
-    while waited < NO_PROGRESS:
-        run = settled(problem, (active, solve), centre, slack, max_iter)
+    slack, best, stalled, kappa = 0.01 * tol, np.inf, 0, KAPPA
+    while stalled < PATIENCE:
+        run = solve_subproblem(problem, (active, solve), centre, slack, max_iter)
         active, solve = run.active, run.solve
         counts["centres"] += 1
         point = _point(problem, run, centre)
@@ -189,26 +194,26 @@ def _proximal(
             return Solution.without_point(qp, Status.INFEASIBLE, message), None
         if not run.settled:
             break
-        waited = 0 if worst < best / 2 else waited + 1
-        if waited and waited % 2 == 0 and kappa < MOST_KAPPA:
-            kappa, solve = STIFFER * kappa, None
-            problem = penalised(qp, counts, kappa)
+        stalled = 0 if worst < best / 2 else stalled + 1
+        if stalled and stalled % 2 == 0 and kappa < MAX_KAPPA:
+            kappa, solve = RHO_GROWTH * kappa, None
+            problem = penalise(qp, counts, kappa)
         centre, best, slack = run.at, min(best, worst), slack / 10
-    if worst <= CLAIM * tol:
+    if worst <= CLAIM_FACTOR * tol:
         return point, Carry(active, Point(point.x, point.y, point.z))
     message = "no further progress in rounding" if run.settled else "step limit"
     return replace(point, status=Status.ITERATION_LIMIT, message=message), None
 
 
 def _no_solution(qp: QP, x: Vector, y: Vector, z: Vector) -> str | None:
-    """Say why there is none, if a move of the centre proves it."""
-    if contradicts(qp, y, z):
+    """Return the reason why no solution exists, if a move of the centre proves it."""
+    if proves_infeasible(qp, y, z):
         return "no point meets all constraints"
-    return "the cost falls without end" if descends(qp, x) else None
+    return "the objective is unbounded below" if proves_unbounded(qp, x) else None
 
 
 def _point(problem: Problem, run: Run, centre: Point) -> Solution:
-    """Hand back the point, with multipliers of the bounds that are active."""
+    """Return the point, with the multipliers of its active bounds."""
     counts, (x, y, z) = problem.counts, run.at
     force = DELTA * problem.D * (x - centre.x) - run.gradient
     z = np.maximum(z, 0)
@@ -217,8 +222,8 @@ def _point(problem: Problem, run: Run, centre: Point) -> Solution:
     fixed = problem.qp.lb == problem.qp.ub
     z_box = np.where(fixed, force, z_box)
     counts["P_products"] += 1  # of the residuals that follow
-    named = {k: v for k, v in counts.items() if k != "solves"}
+    other_counts = {k: v for k, v in counts.items() if k != "solves"}
     return Solution(
         status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box,
-        iterations=counts["solves"], counts=named, message="converged",
+        iterations=counts["solves"], counts=other_counts, message="converged",
     )  # fmt: skip

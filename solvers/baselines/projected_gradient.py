@@ -1,12 +1,12 @@
-"""Spectral projected gradients: bounds only, products with P only.
+"""Spectral projected gradients for bounds, by products with P only.
 
     d = clip(x − αg, lb, ub) − x,   x ← x + td
 
-with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988), s the last step, and a
-line search that lets the cost rise above the last one, not above the largest of the
-last M (Birgin, Martínez and Raydan, Nonmonotone spectral projected gradient methods on
-convex sets, SIAM J. Optim. 10, 2000, Algorithm 2.2). Since the cost is quadratic along
-d, one product Pd per iteration serves the line search and the length.
+with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988), s the last step. The
+line search is nonmonotone: the objective may exceed its last value but not the largest
+of the last M (Birgin, Martínez and Raydan, Nonmonotone spectral projected gradient
+methods on convex sets, SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective is
+quadratic along d, so one product Pd per iteration suffices for line search and α.
 
 Alternating with sᵀPs/‖Ps‖² (ABBmin) halves the steps for a string on an obstacle, but
 takes five to twenty times as many on the duals of contact problems.
@@ -22,22 +22,24 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
-from mortarbench.solvers.baselines.infeasibility_certificate import descends
-from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.baselines.infeasibility_certificate import proves_unbounded
+from mortarbench.solvers.common.conversion import check_positive
 
-SUFFICIENT = 1e-4  #: share of the linear decrease that a step must bring
-CLAIM = 5.0  #: claimed solved: the KKT residuals are within this times the tolerance
-TIGHTEST = 1e-4  #: factor of the tolerance at which they have had their chance
+SUFFICIENT_DECREASE = 1e-4  #: share of the linear decrease that a step must achieve
+CLAIM_FACTOR = (
+    5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
+)
+MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
 
 
 @dataclass(frozen=True)
 class ProjectedGradient:
     """In-house spectral projected gradient method.
 
-    `tol` bounds ‖g^P‖/‖q‖ with the projected gradient g^P, less where the KKT residuals
-    on the QP are not within 5·tol then; no other point is claimed solved. It starts
-    from the point of the box nearest to zero, with the α of the exact line search.
-    Iterations are steps; all products with P are counted.
+    `tol` bounds ‖g^P‖/‖q‖ with the projected gradient g^P. If the KKT residuals on the
+    QP are then not within 5·tol, this bound is lowered; no other point is claimed
+    solved. The start is the point of the box nearest to zero, the first α that of the
+    exact line search. Iterations are steps; all products with P are counted.
     """
 
     memory: int = 10  #: M of the line search; 1 is monotone
@@ -52,23 +54,23 @@ class ProjectedGradient:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(memory=self.memory, max_iter=self.max_iter)
+        check_positive(memory=self.memory, max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
         return "takes bounds only" if qp.b.size or qp.h.size else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        return lambda: _certified(_Task(qp, self, Counter()), tol)
+        return lambda: _solve(_Task(qp, self, Counter()), tol)
 
 
 class _State(NamedTuple):
-    """Where the iteration is."""
+    """Iterate, with its gradient and step length."""
 
     x: Vector
     g: Vector  #: Px + q
     alpha: float
-    costs: tuple[float, ...]  #: the last M, relative to the start
-    direction: Vector | None = None  #: of a step without curvature
+    costs: tuple[float, ...]  #: objectives of the last M iterates, minus the first one
+    direction: Vector | None = None  #: last d if its curvature dᵀPd is zero, else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +84,7 @@ class _Task:
         return np.asarray(self.qp.P @ v)
 
     def downhill(self, s: _State) -> Vector:
-        """−g^P: −g without what leads out of the box."""
+        """Return −g^P: −g without the components that point out of the box."""
         out = ((s.x <= self.qp.lb) & (s.g > 0)) | ((s.x >= self.qp.ub) & (s.g < 0))
         return np.where(out, 0.0, -s.g)
 
@@ -97,14 +99,14 @@ def _start(task: _Task) -> _State:
 
 
 def _step(task: _Task, s: _State) -> _State:
-    """Move once; the cost along x + td is cost + t·gᵀd + t²/2·dᵀPd."""
+    """Return the next iterate; the objective at x + td is f + t·gᵀd + t²/2·dᵀPd."""
     lb, ub = task.qp.lb, task.qp.ub
     d = np.clip(s.x - s.alpha * s.g, lb, ub) - s.x
     w = task.product(d)
     slope, curvature, square = float(s.g @ d), float(d @ w), float(d @ d)
-    allowed, t = max(s.costs) - s.costs[-1], 1.0
-    if slope + curvature / 2 > allowed + SUFFICIENT * slope:
-        t = -slope / curvature  # the minimiser along d, which always suffices
+    rise, t = max(s.costs) - s.costs[-1], 1.0
+    if slope + curvature / 2 > rise + SUFFICIENT_DECREASE * slope:
+        t = -slope / curvature  # the minimiser along d always decreases enough
     cost = s.costs[-1] + t * slope + t * t / 2 * curvature
     curved = curvature > 1e-15 * np.sqrt(square * float(w @ w))
     task.counts["steps"] += 1
@@ -116,8 +118,8 @@ def _step(task: _Task, s: _State) -> _State:
     )  # fmt: skip
 
 
-def _certified(task: _Task, tol: float) -> Solution:
-    """Tighten the tolerance until the KKT residuals agree."""
+def _solve(task: _Task, tol: float) -> Solution:
+    """Lower the bound of ‖g^P‖ until the KKT residuals are within 5·tol."""
     qp, s, tighter = task.qp, _start(task), 1.0
     size = float(np.linalg.norm(qp.q)) or float(np.linalg.norm(s.g))
     while True:
@@ -125,16 +127,17 @@ def _certified(task: _Task, tol: float) -> Solution:
             if task.counts["steps"] >= task.options.max_iter:
                 return _unsolved(_point(task, s), "step limit")
             s = _step(task, s)
-            if s.direction is not None and descends(qp, s.direction):
-                message = "the cost falls without end"
+            if s.direction is not None and proves_unbounded(qp, s.direction):
+                message = "the objective is unbounded below"
                 return Solution.without_point(qp, Status.INFEASIBLE, message)
+        # g was updated by g + tPd; recompute it before it becomes the multipliers
         s = s._replace(g=task.product(s.x) + qp.q)
         point = _point(task, s)
         worst = kkt_residuals(qp, point).worst
-        if worst <= CLAIM * tol:
+        if worst <= CLAIM_FACTOR * tol:
             return point
-        tighter *= min(0.5, CLAIM * tol / worst)
-        if tighter < TIGHTEST:
+        tighter *= min(0.5, CLAIM_FACTOR * tol / worst)
+        if tighter < MIN_TOL_FACTOR:
             return _unsolved(point, "no further progress in rounding")
 
 
@@ -143,7 +146,7 @@ def _unsolved(point: Solution, message: str) -> Solution:
 
 
 def _point(task: _Task, s: _State) -> Solution:
-    """Hand back the point; multipliers of bounds are gradients there."""
+    """Return the point; the multipliers of active bounds are components of −g."""
     lb, ub = task.qp.lb, task.qp.ub
     z_box = np.where(s.x <= lb, -np.maximum(s.g, 0), 0.0)
     z_box += np.where(s.x >= ub, -np.minimum(s.g, 0), 0.0)

@@ -1,1 +1,1 @@
-"""What solvers share: conversion of QPs, sequences of them, and lists of backends."""
+"""Tools shared by solvers: conversion of QPs, sequences of QPs, lists of backends."""

@@ -1,7 +1,8 @@
-"""Which backends a library of solvers knows, found without importing the library.
+"""Backends of qpsolvers and cvxpy, listed without importing these libraries.
 
-Importing qpsolvers or cvxpy imports every installed backend, which takes a second.
-Their adapter files are there to be listed, and name the modules that they import.
+Importing either library imports every installed backend, which takes a second. So the
+backends are listed from the files of the library's own adapters, and the packages that
+a backend needs from the import statements in these files.
 """
 
 from __future__ import annotations
@@ -19,28 +20,28 @@ from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 
 @dataclass(frozen=True)
 class Call:
-    """How one backend of a library of solvers is called for a tolerance."""
+    """Keyword arguments and scaling for one backend of a library of solvers."""
 
-    tolerances: tuple[str, ...] = ()  #: keywords that get max(tighter·tol, floor)
+    tolerances: tuple[str, ...] = ()  #: keywords set to max(tighter·tol, floor)
     fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords
-    size: float = OBJECTIVE_SIZE  #: ‖q‖∞ that the objective is multiplied to
+    size: float = OBJECTIVE_SIZE  #: ‖q‖∞ after the scaling of the objective
     tighter: float = 1.0
     floor: float = 0.0
 
     def options(self, tol: float) -> dict[str, Any]:
-        """All keywords with their values."""
+        """Return all keyword arguments for a tolerance."""
         value = max(self.tighter * tol, self.floor)
         return {**dict.fromkeys(self.tolerances, value), **self.fixed}
 
 
 def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
-    """Map the name of each backend, as its file spells it, to its adapter's file.
+    """Return the adapter file of each backend, by the name in the file's name.
 
     Parameters
     ----------
-    library : an importable package; nothing is found when it is not installed
-    pattern : glob of the adapters' files, relative to the package
-    suffix : what the names of these files end in, e.g. "_.py" in "osqp_.py"
+    library : name of a package; the result is empty if it is not installed
+    pattern : glob of the adapter files, relative to the package
+    suffix : end of their names after the backend's name, e.g. "_.py" in "osqp_.py"
 
     """
     spec = find_spec(library)
@@ -53,30 +54,34 @@ def adapter_files(library: str, pattern: str, suffix: str) -> dict[str, Path]:
     }
 
 
-def why_not(library: str, backend: str, files: Mapping[str, Path]) -> str | None:
-    """Say why a backend cannot be used, or None; `files` as from `adapter_files`.
+def reason_unavailable(
+    library: str, backend: str, files: Mapping[str, Path]
+) -> str | None:
+    """Return the reason why a backend cannot be used, or None.
 
-    A library that is not installed is no reason: importing it will say so.
+    None also if the library itself is not installed: its import raises in `prepare`.
+
+    files : result of `adapter_files`
     """
     if not files:
         return None
-    lacking = _not_installed(files[backend]) if backend in files else []
-    if backend in files and not lacking:
+    missing = _missing_packages(files[backend]) if backend in files else []
+    if backend in files and not missing:
         return None
-    installed = ", ".join(name for name in files if not _not_installed(files[name]))
-    if lacking:
-        return f"not installed: {', '.join(lacking)}; {library} finds {installed}"
+    installed = ", ".join(name for name in files if not _missing_packages(files[name]))
+    if missing:
+        return f"not installed: {', '.join(missing)}; {library} finds {installed}"
     return f"{library} has no backend {backend!r}; installed: {installed}"
 
 
-def _not_installed(adapter: Path) -> list[str]:
-    """List the top-level packages that an adapter's file imports and we lack."""
-    return [root for root in _imported(adapter) if find_spec(root) is None]
+def _missing_packages(adapter: Path) -> list[str]:
+    """Return the packages that an adapter file imports and that are not installed."""
+    return [root for root in _imported_packages(adapter) if find_spec(root) is None]
 
 
 @cache
-def _imported(adapter: Path) -> tuple[str, ...]:
-    """List the top-level packages that an adapter's file imports."""
+def _imported_packages(adapter: Path) -> tuple[str, ...]:
+    """Return the top-level packages that an adapter file imports."""
     roots: dict[str, None] = {}
     for node in ast.walk(ast.parse(adapter.read_text(encoding="utf-8"))):
         match node:

@@ -1,8 +1,8 @@
-"""The packages whose versions decide how fast a solver is, and what it answers."""
+"""Packages whose versions affect the times and answers of solvers."""
 
 from __future__ import annotations
 
-#: of adapters, and those that do their work: backends, and factorisations
+#: those that adapters call, and those behind them: backends and factorisations
 PACKAGES = (
     "clarabel", "cvxopt", "cvxpy", "daqp", "highspy", "highspy-extras", "osqp", "piqp",
     "proxsuite", "py-mkl-pardiso", "qoco", "qpalm", "qpsolvers", "qtqp", "quadprog",

@@ -1,4 +1,4 @@
-"""Sequences of QPs: what a solver carries from one to the next."""
+"""Sequences of QPs: one solver object, updated or restarted from the last point."""
 
 from __future__ import annotations
 
@@ -11,54 +11,62 @@ from mortarbench.harness import QP, Matrix, Solution
 
 
 class Session(NamedTuple):
-    """A solver that holds one QP, through the calls that its library offers."""
+    """Solver object of a library, set up for one QP, as four operations."""
 
     solve: Callable[[], Solution]
-    #: take over the vectors of a QP with the same matrices and the same bounds present
-    update: Callable[[QP], None]
-    #: start the next solve from the point of an earlier QP of the same shape
+    #: replace the vectors of the QP; matrices and the places of bounds are unchanged.
+    #: None: every QP needs a new session
+    update: Callable[[QP], None] | None = None
+    #: start the next solve from this point; None: the library takes no start
     start: Callable[[Solution], None] | None = None
-    #: solve to another tolerance from now on
+    #: change the tolerance of all later solves; None: that needs a new session
     tighten: Callable[[float], None] | None = None
 
 
-def in_sequence(
-    begin: Callable[[QP], Session],
+def chain(
+    begin: Callable[[QP, float], Session], tol: float
 ) -> Callable[[QP], Callable[[], Solution]]:
-    """Make the `prepare` of a chain, whose one tolerance `begin` knows."""
-    prepare = tightening(lambda qp, tol: begin(qp))
-    return lambda qp: prepare(qp, 0.0)
+    """Return the `prepare` of a sequence whose QPs are all solved to `tol`."""
+    prepare = tightening(begin)
+    return lambda qp: prepare(qp, tol)
 
 
 def tightening(
     begin: Callable[[QP, float], Session],
 ) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Make the `prepare` of a sequence: update where only vectors changed, or rebuild.
+    """Return the `prepare` of a sequence whose QPs have a tolerance each.
 
-    After a rebuild the last point is where the new session starts, if it has one of
-    the right shape. (A session that was updated starts where it ended, if its library
-    can.) A session that takes no other tolerance is rebuilt for it.
+    If only vectors changed since the last QP, the session is updated; libraries that
+    can then start from the point where they ended. Otherwise `begin` builds a new
+    session, which starts from the last point if it takes starts and the point has the
+    right shape. A new tolerance also needs a new session, unless it has `tighten`.
     """
-    held: Session | None = None
+    session: Session | None = None
+    session_qp: QP
+    session_tol: float
     last: tuple[QP, Solution] | None = None
-    of: tuple[QP, float] | None = None
 
     def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
-        nonlocal held, of
-        if held is not None and of is not None and _goes_on(held, *of, qp, tol):
-            held.update(qp)
-            if held.tighten is not None:
-                held.tighten(tol)
+        nonlocal session, session_qp, session_tol
+        if (
+            session is not None
+            and session.update is not None
+            and (tol == session_tol or session.tighten is not None)
+            and only_vectors_differ(session_qp, qp)
+        ):
+            session.update(qp)
+            if session.tighten is not None:
+                session.tighten(tol)
         else:
-            held = begin(qp, tol)
-            if last is not None and held.start is not None and _fits(*last, qp):
-                held.start(last[1])
-        of = qp, tol
-        session = held
+            session = begin(qp, tol)
+            if last is not None and session.start is not None and _fits(*last, qp):
+                session.start(last[1])
+        session_qp, session_tol = qp, tol
+        solve_session = session.solve
 
         def solve() -> Solution:
             nonlocal last
-            solution = session.solve()
+            solution = solve_session()
             last = qp, solution
             return solution
 
@@ -67,13 +75,8 @@ def tightening(
     return prepare
 
 
-def _goes_on(held: Session, of: QP, at: float, qp: QP, tol: float) -> bool:
-    """Whether a session that holds `of` to the tolerance `at` can take the next QP."""
-    return (at == tol or held.tighten is not None) and only_vectors_differ(of, qp)
-
-
 def only_vectors_differ(one: QP, other: QP) -> bool:
-    """Whether two QPs have the same matrices, and bounds at the same places."""
+    """Return True if two QPs have equal matrices, and bounds at the same places."""
     matrices = ((one.P, other.P), (one.A, other.A), (one.G, other.G))
     bounds = ((one.lb, other.lb), (one.ub, other.ub))
     return all(_equal(*pair) for pair in matrices) and all(
@@ -90,7 +93,8 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
-    """Whether a point is finite and has the shape of `qp`, bounds included."""
+    """Return True if a point is finite and has the shape of `qp`, bounds included."""
+    # bounds at other places would shift the multipliers of `to_one_sided` rows
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))

@@ -1,1 +1,1 @@
-"""The reference solve, which shares no code with the solvers under test."""
+"""Reference solves, which share no code with the solvers under test."""

@@ -1,10 +1,11 @@
-"""The units taken out of a QP: a transform with its way back.
+"""Equilibration: scaling of variables and rows that is independent of units.
 
 Rows and columns of [P Aᵀ Gᵀ; A 0 0; G 0 0] are divided by the square roots of their
-largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). That leaves a
-factor of x against those of y and z open: it makes the largest entry of P about one,
-whatever the unit of the objective. All factors are powers of two, so that no entry is
-rounded: a point of the scaled QP is a point of the given one, digit for digit.
+largest entries until these are about one (Ruiz 2001, RAL-TR-2001-034). One factor of x
+relative to y and z remains free; it is chosen so that the largest entry of P is about
+one, whatever the unit of the objective. All factors are powers of two, so no entry is
+rounded, and a point of the scaled QP equals a point of the original one to the last
+digit.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from scipy.sparse import csc_array
 
 from mortarbench.harness import QP, Matrix, Solution, Vector
 
-ROUNDS = 20  #: more than it takes units that differ by 1e±12 from entry to entry
+#: rounds of scaling; entries whose units differ by factors of 1e±12 need fewer
+ROUNDS = 20
 Exponents = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
-class Equilibrated:
-    """A scaled QP, with the factors of x, y and z: x = D x̂, y = E ŷ, z = H ẑ."""
+class ScaledQP:
+    """Scaled QP, with the factors of x, y and z: x = D x̂, y = E ŷ, z = H ẑ."""
 
     qp: QP
     D: Vector  #: (n,)
@@ -31,14 +33,14 @@ class Equilibrated:
     H: Vector  #: (p,)
 
     def recover(self, s: Solution) -> Solution:
-        """Take a point of the scaled QP to the given one."""
+        """Return the point of the original QP for a point of the scaled one."""
         return replace(
             s, x=s.x * self.D, y=s.y * self.E, z=s.z * self.H, z_box=s.z_box / self.D
         )
 
 
-def equilibrated(qp: QP) -> Equilibrated:
-    """Scale a QP with an explicit P; all matrices sparse unless P is dense."""
+def equilibrate(qp: QP) -> ScaledQP:
+    """Scale a QP with an explicit P; its matrices become dense if P is, else sparse."""
     store = _dense if isinstance(qp.P, np.ndarray) else _sparse
     P, A, G = (store(M) for M in (qp.P, qp.A, qp.G))
     d, e, h = (np.zeros(v.size, dtype=np.int64) for v in (qp.q, qp.b, qp.h))
@@ -56,7 +58,7 @@ def equilibrated(qp: QP) -> Equilibrated:
         P=_times(d, P, d), q=D * qp.q, A=_times(e, A, d), b=E * qp.b,
         G=_times(h, G, d), h=H * qp.h, lb=qp.lb / D, ub=qp.ub / D,
     )  # fmt: skip
-    return Equilibrated(scaled, D, E, H)
+    return ScaledQP(scaled, D, E, H)
 
 
 def _dense(M: Matrix) -> Matrix:
@@ -64,7 +66,7 @@ def _dense(M: Matrix) -> Matrix:
 
 
 def _sparse(M: Matrix) -> csc_array:
-    """Store by columns, each entry once."""
+    """Return a CSC array without duplicate entries."""
     stored = csc_array(M)
     if not stored.has_canonical_format:
         stored = stored.copy()
@@ -73,7 +75,7 @@ def _sparse(M: Matrix) -> csc_array:
 
 
 def _times(left: Exponents, M: Matrix, right: Exponents) -> Matrix:
-    """Multiply by powers of two from both sides."""
+    """Return diag(2^left) M diag(2^right)."""
     rows, columns = np.ldexp(1.0, left), np.ldexp(1.0, right)
     if isinstance(M, np.ndarray):
         return rows[:, None] * M * columns
@@ -82,12 +84,12 @@ def _times(left: Exponents, M: Matrix, right: Exponents) -> Matrix:
 
 
 def _columns(M: csc_array) -> NDArray[np.int64]:
-    """Give the column of each stored entry."""
+    """Return the column index of each stored entry."""
     return np.repeat(np.arange(M.shape[1]), np.diff(M.indptr))
 
 
 def _largest(M: Matrix, axis: int) -> Vector:
-    """Largest |entry| per column (axis 0) or row (axis 1)."""
+    """Return the largest |entry| of each column (axis 0) or row (axis 1)."""
     if isinstance(M, np.ndarray):
         return np.asarray(abs(M).max(axis=axis, initial=0.0))
     largest = np.zeros(M.shape[1 - axis])
@@ -96,6 +98,6 @@ def _largest(M: Matrix, axis: int) -> Vector:
 
 
 def _root(largest: Vector) -> Exponents:
-    """Give the exponent of about 1/√largest; zero for an empty row."""
+    """Return the rounded exponent of 1/√largest in base 2; 0 for an empty row."""
     filled = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
     return np.rint(-0.5 * np.log2(filled)).astype(np.int64)

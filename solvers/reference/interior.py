@@ -1,4 +1,4 @@
-"""A primal-dual interior-point method: where the reference solve looks first.
+"""Primal-dual interior-point method, the first stage of the reference solve.
 
 Mehrotra's predictor and corrector for  min ½xᵀPx + qᵀx,  Ax = b,  Cx + s = d,  s ≥ 0
 (Nocedal and Wright 2006, Numerical Optimization, ch. 16.6; Gertz and Wright 2003, ACM
@@ -8,10 +8,11 @@ Trans. Math. Softw. 29), with C the rows of G and of the finite bounds. A step s
     [A      −δ      ] [dy] = [−(Ax − b)              ],  ds = −(Cx + s − d) − C dx,
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
-for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector), and goes 0.995 of
-the way to the next bound, by one length in x, y, z and s. δ is that of a proximal
-method of multipliers centred at the iterate (Pougkakiotis and Gondzio 2021, Comput.
-Optim. Appl. 78): it moves no solution, and P may be singular and rows dependent.
+for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). The step goes 0.995
+of the way to the boundary, with a common length for x, y, z and s. δ is the parameter
+of a proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio
+2021, Comput. Optim. Appl. 78): the solutions do not depend on it, and P may be singular
+and rows may be linearly dependent.
 """
 
 from __future__ import annotations
@@ -26,15 +27,17 @@ from scipy.sparse import csc_array, csr_array, eye_array, vstack
 from mortarbench.harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
-DELTA = 1e-10  #: of a QP whose largest entries are about one
-CLOSE = 1e-11  #: KKT residual that tells the active constraints from the others
-MOST = 100  #: iterations
-PATIENCE = 12  #: iterations that need not lessen the residual
-KEEP = 0.995  #: of the way to the boundary
+DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
+#: KKT residual at which the iteration ends: small enough to identify the active
+#: constraints, which `polish` then takes as equations
+STOP_RESIDUAL = 1e-11
+MAX_ITERATIONS = 100
+PATIENCE = 12  #: iterations without a halved residual after which it ends
+BOUNDARY_FRACTION = 0.995  #: share of the way to the boundary that a step goes
 
 
 class Iterate(NamedTuple):
-    """A point with s, z > 0."""
+    """Point with s, z > 0."""
 
     x: Vector
     y: Vector
@@ -44,7 +47,7 @@ class Iterate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """Fixed variables are rows of A here; C holds G, then upper, then lower bounds."""
+    """QP with rows of A for fixed variables; C stacks G, upper, then lower bounds."""
 
     qp: QP
     A: Matrix
@@ -55,7 +58,7 @@ class _Problem:
     fixed: NDArray[np.int64]
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
-    saddle: Factorise  #: of P, and the rows of A and G
+    saddle: Factorise  #: factorises [P + D Bᵀ; B −W], B = [A; G]
 
     def C(self, x: Vector) -> Vector:
         """Return Cx."""
@@ -67,16 +70,16 @@ class _Problem:
         return self._box_T(z[p:], start=self.G_T @ z[:p])
 
     def _box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
-        """Add the multipliers of bounds to a force.
+        """Add the multipliers z of upper and lower bounds to the vector `start` (n,).
 
-        lower : sign of those of lower bounds
+        lower : factor of the multipliers of lower bounds
         """
         start[self.upper] += z[: self.upper.size]
         start[self.lower] += lower * z[self.upper.size :]
         return start
 
-    def factorised(self, w: Vector) -> Solve:
-        """Prepare to solve for (dx, dy, dz) given diag(w) = S/Z.
+    def factorise(self, w: Vector) -> Solve:
+        """Factorise the system of a step with diag(w) = S/Z; return its solve.
 
         The rows of bounds are eliminated: they add 1/w to the diagonal of P.
         """
@@ -87,17 +90,17 @@ class _Problem:
             np.append(np.full(m, DELTA), w[:p]),
         )
 
-        def whole(r: Vector, t: Vector) -> tuple[Vector, Vector]:
+        def solve_all(r: Vector, t: Vector) -> tuple[Vector, Vector]:
             t_box = t[m + p :]
             r = self._box_T(t_box / w_box, start=r.copy())
             dx, rest = solve(r, t[: m + p])
             box = np.append(dx[self.upper], -dx[self.lower])
             return dx, np.append(rest, (box - t_box) / w_box)
 
-        return whole
+        return solve_all
 
     def solution(self, at: Iterate) -> Solution:
-        """Give the point in the terms of the QP."""
+        """Return the iterate as a point of the QP."""
         m, p = self.qp.b.size, self.qp.h.size
         z_box = np.zeros(at.x.size)
         z_box[self.fixed] = at.y[m:]
@@ -108,27 +111,28 @@ class _Problem:
         )
 
 
-@np.errstate(all="ignore")  # what diverges is not finite, and is seen
+@np.errstate(all="ignore")  # a divergent residual is not finite and ends the loop
 def interior_point(qp: QP) -> Solution:
-    """Find a point of small KKT residuals, strictly inside of all inequalities.
+    """Return the iterate with the smallest KKT residual.
 
-    Best for a QP whose largest entries are about one (`equilibrate`).
-    Where there is no solution, the point is the best of what was met.
+    The slacks and multipliers of all inequalities are positive. The constants suit a
+    QP whose largest entries are about one (`equilibrate`). Nothing is raised if there
+    is no solution; the caller checks the residual.
     """
     problem = _problem(qp)
-    best, least, waited = Solution.without_point(qp, Status.FAILED), np.inf, 0
+    best, least, stalled = Solution.without_point(qp, Status.FAILED), np.inf, 0
     try:
         at = _start(problem)
-        for k in range(MOST):
+        for k in range(MAX_ITERATIONS):
             point = replace(problem.solution(at), iterations=k)
             worst = kkt_residuals(qp, point).worst
-            waited = 0 if worst < least / 2 else waited + 1
+            stalled = 0 if worst < least / 2 else stalled + 1
             if worst < least:
                 best, least = point, worst
-            if least <= CLOSE or waited == PATIENCE or not np.isfinite(worst):
+            if least <= STOP_RESIDUAL or stalled == PATIENCE or not np.isfinite(worst):
                 break
             at = _step(problem, at)
-    except ArithmeticError:  # a step too far: the best point is what is left
+    except ArithmeticError:  # the next system is singular: return the best iterate
         pass
     return best
 
@@ -155,12 +159,13 @@ def _problem(qp: QP) -> _Problem:
 
 
 def _start(problem: _Problem) -> Iterate:
-    """Minimise with ½|Cx − d|² for the inequalities, then shift s and z inside.
+    """Minimise with ½|Cx − d|² in place of Cx ≤ d, then shift s and z to be positive.
 
-    As Vandenberghe (2010, The CVXOPT linear and quadratic cone program solvers, 5.3).
+    Source: Vandenberghe (2010), The CVXOPT linear and quadratic cone program solvers,
+    section 5.3.
     """
     qp, m = problem.qp, problem.b.size
-    solve = problem.factorised(np.ones(problem.d.size))
+    solve = problem.factorise(np.ones(problem.d.size))
     x, rest = solve(-qp.q, np.append(problem.b, problem.d))
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
@@ -169,12 +174,12 @@ def _start(problem: _Problem) -> Iterate:
 
 
 def _step(problem: _Problem, at: Iterate) -> Iterate:
-    """Predict, centre and correct."""
+    """Return the next iterate: predictor, centring and corrector."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
     r_d = qp.P @ x + qp.q + A.T @ y + problem.C_T(z)
     r_p, r_c = A @ x - problem.b, C(x) + s - problem.d
-    solve = problem.factorised(s / z)
+    solve = problem.factorise(s / z)
 
     def direction(r_sz: Vector) -> Iterate:
         dx, rest = solve(-r_d, np.append(-r_p, r_sz / z - r_c))
@@ -182,14 +187,15 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
 
     step = direction(s * z)
     if z.size:
-        mu, length = s @ z / z.size, _length(at, step)
+        mu, length = s @ z / z.size, _step_length(at, step)
         affine = (s + length * step.s) @ (z + length * step.z) / z.size
+        # σ = (μ_affine/μ)³, Mehrotra's choice
         step = direction(s * z + step.s * step.z - (affine / mu) ** 3 * mu)
-    length = min(1.0, KEEP * _length(at, step))
+    length = min(1.0, BOUNDARY_FRACTION * _step_length(at, step))
     return Iterate(*(v + length * dv for v, dv in zip(at, step, strict=True)))
 
 
-def _length(at: Iterate, step: Iterate) -> float:
-    """Give the longest step, at most 1/KEEP, that keeps s and z nonnegative."""
+def _step_length(at: Iterate, step: Iterate) -> float:
+    """Return the longest step that keeps s, z ≥ 0, at most 1/BOUNDARY_FRACTION."""
     lengths = [-v[dv < 0] / dv[dv < 0] for v, dv in ((at.s, step.s), (at.z, step.z))]
-    return float(np.concatenate(lengths).min(initial=1 / KEEP))
+    return float(np.concatenate(lengths).min(initial=1 / BOUNDARY_FRACTION))

@@ -1,18 +1,18 @@
-"""The last digits: the active constraints as equations, refined in extended precision.
+"""Refinement of a solution in extended precision, with active constraints as equations.
 
-Given which bounds and rows are active, the KKT conditions are linear. They are solved
-by Newton steps with residuals evaluated in `numpy.longdouble` (iterative refinement,
-Higham 2002, Accuracy and Stability of Numerical Algorithms, ch. 12) and one factor of
+For a fixed active set the KKT conditions are linear. They are solved by Newton steps
+with residuals evaluated in `numpy.longdouble` (iterative refinement, Higham 2002,
+Accuracy and Stability of Numerical Algorithms, ch. 12) and one factor of
 
     [P_FF + δ  B_Fᵀ]     F: variables off their bounds,
     [B_F       −δ  ]     B: A and the active rows of G.
 
-δ makes it regular whatever P and B. What the steps converge to does not know of it:
-they are the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1), and
-end, where the solutions or the multipliers are many, near those that they start from.
-Then constraints that are violated enter the active set, those with a multiplier of the
-wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13), until
-nothing changes.
+δ makes the matrix regular for every P and B. The limit does not depend on δ: the steps
+are those of the proximal method of multipliers (Rockafellar 1976, Math. Oper. Res. 1),
+and if solutions or multipliers are not unique they converge to some near the start.
+Then violated constraints enter the active set and constraints with a multiplier of the
+wrong sign leave it (Hintermüller, Ito and Kunisch 2003, SIAM J. Optim. 13), until it no
+longer changes.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ from mortarbench.harness import QP, Matrix, Solution, Status
 from mortarbench.solvers.reference.saddle import saddle
 
 Extended = NDArray[np.longdouble]
-DELTA = 1e-10  #: of a QP whose largest entries are about one
-STEPS = 40  #: of refinement
-SHRINK = 0.9  #: of a step to the one before
-CHANGES = 30  #: of the active set
-ALL_AT_ONCE = 10  #: changes after which only the worst constraint changes
-ROUNDING = 4 * float(np.finfo(float).eps)  #: of signs and slacks
+DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
+MAX_REFINEMENTS = 40  #: steps of refinement with one active set
+MAX_STEP_RATIO = 0.9  #: refinement ends at a step longer than this times the last one
+MAX_ACTIVE_SETS = 30
+FULL_CHANGES = 10  #: updates of the active set before only the worst constraint changes
+#: multipliers of the wrong sign and violations below this, relative to the largest
+#: component, are rounding
+SIGN_ROUNDING = 4 * float(np.finfo(float).eps)
 
 
 class _Active(NamedTuple):
@@ -50,7 +52,7 @@ class _Point(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A QP with its matrices in both precisions."""
+    """QP, with its matrices in extended precision beside it."""
 
     qp: QP
     P: Matrix
@@ -58,19 +60,19 @@ class _Problem:
     G: Matrix
 
     def gradient(self, at: _Point) -> Extended:
-        """Px + q + Aᵀy + Gᵀz."""
+        """Return Px + q + Aᵀy + Gᵀz."""
         g = self.P @ at.x + self.qp.q + self.A.T @ at.y + self.G.T @ at.z
         return np.asarray(g, dtype=np.longdouble)
 
 
-@np.errstate(all="ignore")  # what diverges is not finite, and is seen
-def polished(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
-    """Give refined points, each with a better guess of the active set; few, often one.
+@np.errstate(all="ignore")  # callers compare residuals, which are then not finite
+def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
+    """Yield a refined point for each active set that is tried; often there is one.
 
-    qp : with the largest entries about one; P, A and G all dense or all sparse
-    start : near a solution, mostly of an interior-point method
-    delta : with a smaller one the steps see weaker curvature and rows nearer to others,
-        but the factor is that of a matrix nearer to singular
+    qp : largest entries about one; P, A and G all dense or all sparse
+    start : point near a solution, such as that of an interior-point method
+    delta : δ; a smaller one resolves weaker curvature and more nearly parallel rows,
+        but the matrix is closer to singular
     """
     problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))
@@ -78,20 +80,22 @@ def polished(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution
     side = 1 * (start.z_box > qp.ub - start.x) - 1 * (-start.z_box > start.x - qp.lb)
     side = np.where(qp.lb == qp.ub, -1, side).astype(np.int8)
     active = _Active(side, start.z > slack)
-    for k in range(CHANGES):
+    for k in range(MAX_ACTIVE_SETS):
         try:
-            at = _refined(problem, active, at, delta)
+            at = _solve_active_set(problem, active, at, delta)
         except ArithmeticError:
             return
-        yield replace(_rounded(problem, active, at), iterations=start.iterations)
-        new = _corrected(problem, active, at, one=k >= ALL_AT_ONCE)
+        yield replace(_round(problem, active, at), iterations=start.iterations)
+        new = _update_active_set(problem, active, at, one=k >= FULL_CHANGES)
         if not any((a != b).any() for a, b in zip(new, active, strict=True)):
             return
         active = new
 
 
-def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _Point:
-    """Solve the KKT equations of an active set, in steps until they hardly shrink."""
+def _solve_active_set(
+    problem: _Problem, active: _Active, at: _Point, delta: float
+) -> _Point:
+    """Solve the KKT equations of an active set by iterative refinement."""
     qp, m = problem.qp, problem.qp.b.size
     free, rows = np.flatnonzero(active.side == 0), np.flatnonzero(active.rows)
     x = np.where(active.side < 0, qp.lb, np.where(active.side > 0, qp.ub, at.x))
@@ -100,12 +104,12 @@ def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _P
     B = np.vstack([A, G]) if isinstance(P, np.ndarray) else vstack([A, G])
     solve = saddle(P, B)(np.full(free.size, delta), np.full(B.shape[0], delta))
     size = np.inf
-    for _ in range(STEPS):
+    for _ in range(MAX_REFINEMENTS):
         r = problem.gradient(_Point(x, y, z))[free]
         t = np.append(problem.A @ x - qp.b, (problem.G @ x - qp.h)[rows])
         dx, rest = solve(-r.astype(float), -t.astype(float))
         last, size = size, _sup(dx, rest)
-        if not size < SHRINK * last:
+        if not size < MAX_STEP_RATIO * last:
             break
         x[free] += dx
         y += rest[:m]
@@ -113,13 +117,16 @@ def _refined(problem: _Problem, active: _Active, at: _Point, delta: float) -> _P
     return _Point(x, y, z)
 
 
-def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> _Active:
-    """Let violated constraints enter and multipliers of the wrong sign leave.
+def _update_active_set(
+    problem: _Problem, active: _Active, at: _Point, *, one: bool
+) -> _Active:
+    """Add violated constraints; drop those with a multiplier of the wrong sign.
 
-    Active rows that are almost dependent cannot all be met, short of huge multipliers;
-    when all else is right, those that keep a slack leave.
+    Nearly dependent active rows cannot all hold unless their multipliers are huge. So
+    when no other constraint is wrong, active rows that keep a slack are dropped.
 
-    one : only that which is most wrong, relative to x or to the gradient
+    one : change only the constraint with the largest error, relative to the size of x
+        (violations) or of the gradient (signs)
     """
     qp, side = problem.qp, active.side
     g = problem.gradient(at)
@@ -129,12 +136,12 @@ def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> 
     wrong_side = np.where(side == 0, outside, pulled)
     violated = (problem.G @ at.x - qp.h) / X
     wrong_rows = np.where(active.rows, -at.z / S, violated)
-    if max(wrong_side.max(initial=0), wrong_rows.max(initial=0)) < ROUNDING:
+    if max(wrong_side.max(initial=0), wrong_rows.max(initial=0)) < SIGN_ROUNDING:
         wrong_rows = np.where(active.rows, -violated, 0.0)
-    least = ROUNDING
+    least = SIGN_ROUNDING
     if one:
         least = max(
-            ROUNDING, _sup(*(np.maximum(w, 0) for w in (wrong_side, wrong_rows)))
+            SIGN_ROUNDING, _sup(*(np.maximum(w, 0) for w in (wrong_side, wrong_rows)))
         )
     change_side, change_rows = wrong_side >= least, wrong_rows >= least
     entering = np.where(at.x < qp.lb, -1, 1)
@@ -142,8 +149,8 @@ def _corrected(problem: _Problem, active: _Active, at: _Point, *, one: bool) -> 
     return _Active(new.astype(np.int8), active.rows ^ change_rows)
 
 
-def _rounded(problem: _Problem, active: _Active, at: _Point) -> Solution:
-    """Round to double precision; multipliers of the bounds by stationarity."""
+def _round(problem: _Problem, active: _Active, at: _Point) -> Solution:
+    """Round to double precision; compute z_box from stationarity at the rounded x."""
     qp, side = problem.qp, active.side
     x = np.clip(at.x.astype(float), qp.lb, qp.ub)
     y, z = at.y.astype(float), np.maximum(at.z.astype(float), 0)

@@ -1,16 +1,17 @@
-"""Reference solve of QPs over convex sets of any kind, by their projections alone.
+"""Reference solve of QPs over arbitrary convex sets, by projections only.
 
 With M = [A; G; I] and C = {b} × {w ≤ h} × S, a QP is  min ½xᵀPx + qᵀx,  Mx ∈ C. A
-point t of the range of M gives both w = Π(t) in C and multipliers λ = R(t − w) normal
-to C at w, for R > 0 diagonal and the same within a set: what is left of the KKT
-conditions is the normal map (Robinson 1992, Math. Oper. Res. 17),
+point t of the space of Mx gives both w = Π(t) in C and multipliers λ = R(t − w) normal
+to C at w, if R > 0 is diagonal and constant within each set. The remaining KKT
+conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
 
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
-1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12) comes near to its zero from
-   anywhere, with R as its penalty.
-2. Newton's method ends there, with difference quotients of Π and residuals in extended
-   precision: the error of the quotients, √ε, is a factor of convergence.
+1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, comes near this
+   zero from any start.
+2. Newton's method converges to it, with Π' by difference quotients and residuals in
+   extended precision. The error of the quotients, √ε, only limits the rate: it is the
+   factor by which each step reduces the residual.
 """
 
 from __future__ import annotations
@@ -23,26 +24,27 @@ from scipy.linalg import lu_factor, lu_solve
 
 from mortarbench.harness import QP, Solution, Status, Vector
 
-ROUNDS = 12  #: of both, with another penalty each
+ROUNDS = 12  #: rounds of ADMM and Newton's method, each with another penalty
 ADMM_STEPS = 400  #: per round
-NEWTON_STEPS = 30
-RELAXATION = 1.6
-EQUALITIES = 1e3  #: penalty of rows of A, relative to others
-RANGE = 10.0  #: largest factor between the penalties of two rounds
-STEP = 2.0**-26  #: of difference quotients, relative to t
-#: regularises dependent rows: it makes steps wrong by as much, the zero of (1) stays
+NEWTON_STEPS = 30  #: at most, per round
+RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
+EQUALITY_PENALTY = 1e3  #: penalty of rows of A relative to the others, as in OSQP
+MAX_PENALTY_CHANGE = 10.0  #: largest factor between the penalties of two rounds
+DIFFERENCE_STEP = 2.0**-26  #: √ε, step of difference quotients relative to t
+#: diagonal shift, relative, of the Newton matrix: it regularises dependent rows and
+#: perturbs the steps, but not the zero of (1)
 SHIFT = 1e-15
 
 
-def projected(qp: QP) -> Iterator[Solution]:
-    """Yield points, each by more steps than the ones before."""
+def projection_iterates(qp: QP) -> Iterator[Solution]:
+    """Yield the point of each round; later ones took more steps."""
     n, m, p = qp.q.size, qp.b.size, qp.h.size
     P, rows = _dense(qp.P), np.vstack([_dense(qp.A), _dense(qp.G)])
     size = np.linalg.norm(rows, axis=1)
     size[size == 0] = 1
     M = np.vstack([rows / size[:, None], np.eye(n)])
     b, h = qp.b / size[:m], qp.h / size[m:]
-    kinds = np.array([EQUALITIES] * m + [1.0] * (p + n))
+    relative_penalty = np.array([EQUALITY_PENALTY] * m + [1.0] * (p + n))
 
     def project(t: Any) -> Any:
         x = t[m + p :]
@@ -53,7 +55,7 @@ def projected(qp: QP) -> Iterator[Solution]:
     rho = float(np.abs(P).max(initial=0)) or 1.0
     x, t, multipliers = np.zeros(n), np.zeros(m + p + n), np.zeros(m + p + n)
     for _ in range(ROUNDS):
-        R = rho * kinds
+        R = rho * relative_penalty
         t = project(t) + multipliers / R
         K = lu_factor(P + M.T @ (R[:, None] * M))
         for _ in range(ADMM_STEPS):
@@ -70,13 +72,15 @@ def projected(qp: QP) -> Iterator[Solution]:
             status=Status.SOLVED, x=x_end, y=y, z=z,
             z_box=force[m + p :].astype(float),
         )  # fmt: skip
-        missed = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
+        # balance the relative residuals: √(primal/dual), as OSQP updates its ρ
+        primal = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
         forces = [P @ x, qp.q, M.T @ multipliers]
-        left = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
-        rho *= float(np.clip(np.sqrt(missed / left), 1 / RANGE, RANGE))
+        dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
+        change = float(np.sqrt(primal / dual))
+        rho *= min(max(change, 1 / MAX_PENALTY_CHANGE), MAX_PENALTY_CHANGE)
 
 
-@np.errstate(all="ignore")  # what is not finite ends it
+@np.errstate(all="ignore")  # a residual that is not finite ends the loop
 def _newton(
     P: Any, q: Vector, M: Any, R: Vector, project: Any, x: Vector, t: Vector
 ) -> Any:
@@ -106,10 +110,10 @@ def _newton(
 
 
 def _derivative(project: Any, t: Vector) -> Any:
-    """Return difference quotients of Π at t, a column for each component."""
+    """Return the central difference quotients of Π at t, one column per component."""
     D = np.empty((t.size, t.size))
     for j, at in enumerate(t):
-        h = STEP * max(abs(at), float(np.abs(t).max()) or 1.0)
+        h = DIFFERENCE_STEP * max(abs(at), float(np.abs(t).max()) or 1.0)
         there, here = t.copy(), t.copy()
         there[j], here[j] = at + h, at - h
         D[:, j] = (project(there) - project(here)) / (there[j] - here[j])

@@ -1,9 +1,9 @@
 """Saddle-point systems [P + D Bᵀ; B −W] with D, W > 0 diagonal, by LU factors.
 
-Where P is positive semidefinite, such a matrix is quasidefinite: it is regular, and a
-sparse one has triangular factors in every symmetric order of its rows (Vanderbei 1995,
-SIAM J. Optim. 5), hence the order is that of least fill, without pivoting. Where D and
-W are so small that rounding spoils such factors, pivots are chosen by size.
+If P is positive semidefinite, such a matrix is quasidefinite: it is regular and has
+triangular factors for every symmetric permutation (Vanderbei 1995, SIAM J. Optim. 5).
+So a sparse one is ordered for least fill and factorised without pivoting. If D and W
+are so small that rounding spoils these factors, it is factorised with partial pivoting.
 """
 
 from __future__ import annotations
@@ -17,35 +17,38 @@ from scipy.sparse.linalg import splu
 
 from mortarbench.harness import Matrix, Vector
 
-#: for `splu`
+#: arguments of `splu`: symmetric order of least fill, no pivoting
 LEAST_FILL = dict(
     permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=dict(SymmetricMode=True)
 )
 PIVOTED = dict(permc_spec="COLAMD", diag_pivot_thresh=1.0)
-GOOD = 1e-6  #: residual of a solve that refinement soon makes as small as rounding
+#: relative residual of a solve below which one step of refinement reaches rounding
+MAX_SOLVE_RESIDUAL = 1e-6
 
 Solve = Callable[[Vector, Vector], tuple[Vector, Vector]]
 Factorise = Callable[[Vector, Vector], Solve]
 
 
 def saddle(P: Matrix, B: Matrix) -> Factorise:
-    """Give what factorises [P + D Bᵀ; B −W] for D (n,) and W (r,), both positive.
+    """Return a function that factorises [P + D Bᵀ; B −W] for D (n,), W (r,) > 0.
 
-    What that returns solves for (u, v) with (r, t) on the right. It raises
-    ArithmeticError where an entry is not finite, or a pivot vanishes.
+    It returns the solve, (r, t) ↦ (u, v), and raises ArithmeticError if an entry is not
+    finite or a pivot is zero.
 
     P : (n, n), and B : (r, n), both dense or both sparse
     """
     n = P.shape[0]
-    with_diagonal = _dense(P, B) if isinstance(P, np.ndarray) else _sparse(P, B)
+    with_diagonal = (
+        _dense_matrices(P, B) if isinstance(P, np.ndarray) else _sparse_matrices(P, B)
+    )
 
-    def factorised(D: Vector, W: Vector) -> Solve:
+    def factorise(D: Vector, W: Vector) -> Solve:
         if not (np.isfinite(D).all() and np.isfinite(W).all()):
             raise ArithmeticError(
-                "the saddle-point matrix holds numbers beyond all bounds"
+                "the saddle-point matrix has entries that are not finite"
             )
         K = with_diagonal(np.append(D, -W))
-        once = _factorised(K)
+        once = _factorise(K)
 
         def solve(r: Vector, t: Vector) -> tuple[Vector, Vector]:
             right = np.concatenate([r, t])
@@ -55,11 +58,11 @@ def saddle(P: Matrix, B: Matrix) -> Factorise:
 
         return solve
 
-    return factorised
+    return factorise
 
 
-def _dense(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
-    """Give the map from d (n + r,) to [P Bᵀ; B 0] + diag(d)."""
+def _dense_matrices(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
+    """Return the function d (n + r,) ↦ [P Bᵀ; B 0] + diag(d)."""
     n, r = P.shape[0], B.shape[0]
     base, every = np.zeros((n + r, n + r)), np.arange(n + r)
     base[:n, :n], base[:n, n:], base[n:, :n] = P, B.T, B
@@ -72,11 +75,12 @@ def _dense(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
     return plus
 
 
-def _sparse(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
-    """Do so for sparse matrices, whose diagonal is stored."""
+def _sparse_matrices(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
+    """Return the same function for sparse matrices; the result is CSC."""
     size = P.shape[0] + B.shape[0]
     base = csc_array(block_array([[P, B.T], [B, None]])) if B.shape[0] else P
     values = base.diagonal()
+    # store every diagonal entry, so that adding d is one update of `data`
     base = csc_array(base + diags_array(np.where(values == 0, 1.0, values)))
     base.sort_indices()
     columns = np.repeat(np.arange(size), np.diff(base.indptr))
@@ -90,7 +94,7 @@ def _sparse(P: Matrix, B: Matrix) -> Callable[[Vector], Matrix]:
     return plus
 
 
-def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
+def _factorise(K: Matrix) -> Callable[[Vector], Vector]:
     if not K.shape[0]:
         return np.copy
     if isinstance(K, np.ndarray):
@@ -103,12 +107,12 @@ def _factorised(K: Matrix) -> Callable[[Vector], Vector]:
             lu = splu(K, **order)
         except RuntimeError:  # a pivot is zero
             continue
-        if order is PIVOTED or _solves(lu.solve, K):
+        if order is PIVOTED or _is_accurate(lu.solve, K):
             return lambda v, lu=lu: np.asarray(lu.solve(v))  # type: ignore[misc]
     raise ArithmeticError("the saddle-point matrix is singular")
 
 
-def _solves(solve: Callable[[Vector], Vector], K: Matrix) -> bool:
-    """Whether refinement with these factors converges, tried on one right side."""
+def _is_accurate(solve: Callable[[Vector], Vector], K: Matrix) -> bool:
+    """Return True if the factors solve one test system to MAX_SOLVE_RESIDUAL."""
     v = K @ np.linspace(1, 2, K.shape[0])
-    return bool(np.abs(K @ solve(v) - v).max() <= GOOD * np.abs(v).max())
+    return bool(np.abs(K @ solve(v) - v).max() <= MAX_SOLVE_RESIDUAL * np.abs(v).max())

@@ -1,18 +1,17 @@
-"""The reference solve: what is true of a QP, told by none of the solvers under test.
+"""Reference solutions of QPs, computed without any of the solvers under test.
 
 With lower bounds only and a dense positive definite P = LLᵀ, min ½xᵀPx + qᵀx over
 x ≥ lb is the nonnegative least-squares problem min ½‖Lᵀy + L⁻¹(q + P lb)‖² over
 y = x − lb ≥ 0. Lawson and Hanson's active-set method ends after finitely many
-steps with the exact active set; the free components are then solved for once more,
-directly, with one step of iterative refinement.
+steps with the exact active set; the free components are then computed once more by a
+direct solve with one step of iterative refinement.
 
-Any other QP is scaled (`equilibrate`), solved by an interior-point
-method as far as tells the active constraints from the others
-(`interior`), and the equations of the active set are refined in
-extended precision (`polish`). What is handed back is the point with
-the least KKT residuals, as the harness measures them on the QP as given.
+Any other QP is scaled (`equilibrate`), solved by an interior-point method until the
+active constraints can be identified (`interior`), and the equations of the active set
+are refined in extended precision (`polish`). The result is the point with the smallest
+KKT residual, as the harness measures it on the original QP.
 
-A QP with sets other than bounds is solved by the projections on them (`projection`).
+A QP with sets other than bounds is solved by projections on the sets (`projection`).
 """
 
 from __future__ import annotations
@@ -28,32 +27,42 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from mortarbench.harness import QP, Solution, Status, kkt_residuals
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
-from mortarbench.solvers.reference.equilibrate import equilibrated
+from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import interior_point
-from mortarbench.solvers.reference.polish import polished
-from mortarbench.solvers.reference.projection import projected
+from mortarbench.solvers.reference.polish import polish
+from mortarbench.solvers.reference.projection import projection_iterates
 
-NEAR = 1e-3  #: KKT residual of a start: from farther off refinement ends, where the
-#: solutions are many, at one that is far off, and other starts are tried
-ACCEPTED = 1e-9  #: KKT residual of what is called a solution
-FAR = 1e4  #: times the median datum of a scaled QP: what is larger is left out at first
+#: largest KKT residual of a start for refinement. From a worse one, refinement of a QP
+#: with many solutions ended at one of size 1e10, whose rounding hid errors of the
+#: optimal value; so other starts are tried too
+MAX_START_RESIDUAL = 1e-3
+MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
+#: data of a scaled QP larger than this times their median are first left out
+OUTLIER_FACTOR = 1e4
 
 
 def reference_solution(qp: QP) -> Solution:
     """Solve a convex QP to about the rounding of x and its multipliers.
 
-    Told are the iterations of the interior-point method, where it was needed. What
-    remains of the residuals comes of rounding x to double precision: up to some
-    1e-16·|P||x| against |Px|, a few 1e-12 for stiff bodies in their displacements.
+    `iterations` counts those of the interior-point method, if it ran. The remaining
+    residual is the effect of rounding x to double precision: about 1e-16·|P||x|
+    relative to |Px|, a few 1e-12 for the displacements of stiff bodies. P is assumed,
+    not checked, to be positive semidefinite.
 
     Raises
     ------
     ValueError
-        When P is an operator that is not small, or a matrix holds NaN or inf.
+        If P is an operator of a QP that is not small, or a matrix contains NaN or inf.
     ArithmeticError
-        When no point with KKT residuals up to 1e-9 is found: constraints contradict
-        each other, or the cost is unbounded. (That P is positive semidefinite is taken
-        on trust.)
+        If no point with a KKT residual of at most 1e-9 is found: the constraints
+        contradict each other, or the objective is unbounded below.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> qp = mb.QP.from_arrays([[2.0, 0.0], [0.0, 2.0]], [-2.0, 2.0], lb=[0.0, 0.0])
+    >>> reference_solution(qp).x.tolist()
+    [1.0, 0.0]
 
     """
     if not qp.is_explicit and is_small(qp):
@@ -63,17 +72,23 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices, got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    ways = (_candidates(qp), _tamed_candidates(qp), _weak_candidates(qp))
-    for candidates in (_projected_candidates(qp),) if len(qp.sets) > 1 else ways:
+    ways = (
+        _candidates(qp),
+        _candidates_without_outliers(qp),
+        _less_regularised_candidates(qp),
+    )
+    for candidates in (_projection_candidates(qp),) if len(qp.sets) > 1 else ways:
         residuals = list[float]()
         for point in candidates:
             residuals.append(worst := _residual(qp, point))
             if worst <= least:
                 best, least = point, worst
-        is_near = residuals[0] <= NEAR
-        if is_near and least <= (MAX_RESIDUAL if is_small(qp) else ACCEPTED):
+        is_near = residuals[0] <= MAX_START_RESIDUAL
+        if is_near and least <= (
+            MAX_RESIDUAL if is_small(qp) else MAX_REFERENCE_RESIDUAL
+        ):
             return best
-    if least <= ACCEPTED:
+    if least <= MAX_REFERENCE_RESIDUAL:
         return best
     raise ArithmeticError(
         "the reference solve found no optimal point, the least KKT residual is "
@@ -82,68 +97,71 @@ def reference_solution(qp: QP) -> Solution:
 
 
 def _residual(qp: QP, s: Solution) -> float:
-    """Give the worst KKT residual, without the rounding of its own evaluation."""
+    """Return the largest KKT residual, evaluated in extended precision."""
     vectors = {k: getattr(s, k).astype(np.longdouble) for k in ("x", "y", "z", "z_box")}
     return kkt_residuals(qp, replace(s, **vectors)).worst
 
 
 def _candidates(qp: QP) -> Iterator[Solution]:
-    """Give points, each expected to be better than the ones before."""
+    """Yield points, each usually better than the one before."""
     if _is_nonnegative(qp):
-        with suppress(np.linalg.LinAlgError, RuntimeError):  # singular; steps ran out
+        # LinAlgError: P is singular; RuntimeError: scipy's nnls reached its step limit
+        with suppress(np.linalg.LinAlgError, RuntimeError):
             yield (point := _nonnegative(qp))
             if _residual(qp, point) <= MAX_RESIDUAL:
                 return
-    scaled = equilibrated(qp)
+    scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     yield scaled.recover(start)
-    yield from map(scaled.recover, polished(scaled.qp, start))
+    yield from map(scaled.recover, polish(scaled.qp, start))
 
 
-def _projected_candidates(qp: QP) -> Iterator[Solution]:
-    """Give points over sets of any kind, until rounding is all that is left."""
-    for point in projected(qp):
+def _projection_candidates(qp: QP) -> Iterator[Solution]:
+    """Yield points of a QP over arbitrary sets, until the residual is rounding."""
+    for point in projection_iterates(qp):
         yield point
         if _residual(qp, point) <= MAX_RESIDUAL:
             return
 
 
-def _tamed_candidates(qp: QP) -> Iterator[Solution]:
-    """Do so once more, where the interior-point method may have begun too far off."""
-    scaled = equilibrated(qp)
-    near = scaled.qp.h < _most(scaled.qp)
-    tame = equilibrated(_tamed(scaled.qp, near))
+def _candidates_without_outliers(qp: QP) -> Iterator[Solution]:
+    """Yield points from a start that ignores data far larger than all others."""
+    scaled = equilibrate(qp)
+    near = scaled.qp.h < _outlier_size(scaled.qp)
+    tame = equilibrate(_without_outliers(scaled.qp, near))
     start = tame.recover(interior_point(tame.qp))
     z = np.zeros(near.size)
     z[near] = start.z
     start = replace(start, z=z)
     yield scaled.recover(start)
-    yield from map(scaled.recover, polished(scaled.qp, start))
+    yield from map(scaled.recover, polish(scaled.qp, start))
 
 
-def _weak_candidates(qp: QP) -> Iterator[Solution]:
-    """Do so with less regularisation, for weak curvature and nearly parallel rows."""
-    scaled = equilibrated(qp)
+def _less_regularised_candidates(qp: QP) -> Iterator[Solution]:
+    """Yield points with a smaller δ, for weak curvature and nearly parallel rows."""
+    scaled = equilibrate(qp)
     start = interior_point(scaled.qp)
     for delta in (1e-13, 1e-16):
-        yield from map(scaled.recover, polished(scaled.qp, start, delta))
+        yield from map(scaled.recover, polish(scaled.qp, start, delta))
 
 
-def _most(qp: QP) -> float:
+def _outlier_size(qp: QP) -> float:
+    """Return the size above which a datum of a scaled QP counts as an outlier."""
     data = np.concatenate([qp.q, qp.b, qp.h, qp.lb, qp.ub])
-    told = np.abs(data[np.isfinite(data) & (data != 0)])
-    return FAR * float(np.median(told)) if told.size else np.inf
+    sizes = np.abs(data[np.isfinite(data) & (data != 0)])
+    return OUTLIER_FACTOR * float(np.median(sizes)) if sizes.size else np.inf
 
 
-def _tamed(qp: QP, near: NDArray[np.bool_]) -> QP:
-    """Leave out what dwarfs all other data of a scaled QP: where to look first.
+def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
+    """Drop or clip data of a scaled QP that dwarf all others, to find a start.
 
-    Bounds and rows so far away do not bind, and a cost so large holds its variable at a
-    bound already when it is smaller. Whether that is true, the QP as given will tell.
+    Bounds and rows so far away are assumed inactive, and an objective coefficient so
+    large is assumed to push its variable to a bound even after clipping. The residual
+    on the original QP checks both assumptions.
 
     near : (p,) rows to keep
     """
-    most = _most(qp)
+    most = _outlier_size(qp)
     tamed = replace(qp, q=np.clip(qp.q, -most, most), G=qp.G[near], h=qp.h[near])
     return tamed.with_bounds(
         np.where(qp.lb < -most, -np.inf, qp.lb), np.where(qp.ub > most, np.inf, qp.ub)
@@ -151,9 +169,9 @@ def _tamed(qp: QP, near: NDArray[np.bool_]) -> QP:
 
 
 def _is_nonnegative(qp: QP) -> bool:
-    """Whether P is dense, and there are lower bounds only, on all variables.
+    """Return True if P is dense and the only constraints are x ≥ lb, lb finite.
 
-    Without variables it is not: scipy's nnls (1.17.1) would crash Python.
+    False for a QP without variables, on which scipy's nnls (1.17.1) crashes Python.
     """
     only = not qp.b.size and not qp.h.size and np.isinf(qp.ub).all()
     lower = qp.q.size > 0 and np.isfinite(qp.lb).all()
@@ -162,7 +180,7 @@ def _is_nonnegative(qp: QP) -> bool:
 
 def _nonnegative(qp: QP) -> Solution:
     """Solve  min ½xᵀPx + qᵀx, x ≥ lb, by nonnegative least squares."""
-    from scipy.optimize import nnls  # late: it takes long, and workers need none
+    from scipy.optimize import nnls  # a slow import that workers do not need
 
     P, gradient_at_lb = qp.P, qp.q + qp.P @ qp.lb
     L = cholesky(P, lower=True)

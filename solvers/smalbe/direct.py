@@ -25,7 +25,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
-from mortarbench.solvers.common.conversion import dense, needs_dense, positive
+from mortarbench.solvers.common.conversion import check_positive, dense, needs_dense
 from mortarbench.solvers.smalbe.compiled import Reduction, residual_bound
 from mortarbench.solvers.smalbe.driver import CLAIM_FACTOR, MAX_IDLE_TIGHTENINGS
 from mortarbench.solvers.smalbe.faces import Faces
@@ -62,7 +62,7 @@ class Direct:
     )  # fmt: skip
 
     def __post_init__(self) -> None:
-        positive(max_solves=self.max_solves)
+        check_positive(max_solves=self.max_solves)
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:

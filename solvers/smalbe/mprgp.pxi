@@ -155,7 +155,7 @@ cdef class MPRGP:
     as the rate of the book requires. Except for the first expansion by a model with
     directions, an expansion does not free components that the half step left on the
     boundary: from one proportioning to the next the active set only grows.
-    docs/smalbe.md draws the conclusions.
+    docs/smalbe-theory.md draws the conclusions.
     """
 
     cdef Product F

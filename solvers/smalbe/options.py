@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from mortarbench.harness import QP
-from mortarbench.solvers.common.conversion import positive
+from mortarbench.solvers.common.conversion import check_positive
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
 from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Preconditioner
 
@@ -58,7 +58,7 @@ class Options:
     max_steps: int = 200_000  #: limit of MPRGP steps and outer iterations, in total
 
     def __post_init__(self) -> None:
-        positive(
+        check_positive(
             M=self.M, eta=self.eta, Gamma=self.Gamma, alpha=self.alpha,
             lanczos_steps=self.lanczos_steps, max_steps=self.max_steps,
         )  # fmt: skip

@@ -12,7 +12,7 @@ import numpy as np
 
 from mortarbench.harness import QP, Status, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector, distributed
-from mortarbench.solvers.common.conversion import boxed
+from mortarbench.solvers.common.conversion import has_bound
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product, Reduction
 from mortarbench.solvers.smalbe.rows import (
@@ -101,7 +101,7 @@ def projected_problem(
         over = Reduction(qp.q.ranks, distributed)
     F = Product(qp.P, qp.q.size, over)
     if is_sparse(qp.A):
-        rows = equality_rows(qp.A, qp.b, boxed(qp))
+        rows = equality_rows(qp.A, qp.b, has_bound(qp))
     else:
         rows = orthonormal_rows(qp.A, qp.b)
     C, diagonal = compiled.Rows(rows, over), _diagonal(qp)

@@ -88,7 +88,7 @@ class SMALBE(Options):
         return prepare
 
 
-#: constants and step rules of PERMON (docs/performance.md): MPRGP with the standard
+#: constants and step rules of PERMON (docs/smalbe-options.md): MPRGP with the standard
 #: expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
 PERMON = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,

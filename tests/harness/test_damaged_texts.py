@@ -34,7 +34,11 @@ from mortarbench.harness.results.faults import FAULTS
 from mortarbench.harness.results.folder import environment_of, refuse_other
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.growth import as_toml
-from mortarbench.harness.suite.solver_options import as_given, options_for, swept
+from mortarbench.harness.suite.solver_options import (
+    options_as_texts,
+    options_for,
+    sweep,
+)
 from mortarbench.harness.suite.suite import load_suite, read_stored
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
@@ -360,9 +364,9 @@ def test_damaged_options_are_taken_or_refused(count):
         key = chance.choice(("max_iter", "eps_abs", "polish", *ODD))
         tried(
             (key, value),
-            lambda key=key, value=value: swept(
+            lambda key=key, value=value: sweep(
                 [SolverSpec(name="osqp", label="osqp")],
-                as_given({key: value} if isinstance(key, str) else value),
+                options_as_texts({key: value} if isinstance(key, str) else value),
                 SOLVERS,
             ),
         )

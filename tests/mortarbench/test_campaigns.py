@@ -137,7 +137,7 @@ def test_solvers_of_different_sessions_are_compared_unpaired_and_it_is_said(camp
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"depths": "2"}, "holds well/dual, which the suite has no longer"),
+        ({"depths": "2"}, "holds well/dual, which is no longer in the suite"),
         ({"time_limit": 5}, r"time_limit was 60, now 5\); choose another --out"),
         (
             {"solvers": '{name = "exact", options = {factor = 1.5}}, "lax"'},
@@ -245,7 +245,7 @@ def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_pat
         ),
         (
             lambda a, b: (b / "suite.toml").write_text("time_limit = 5\n"),
-            r"time_limit is 60 in .*a, 5 in .*b; expected suites whose measurements",
+            r"time_limit is 60 in .*a, 5 in .*b; expected equal settings",
         ),
         (
             lambda a, b: (b / "suite.toml").write_text(
@@ -253,7 +253,7 @@ def test_what_was_measured_twice_in_one_environment_counts_once(measure, tmp_pat
             ),
             "label 'exact' is {'name': 'exact'} in .* expected one solver for a label",
         ),
-        (lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"), "is no suite"),
+        (lambda a, b: (b / "suite.toml").write_text("solvers = 1\n"), "is not a suite"),
         (lambda a, b: shutil.rmtree(b / "journal"), "no journal in"),
     ],
 )
@@ -276,7 +276,7 @@ def test_a_run_or_one_of_the_folders_is_no_place_to_merge_into(stored, tmp_path)
         mb.merge(a, out=b)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine/suite.toml").write_text("mine")
-    with pytest.raises(mb.InputError, match="is no result folder"):
+    with pytest.raises(mb.InputError, match="is not a result folder"):
         mb.merge(a, b, out=tmp_path / "mine")
     assert (tmp_path / "mine/suite.toml").read_text() == "mine"
 

@@ -20,11 +20,11 @@ from mortarbench.cli.main import main
 from mortarbench.harness import Verdict
 from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.names import parse
-from mortarbench.harness.processes.reaper import lives
+from mortarbench.harness.processes.reaper import is_alive
 from mortarbench.harness.registry import SolverSpec, load_plugin
 from mortarbench.harness.results.journal import Journal, read_journal
 from mortarbench.harness.verify.verdicts import new_record
-from mortarbench.progress import shown_on
+from mortarbench.progress import display_on
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import LONGEST
@@ -344,7 +344,7 @@ def test_a_solver_deaf_to_interrupts_ends_with_the_command(tmp_path):
 
     assert (command.returncode, out) == (130, "")
     assert err == "mortarbench: interrupted\n"
-    assert not lives(int(started.read_text()))
+    assert not is_alive(int(started.read_text()))
 
 
 def test_what_a_plugin_prints_is_no_result(cli, pit):
@@ -613,7 +613,7 @@ PROBLEMS = {{"deeper": Deeper(), "nothing": Nothing()}}
 
 
 def test_paper_says_what_it_measures_and_prints_where_the_page_is(cli, monkeypatch):
-    monkeypatch.setattr("mortarbench.cli.paper.measured_paper", paper)
+    monkeypatch.setattr("mortarbench.cli.paper.measure_and_write", paper)
 
     assert cli("paper") == (
         0,
@@ -778,7 +778,7 @@ def test_a_run_on_a_busy_machine_says_what_that_means(
 def test_a_run_that_nobody_listens_to_goes_on():
     reading, writing = os.pipe()
     os.close(reading)
-    with open(writing, "w", buffering=1) as stream, shown_on(stream) as progress:
+    with open(writing, "w", buffering=1) as stream, display_on(stream) as progress:
         progress.start(7)
         progress.warn("who is there?")
         os.dup2(os.open(os.devnull, os.O_WRONLY), writing)  # let it be closed
@@ -789,7 +789,7 @@ def test_on_a_terminal_a_run_is_a_bar_that_says_what_it_does(monkeypatch):
     terminal = io.StringIO()
     terminal.isatty = lambda: True
 
-    with shown_on(terminal) as progress:
+    with display_on(terminal) as progress:
         progress.start(7)
         progress.say("osqp on [red]/primal")
         progress.advance(None)
@@ -814,7 +814,7 @@ def test_a_bar_fits_its_terminal_with_count_and_time_left(monkeypatch, width):
         options={}, tol=1e-8, repeat=0, environment="here",
     ).replace(verdict=Verdict.VERIFIED)  # fmt: skip
 
-    with shown_on(terminal) as bar:
+    with display_on(terminal) as bar:
         bar.start(1234)
         for _ in range(1000):
             bar.advance(None)

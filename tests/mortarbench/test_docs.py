@@ -9,18 +9,33 @@ import yaml
 
 from mortarbench.answer import solve
 from mortarbench.case import build
-from mortarbench.cli.list_ import solvers_page
+from mortarbench.cli.list_ import solvers_page, solvers_pages
 from mortarbench.cli.main import _parser as command_line_parser
 from mortarbench.cli.main import main
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import (
+    InputError,
+    Residuals,
+    Status,
+    kkt_residuals,
+    verdict,
+)
+from mortarbench.harness.limits import ONE_THREAD
+from mortarbench.harness.record import VERIFIED_FACTOR
 from mortarbench.harness.registry import load_plugin
+from mortarbench.harness.verify import measure
 from mortarbench.listing import about
 from mortarbench.problems import elastic
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.registries import Registries
+from mortarbench.reports.data.aggregation import Convention
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT
+
+DOCUMENTS = [
+    *sorted((ROOT / "docs").glob("*.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+]
 
 
 def test_the_solver_of_the_contributing_guide_solves(tmp_path):
@@ -88,9 +103,16 @@ def test_the_adapter_that_the_contributing_guide_shows_is_the_real_one():
     assert shown == (ROOT / "solvers/adapters/piqp_.py").read_text()
 
 
-def test_the_page_of_solvers_is_up_to_date():
-    """`make docs` writes it."""
-    assert (ROOT / "docs/solvers.md").read_text() == solvers_page(SOLVERS)
+def test_the_pages_of_solvers_are_up_to_date():
+    """`make docs` writes them; together they have every section of the whole."""
+    pages = solvers_pages(SOLVERS)
+
+    for name, text in pages.items():
+        assert (ROOT / "docs" / name).read_text("utf-8") == text
+    heads = re.findall(r"^## .*$", solvers_page(SOLVERS), re.M)
+    assert sorted(heads) == sorted(
+        re.findall(r"^## .*$", "\n".join(pages.values()), re.M)
+    )
 
 
 def test_the_page_of_solvers_tells_the_facts_of_each():
@@ -118,6 +140,25 @@ def test_every_family_and_suite_that_commands_name_exists():
 
 def test_the_readme_is_at_most_120_lines():
     assert len((ROOT / "README.md").read_text("utf-8").splitlines()) <= 120
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: page.stem)
+def test_a_page_has_at_most_2500_words(page):
+    assert len(page.read_text("utf-8").split()) <= 2500
+
+
+def test_the_start_page_leads_every_kind_of_user_to_a_page_with_commands():
+    """One click: what comes first; there, a command or a session that is executed."""
+    start = (ROOT / "README.md").read_text("utf-8")
+    table = start.partition("## Where to start")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| .*\*\*.*$", table, re.M)
+
+    assert len(rows) == 4
+    for row in rows:
+        first = re.findall(r"\]\((docs/[\w-]+\.md)", row.split("|")[2])
+        assert first
+        for page in first:
+            assert re.search(r"^(```sh|```pycon)$", (ROOT / page).read_text(), re.M)
 
 
 def test_every_file_that_a_page_names_exists():
@@ -194,3 +235,25 @@ def test_the_citation_is_of_this_version_and_names_the_paper():
     assert [a["family-names"] for a in paper["authors"]] == [
         "Pospíšil", "Světlík", "Varga", "Čermák",
     ]  # fmt: skip
+
+
+def test_the_comparison_policy_agrees_with_the_code():
+    """Its sentences are numbered without gaps, and state the constants of the code."""
+    page = (ROOT / "docs/fair-play.md").read_text("utf-8")
+    sentences = dict(
+        re.findall(r"^- <span id=\"s(\d+)\">\*\*\1\.\*\*</span> (.*)", page, re.M)
+    )
+    libraries = ("OMP", "OPENBLAS", "MKL", "BLIS", "NUMEXPR", "RAYON")
+
+    assert list(sentences) == [str(n) for n in range(1, 43)]
+    assert {f"{name}_NUM_THREADS": "1" for name in libraries} == ONE_THREAD
+    assert "OpenMP, OpenBLAS, MKL, BLIS, NumExpr and Rayon" in sentences["25"]
+    assert f"up to {measure.MAX_ASSEMBLED_ROWS} rows" in sentences["13"]
+    assert f"take {1e3 * measure.SAMPLE_SECONDS:g} ms together" in sentences["22"]
+    assert f"below {500 * measure.SAMPLE_SECONDS:g} ms" in sentences["22"]
+    assert f"at most {measure.MAX_INNER_LOOPS}" in sentences["22"]
+    assert "at most ten times the tolerance" in sentences["33"]
+    assert VERIFIED_FACTOR == 10
+    assert verdict(Status.ITERATION_LIMIT, Residuals(0, 0, 0, 0), 1e-6).is_verified
+    assert "charged three time limits" in sentences["40"]
+    assert Convention().penalty == 3

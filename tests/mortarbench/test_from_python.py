@@ -447,7 +447,10 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
     assert mb.Case is plugin.Case
     case = mb.build("obstacle/dim=1/n=4/primal")
     assert isinstance(case, mb.Case)
-    assert (case.scale, case.constant) == (case.made.scale, case.made.constant)
+    assert (case.scale, case.constant) == (
+        case.family_case.scale,
+        case.family_case.constant,
+    )
     file = tmp_path / "mine.py"
     file.write_text(
         "from dataclasses import dataclass, field\n"

@@ -13,7 +13,7 @@ import pytest
 import mortarbench as mb
 from mortarbench.harness import Verdict
 from mortarbench.harness.results.journal import read_journal
-from mortarbench.listing import CATALOGUE, described
+from mortarbench.listing import CATALOGUE, describe
 from mortarbench.progress import remaining, shown
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
@@ -69,7 +69,7 @@ def test_a_point_gives_the_physics_of_its_case():
     case = mb.build("obstacle/dim=1/n=12/primal")  # exact at nodes: u = (|x| − 1)²
     answer = mb.solve(case, "clarabel")
 
-    u = case.made.recover(answer.solution)
+    u = case.family_case.recover(answer.solution)
     x = np.linspace(-1.5, 1.5, 13)
     assert np.abs(u - np.maximum(np.abs(x) - 1, 0) ** 2).max() < 0.02
     assert case.quantities(answer.solution) == pytest.approx(answer.quantities)
@@ -234,7 +234,7 @@ def test_lists_are_tables():
 
 def test_the_catalogue_is_what_the_solvers_say_of_themselves():
     stored = json.loads(CATALOGUE.read_text())
-    live = {name: described(solver) for name, solver in SOLVERS.items()}
+    live = {name: describe(solver) for name, solver in SOLVERS.items()}
 
     assert stored == json.loads(json.dumps(live)), "run `make docs`"
 

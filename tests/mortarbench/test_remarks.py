@@ -78,7 +78,7 @@ def test_a_contact_that_never_closes_is_remarked_upon(tmp_path, form, solver):
     ("bound", "told"),
     [
         (0.009, None),
-        (0.83, "the solver's error is certified to be at most 83 % only"),
+        (0.83, "the solver's error is only certified to be at most 83 %;"),
         (np.inf, "the certificate does not bound the solver's error"),
     ],
 )

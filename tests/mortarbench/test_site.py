@@ -22,7 +22,10 @@ SOURCES = {
     )
 }
 #: written from docstrings, which terminals show, and what was written before
-UNICODE = {"solvers.md", "weaknesses.md", "CHANGELOG.md"}
+UNICODE = {
+    "solvers.md", "solvers-own.md", "solvers-libraries.md", "weaknesses.md",
+    "CHANGELOG.md",
+}  # fmt: skip
 #: letters of formulas that plain text has no business with
 FORMULA = re.compile(r"[ᵀ‖½√∑Σ∫∂𝒫ᵢⱼₖ⁺λΩ\u0302\u0303]")
 CODE = re.compile(r"^```.*?^```$|`[^`]*`|<!--.*?-->", re.DOTALL | re.MULTILINE)

@@ -8,7 +8,12 @@ from pathlib import Path
 import pytest
 
 from mortarbench.cli.main import main
-from mortarbench.harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from mortarbench.harness.conformance.conformance import (
+    CHECKS,
+    INVARIANCE_PREFIX,
+    Grade,
+    run_check,
+)
 from mortarbench.harness.registry import load_plugin
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.suite.suite import load_suite
@@ -164,7 +169,7 @@ def starting(capsys, monkeypatch, tmp_path):
 def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
     code, out, err = starting("new", "solver", "my-own")
     solver = load_plugin("my-own.py").solvers["my-own"]
-    strict = [check for check in CHECKS if not check.startswith(KEEPS)]
+    strict = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
     results = {check: run_check(check, solver) for check in strict}
 
     assert (code, out) == (0, "my-own.py\n")
@@ -178,7 +183,7 @@ def test_a_new_solver_passes_the_conformance_suite_as_it_is(starting):
 def test_a_new_solver_keeps_its_answer_in_every_equivalent_formulation(starting):
     starting("new", "solver", "my-own")
     solver = load_plugin("my-own.py").solvers["my-own"]
-    kept = [check for check in CHECKS if check.startswith(KEEPS)]
+    kept = [check for check in CHECKS if check.startswith(INVARIANCE_PREFIX)]
 
     assert {run_check(check, solver).grade for check in kept} <= {
         Grade.PASS, Grade.WEAK

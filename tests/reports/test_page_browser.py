@@ -409,7 +409,7 @@ def test_a_number_leads_to_the_line_of_the_journal(visit, folder, records):
     link.click()
     dialog = opened(page)
     assert page.url.endswith(f"#run-{wanted.run_id}")
-    dialog.get_by_text("the other fields").click()
+    dialog.get_by_text("other fields of the journal line").click()
     fields = dict(zip(dialog.locator("th").all_inner_texts(),
                       dialog.locator("td").all_inner_texts(), strict=True))  # fmt: skip
     line = page.evaluate("(line) => JSON.parse(line)", wanted.to_json())

@@ -117,7 +117,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
         measured("both", dual=3e-1, **off),
     ]
     page = compose(evidence(records))
-    legend = "⋆: decided by the proven optimum of a small QP, against the residuals."
+    legend = "⋆: the proven optimum of a small QP overrules the residuals."
     texts = {
         "residuals": "verified", "agreed": "verified", "optimum": "verified ⋆",
         "refuted": "wrong ⋆", "both": "wrong",
@@ -130,7 +130,7 @@ def test_verdicts_of_a_proven_optimum_against_residuals_are_marked(measured, evi
     text = markdown(page)
     assert text.count(legend) == 3  # verdicts, refuted claims, errors
     assert text.count("(⋆ in tables)") == 1  # the figure of accuracy
-    assert "or for small QPs from a proven optimum" in text
+    assert "or, for small QPs, on a proven optimum" in text
 
     page = compose(evidence(records[:2]))
     assert "⋆" not in markdown(page)
@@ -195,13 +195,13 @@ def test_the_summary_names_who_misses_the_tolerance_and_where(measured, evidence
     ]
     found = evidence(records)
     assert sentences(found, "osqp") == [
-        "osqp: 1 of 3 cases claimed solved but inaccurate at tol 1e-8 (worst residual "
-        "4.0e-6, on beam-ring/size=20/dual); 1 of 3 cases ended at the time limit at "
-        "tol 1e-8 (on beam-ring/size=40/dual)."
+        "osqp: claimed success but was inaccurate on 1 of 3 cases at tol 1e-8 (worst "
+        "residual 4.0e-6; beam-ring/size=20/dual); reached the time limit on 1 of 3 "
+        "cases at tol 1e-8 (beam-ring/size=40/dual)."
     ]
     assert sentences(found, "good") == [
         "good: verified on all 2 cases at tol 1e-8; worst residual 2.0e-9; 1 verified "
-        "answer not claimed to be solved."
+        "answer without a claim of success."
     ]
     assert sentences(found, "shy") == ["shy: declined 1 case: has rows."]
     counts = {row["solver"].text: row for row in table(compose(found), "summary")}
@@ -215,7 +215,7 @@ def test_the_summary_names_who_misses_the_tolerance_and_where(measured, evidence
 def test_each_tolerance_has_a_sentence_of_its_own(measured, evidence):
     found = evidence([measured("a"), measured("a", tol=1e-4, verdict=Verdict.WRONG)])
     loose, tight = sentences(found, "a")
-    assert "wrong at tol 1e-4" in loose
+    assert "wrong on 1 of 1 case at tol 1e-4" in loose
     assert "verified on its only case at tol 1e-8" in tight
 
 

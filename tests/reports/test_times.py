@@ -53,8 +53,8 @@ def test_dualising_is_charged_to_dual_forms_only(record, section):
     _, charged = section(primal + dual, "times").tables
     (row,) = rows(charged)
     assert row["case"].text == "box/dual"
-    assert row["dualising"].value == pytest.approx(0.04)
-    assert row["dualising"].text.endswith("[1 run]")
+    assert row["dualisation"].value == pytest.approx(0.04)
+    assert row["dualisation"].text.endswith("[1 run]")
     assert row["a"].value == pytest.approx(0.05)
 
 
@@ -74,10 +74,10 @@ def test_a_null_arm_is_paired_with_its_solver(record, section, factor, held):
     ]
     found = section(plain + null, "precision")
     (row,) = rows(found.tables[0])
-    assert row["holds 1"].text == held
+    assert row["contains 1"].text == held
     assert row["ratio"].value == pytest.approx(factor, rel=0.01)
     assert row["blocks"].value == 5
-    assert re.search(r"Here [01] of 1 interval", found.prose[0])
+    assert re.search(r"here [01] of 1 interval", found.prose[0])
 
 
 def test_a_null_arm_does_not_win(record, section):
@@ -111,7 +111,7 @@ def test_the_drift_of_the_canary_is_that_of_the_machine(record, section):
 def test_one_canary_has_no_spread(record, section):
     first, *_ = rows(section([record(canary_seconds=1e-5)], "precision").tables[0])
 
-    assert (first["nine tenths"].text, first["nine tenths"].value) == ("–", None)
+    assert (first["central 90 %"].text, first["central 90 %"].value) == ("–", None)
     assert first["drift"].text == "–"
 
 

@@ -18,7 +18,7 @@ from mortarbench.harness.environment.environment import PACKAGES as OWN
 from mortarbench.harness.registry import options_of
 from mortarbench.problems.families.beam_ring import BeamRing
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.adapters.cvxpy_ import REFUSED
+from mortarbench.solvers.adapters.cvxpy_ import DECLINED_BACKENDS
 from mortarbench.solvers.common.conversion import csc, on_present_bounds
 from mortarbench.solvers.common.libraries import PACKAGES
 from mortarbench.solvers.common.sequence import only_vectors_differ
@@ -100,7 +100,7 @@ def test_accuracy_does_not_depend_on_the_units(manufactured, name, energy, lengt
         b=qp.b * length, h=qp.h * length, lb=qp.lb * length, ub=qp.ub * length,
     )  # fmt: skip
     solution = solve(name, scaled, tol=1e-6)
-    if name == "highs" and length != 1:  # a known limit, in docs/solvers.md
+    if name == "highs" and length != 1:  # in docs/solvers-libraries.md
         assert solution.message == "kSolveError"
         return
     assert solution.status is Status.SOLVED
@@ -203,7 +203,7 @@ def test_the_backends_that_decline_are_those_not_installed(manufactured, wildcar
     }
 
     able = {b for b, reason in reasons.items() if not reason}
-    assert able == set(installed) - REFUSED.keys()
+    assert able == set(installed) - DECLINED_BACKENDS.keys()
     lacking = [r for b, r in reasons.items() if b not in installed]
     assert all(r.startswith("not installed: ") for r in lacking)
 
@@ -278,7 +278,7 @@ def test_a_vector_update_costs_a_sequence_fewer_iterations(manufactured):
         assert warm < SOLVERS[name].prepare(moved, 1e-6)().iterations <= 2 * first
 
 
-@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse"])
+@pytest.mark.parametrize("name", ["osqp", "scs", "qpalm", "proxqp-sparse", "qtqp"])
 def test_a_rebuilt_session_starts_where_the_last_one_ended(manufactured, name):
     qp, _ = manufactured("everything", n=40)
     other = replace(qp, P=qp.P * (1 + 1e-9))  # as good as the same, but no update

@@ -1,4 +1,4 @@
-"""Plug-ins and data of the tests, and where they lie."""
+"""Plug-ins and data of the tests, and their paths."""
 
 from pathlib import Path
 

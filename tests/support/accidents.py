@@ -1,7 +1,7 @@
-"""A plug-in: solvers that disturb a run, and an honest one that looks around.
+"""Plug-in with solvers that disturb a run, and one that detects disturbances.
 
-They solve `tiny` of adversaries.py, rightly, but for what they do besides. `witness`
-fails where a process of another solver runs while it solves.
+They solve `tiny` of adversaries.py correctly, apart from their side effects. `witness`
+fails if a process of another solver runs while it solves.
 
 Run as a program with the name of a solver and two file descriptors, it is a worker.
 """
@@ -31,7 +31,7 @@ from mortarbench.harness.processes.worker import serve
 
 
 def processes(of_run):
-    """List the processes that a run has started, directly or not.
+    """List the processes that a run has started, directly or indirectly.
 
     of_run : value of the variable WATCHED in their environment
     """
@@ -43,7 +43,7 @@ def processes(of_run):
 
 
 class Witness(Honest):
-    """Fails where a foreign process could run: not stopped, and no sub-reaper."""
+    """Fails if another process can run that is neither stopped nor a sub-reaper."""
 
     def act(self, qp):
         mine = {os.getppid(), *descendants(os.getppid())}
@@ -60,7 +60,7 @@ class Witness(Honest):
 
 
 def reply_pipe():
-    """Find where this worker replies: the pipes that it may write to."""
+    """Return the pipes to which this worker may write its replies."""
     for name in os.listdir("/proc/self/fd"):
         fd = int(name)
         try:
@@ -72,7 +72,7 @@ def reply_pipe():
 
 
 class WritesNoise(Honest):
-    """Mistakes the file descriptor of the replies for its own."""
+    """Writes to the file descriptor of the replies by mistake."""
 
     def act(self, qp):
         for fd in reply_pipe():
@@ -81,7 +81,7 @@ class WritesNoise(Honest):
 
 
 class WritesEndlessly(Honest):
-    """Megabytes without an end of line."""
+    """Writes megabytes without an end of line."""
 
     def act(self, qp):
         (fd,) = reply_pipe()
@@ -104,7 +104,7 @@ class Daemon(Honest):
 
 
 class ExecutedDaemon(Honest):
-    """Another program, that has closed all it inherited."""
+    """Starts another program that has closed all inherited descriptors."""
 
     def act(self, qp):
         code = "import os\nif os.fork() == 0:\n  os.setsid()\n  while True: pass"
@@ -113,7 +113,7 @@ class ExecutedDaemon(Honest):
 
 
 class ForkBomb(Honest):
-    """Processes that replace each other faster than one can kill them one by one."""
+    """Starts processes that replace each other faster than single kills."""
 
     def act(self, qp):
         if os.fork() == 0:
@@ -151,7 +151,7 @@ class Pools(Honest):
 
 
 class HoardsInShm(Honest):
-    """600 MiB in /dev/shm, left there."""
+    """Leaves 600 MiB in /dev/shm."""
 
     def act(self, qp):
         with open(f"/dev/shm/{os.environ['WATCHED']}-{os.getpid()}", "wb") as file:
@@ -162,7 +162,7 @@ class HoardsInShm(Honest):
 
 
 class SharesPages(Honest):
-    """150 MiB that four processes share: 600 if each were counted."""
+    """Uses 150 MiB that four processes share: 600 MiB if each were counted."""
 
     def act(self, qp):
         hoard = np.ones(150 * 2**17)
@@ -180,7 +180,7 @@ class SharesPages(Honest):
 
 
 class HoardsInADaemon(Honest):
-    """600 MiB in a process that has left the session."""
+    """Uses 600 MiB in a process that has left the session."""
 
     def act(self, qp):
         hoarded, tells = os.pipe()
@@ -206,7 +206,7 @@ def spin(seconds):
 
 
 class Computes(Honest):
-    """Takes some milliseconds of arithmetic, as an honest solver does."""
+    """Computes for some milliseconds, like an honest solver."""
 
     def act(self, qp):
         matrix, vector = np.ones((200, 200)), np.ones(200)
@@ -216,7 +216,7 @@ class Computes(Honest):
 
 
 class PatchesTheClock(Honest):
-    """2 ms of work under a library that replaces the clock, as some tests do."""
+    """Works for 2 ms under a library that replaces the clock, as some tests do."""
 
     def act(self, qp):
         from mortarbench.harness.verify import measure
@@ -227,7 +227,7 @@ class PatchesTheClock(Honest):
 
 
 class Remembers(Honest):
-    """16 ms at first; then it knows the answer, in this and other measurements."""
+    """Works for 16 ms at first, then returns a cached answer, in all measurements."""
 
     known: ClassVar[dict] = {}
 
@@ -240,7 +240,7 @@ class Remembers(Honest):
 
 
 class WorksInDeclines(Honest):
-    """20 ms where it is only asked whether it would."""
+    """Works for 20 ms in `declines`."""
 
     def declines(self, qp):
         if qp.q[0] == -4.0:
@@ -253,7 +253,7 @@ class StopsItself(Honest):
 
 
 class KillsItself(Honest):
-    """As if somebody else did, when one has had a look at its memory."""
+    """Ends by SIGKILL, after the supervisor has polled its memory."""
 
     def act(self, qp):
         time.sleep(0.2)
@@ -261,7 +261,7 @@ class KillsItself(Honest):
 
 
 class KilledOnceWarmingUp(Honest):
-    """By what looks like somebody else; knows by $KILLED that it has been."""
+    """Ends once by SIGKILL in the warm-up; the file $KILLED records that."""
 
     def prepare(self, qp, tol):
         killed = Path(os.environ["KILLED"])
@@ -278,7 +278,7 @@ class ClosesAll(Honest):
 
 
 def unsolved(qp):
-    """There is no reference solve here: residuals decide."""
+    """Raise: there is no reference solver here, so residuals decide."""
     raise ArithmeticError("no reference solve")
 
 

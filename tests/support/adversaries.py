@@ -1,4 +1,4 @@
-"""A plug-in: a family of tiny QPs, one honest solver, and solvers that misbehave.
+"""Plug-in with a family of tiny QPs, an honest solver, and misbehaving ones.
 
     min x₁² + ½x₂² − 4x₁ + 3x₂   s.t.   x₁ ≤ h,  x ≥ 0
 
@@ -75,7 +75,7 @@ class Tiny:
 
 @dataclass(frozen=True)
 class Sized:
-    """min ½|x|² + qᵀx over x ≥ 0 with q > 0, of any size: x = 0."""
+    """QPs  min ½|x|² + qᵀx, x ≥ 0  of any size with q > 0; the solution is x = 0."""
 
     name: str = "sized"
     forms: tuple[str, ...] = ("plain",)
@@ -94,7 +94,7 @@ class Sized:
 
 
 def at_the_row(qp):
-    """The point with x₁ = h and no other residual than, for h > 2, the sign of z."""
+    """Return the point with x₁ = h; its only residual, for h > 2, is the sign of z."""
     h = qp.h[0]
     return Solution(
         status=Status.SOLVED, x=np.array([h, 0.0]), y=np.zeros(0),
@@ -137,7 +137,7 @@ class Dies(Honest):
 
 
 class DiesLater(Honest):
-    """Answers, and ends the process a moment afterwards."""
+    """Returns an answer, and ends the process a moment later."""
 
     def act(self, qp):
         Timer(0.3, os._exit, [7]).start()
@@ -183,14 +183,14 @@ class PrintsEndlessly(Honest):
 
 
 class AsksForTheMoon(Honest):
-    """One allocation beyond all memory, that the library refuses."""
+    """Requests more memory than the machine has, by one allocation."""
 
     def act(self, qp):
         np.ones(2**40)
 
 
 class AbortsForMemory(Honest):
-    """As Rust and C++ end when an allocation fails."""
+    """Aborts like programs in Rust and C++ when an allocation fails."""
 
     def act(self, qp):
         print("memory allocation of 64 bytes failed", file=sys.stderr, flush=True)
@@ -198,7 +198,7 @@ class AbortsForMemory(Honest):
 
 
 class SpikesUnseen(Honest):
-    """Answers, after more memory than allowed for a shorter time than one looks."""
+    """Exceeds the memory limit for less time than between two polls, then answers."""
 
     def act(self, qp):
         np.ones(2**26)  # 512 MiB
@@ -206,7 +206,7 @@ class SpikesUnseen(Honest):
 
 
 class ForksAHoarder(Honest):
-    """Leaves the hoarding to a child."""
+    """Exceeds the memory limit in a child process."""
 
     def act(self, qp):
         if os.fork() == 0:
@@ -215,7 +215,7 @@ class ForksAHoarder(Honest):
 
 
 class WrongSign(Honest):
-    """A multiplier that pulls where the row can only push; primal and gap are zero."""
+    """Returns a multiplier of the wrong sign; primal residual and gap are zero."""
 
     def act(self, qp):
         s = at_the_row(qp)
@@ -223,7 +223,7 @@ class WrongSign(Honest):
 
 
 class AnswersAnotherProblem(Honest):
-    """Gives the first problem's answer to all."""
+    """Returns the answer to the first problem for all problems."""
 
     first = None
 
@@ -234,7 +234,7 @@ class AnswersAnotherProblem(Honest):
 
 
 class Sleeps(Honest):
-    """Takes 20 ms."""
+    """Sleeps for 20 ms."""
 
     def act(self, qp):
         time.sleep(0.02)
@@ -242,7 +242,7 @@ class Sleeps(Honest):
 
 
 class Products(Honest):
-    """Takes some milliseconds of arithmetic."""
+    """Computes for some milliseconds."""
 
     def act(self, qp):
         matrix, vector = np.ones((200, 200)), np.ones(200)
@@ -255,9 +255,9 @@ class Products(Honest):
 class SleepsByPower(Honest):
     """Sleeps 0.02·(n/10)^1.5 s on the QPs of `Sized`, now 1 % more, now 1 % less.
 
-    More at the ends and less between: a scatter that has no slope. Its worker's clock
-    counts what it has asked to sleep and nothing else, so that a busy machine, on which
-    it sleeps longer, adds no scatter of its own.
+    More at the ends and less between, so that the scatter has no slope. The clock of
+    its worker counts only the requested time, so that a busy machine, on which sleeps
+    take longer, adds no scatter.
     """
 
     clock: ClassVar[list[float]] = [0.0]
@@ -282,7 +282,7 @@ class SleepsByPower(Honest):
 
 @dataclass(frozen=True)
 class Chains(Honest):
-    """Tells by its iterations how many QPs of a sequence it has seen."""
+    """Reports as its iterations the number of QPs of a sequence so far."""
 
     def chain(self, tol):
         seen = []
@@ -295,7 +295,7 @@ class Chains(Honest):
 
 
 class Tightens(Chains):
-    """Tells the tolerance of each QP of a sequence, too."""
+    """Reports also the tolerance of each QP of a sequence."""
 
     def tightening(self):
         prepare = self.chain(0.0)
@@ -337,12 +337,12 @@ class Forks(Honest):
 
 
 def above(process):
-    """The parent of a process."""
+    """Return the parent of a process."""
     return int(Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1])
 
 
 class ReturnsTwice(Honest):
-    """Lets a child return first; tells whose grandchild it is that returned."""
+    """Lets a child return first; reports the grandparent of the one that returns."""
 
     def act(self, qp):
         if os.fork() != 0:
@@ -378,7 +378,7 @@ class Mutates(Honest):
 
 
 class MutatesByForce(Honest):
-    """Answers rightly the QP that it was given, then spoils it."""
+    """Returns the correct answer, then changes the arrays of the QP."""
 
     def act(self, qp):
         answer = at_the_row(qp)
@@ -389,7 +389,7 @@ class MutatesByForce(Honest):
 
 
 class Warm(Honest):
-    """Needs fewer iterations when what it prepared is solved again."""
+    """Needs fewer iterations when a prepared QP is solved again."""
 
     def prepare(self, qp, tol):
         iterations = iter([9, 1, 1])
@@ -407,7 +407,7 @@ class Lacks(Honest):
 
 
 class NumpyScalars(Honest):
-    """Returns what compares equal to plain numbers but is no JSON."""
+    """Returns numpy scalars, which equal plain numbers but are not JSON."""
 
     def act(self, qp):
         return replace(
@@ -417,7 +417,7 @@ class NumpyScalars(Honest):
 
 
 def unsolved(qp):
-    """There is no reference solve here: residuals decide."""
+    """Raise: there is no reference solver here, so residuals decide."""
     raise ArithmeticError("no reference solve")
 
 

@@ -1,4 +1,4 @@
-"""Bounds of time and memory on code under test: it must neither hang nor swell."""
+"""Limits of time and memory for code under test."""
 
 import re
 import resource
@@ -10,14 +10,14 @@ _SPARE = 4 * 2**30  #: bytes of address space; allocators reserve more than they
 
 
 class HangError(BaseException):
-    """No exception that a reader could catch."""
+    """Timeout; a BaseException, which readers do not catch."""
 
 
 @contextmanager
 def bounded(seconds=300, mib=1024):
     """Raise `HangError` after `seconds`; assert that at most `mib` more were resident.
 
-    The kernel refuses address space far above that, lest a test stops the machine.
+    Address space is limited far above that, so that a test cannot stop the machine.
     """
 
     def ring(*_):
@@ -40,7 +40,7 @@ def bounded(seconds=300, mib=1024):
 
 
 def _status():
-    """Return what is resident, and the most that was, KiB."""
+    """Return the resident memory and its peak, in KiB."""
     text = Path("/proc/self/status").read_text()
     return [int(re.search(rf"{name}:\s+(\d+)", text)[1]) for name in ("VmRSS", "VmHWM")]
 

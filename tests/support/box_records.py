@@ -1,10 +1,10 @@
-"""Records of a family "box" that there is not, for reports."""
+"""Records of a fictitious family "box", for tests of reports."""
 
 from mortarbench.harness import Record, Verdict
 
 
 def box_record(solver, case, seconds=0.01, repeat=0, **changes):
-    """Make the record of a verified answer, but for the changes.
+    """Return the record of a verified answer, with changes.
 
     case : n of the box, which has 100·(n + 1) dofs
     """

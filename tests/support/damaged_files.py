@@ -1,4 +1,4 @@
-"""Damaged data files, at random from a seed: what readers must refuse or read."""
+"""Randomly damaged data files, which readers must refuse or read."""
 
 import io
 import json
@@ -54,7 +54,7 @@ ENDATA
 
 
 def tiny_qp(dense=False):
-    """A QP with every kind of constraint."""
+    """Return a QP with every kind of constraint."""
     rng = np.random.default_rng(7)
     P = random_array((6, 6), density=0.4, rng=rng)
     P = csc_array(P @ P.T + 2 * np.eye(6))
@@ -66,7 +66,7 @@ def tiny_qp(dense=False):
 
 
 def seeds(folder):
-    """Whole files of every kind, by the ending of their names."""
+    """Return intact files of every kind, by the ending of their names."""
     qp, meta = tiny_qp(), {"name": "tiny", "scale": 2.0, "constant": 1.0}
     found = {kind: [] for kind in ("npz", "mat", "parquet", "qps", "msh")}
 
@@ -96,7 +96,7 @@ def seeds(folder):
 
 
 def repacked(path, compression):
-    """Write the Parquet file that is there once more, compressed otherwise."""
+    """Return a Parquet file with another compression."""
     pq.write_table(pq.ParquetFile(path).read(), path, compression=compression)
 
 
@@ -126,7 +126,7 @@ $EndElements
 
 
 def meshes(folder):
-    """The same, as meshio writes it in format 4.1, as text and binary."""
+    """Return the same mesh in format 4.1, as text and binary, written by meshio."""
     import meshio
 
     (folder / "text.msh").write_bytes(msh_22())
@@ -189,20 +189,20 @@ def truncated(rng, data, at, others):
 
 
 def spliced(rng, data, at, others):
-    """Put in a piece of another file."""
+    """Insert a piece of another file."""
     other = others[rng.integers(0, len(others))]
     start = int(rng.integers(0, len(other)))
     return over(data, at, other[start : start + int(rng.integers(1, 200))])
 
 
 def numbered(rng, data, at, others):
-    """Write an extreme integer, as heads have them."""
+    """Overwrite with an extreme integer, in a format of file headers."""
     value = EXTREMES[rng.integers(0, len(EXTREMES))] % 2**64
     return over(data, at, struct.pack("<Q", value)[: (2, 4, 8)[rng.integers(0, 3)]])
 
 
 def worded(rng, data, at, others):
-    """Write an odd word, or put it in."""
+    """Overwrite with, or insert, an unusual word."""
     word = WORDS[rng.integers(0, len(WORDS))]
     return over(data, at, word) if rng.random() < 0.5 else data[:at] + word + data[at:]
 
@@ -220,12 +220,12 @@ def doubled(rng, data, at, others):
 
 
 def shortened(rng, data, at, others):
-    """Leave out some bytes."""
+    """Delete some bytes."""
     return data[:at] + data[at + int(rng.integers(1, 40)) :]
 
 
 def over(data, at, piece):
-    """Write `piece` over what is there."""
+    """Overwrite with `piece` at a position."""
     return data[:at] + piece + data[at + len(piece) :]
 
 
@@ -269,7 +269,7 @@ def read(path):
 
 
 def fuzz(kind, count, seed, folder, seconds):
-    """Read `count` damaged files of a kind; count those that were read all the same."""
+    """Read `count` damaged files of a kind; return how many were accepted."""
     rng = np.random.default_rng(seed)
     whole = seeds(folder)[kind]
     path = folder / f"damaged.{kind}"

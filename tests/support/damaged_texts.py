@@ -1,4 +1,4 @@
-"""Texts damaged at random from a seed: what readers must take or refuse in a line."""
+"""Randomly damaged texts, which readers must accept or refuse in one line."""
 
 import json
 from copy import deepcopy
@@ -39,7 +39,7 @@ def damaged(text, random):
 
 
 def distorted(data, random):
-    """Put another value somewhere into nested plain data; returns a copy."""
+    """Return a copy of nested plain data with one value replaced."""
     data = json.loads(json.dumps(data))
     for _ in range(random.choice((1, 1, 2, 5))):
         at = data

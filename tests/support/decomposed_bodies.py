@@ -1,4 +1,4 @@
-"""Bodies in the subdomains that cells are labelled with, for tests."""
+"""Bodies decomposed into subdomains by labels of their cells, for tests."""
 
 from dataclasses import replace
 from importlib import import_module
@@ -25,26 +25,28 @@ from mortarbench.problems.feti.subdomains import (
     DecomposedProblem,
     on_one_process,
 )
-from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
+from mortarbench.problems.models.beam_ring import bodies as spectrum_of_beam_ring
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
 
 
-def labelled_subdivision(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
-    """Know the bodies by the labels (E,) of their cells; all nodes are listed."""
+def labelled(bodies: Bodies, label: NDArray[np.int64]) -> Subdivision:
+    """Return bodies with labels (E,) of their cells; all nodes are listed."""
     every = np.arange(len(bodies.mesh.points))
     return mesh_in_subdomains(bodies.mesh, label, bodies.body, every)
 
 
-def torn_by(
+def decompose_by_labels(
     bodies: Bodies,
     layout: Subdivision,
     primal: QP,
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> DecomposedBodies:
-    """Tear bodies with a QP of theirs, with friction."""
-    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).decomposed
+    """Decompose bodies with their QP, with friction."""
+    return on_one_process(
+        parts_by(bodies, layout, primal, friction, rows)
+    ).decomposed_bodies
 
 
 def parts_by(
@@ -54,7 +56,7 @@ def parts_by(
     friction: Friction = NO_FRICTION,
     rows: str = "orthonormal",
 ) -> DecomposedProblem:
-    """Pose a QP of the bodies, with friction, on their subdomains."""
+    """Return the QP of the bodies, with friction, on their subdomains."""
     of = elastic_bodies_of(replace(bodies, f=-primal.q))
     (stage,) = load_steps(1, 1, of.forces, of.fixed)
     contact = Contact(*contact_rows(primal, friction), friction.bound)
@@ -62,11 +64,11 @@ def parts_by(
 
 
 def parts_of(name: str) -> DecomposedProblem:
-    """Describe the dual of a case; what comes before it is solved."""
+    """Describe the dual of a case; its earlier load steps are solved."""
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
-            case.family.stated(case.params),
+            case.family.elastic_bodies_of(case.params),
             qp_choice("dual", case.params),
         )
         path = monolithic_path(problem, reference_solution)
@@ -80,17 +82,17 @@ def parts_of(name: str) -> DecomposedProblem:
     return found
 
 
-def torn_pair(
+def decomposed_pair(
     rows: str = "orthonormal", most: int = 2
 ) -> tuple[Bodies, Any, DecomposedBodies]:
-    """Bodies of 32 × 4 and 36 × 6 cells, their QP, and both in subdomains."""
+    """Return bodies of 32 × 4 and 36 × 6 cells with their QP, and both decomposed."""
     geometry = (4, 3, 6, "strain")
     bodies = model(*geometry)
     contact = linearisation(bodies, "mortar", "dual")(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, contact)
-    label = of_beam_ring(*geometry).shape.layout(most).label
+    label = spectrum_of_beam_ring(*geometry).shape.layout(most).label
     return (
         bodies,
         primal,
-        torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows),
+        decompose_by_labels(bodies, labelled(bodies, label), primal, rows=rows),
     )

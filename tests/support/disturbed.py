@@ -1,4 +1,4 @@
-"""Answers that are disturbed at random, to try certificates with."""
+"""Random disturbances of answers, to test certificates."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ def wrong_rows(s: Solution, size: float, rng: np.random.Generator) -> Solution:
 
 
 def infeasible(s: Solution, size: float, rng: np.random.Generator) -> Solution:
-    """Push bodies into each other, move what is held, and let contact pull."""
+    """Add penetration, displaced supports and tensile contact forces."""
     x = s.x * (1 + 10 * size) + size * np.abs(s.x).max() * rng.random(s.x.size)
     return replace(
         s, x=x, z=s.z - size * np.abs(s.z).max(initial=0.0) * rng.random(s.z.size)
@@ -50,7 +50,7 @@ def relative_noise(s: Solution, size: float, rng: np.random.Generator) -> Soluti
 def moved_apart(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Move each body on its own, up to ten thousand times as far."""
+    """Move each body rigidly, by up to ten thousand times its displacement."""
     far = 10 ** rng.uniform(0, 4) * size * np.linalg.norm(s.x)
     R = mechanics.rigid
     return replace(s, x=s.x + R @ (far * rng.standard_normal(R.shape[1])))
@@ -59,7 +59,7 @@ def moved_apart(
 def bent(
     s: Solution, size: float, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Bend bodies in the way that costs least energy."""
+    """Bend bodies in their mode of least energy."""
     whole, x = mechanics.whole, s.x.astype(Real)
     v = whole.apply_inverse(
         whole.apply_inverse(rng.standard_normal(x.size).astype(Real))
@@ -74,7 +74,7 @@ DISTURBANCES = (noise, scaled, wrong_rows, infeasible, shifted)
 def disturbed(
     s: Solution, i: int, rng: np.random.Generator, mechanics: Mechanics
 ) -> Solution:
-    """Disturb an answer in the i-th way of all, in turn, by 1e-13 to twice its size."""
+    """Apply the i-th disturbance, in turn, of relative size 1e-13 to 2."""
     size = 10 ** rng.uniform(-13, 0.3)
     ways = len(DISTURBANCES) + 3
     match i % ways - len(DISTURBANCES):

@@ -1,11 +1,11 @@
-"""Ranks that die in a known order: one by itself, the others when they see that it did.
+"""Ranks that end in a known order: one by itself, the others when they notice that.
 
 ``dying_ranks.py COUNT TRIALS SEED SECONDS``: in each trial so many ranks are launched,
 of which one is killed, exits, or prints a line that could pass for one of ours and is
 killed. The others die at once when it has, or stay; some are killed together with what
 is above them. Prints the trials of which `launch` named another rank, as JSON.
 
-It loads nothing, so that a rank starts within milliseconds.
+It imports nothing, so that a rank starts within milliseconds.
 """
 
 import os
@@ -16,7 +16,7 @@ SIGKILL = 9
 
 
 def be_rank(first, way, count, follow, folder):
-    """Die first, or after that rank; ranks tell one another their numbers in files."""
+    """End first, or after that rank; ranks exchange process numbers by files."""
     rank = int(os.environ["PMI_RANK"])
     with open(f"{folder}/{rank}.new", "w") as file:
         file.write(str(os.getpid()))

@@ -1,7 +1,7 @@
-"""What tests/problems/feti/test_distributed_dual.py runs on several ranks; prints JSON.
+"""Program of tests/problems/feti/test_distributed_dual.py on ranks; prints JSON.
 
 Run as ``mpiexec -n N python -m mpi4py emitted_on_ranks.py CASE…``. The shares that
-ranks emit are put together here, and compared with the QP that one process emits.
+ranks emit are assembled and compared with the QP that one process emits.
 """
 
 import json
@@ -27,12 +27,12 @@ from tests.support.decomposed_bodies import parts_of
 
 
 def probe(n):
-    """Make a vector (n,) to multiply with."""
+    """Return a random vector (n,) to multiply with."""
     return np.random.default_rng(3).standard_normal(n)
 
 
 def told(name, ranks):
-    """Emit by all ranks; tell the first one what each has."""
+    """Emit on all ranks; gather a description of each share on the first."""
     case = parse(name, PROBLEMS)
     made = case.family.emission("dual", case.params)(ranks, reference_over_ranks)
     share = made.share().qp
@@ -72,7 +72,7 @@ def own_subdomains(name, ranks):
 
 
 def named(kind, touched):
-    """Name what the blocks of a kind depend on."""
+    """Return a name of the data that the blocks of a kind depend on."""
     return hex_digest((kind.K.data.tobytes(), touched.tobytes()))
 
 
@@ -92,7 +92,7 @@ def forming(act):
 
 
 def compared(name, everyone):
-    """Tell how far the shares are from the QP of one process, part by part."""
+    """Return the differences between the shares and the QP of one process."""
     qp = parse(name, PROBLEMS).build(reference_solution).qp
     whole = qp.P.build()
 
@@ -141,7 +141,7 @@ def compared(name, everyone):
 
 
 def _largest(M):
-    """Return the largest size of an entry; 0 where no subdomain floats."""
+    """Return the largest absolute entry; 0 if no subdomain is floating."""
     return float(abs(M).max()) if M.shape[0] else 0.0
 
 
@@ -151,7 +151,7 @@ def _off(found, known):
 
 
 def _bounds_off(found, known):
-    """Compare what is finite; infinite if that is not the same of both."""
+    """Return the difference of finite bounds; infinite if other ones are finite."""
     finite = np.isfinite(known)
     if not np.array_equal(found[~finite], known[~finite]):
         return float("inf")

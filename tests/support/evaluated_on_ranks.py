@@ -1,4 +1,4 @@
-"""What tests/harness/verify/test_over_ranks.py runs on several ranks; prints JSON.
+"""Program of tests/harness/verify/test_over_ranks.py on several ranks; prints JSON.
 
 Run as ``mpiexec -n N python -m mpi4py evaluated_on_ranks.py CASE…``.
 """
@@ -27,7 +27,7 @@ WRONG = ((1e-4, 1.0), (1e-6, 1.0), (1e-6, 1.01))
 
 
 def evaluated(name, ranks):
-    """Evaluate answers by all ranks; on the first, return the answers, too."""
+    """Evaluate answers on all ranks; the first also returns the answers."""
     case_id = parse(name, PROBLEMS)
     emit = case_id.family.emission(case_id.form, case_id.params)
     emitted = emit(ranks, reference_over_ranks)
@@ -50,7 +50,7 @@ def evaluated(name, ranks):
 
 
 def beside_one_process(name, found):
-    """Say of answers what one process that has built the case finds."""
+    """Add to answers their evaluation by one process that has built the case."""
     case = parse(name, PROBLEMS).build(reference_solution)
     for told, whole in found:
         one = {"objective": case.qp.objective(whole.x)}

@@ -1,4 +1,4 @@
-"""Feasibility of small QPs in rational arithmetic; QPs that make it hard to tell."""
+"""Feasibility of small QPs in rational arithmetic, and nearly infeasible QPs."""
 
 from fractions import Fraction
 
@@ -13,7 +13,7 @@ def is_feasible(qp, relaxed=0):
     With x = x⁺ − x⁻ and a slack for each inequality, phase one minimises the sum of
     artificial variables; the tableau holds fractions.
 
-    relaxed : by this part of themselves, right-hand sides and bounds give way
+    relaxed : relative relaxation of right-hand sides and bounds
     """
     n = qp.q.size
     A, G = (

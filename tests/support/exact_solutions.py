@@ -30,7 +30,7 @@ from mortarbench.harness.verify.active_set_refinement import (
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.held_by_contact import _eliminated, _loose, _substituted
+from tests.support.supported_by_contact import _eliminated, _loose, _substituted
 
 BITS = 500  #: after the binary point
 FINE = 330  #: bits, relative to the largest unknown, that refinement settles
@@ -79,7 +79,7 @@ class Rows:
 
 
 class UnsettledError(Exception):
-    """Why the stored problem has no exact solution here."""
+    """Failure to find an exact solution of the stored problem."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class ExactSolution:
         return R, _inverse(gram)
 
     def without_motion(self, v: Integers) -> Integers:
-        """Take the rigid motions out of v (n,)."""
+        """Return v (n,) without its rigid motions."""
         R, inverse = self._R
         along = [Fraction(sum(r * v)) for r in R.T]
         for r, row in zip(R.T, inverse, strict=True):
@@ -122,7 +122,7 @@ class ExactSolution:
 
     @cached_property
     def norm(self) -> float:
-        """‖u*‖."""
+        """Energy norm ‖u*‖."""
         return self.length(self.u)
 
     def answer(self) -> Solution:

@@ -1,6 +1,6 @@
-"""A plug-in: solvers that claim what is not so, two of them real ones, ill-used.
+"""Plug-in with solvers that make false claims, two of them real but misused.
 
-And two families without mechanics: a membrane, and  min ½(x + 1)²,  x ≤ 0.
+It has two families without mechanics: a membrane, and  min ½(x + 1)²,  x ≤ 0.
 """
 
 from dataclasses import dataclass, field, replace
@@ -55,7 +55,7 @@ class Exact(Any):
 
 @dataclass(frozen=True)
 class Stale(Any):
-    """Gives the answer to the QP before, where that has the shape of the new one."""
+    """Returns the answer to the previous QP of the same shape."""
 
     def prepare(self, qp, tol):
         def solve():
@@ -68,7 +68,7 @@ class Stale(Any):
 
 @dataclass(frozen=True)
 class Pulls(Any):
-    """A multiplier of the wrong sign, on a row or bound that it leaves open."""
+    """Returns a multiplier of the wrong sign, on a row or bound that is not active."""
 
     def prepare(self, qp, tol):
         def solve():
@@ -85,7 +85,7 @@ class Pulls(Any):
 
 @dataclass(frozen=True)
 class AtTheRow(Any):
-    """Stays at x = 0, held there by a multiplier that pulls."""
+    """Returns x = 0 with a multiplier of the wrong sign that balances the gradient."""
 
     def prepare(self, qp, tol):
         none = dict(y=np.zeros(0), z_box=np.zeros(1))
@@ -96,7 +96,7 @@ class AtTheRow(Any):
 
 @dataclass(frozen=True)
 class Denies(Any):
-    """Says that there is no solution."""
+    """Claims that the QP is infeasible."""
 
     def prepare(self, qp, tol):
         return lambda: Solution.without_point(qp, Status.INFEASIBLE)
@@ -104,7 +104,7 @@ class Denies(Any):
 
 @dataclass(frozen=True)
 class UncheckedProxQP(Any):
-    """ProxQP as it comes: without the test of the duality gap."""
+    """ProxQP with its defaults, without the test of the duality gap."""
 
     def prepare(self, qp, tol):
         from proxsuite import proxqp
@@ -130,7 +130,7 @@ class UncheckedProxQP(Any):
 
 @dataclass(frozen=True)
 class BareHiGHS(Any):
-    """HiGHS as it comes, on a QP with bounds only."""
+    """HiGHS with its defaults, on a QP with bounds only."""
 
     def prepare(self, qp, tol):
         import highspy

@@ -4,7 +4,7 @@ Run as ``mpiexec -n N python -m mpi4py fooled_on_ranks.py COUNT CASE…``. The t
 the reference point of the whole, which the first rank builds. Every other trial
 disturbs the answer that came nearest to its bound so far.
 
-Without cases, it tells why ranks, and one process, refuse loads that nothing balances.
+Without cases, it prints why ranks, and one process, refuse loads without equilibrium.
 """
 
 import json
@@ -27,7 +27,7 @@ from mortarbench.problems.feti.distributed_dual import distributed_qp, dual_on
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.decomposed_bodies import parts_of
 from tests.support.disturbed import DISTURBANCES
-from tests.support.held_by_contact import disc_between_plates, disc_in_parts
+from tests.support.supported_by_contact import disc_between_plates, disc_in_parts
 
 #: of a disc between plates: what holds it but contact, and where all of it is
 DISCS = {
@@ -39,7 +39,7 @@ NOISE = 1e-7  #: relative error from which on effectivities are measured
 
 
 class KnownSolution(NamedTuple):
-    """The solution of the whole to rounding; on every rank."""
+    """Solution of the undivided problem up to rounding, on every rank."""
 
     u: np.ndarray  #: (n,) extended
     multipliers: np.ndarray  #: (m,) of contact and friction rows
@@ -49,7 +49,7 @@ class KnownSolution(NamedTuple):
 
 
 def posed(name):
-    """Return the problem in parts, and what builds the whole."""
+    """Return the problem in subdomains, and a function that builds it undivided."""
     if name in DISCS:
         keys = DISCS[name]
         return disc_in_parts(**keys), lambda: disc_between_plates(**keys)
@@ -58,7 +58,7 @@ def posed(name):
 
 
 def true(build, ranks):
-    """Solve the whole on the first rank; its mechanics stay there."""
+    """Solve the undivided problem on the first rank, which keeps its mechanics."""
     mechanics, told = None, None
     if ranks.rank == 0:
         mechanics = build().mechanics.whole
@@ -71,13 +71,13 @@ def true(build, ranks):
 
 
 def drifted(s, size, rng, rigid):
-    """Move each body on its own, up to a million times as far as it is displaced."""
+    """Move each body rigidly, by up to a million times its displacement."""
     far = 10 ** rng.uniform(0, 6) * size * np.linalg.norm(s.x)
     return replace(s, x=s.x + rigid @ (far * rng.standard_normal(rigid.shape[1])))
 
 
 def pressed(s, size, rng, rigid):
-    """Press on one row alone, which nothing balances."""
+    """Add a force on one row, which is not in equilibrium."""
     z = s.z.copy()
     if z.size:
         z[rng.integers(z.size)] += size * np.abs(z).max() * rng.standard_normal()
@@ -85,7 +85,7 @@ def pressed(s, size, rng, rigid):
 
 
 def jumped(s, size, rng, rigid):
-    """Be wrong on one stretch of nodes, as a rank is that has lost its data."""
+    """Disturb a range of nodes, as if a rank had lost its data."""
     x, (begin, end) = s.x.copy(), sorted(rng.integers(s.x.size, size=2))
     x[begin:end] += size * np.abs(s.x).max() * rng.choice([-1, 1])
     return replace(s, x=x)
@@ -100,7 +100,7 @@ def disturbed(s, rng, rigid):
 
 
 class BoundSearch:
-    """Certificates of answers to one problem, beside their errors."""
+    """Comparison of certificates of answers to one problem with their errors."""
 
     def __init__(self, name, ranks):
         problem, build = posed(name)
@@ -109,7 +109,7 @@ class BoundSearch:
         self.own = problem_of(problem, ranks)
 
     def errors(self, found, claimed):
-        """Tell all ranks ‖û − u*‖, that of the answer, of the pair, and if û is in."""
+        """Return errors of û, answer and pair, and if û is admissible, on all ranks."""
         own, truth = self.own, self.truth
         told = self.ranks.comm.gather((own.components, found.u))
         still = None
@@ -128,7 +128,7 @@ class BoundSearch:
         return of_u, of_answer, float(np.hypot(of_u, np.sqrt(max(torn, 0)))), inside
 
     def tried(self, s):
-        """Certify an answer; returns a fault or "", and the error over its bound."""
+        """Certify an answer; return a fault or "", and the error over its bound."""
         slack = self.truth.slack
         try:
             found = certify_over_ranks(self.own, s.x[self.own.components], s.z)
@@ -144,7 +144,7 @@ class BoundSearch:
         return fault, max(of_answer, of_pair) / found.error
 
     def result(self, count):
-        """Try so many answers; tell faults, and bounds over errors."""
+        """Certify `count` answers; return faults, and bounds over errors."""
         rng = np.random.default_rng(sum(map(ord, self.name)))
         start = Solution(
             status=Status.SOLVED, x=self.truth.u.astype(float), y=np.zeros(0),
@@ -167,7 +167,7 @@ class BoundSearch:
 
 
 def problem_of(problem, ranks):
-    """Emit a problem; return what this rank has of its bodies."""
+    """Emit a problem; return the local bodies of this rank."""
     share = distributed_qp(dual_on(problem, ranks), None)
     qp = share.share().qp
     nothing = Solution(
@@ -177,7 +177,7 @@ def problem_of(problem, ranks):
 
 
 def refused(ranks, sign, **keys):
-    """Say why an answer is refused under another load: by ranks, by one process."""
+    """Return the reasons, of ranks and of one process, to refuse another load."""
     problem = disc_in_parts(**keys)
     own = problem_of(replace(problem, load=lambda at: sign * problem.load(at)), ranks)
     m = disc_between_plates(**keys).mechanics
@@ -194,7 +194,7 @@ def refused(ranks, sign, **keys):
 
 
 def why(certificate):
-    """Say why there is no certificate; or that there is one."""
+    """Return the reason why there is no certificate, or the bound of one."""
     try:
         return f"bound {certificate().bound}"
     except UncertifiableError as e:

@@ -1,7 +1,7 @@
-"""Starts the processes of runs as forks of one interpreter that has loaded libraries.
+"""Server that starts the processes of runs as forks with libraries loaded.
 
-An interpreter of its own takes each worker half a second of CPU time for imports, more
-than most tests have it do. What `Server.popen` gives in its place is a process like any
+A new interpreter needs half a second of CPU time for imports, more than the work of
+most tests. What `Server.popen` gives in its place is a process like any
 other: it has its own memory, signals and exit code, its files, environment and limits
 are those that it is started with, the sub-reaper above it is the one of
 `harness.processes.reaper`, and that one's parent is the process that asked. Its command
@@ -63,7 +63,7 @@ INSTALL = (
 
 
 class Forks:
-    """Stands for the module `subprocess` in `harness.processes.supervisor`."""
+    """Replacement of the module `subprocess` in `harness.processes.supervisor`."""
 
     PIPE = subprocess.PIPE
     TimeoutExpired = subprocess.TimeoutExpired
@@ -74,7 +74,7 @@ class Forks:
         self._lock = Lock()
 
     def Popen(self, args, **how):
-        """Start a worker below its sub-reaper, and all else as it is."""
+        """Start a worker below its sub-reaper; start other programs normally."""
         own = [sys.executable, "-I", "-S", reaper.__file__]
         if args[:4] != own or args[7:9] != [sys.executable, "-P"] or args[9] == "-c":
             return subprocess.Popen(args, **how)
@@ -84,7 +84,7 @@ class Forks:
     def dask(self, arguments, env, serves):
         """Start ``python -m dask``; silent, and with input from nowhere.
 
-        serves : whether workers that it starts are forks, too
+        serves : True if workers that it starts are forks as well
         """
         request = {
             "program": [sys.executable, "-P", "-m", "dask", *arguments],
@@ -105,7 +105,7 @@ class Forks:
 
 
 class Server:
-    """The parent's side of a process that has loaded some modules."""
+    """Parent's side of a process that has loaded some modules."""
 
     def __init__(self, ours, process):
         self._ours = ours
@@ -136,7 +136,7 @@ class Server:
         self._process.wait()
 
     def start(self, request, fds):
-        """Have a process forked, and be its parent; returns its number."""
+        """Request a fork, adopt it, and return its process number."""
         request |= {
             "cwd": os.getcwd(),
             "cpus": sorted(os.sched_getaffinity(0)),
@@ -151,7 +151,7 @@ class Server:
 
 
 class Program:
-    """What is used of a `subprocess.Popen`."""
+    """The used part of `subprocess.Popen`."""
 
     def __init__(self, pid):
         self.pid = pid
@@ -196,12 +196,12 @@ class Forked(Program):
 
 
 def adopt(orphans):
-    """Become the parent of orphaned descendants, or no longer."""
+    """Adopt orphaned descendants from now on, or stop doing so."""
     CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, int(orphans), 0, 0, 0)
 
 
 def serve(asked):
-    """Fork a process for each request, and leave it to the one that asked."""
+    """Fork a process for each request, as an orphan that the requester adopts."""
     while True:
         message, fds, _, _ = socket.recv_fds(asked, LONGEST, 5)
         if not message:
@@ -226,7 +226,7 @@ def serve(asked):
 
 
 def become(request, fds):
-    """Be the program that was asked for, or the sub-reaper above it."""
+    """Run the requested program, or the sub-reaper above it."""
     os.setsid()
     os.chdir(request["cwd"])
     os.environ.clear()
@@ -252,7 +252,7 @@ def become(request, fds):
 
 
 def show(field, texts):
-    """Have /proc tell of this process what it would after execve(2)."""
+    """Set the entries of this process in /proc as execve(2) would."""
     stat = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     start, end = map(int, stat[field - 3 : field - 1])
     block = b"".join(os.fsencode(text) + b"\0" for text in texts)
@@ -262,7 +262,7 @@ def show(field, texts):
 
 
 def run(_, command):
-    """Do what python does with ``-P FILE ARGUMENT…`` or ``-P -m MODULE ARGUMENT…``."""
+    """Run a command line ``-P FILE ARGUMENT…`` or ``-P -m MODULE ARGUMENT…``."""
     show(ARGUMENTS, command)
     sys.argv = command[2:]
     try:
@@ -281,7 +281,7 @@ def run(_, command):
 
 
 def run_file(path):
-    """Be the program in a file, as `runpy.run_path` makes it, compiled once."""
+    """Run the program in a file like `runpy.run_path`, compiling it once."""
     main = ModuleType("__main__")
     main.__file__, main.__cached__ = path, None
     sys.modules["__main__"] = main
@@ -289,7 +289,7 @@ def run_file(path):
 
 
 def code_of(path):
-    """Compile a file, unless that is as it was when it was last compiled."""
+    """Compile a file, unless it has not changed since it was last compiled."""
     status = os.stat(path)
     return compiled(path, status.st_mtime_ns, status.st_size, status.st_ino)
 
@@ -300,7 +300,7 @@ def compiled(path, *_):
 
 
 def end_well():
-    """End without taking apart what the libraries made, which would be copied first."""
+    """Exit without destructors, which would copy shared pages of the libraries."""
     atexit._run_exitfuncs()
     sys.stdout.flush()
     sys.stderr.flush()

@@ -1,7 +1,7 @@
-"""Contact problems drawn at random, each from its seed.
+"""Random contact problems, determined by a seed.
 
 Towers of blocks on a base, beams on pillars, discs between plates: one to five contacts
-with gaps, bodies that are held and bodies that contact alone holds, moduli up to six
+with gaps, supported bodies and bodies that only contact supports, moduli up to six
 orders apart, node to segment and mortar with either basis, either side as slave. The
 loads press bodies together, so that each has a solution.
 """
@@ -33,7 +33,7 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
-from tests.support.held_by_contact import disc_between_plates
+from tests.support.supported_by_contact import disc_between_plates
 
 PRESSURE = 1e7  #: mean pressure of the loads, Pa
 METHODS = (("nts", "dual"), ("mortar", "dual"), ("mortar", "standard"))

@@ -1,6 +1,6 @@
-"""Tearing and gluing of a whole mesh by sparse algebra: what subdomains must make.
+"""Decomposition of an undivided mesh and its gluing rows, by sparse algebra.
 
-A second way to the same rows, for tests. Rows are those of
+An independent derivation, for tests. Rows are those of
 `mortarbench.problems.feti.subdomains`.
 """
 

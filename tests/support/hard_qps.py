@@ -26,7 +26,7 @@ class HardQP:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Draft:
-    """What is planted; b, h and q follow from it."""
+    """Planted data, from which b, h and q follow."""
 
     P: Vector
     A: Vector
@@ -41,12 +41,12 @@ class _Draft:
 
     @property
     def q(self) -> Vector:
-        """What makes the point stationary."""
+        """Linear term for which the point is stationary."""
         rows = self.A.T @ self.y + self.G.T @ self.z
         return np.asarray(-(self.P @ self.x + rows + self.z_box))
 
     def widened(self, by: int, x: Vector) -> _Draft:
-        """Append free variables that nothing knows of."""
+        """Append free variables without cost and constraints."""
         rows = {k: np.pad(getattr(self, k), ((0, 0), (0, by))) for k in ("A", "G")}
         far = np.full(by, np.inf)
         return replace(
@@ -101,7 +101,7 @@ def _fixed(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _big_m(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Hold a bound by a cost of 1e9; half of the times the bound is zero."""
+    """Activate a bound by a cost of 1e9; in half of the cases it is zero."""
     x = float(d.x[-1] * rng.integers(0, 2))
     return d.at(-1, x=x, lb=x, ub=np.inf, z_box=-1e9)
 
@@ -130,7 +130,7 @@ def _redundant(d: _Draft, rng: np.random.Generator) -> _Draft:
 
 
 def _no_cost(d: _Draft, rng: np.random.Generator) -> _Draft:
-    """Make q zero: one row alone holds x off the origin."""
+    """Set q to zero; one row keeps x away from the origin."""
     d = replace(d, y=0 * d.y, z=0 * d.z, z_box=0 * d.z_box)
     return d.rows((d.P @ d.x)[None], -np.ones(1))
 

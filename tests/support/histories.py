@@ -1,4 +1,4 @@
-"""A plug-in: projected gradient descent that tells what it does, well or badly."""
+"""Plug-in with projected gradient descent and valid or invalid histories."""
 
 import time
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from mortarbench.harness import Solution, Status
 
 @dataclass(frozen=True)
 class Descent:
-    """x ← clip(x − g/‖P‖): takes bounds only; needs many steps."""
+    """Iteration x ← clip(x − g/‖P‖), for bounds only; needs many steps."""
 
     history: bool = False  #: keep a row per step
     max_iter: int = 50_000
@@ -57,7 +57,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class Garbled(Descent):
-    """The same answer with a history that is none."""
+    """The same answer with an invalid history."""
 
     history: object = None
 

@@ -1,4 +1,4 @@
-"""A block on an inclined plane, which friction alone keeps from sliding (CGS-4)."""
+"""Block on an inclined plane that only friction keeps from sliding (CGS-4)."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WEIGHT = 1e5  #: G, N/m
 def incline(ratio: float, slope: float = 0.1) -> Bodies:
     """Push a block of weight G up an incline by the horizontal force ratio·G.
 
-    Drawn with the incline along x; nothing but contact and friction holds the block.
+    Drawn with the incline along x; only contact and friction support the block.
     """
     mesh, body = join((
         prefixed(rectangle((0.0, 0.0), (2.0, 0.5), (8, 2)), "base_"),

@@ -1,4 +1,4 @@
-"""Records of solves on ranks whose every time is made by the model of their cost.
+"""Records of solves on ranks with times from a cost model.
 
     python -m tests.support.manufactured_ranks DIR [SCATTER]
 
@@ -23,7 +23,7 @@ SPENT = {"products": 0.5, "exchange": 0.05, "coarse": 0.15, "waiting": 0.2}  #: 
 
 
 def sent_seconds(ranks: int) -> float:
-    """Add up what messages take; a tree of ranks, and at most six neighbours."""
+    """Return the time of messages: a tree of ranks, and at most six neighbours."""
     if ranks == 1:
         return 0.0
     tree, neighbours = int(np.ceil(np.log2(ranks))), min(ranks - 1, 6)
@@ -33,13 +33,13 @@ def sent_seconds(ranks: int) -> float:
 
 
 def solve_seconds(dofs: int, ranks: int) -> float:
-    """Give the time of a solve on ranks."""
+    """Return the time of a solve on ranks."""
     slow = SLOWDOWN if ranks > 1 else 1.0
     return slow * (WORK * dofs / ranks + ALIKE) + sent_seconds(ranks)
 
 
 def copies_seconds(dofs: int) -> float:
-    """Give the time of as many solves at once as there are ranks, whatever these."""
+    """Return the time of simultaneous solves, one per rank."""
     return SLOWDOWN * (WORK * dofs + ALIKE)
 
 

@@ -1,4 +1,4 @@
-"""What tests/harness/processes/test_ranks.py runs on several ranks; prints JSON.
+"""Program of tests/harness/processes/test_ranks.py on several ranks; prints JSON.
 
 Run as ``mpiexec -n N python -m mpi4py on_ranks.py CASE…``.
 """
@@ -41,7 +41,7 @@ REFUSED = {
 
 
 def vectors(ranks):
-    """Reduce vectors whose values are known to all, and ask for what is refused."""
+    """Compare reductions of vectors with their known values; try refused operations."""
     rng = np.random.default_rng(0)
     a, b = rng.standard_normal((2, 101))
     C = rng.standard_normal((3, 101))
@@ -150,7 +150,7 @@ def projected(qp, most):
 
 def operator(name, ranks):
     """Compare products with F, its rows and its preconditioners with one process's."""
-    qp = mb.build(name).made.qp
+    qp = mb.build(name).family_case.qp
     whole = qp.P.build()
     share = whole.share(qp, ranks)
     P, x = share.qp.P, np.random.default_rng(1).standard_normal(qp.q.size)

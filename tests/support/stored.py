@@ -1,4 +1,4 @@
-"""Points in the folder of vectors, as a run stores them."""
+"""Stored points in the folder of vectors of a run."""
 
 from mortarbench.harness.files.store import point_arrays, save
 

@@ -1,4 +1,4 @@
-"""A result folder as a large campaign leaves it, without the campaign; for reports.
+"""Synthetic result folder of a large campaign, for tests of reports.
 
     python tests/support/synthetic_results.py DIR [SOLVERS CASES REPEATS]
 

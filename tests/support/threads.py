@@ -1,7 +1,7 @@
-"""Ranks that are threads of one process, for tests of what ranks exchange.
+"""Ranks as threads of one process, for tests of communication.
 
-They pass one another what MPI would, in memory, so that a test on three ranks takes
-milliseconds. A rank that waits for a message that nobody sends fails after `PATIENCE`.
+Messages are passed in memory, so that a test on three ranks takes milliseconds. A rank
+that waits for a message which is never sent fails after `PATIENCE`.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ R = TypeVar("R")
 
 
 class Comm:
-    """What `harness.distributed` uses of mpi4py's communicators."""
+    """The part of mpi4py's communicators that `harness.distributed` uses."""
 
     def __init__(self, rank: int, size: int, barrier: Barrier, slots: list[Any]):
         self.rank, self.size = rank, size
@@ -73,7 +73,7 @@ def without_lock(monkeypatch: Any, owner: type, name: str) -> None:
 
 
 def on_threads(size: int, work: Callable[[Ranks], R]) -> list[R]:
-    """Return what `work` returns on each rank, in their order."""
+    """Return the results of `work` on all ranks, in order."""
     barrier, slots = Barrier(size), [None] * size
     comms = [Comm(rank, size, barrier, slots) for rank in range(size)]
     for comm in comms:

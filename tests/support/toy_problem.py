@@ -1,6 +1,6 @@
-"""A plug-in: parabolas over half lines, and solvers for them, some of which misbehave.
+"""Plug-in with parabolas over half lines, and solvers, some of which misbehave.
 
-Run as a program it is the worker of a registries that holds nothing else.
+Run as a program it is a worker whose registries contain nothing else.
 """
 
 import os
@@ -37,7 +37,7 @@ class Well:
             raise InputError(f"well: n={params['n']} must be at least 1")
 
     def build(self, form, params, reference):
-        """min ½|x|² - depth·Σx over x ≥ 0: x = depth, objective -n·depth²/2."""
+        """Return  min ½|x|² − depth·Σx, x ≥ 0:  x = depth, objective −n·depth²/2."""
         n, depth = params["n"], params["depth"]
         if depth in FAULTS:
             raise FAULTS[depth]
@@ -105,7 +105,7 @@ class Dies(Exact):
 
 @dataclass(frozen=True)
 class Hangs(Exact):
-    """Deaf to Ctrl-C, but in the warm-up; touches $STARTED."""
+    """Hangs and ignores Ctrl-C, except in the warm-up; touches $STARTED."""
 
     def prepare(self, qp, tol):
         if qp.q.size != 2:
@@ -117,7 +117,7 @@ class Hangs(Exact):
 
 @dataclass(frozen=True)
 class Slow(Exact):
-    """Takes a while. Adds a line to $STARTS at every start but those to warm up."""
+    """Sleeps. Adds a line to $STARTS at every start except in the warm-up."""
 
     seconds: float = 0.4
 
@@ -131,7 +131,7 @@ class Slow(Exact):
 
 @dataclass(frozen=True)
 class Murders(Exact):
-    """Kills whoever measures it, at depth 4."""
+    """Kills the process that measures it, at depth 4."""
 
     def prepare(self, qp, tol):
         if qp.q[0] == -4:
@@ -142,7 +142,7 @@ class Murders(Exact):
 
 @dataclass(frozen=True)
 class Lax(Exact):
-    """As good as asked for. Not better."""
+    """Returns answers exactly as accurate as the tolerance."""
 
     def prepare(self, qp, tol):
         return Exact(factor=1 + tol).prepare(qp, tol)
@@ -165,7 +165,7 @@ PROBLEMS = {"well": Well()}
 
 
 def unsolved(qp):
-    """There is no reference solve here: residuals decide."""
+    """Raise: there is no reference solver here, so residuals decide."""
     raise ArithmeticError("toy problems have no reference solve")
 
 

@@ -1,12 +1,12 @@
-"""Waiting for what another process does, on machines of any speed."""
+"""Waiting for events in other processes, on machines of any speed."""
 
 import time
 
-LONGEST = 600.0  #: seconds; what never comes is given up then
+LONGEST = 600.0  #: seconds until a wait is given up
 
 
 def soon(condition):
-    """Wait until a condition holds; returns whether it does, at the latest then."""
+    """Wait until a condition holds; return False if it does not in time."""
     deadline = time.monotonic() + LONGEST
     while not (holds := condition()) and time.monotonic() < deadline:
         time.sleep(0.02)

@@ -1,8 +1,8 @@
-"""Our docstrings as griffe, which makes the reference, expects them (an extension).
+"""Extension of griffe that converts our docstrings to numpydoc for the reference.
 
-We say ``tol : relative accuracy`` where numpydoc has the type after the colon and the
-description below; types are in the signature. And what an attribute is stands beside
-it, after ``#:``.
+We write ``tol : relative accuracy``; numpydoc has the type after the colon and the
+description below. Types are in the signature. Attributes are described by comments
+``#:`` beside or above them.
 """
 
 from __future__ import annotations
@@ -12,29 +12,29 @@ from typing import Any
 
 import griffe
 
-#: one or more arguments and what they are, further lines indented
+#: one or more arguments with their description, further lines indented
 _ENTRY = r"\w+(?:, \w+)* : .*\n(?: +.*\n)*"
 _ENTRIES = re.compile(rf"(?:\A|(?<=\n\n))(?:{_ENTRY})+(?=\n|\Z)")
-#: a star behind a letter (u*), which Markdown would take for emphasis
+#: asterisk behind a letter (u*), which Markdown would take for emphasis
 _STAR = re.compile(r"(?<=\w)\*(?!\*)")
 _SECTION = re.compile(rf"(?<=\nParameters\n----------\n)(?:{_ENTRY})+")
 
 
 class Docstrings(griffe.Extension):
-    """Rewrites docstrings of functions, and finds those of attributes."""
+    """Extension that rewrites docstrings of functions and adds those of attributes."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Keep the stars of formulas."""
+        """Escape the asterisks of formulas."""
         if obj.docstring is not None:
             obj.docstring.value = starred(obj.docstring.value)
 
     def on_function(self, *, func: griffe.Function, **_: Any) -> None:
-        """Write arguments as numpydoc has them."""
+        """Convert the descriptions of arguments to numpydoc."""
         if func.docstring is not None:
             func.docstring.value = as_numpydoc(func.docstring.value)
 
     def on_attribute(self, *, attr: griffe.Attribute, **_: Any) -> None:
-        """Take the comment beside an attribute, or above it, for its docstring."""
+        """Use the comment beside or above an attribute as its docstring."""
         if attr.docstring is None and attr.lineno is not None and attr.endlineno:
             sources = attr.parent.module.lines_collection  # type: ignore[union-attr]
             if attr.filepath not in sources:  # in the stub of a compiled module
@@ -46,25 +46,25 @@ class Docstrings(griffe.Extension):
 
 
 def starred(text: str) -> str:
-    """Escape stars behind letters, which Markdown would take for emphasis."""
+    """Escape asterisks behind letters, which Markdown would take for emphasis."""
     parts = re.split(r"(`[^`]*`|^ {4,}.*$)", text, flags=re.MULTILINE)
     parts[::2] = [_STAR.sub(r"\\*", part) for part in parts[::2]]
     return "".join(parts)
 
 
 def as_numpydoc(text: str) -> str:
-    """Put descriptions of arguments below their names, in a section of their own."""
+    """Move descriptions of arguments below their names, into a section Parameters."""
     text += "\n"
 
-    def entry(found: re.Match[str]) -> str:
-        names, description = found[0].split(" : ", 1)
+    def entry(match: re.Match[str]) -> str:
+        names, description = match[0].split(" : ", 1)
         return "".join(f"{name}\n    {description}" for name in names.split(", "))
 
-    def entries(found: re.Match[str]) -> str:
-        return re.sub(_ENTRY, entry, found[0])
+    def entries(match: re.Match[str]) -> str:
+        return re.sub(_ENTRY, entry, match[0])
 
-    def section(found: re.Match[str]) -> str:
-        return f"Parameters\n----------\n{entries(found)}"
+    def section(match: re.Match[str]) -> str:
+        return f"Parameters\n----------\n{entries(match)}"
 
     if _SECTION.search(text):
         return _SECTION.sub(entries, text).rstrip()
@@ -72,14 +72,14 @@ def as_numpydoc(text: str) -> str:
 
 
 def beside(lines: list[str], first: int, last: int) -> str:
-    """Find the comment ``#:`` at the end of lines, or in those directly above."""
-    found = [c for line in lines[first : last + 1] if (c := _comment(line))]
-    if not found:
+    """Return the comment ``#:`` at the end of lines, or in those directly above."""
+    comments = [c for line in lines[first : last + 1] if (c := _comment(line))]
+    if not comments:
         above = first - 1
         while lines[above].strip().startswith("#:"):
-            found.insert(0, _comment(lines[above]))
+            comments.insert(0, _comment(lines[above]))
             above -= 1
-    text = " ".join(found)
+    text = " ".join(comments)
     return text[:1].upper() + text[1:]
 
 

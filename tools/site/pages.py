@@ -1,8 +1,8 @@
-"""The pages of the site that are made of something else, for mkdocs (a hook).
+"""Hook of mkdocs for pages from other sources than docs/*.md, and for formulas.
 
-README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; a notebook of
-docs/gallery is run and becomes a page; `commands.md` gets the help of each command;
-formulas, LaTeX between dollars in the sources, become MathML.
+README, CONTRIBUTING and CHANGELOG become pages beside those of docs/; notebooks of
+docs/gallery are run and become pages; the help of each command is inserted into
+`commands.md`; formulas, LaTeX between dollars in the sources, become MathML.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
 }  #: file of the root → page of the site
-#: a formula as pymdownx.arithmatex leaves it, displayed or in a line
+#: formula in the output of pymdownx.arithmatex, displayed or inline
 FORMULA = re.compile(
     r'<(div|span) class="arithmatex">\\[\[(](.*?)\\[\])]</\1>', re.DOTALL
 )
-#: an asterisk of a formula, u*, that Markdown took for the begin of emphasis
+#: asterisk of a formula, u*, that Markdown has taken for the begin of emphasis
 SWALLOWED = re.compile(r"[\w|‖)\]']<em>.{0,60}")
-HELP = "<!-- help of every command -->"  #: is replaced in commands.md
+HELP = "<!-- help of every command -->"  #: replaced by the help texts in commands.md
 #: one thread in every library, as in the processes of a run
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "COLUMNS": "80"}
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages that lie elsewhere, and those that notebooks become."""
+    """Add the pages from files of the root and from notebooks."""
     from mkdocs.structure.files import File
 
     os.environ.update(ENVIRONMENT)
@@ -57,7 +57,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 def on_page_markdown(
     markdown: str, *, page: Page, config: MkDocsConfig, files: Files
 ) -> str:
-    """Send links out of docs/, and to notebooks, to their pages; insert help texts."""
+    """Redirect links to files of the root and to notebooks; insert help texts."""
     up = "../" * page.file.src_uri.count("/")
     for name, target in PAGES.items():
         markdown = re.sub(rf"\]\((?:\.\./)+{name}", f"]({up}{target}", markdown)
@@ -74,7 +74,7 @@ def on_page_content(
     Raises
     ------
     PluginError
-        When a formula cannot be converted, or Markdown has read one as emphasis.
+        If a formula cannot be converted, or Markdown has taken one for emphasis.
 
     """
     from mkdocs.exceptions import PluginError
@@ -86,12 +86,12 @@ def on_page_content(
 
 
 def typeset(content: str) -> str:
-    """Replace the formulas of HTML by MathML; a displayed one may scroll.
+    """Replace the formulas in HTML by MathML.
 
     Raises
     ------
     ValueError
-        When a formula cannot be converted, or Markdown has read one as emphasis.
+        If a formula cannot be converted, or Markdown has taken one for emphasis.
 
     """
     if swallowed := SWALLOWED.search(content):
@@ -105,7 +105,7 @@ def typeset(content: str) -> str:
 
 
 def from_root(text: str) -> str:
-    """Have the links of a file of the root lead from a page beside those of docs/."""
+    """Return the text of a file of the root, with links as in the folder docs/."""
     text = re.sub(r"\]\(docs/", "](", text)
     for name, page in PAGES.items():
         text = text.replace(f"]({name}", f"]({page}")
@@ -113,7 +113,7 @@ def from_root(text: str) -> str:
 
 
 def help_texts() -> str:
-    """Give the help of each command, a section each."""
+    """Return the help of all commands, a section each."""
 
     def printed(*arguments: str) -> str:
         command = [sys.executable, "-m", "mortarbench", *arguments, "--help"]
@@ -126,7 +126,7 @@ def help_texts() -> str:
 
 
 def gallery_page(path: Path) -> dict[str, str | bytes]:
-    """Run a notebook in an empty folder: its page, and the pictures that this shows."""
+    """Run a notebook in an empty folder; return its page and pictures by path."""
     import nbformat
     from nbconvert import MarkdownExporter
     from nbconvert.preprocessors import ExecutePreprocessor

@@ -1,11 +1,11 @@
 "use strict";
-// What all parts of the page share: the data, what the reader hides, and nodes.
+// Shared by all parts of the page: the data, the state of the filters, and DOM nodes.
 
 const data = JSON.parse(document.getElementById("data").textContent);
 const runs = data.runs;
 const hidden = new Set(); // positions of solvers
 const asked = { words: [], tol: "", verdict: "" };
-const views = []; // each draws one part anew
+const views = []; // functions that redraw one part each
 
 const byId = (id) => document.getElementById(id);
 const solverOf = new Map(data.solvers.flatMap((s, i) => s.names.map((name) => [name, i])));
@@ -14,9 +14,9 @@ const holds = (text, wanted) => {
   const lower = text.toLowerCase();
   return wanted.every((word) => lower.includes(word));
 };
-const told = (column, run) => runs[column].values[runs[column].at[run]];
+const columnValue = (column, run) => runs[column].values[runs[column].at[run]];
 
-/** An element with attributes; children are nodes or text, never markup. */
+/** Create an element with attributes; children are nodes or text, never markup. */
 function make(tag, attributes = {}, ...children) {
   const node = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) node.setAttribute(name, value);
@@ -24,17 +24,17 @@ function make(tag, attributes = {}, ...children) {
   return node;
 }
 
-/** Whether a measurement has the verdict that is asked for. */
+/** Return whether a measurement has the selected verdict. */
 const hasVerdict = (run) =>
   asked.verdict === "" ||
-  (asked.verdict === "not verified" ? told("status", run) !== "verified" : told("status", run) === asked.verdict);
+  (asked.verdict === "not verified" ? columnValue("status", run) !== "verified" : columnValue("status", run) === asked.verdict);
 
-/** Whether a measurement is to be seen: not hidden, and what is asked for. */
+/** Return whether a measurement passes all filters. */
 const seen = (run) =>
-  !hidden.has(solverOf.get(told("solver", run))) &&
-  (asked.tol === "" || told("tol", run) === asked.tol) &&
+  !hidden.has(solverOf.get(columnValue("solver", run))) &&
+  (asked.tol === "" || columnValue("tol", run) === asked.tol) &&
   hasVerdict(run) &&
-  holds(told("case", run), asked.words);
+  holds(columnValue("case", run), asked.words);
 
 function redraw() {
   for (const view of views) view();
@@ -45,7 +45,7 @@ function toggle(solver) {
   redraw();
 }
 
-/** Light, dark, or as the system has it; the choice is kept where that is allowed. */
+/** Switch between light, dark and system colours; the choice is stored where allowed. */
 function themes() {
   const button = byId("theme");
   const names = ["system", "light", "dark"];
@@ -54,7 +54,7 @@ function themes() {
     const store = window.localStorage;
     kept.get = () => store.getItem("theme");
     kept.set = (name) => store.setItem("theme", name);
-  } catch { /* a page from a file may have none */ }
+  } catch { /* browsers may deny storage to local files */ }
   const apply = (name) => {
     document.documentElement.style.colorScheme = name === "system" ? "light dark" : name;
     button.textContent = `colours: ${name}`;
@@ -72,7 +72,7 @@ function themes() {
   addEventListener("afterprint", () => apply(before));
 }
 
-/** A button that shows and hides one solver everywhere. */
+/** Create a button that shows and hides one solver in all tables and plots. */
 function solverButton(solver, text, look) {
   const button = make("button", { type: "button", class: "key" }, swatch(look), text || "(no name)");
   const view = () => button.setAttribute("aria-pressed", String(!hidden.has(solver)));
@@ -82,7 +82,7 @@ function solverButton(solver, text, look) {
   return button;
 }
 
-/** The bar that filters all tables and plots. */
+/** Set up the bar that filters all tables and plots. */
 function tools() {
   const bar = byId("tools");
   if (!bar) return;

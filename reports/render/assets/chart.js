@@ -1,13 +1,13 @@
-// One panel of a plot: curves of a printed figure drawn anew, to zoom in and point at.
+// One panel of a plot: the curves of a printed figure, with zoom and tooltips.
 
-const NEAR = 24; // px within which a point counts as pointed at
-const APART = 70; // px between the marks of a line that has few
-const LETTER = 6.2; // px, about as wide as one is
+const NEAR = 24; // px, largest distance of the pointer from a selected point
+const APART = 70; // px between the marks of a line with sparse marks
+const LETTER = 6.2; // px, approximate width of a letter
 const MARGIN = 66; // px left of the axis, at least
-const MOST = 0.4; // of the width that names left of the axis may take
-const PER_INCH = 104; // px of a printed inch
+const MOST = 0.4; // largest share of the width for names left of the axis
+const PER_INCH = 104; // px per inch of the printed figure
 
-/** One panel: axes, traces, what is pointed at; `linked` are those with the same x. */
+/** Draw one panel with axes, traces and selection; `linked` panels share the x axis. */
 function chart(box, content, linked, name) {
   const axes = { x: { ...content.x, view: content.x.limits }, y: { ...content.y, view: content.y.limits } };
   const small = content.y.ticks?.length === 0;
@@ -29,7 +29,7 @@ function chart(box, content, linked, name) {
   };
   const inside = (axis, v) => v !== null && (!axes[axis].log || v > 0);
 
-  function all(axis) { // values that are shown
+  function all(axis) { // visible values
     const found = [];
     for (const t of content.traces) {
       if (t.kind === "line") t[axis].forEach((v, i) => { if (inside(axis, v) && shows(t, i)) found.push(v); });
@@ -108,7 +108,7 @@ function chart(box, content, linked, name) {
   }
 
   const aside = () => labelled(axes.y, Math.max(2, Math.floor((height - below - top) / 45)));
-  function margin() { // what the texts left of the axis need
+  function margin() { // width of the texts left of the axis
     const texts = small ? [axes.y.label] : aside().map(([, text]) => text);
     return Math.max(MARGIN, titled + 8 + Math.max(0, ...texts.map((text) => breadth(text, drawing))));
   }
@@ -197,7 +197,7 @@ function chart(box, content, linked, name) {
     const packed = t.runs?.length > 1 ? t.runs[k] : t.runs?.[0];
     const run = packed?.[0];
     const said = [t.s >= 0 ? data.solvers[t.s].names[0] : ""];
-    if (run !== undefined) said.push(`${told("case", run)}, tol ${told("tol", run)}, ${told("status", run)}`);
+    if (run !== undefined) said.push(`${columnValue("case", run)}, tol ${columnValue("tol", run)}, ${columnValue("status", run)}`);
     said.push(`${axes.x.label || linked.map((one) => one.label).find(Boolean) || "x"}: ${number(t.x[k])}`, `${axes.y.label}: ${number(t.y[k])}`);
     if (run !== undefined) said.push(`run ${runs.id[run]}`);
     tip.replaceChildren(...said.filter(Boolean).map((s) => make("div", {}, s)));

@@ -1,4 +1,4 @@
-// What plots are made of: marks, swatches, ticks and numbers.
+// Elements of plots: marks, swatches, ticks and numbers.
 
 const RAISED = "⁰¹²³⁴⁵⁶⁷⁸⁹";
 const OUTLINES = { // on the square from −1 to 1
@@ -18,7 +18,7 @@ function svg(tag, attributes = {}, ...children) {
   return node;
 }
 
-/** A mark's outline about a point, in the same order of commands for all. */
+/** Return the outline of a mark centred at a point, as path data. */
 function mark(name, x, y, r) {
   const at = (t, v) => (v * r + t).toFixed(1);
   return (OUTLINES[name] ?? ROUND).replace(/([MLHVA])([^MLHVAZ]*)/g, (_, command, rest) => {
@@ -38,7 +38,7 @@ const stroke = (t) => ({
   stroke: t.colour, fill: "none", "stroke-width": 1.35 * t.width, ...(t.dash ? { "stroke-dasharray": t.dash } : {}),
 });
 
-/** What a line and its marks look like, for a key. */
+/** Draw a sample of a line and its marks for a legend. */
 function swatch(look) {
   const line = look.dash === null || look.dash === undefined ? [] : [svg("path", { d: "M1 7H27", ...stroke(look) })];
   const dot = look.marker ? [svg("path", { d: mark(look.marker, 14, 7, 4), ...ink(look) })] : [];
@@ -47,13 +47,13 @@ function swatch(look) {
 
 const pen = document.createElement("canvas").getContext("2d");
 
-/** How wide a text is, in px, in the font of a node. */
+/** Return the width of a text in px, in the font of a node. */
 function breadth(text, node) {
   pen.font = getComputedStyle(node).font;
   return pen.measureText(text).width;
 }
 
-/** A text without its middle, if it has not the room: names differ at their ends. */
+/** Drop the middle of a text that is too wide: names differ at their ends. */
 function shortened(text, room, node) {
   let shown = text, letters = [...text];
   while (letters.length > 3 && breadth(shown, node) > room) {
@@ -69,7 +69,7 @@ const raised = (k) => (k < 0 ? "⁻" : "") + [...String(Math.abs(k))].map((d) =>
 const decade = (v) => Math.floor(Math.log10(Math.abs(v)) + 1e-9);
 const plain = (v) => v === 0 || (decade(v) >= -3 && decade(v) <= 4);
 
-/** A number as people write it; with its power of ten if it asks for one. */
+/** Format a number, with a power of ten where it is very small or large. */
 function number(v, powered = !plain(v)) {
   if (v === 0) return "0";
   const size = decade(v);
@@ -78,7 +78,7 @@ function number(v, powered = !plain(v)) {
   return (front === 1 ? "" : `${front}·`) + "10" + raised(size);
 }
 
-/** Round places between two ends, about as many as wanted. */
+/** Return about `most` round values between two ends. */
 function ticks([low, high], log, most) {
   if (log) {
     const a = Math.log10(low), b = Math.log10(high);
@@ -96,7 +96,7 @@ function ticks([low, high], log, most) {
   return found;
 }
 
-/** Ticks within the view of an axis, those that are set or `most`, with texts of one kind. */
+/** Return the ticks in view, given ones or about `most`, with labels in one format. */
 function labelled({ view, log, ticks: set }, most) {
   const within = (v) => v >= view[0] && v <= view[1];
   if (set) return set.filter(([v]) => within(v));

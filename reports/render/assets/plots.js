@@ -1,6 +1,6 @@
-// Plots: the panels of a figure and one legend, whose keys act on all of the page.
+// Plots: the panels of a figure and a legend whose keys act on the whole page.
 
-/** Keys of lines; those of solvers are buttons. */
+/** Build a legend; keys of solvers are buttons. */
 function legend({ title, keys }) {
   const key = (k) => (k.s >= 0 ? solverButton(k.s, k.label, k) : make("span", { class: "key" }, swatch(k), k.label));
   return make("div", { class: "legend" }, ...(title && keys.length ? [make("span", {}, title)] : []), ...keys.map(key));

@@ -1,17 +1,17 @@
-// The measurement behind a number: every field of its journal line, and how to repeat it.
+// The measurement behind a number: all fields of its journal line, and the command that repeats it.
 
 let details = null;
 const SHORT = ["case", "solver", "tol", "repeat", "status", "claimed", "message", "iterations",
   "prepare_seconds", "solve_seconds", "total_seconds", "primal", "dual", "complementarity", "gap", "objective"];
 
-/** Every field of every measurement, unpacked when the first is asked for. */
+/** Unpack all fields of all measurements; called when the first one is shown. */
 function unpack() {
   const bytes = Uint8Array.from(atob(byId("details").textContent), (c) => c.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
   return new Response(stream).json();
 }
 
-/** One journal line, field by field. */
+/** Return one journal line, field by field. */
 async function line(run) {
   details ??= unpack();
   const columns = Object.entries(await details);
@@ -19,14 +19,14 @@ async function line(run) {
   return Object.fromEntries(columns.map(([name, column]) => [name, pick(column)]));
 }
 
-/** The result folder as a shell takes it; known only where the page lies in it. */
+/** Return the quoted path of the result folder, or DIR if the page lies elsewhere. */
 function folder() {
   const parts = decodeURIComponent(location.pathname).split("/");
   if (location.protocol !== "file:" || parts.at(-2) !== "report") return "DIR";
   return quoted(parts.slice(0, -2).join("/") || "/");
 }
 
-/** A word as a shell takes it. */
+/** Quote a word for a shell. */
 const quoted = (word) => (/^[\w@%+=:,./-]+$/.test(word) ? word : `'${word.replaceAll("'", "'\\''")}'`);
 
 function pairs(fields) {
@@ -58,13 +58,13 @@ async function fill(dialog, run, others) {
         : []),
       close),
     make("h2", { id: "run-title" }, `Run ${runs.id[run]}`),
-    make("p", {}, "Measure it again: ", make("code", {}, command)),
+    make("p", {}, "Repeat this measurement: ", make("code", {}, command)),
     make("ul", {}, ...stored),
     pairs(SHORT.filter((name) => name in record).map((name) => [name, record[name]])),
-    make("details", {}, make("summary", {}, "the other fields of its journal line"), pairs(rest)));
+    make("details", {}, make("summary", {}, "other fields of the journal line"), pairs(rest)));
 }
 
-/** Show one run of several that stand behind the same number. */
+/** Show one of the runs behind a number. */
 async function visit(run, others) {
   const dialog = byId("run");
   await fill(dialog, run, others);
@@ -73,7 +73,7 @@ async function visit(run, others) {
   dialog.scrollTop = 0;
 }
 
-/** The run that the address names. */
+/** Show the run named in the address. */
 function arrive() {
   if (!location.hash.startsWith("#run-")) return;
   const run = runs.id.indexOf(decodeURIComponent(location.hash.slice(5)));

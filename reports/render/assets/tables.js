@@ -1,4 +1,4 @@
-// Tables: sort, filter, hide, and show only as many rows as one can read.
+// Tables: sorting, filtering, hiding and paging.
 
 const PAGE = 50; // rows, as many as the page was written with
 const NUMBER = /(\b\d[\d.]*e-\d+\b)/;
@@ -8,7 +8,7 @@ const TEXT = 0, VALUE = 1, KIND = 2, SYMBOL = 3, AFTER = 4, TITLE = 5, RUNS = 6;
 const field = (cell, i) => (typeof cell === "string" ? (i === TEXT ? cell : undefined) : cell[i]) ?? null;
 const textOf = (cell) => [SYMBOL, TEXT, AFTER].map((i) => field(cell, i) ?? "").join(" ");
 
-/** Text that may break after slashes, and not within 1e-8; as the page's writer has it. */
+/** Allow line breaks after slashes and none within 1e-8, like html_page.breakable. */
 function breakable(text) {
   const split = (parts, pattern, wrap) => parts.flatMap((part) =>
     typeof part === "string" ? part.split(pattern).map((t, i) => (i % 2 ? wrap(t) : t)) : [part]);
@@ -17,7 +17,7 @@ function breakable(text) {
   return split(kept, LEFTWARDS, (t) => make("bdi", {}, t));
 }
 
-/** A table cell as the page's writer makes it. */
+/** Build a table cell, like the macro `entry` of the page. */
 function entry(cell, isName) {
   const text = field(cell, TEXT), kind = field(cell, KIND) ?? "", links = field(cell, RUNS);
   const shown = kind === "void" ? [make("s", {}, text)] : breakable(text);
@@ -32,7 +32,7 @@ function entry(cell, isName) {
   return td;
 }
 
-/** Every measurement of a packed list: first, count, first, count … */
+/** Yield the measurements of a packed list: first, count, first, count … */
 function* unpacked(packed) {
   for (let i = 0; i < packed.length; i += 2) {
     for (let k = 0; k < packed[i + 1]; k++) yield packed[i] + k;
@@ -144,14 +144,14 @@ function table(figure, content) {
 
 const collator = new Intl.Collator("en", { numeric: true });
 
-/** Say when a table or a printed figure is wider than its box. */
+/** Show a hint when a table or a printed figure is wider than its box. */
 function measure(box) {
   const wide = box.scrollWidth > box.clientWidth + 1;
   box.classList.toggle("wide", wide);
   box.previousElementSibling.hidden = !wide;
 }
 
-/** One link of a table is in the tab order; arrow keys reach the others. */
+/** Keep one link of a table in the tab order; arrow keys reach the others. */
 function roving(body) {
   body.querySelectorAll("a").forEach((a, i) => { a.tabIndex = i ? -1 : 0; });
 }

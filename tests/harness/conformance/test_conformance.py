@@ -13,11 +13,16 @@ import pytest
 
 from mortarbench.harness import Solution, Status, kkt_residuals
 from mortarbench.harness.conformance import conformance
-from mortarbench.harness.conformance.conformance import CHECKS, KEEPS, Grade, run_check
+from mortarbench.harness.conformance.conformance import (
+    CHECKS,
+    INVARIANCE_PREFIX,
+    Grade,
+    run_check,
+)
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     DeclinedError,
-    WeakError,
+    WeaknessError,
     answer,
     changes_of,
     same_answer,
@@ -32,7 +37,7 @@ from mortarbench.harness.conformance.weaknesses import line_of
 from mortarbench.solvers import SOLVERS
 from tests.support import ROOT
 
-#: backends that stand for the wildcard entries of the registry; the others are slow
+#: backends that represent the wildcard entries of the registry; the others are slow
 BACKENDS = {
     "qpsolvers:*": ("clarabel", "highs", "quadprog", "sip"),
     "cvxpy:*": ("CLARABEL", "HIGHS"),
@@ -58,20 +63,20 @@ def configured(backends):
 NATIVE = {name: s for name, s in SOLVERS.items() if name not in BACKENDS}
 SLOW = {name: NATIVE.pop(name) for name in VARIANTS} | configured(OTHERS)
 CONCRETE = NATIVE | configured(BACKENDS)
-#: no condition of conformance are equivalent formulations, which have their own test
-STRICT = [check for check in CHECKS if not check.startswith(KEEPS)]
+#: equivalent formulations are not a condition of conformance; they have their own test
+STRICT = [check for check in CHECKS if not check.startswith(INVARIANCE_PREFIX)]
 #: take seconds for all equivalent formulations
 REWRITTEN = {
     "highs", "qtqp", "daqp", "proxqp", "highs-hipo", "osqp-polish", "scs", "qpalm",
 }  # fmt: skip
-#: takes equations alone, of which these QPs are none
+#: accepts only equations, and so none of these QPs
 LINEAR = {"feti"}
 WEAKNESSES = ROOT / "docs/weaknesses.md"
 
 
 @pytest.fixture(autouse=True, scope="module")
 def loaded_once():
-    """Keep what libraries load out of the collection before every measurement."""
+    """Exclude loaded libraries from the collection before every measurement."""
     import cvxpy  # noqa: F401
     import qpsolvers  # noqa: F401
 
@@ -87,12 +92,12 @@ def test_a_planted_point_is_a_solution(shape, dense):
 
 
 UNBOUNDED = "claims no success: unbounded"
-#: go on to the last of their iterations, for many seconds; `smalbe` is here for its kin
+#: iterate to their limit, for many seconds; `smalbe` represents its variants
 LONG = [
     ("proxqp", UNBOUNDED), ("smalbe-condensed", UNBOUNDED),
     ("projected-gradient", UNBOUNDED),
 ]  # fmt: skip
-#: planted solutions for all solvers: each shape once, and one of them in every way
+#: planted solutions for all solvers: each shape once, and one of them in every storage
 PLANTED = re.compile(
     r"(finds the planted solution|reaches the tolerance [\d.e-]+): (.*)"
 )
@@ -101,7 +106,7 @@ ONCE = ", sparse"
 
 
 def is_for_all(name, check):
-    """Whether a check is made by default; of our own solver, all are."""
+    """Return True if a check runs by default; for our own solver, all do."""
     planted = PLANTED.match(check)
     return name == "smalbe" or planted is None or (
         planted[2].startswith(IN_EVERY_WAY) or planted[2].endswith(ONCE)
@@ -140,7 +145,7 @@ def test_variants_and_other_backends_conform(name, check):
 
 
 def weaknesses(solver):
-    """Every (form, change) that changes verdict or answer, and how many were solved."""
+    """Return each (form, change) with a weakness, and the number of solved ones."""
     weak, solved = [], 0
     for form in FORMS:
         old = None
@@ -148,7 +153,7 @@ def weaknesses(solver):
             try:
                 old = old or answer(solver, strings(form))
                 same_answer(form, change, solver, old)
-            except WeakError:
+            except WeaknessError:
                 weak.append((form, change))
             except DeclinedError:
                 continue
@@ -162,11 +167,11 @@ def weaknesses(solver):
         pytest.param(
             name, marks=() if name in NATIVE.keys() - REWRITTEN else pytest.mark.slow
         )
-        for name in CONCRETE  # the others hand the same QPs to libraries among these
+        for name in CONCRETE  # the others pass the same QPs to libraries of these
     ],
 )
-def test_what_an_equivalent_formulation_changes_is_in_the_documents(name):
-    """`make weaknesses` writes the page; one that is gone again may stay there."""
+def test_weaknesses_are_documented(name):
+    """`make weaknesses` writes the page; it may list weaknesses that are gone."""
     page = WEAKNESSES.read_text()
     weak, solved = weaknesses(CONCRETE[name])
 
@@ -185,7 +190,7 @@ def test_our_own_solvers_have_no_weakness():
 
 @dataclass(frozen=True)
 class Sound:
-    """PIQP in disguise, for others to spoil."""
+    """PIQP under another name, base class of the faulty solvers."""
 
     spoilt: str = ""
 
@@ -243,7 +248,7 @@ class Wanders(Sound):
 
 
 class Scales(Sound):
-    """Answers rightly, after scaling the data in place by force."""
+    """Correct answers, after scaling the read-only data in place."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -283,7 +288,7 @@ class TakesOperatorsForZero(Sound):
 
 
 class StopsAtTheStart(Sound):
-    """As HiGHS 1.15.1 did on QPs with bounds only."""
+    """Claim of optimality at the first point, as by HiGHS 1.15.1 for bounds only."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -297,7 +302,7 @@ class Slow(Sound):
 
 
 class MindsUnits(Sound):
-    """Gives up where numbers are large, as an absolute tolerance would."""
+    """Failure for large numbers, like with an absolute tolerance."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -305,7 +310,7 @@ class MindsUnits(Sound):
 
 
 class SlowInNewtons(Sound):
-    """Takes 49 times the iterations where unknowns are large, as OSQP does."""
+    """49 times the iterations for large unknowns, as OSQP takes."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -314,7 +319,7 @@ class SlowInNewtons(Sound):
 
 
 class MindsTheOrder(Sound):
-    """Fails where the first unknown may be no less than zero."""
+    """Failure if the first unknown has the lower bound zero."""
 
     def act(self, qp, tol):
         s = self.honest(qp, tol)
@@ -392,15 +397,15 @@ def test_rounding_on_absent_bounds_passes_with_a_remark():
     assert run_check("puts none on absent bounds", Sound()).message == ""
 
 
-def test_a_right_claim_of_infeasibility_is_told_from_giving_up():
+def test_a_correct_claim_of_infeasibility_is_distinguished_from_giving_up():
     message = run_check("claims no success: infeasible", Sound()).message
     assert message == "verified infeasible"
     message = run_check("claims no success: unbounded", Sound()).message
     assert message != "verified infeasible"
 
 
-def test_who_fails_on_an_operator_is_told_the_line_to_write():
-    """The line itself, put where the message says, makes the check pass."""
+def test_a_solver_that_fails_on_an_operator_is_advised_of_the_missing_line():
+    """The line of the message, inserted at its place, makes the check pass."""
     check = "takes or declines an operator"
     message = run_check(check, TakesOperatorsForZero()).message
     ((line, where),) = re.findall(r"`(if .*)` \((from .*)\)", message)
@@ -408,7 +413,7 @@ def test_who_fails_on_an_operator_is_told_the_line_to_write():
     exec(f"{where}\ndef declines(self, qp):\n    {line}", scope)
     told = type("Told", (TakesOperatorsForZero,), {"declines": scope["declines"]})
 
-    # it declines, and is handed the operator multiplied out
+    # it declines, and the harness multiplies the operator out
     assert run_check(check, told()) == (Grade.PASS, "", None)
 
 
@@ -419,12 +424,12 @@ def test_who_fails_on_an_operator_is_told_the_line_to_write():
         (MindsTheOrder, "keeps its answer: dual, unknowns permuted"),
     ],
 )
-def test_what_an_equivalent_formulation_changes_is_a_weakness(kind, check):
+def test_a_change_by_an_equivalent_formulation_is_a_weakness(kind, check):
     assert run_check(check, Sound()).grade is Grade.PASS
     assert run_check(check, kind()).grade is Grade.WEAK
 
 
-def test_what_was_not_solved_cannot_change():
+def test_a_form_that_is_not_solved_has_no_weakness():
     weak = run_check("keeps its answer: dual-bounds, as it is", MindsTheOrder())
     other = run_check("keeps its answer: dual-bounds, mirrored", MindsTheOrder())
     assert weak.grade is Grade.WEAK
@@ -432,7 +437,7 @@ def test_what_was_not_solved_cannot_change():
     assert other.message.startswith("not solved as it is: ended as failed")
 
 
-def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
+def test_more_cpu_time_than_wall_time_means_several_threads(monkeypatch):
     # a fake clock: real threads need idle cores to show
     monkeypatch.setattr(time, "process_time", lambda: 2 * time.perf_counter())
     slow = Slow()
@@ -441,7 +446,7 @@ def test_more_cpu_time_than_passes_is_more_than_one_thread(monkeypatch):
     assert run_check("computes in one thread", slow).grade is Grade.PASS
 
 
-def test_a_decline_of_all_is_no_pass():
+def test_declining_everything_is_not_a_pass():
     kinds = {check.partition(":")[0]: check for check in CHECKS}
     grades = {run_check(check, DeclinesAll()).grade for check in kinds.values()}
     assert Grade.PASS in grades  # its options
@@ -451,7 +456,7 @@ def test_a_decline_of_all_is_no_pass():
 
 @pytest.fixture
 def plugin(tmp_path):
-    """This file's solvers, offered as a plug-in."""
+    """Return the path of a plug-in with the solvers of this file."""
     path = tmp_path / "spoilt.py"
     here = os.path.abspath(__file__)
     path.write_text(
@@ -482,7 +487,7 @@ def test_the_command_says_how_every_check_ended(plugin, capsys):
     assert {row["grade"] for row in rows} == {"pass", "decline"}
 
 
-def test_weaknesses_are_told_and_solvers_that_have_some_conform(
+def test_weaknesses_are_reported_and_solvers_with_some_conform(
     plugin, capsys, monkeypatch
 ):
     few = [c for c in CHECKS if c.startswith(("finds the planted", "keeps its answer"))]
@@ -543,7 +548,7 @@ def test_a_solver_that_solves_nothing_does_not_conform(plugin, capsys):
     assert "never on a Monday" in capsys.readouterr().out
 
 
-def test_what_fails_is_said_where_the_exit_code_is_1(plugin, capsys, monkeypatch):
+def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
     few = [
         "finds the planted solution: bounds, sparse", "refuses a misspelt option",
         "gives multipliers our signs",

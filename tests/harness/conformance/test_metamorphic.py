@@ -1,4 +1,4 @@
-"""Equivalent formulations: each change is one, and its way back leads back."""
+"""Each change is an equivalent formulation, and its inverse map recovers solutions."""
 
 from dataclasses import replace
 
@@ -21,41 +21,41 @@ from mortarbench.harness.conformance.metamorphic import (
 from mortarbench.solvers.adapters.piqp_ import PIQP
 
 
-def drawn():
+def generator():
     return np.random.default_rng(161803)
 
 
-#: that leave every residual as it is, at any point: nothing but names and units
+#: changes that preserve every residual at every point
 NAMES_AND_UNITS = {
     "units": lambda qp: change_units(qp, unknown=2.0**-11, objective=2.0**28),
     "odd units": lambda qp: change_units(qp, unknown=0.0254, objective=4.448),
     "unknowns permuted": lambda qp: permute_unknowns(
-        qp, drawn().permutation(qp.q.size)
+        qp, generator().permutation(qp.q.size)
     ),
     "rows permuted": lambda qp: permute_rows(
-        qp, drawn().permutation(qp.b.size), drawn().permutation(qp.h.size)
+        qp, generator().permutation(qp.b.size), generator().permutation(qp.h.size)
     ),
     "rows scaled": lambda qp: scale_rows(
         qp,
-        2.0 ** drawn().integers(-9, 9, qp.b.size),
-        2.0 ** drawn().integers(-9, 9, qp.h.size),
+        2.0 ** generator().integers(-9, 9, qp.b.size),
+        2.0 ** generator().integers(-9, 9, qp.h.size),
     ),
-    "mirrored": lambda qp: mirror(qp, drawn().random(qp.q.size) < 0.5),
+    "mirrored": lambda qp: mirror(qp, generator().random(qp.q.size) < 0.5),
 }
 TRANSFORMS = NAMES_AND_UNITS | {
     "rows twice": lambda qp: duplicate_rows(
-        qp, np.arange(0, qp.b.size, 2), drawn().random(qp.h.size) < 0.5
+        qp, np.arange(0, qp.b.size, 2), generator().random(qp.h.size) < 0.5
     ),
     "unknowns shifted": lambda qp: shift_unknowns(
-        qp, drawn().integers(-8, 8, qp.q.size) / 8
+        qp, generator().integers(-8, 8, qp.q.size) / 8
     ),
     "all": lambda qp: (
         TRANSFORMS["units"](qp)
-        .then(TRANSFORMS["unknowns shifted"])
-        .then(TRANSFORMS["unknowns permuted"])
-        .then(TRANSFORMS["mirrored"])
-        .then(TRANSFORMS["rows twice"])
-        .then(TRANSFORMS["rows scaled"])
+        .followed_by(TRANSFORMS["unknowns shifted"])
+        .followed_by(TRANSFORMS["unknowns permuted"])
+        .followed_by(TRANSFORMS["mirrored"])
+        .followed_by(TRANSFORMS["rows twice"])
+        .followed_by(TRANSFORMS["rows scaled"])
     ),
 }
 
@@ -63,15 +63,15 @@ every_transform = pytest.mark.parametrize("transform", TRANSFORMS)
 every_shape = pytest.mark.parametrize("shape", SHAPES)
 
 
-def anywhere(qp):
-    """A point that is no solution: multipliers of any sign, on absent bounds too."""
-    rng = drawn()
+def random_point(qp):
+    """Return a random point, with multipliers of any sign, also on absent bounds."""
+    rng = generator()
     x, y, z, z_box = (rng.standard_normal(v.size) for v in (qp.q, qp.b, qp.h, qp.q))
     return Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
 def lagrangian(qp, s):
-    """Objective + yᵀ(Ax − b) + zᵀ(Gx − h) + the box' part, with bounds that exist."""
+    """Return objective + yᵀ(Ax − b) + zᵀ(Gx − h) + the terms of finite bounds."""
     box = np.where(s.z_box > 0, s.x - qp.ub, s.x - qp.lb)
     box = s.z_box @ np.where(np.isfinite(box), box, 0)
     return (
@@ -82,10 +82,8 @@ def lagrangian(qp, s):
 @every_transform
 @every_shape
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
-def test_the_way_back_leads_from_a_solution_to_the_solution(
-    manufactured, transform, shape, dense
-):
-    """Solved anew, the changed QP has the planted minimiser and objective."""
+def test_the_map_back_recovers_the_solution(manufactured, transform, shape, dense):
+    """The solution of the changed QP is mapped to the planted minimiser."""
     qp, expected = manufactured(shape, dense=dense)
     new = TRANSFORMS[transform](qp)
     s = PIQP().prepare(new.qp, 1e-11)()
@@ -111,7 +109,7 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 ):
     qp, _ = manufactured(shape, dense=True)
     new = TRANSFORMS[transform](qp)
-    s = anywhere(new.qp)
+    s = random_point(new.qp)
     back = new.recover(s)
 
     for value in (lambda q, at: q.objective(at.x), lagrangian):
@@ -121,8 +119,8 @@ def test_objective_and_lagrangian_keep_their_relation_at_every_point(
 
 @pytest.mark.parametrize("transform", NAMES_AND_UNITS)
 @every_shape
-def test_what_is_violated_stays_violated(manufactured, transform, shape):
-    """Rows, bounds and signs of multipliers, at a point that is anything but good."""
+def test_violated_constraints_stay_violated(manufactured, transform, shape):
+    """Rows, bounds and signs of multipliers, at a random point."""
 
     def violated(qp, s):
         z_lb, z_ub = s.z_box < 0, s.z_box > 0
@@ -132,7 +130,7 @@ def test_what_is_violated_stays_violated(manufactured, transform, shape):
 
     qp, _ = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
-    s = anywhere(new.qp)
+    s = random_point(new.qp)
 
     assert violated(new.qp, s) == violated(qp, new.recover(s))
 
@@ -142,13 +140,15 @@ def test_what_is_violated_stays_violated(manufactured, transform, shape):
 def test_names_and_units_change_no_residual_at_any_point(
     manufactured, transform, shape
 ):
-    """What `harness.verify.kkt` promises, at good and bad points, and at none."""
+    """Test the promise of `harness.verify.kkt` at good points, bad points and NaN."""
     qp, expected = manufactured(shape, dense=True)
     new = NAMES_AND_UNITS[transform](qp)
     inverse = preimage(qp, new)
-    near = replace(expected, x=expected.x + 1e-5 * drawn().standard_normal(qp.q.size))
+    near = replace(
+        expected, x=expected.x + 1e-5 * generator().standard_normal(qp.q.size)
+    )
     for old in (
-        anywhere(qp),
+        random_point(qp),
         near,
         expected,
         Solution.without_point(qp, Status.SOLVED),
@@ -162,7 +162,7 @@ def test_names_and_units_change_no_residual_at_any_point(
 
 
 def preimage(qp, new):
-    """Invert a way back, which is linear but for a shift, by what it does to units."""
+    """Invert the map back, which is affine, from its images of unit vectors."""
     parts = ("x", "y", "z", "z_box")
     sizes = [new.qp.q.size, new.qp.b.size, new.qp.h.size, new.qp.q.size]
     cuts = np.cumsum(sizes)[:-1]
@@ -189,13 +189,13 @@ def preimage(qp, new):
 
 
 @every_shape
-def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
+def test_a_duplicated_row_changes_residuals_by_a_factor_of_two_at_most(
     manufactured, shape
 ):
-    """With each multiplier halved nothing but z⁻ and zᵢ·slackᵢ can shrink, twofold."""
+    """Each multiplier is halved, so only z⁻ and zᵢ·slackᵢ can shrink, by two."""
     qp, _ = manufactured(shape, dense=True)
     new = duplicate_rows(qp, np.arange(qp.b.size), np.arange(qp.h.size))
-    old = anywhere(qp)
+    old = random_point(qp)
     s = replace(old, y=np.tile(old.y / 2, 2), z=np.tile(old.z / 2, 2))
     got, before = kkt_residuals(new.qp, s), kkt_residuals(qp, old)
 
@@ -207,7 +207,7 @@ def test_a_row_written_twice_changes_residuals_by_its_two_halves_at_most(
 
 
 @pytest.mark.parametrize("transform", ["units", "rows scaled", "mirrored"])
-def test_powers_of_two_lose_no_bit(manufactured, transform):
+def test_powers_of_two_are_exact(manufactured, transform):
     qp, _ = manufactured("everything")
     new = TRANSFORMS[transform](qp).qp
     for name in ("P", "q", "A", "b", "G", "h", "lb", "ub"):
@@ -234,7 +234,7 @@ def test_the_structure_of_a_dual_is_that_of_the_changed_dual(form, transform):
 
 
 def test_units_of_the_strings_are_those_of_textbooks():
-    """K in Pa, MPa and GPa, λ in N/m, N/mm and GN/m for one and the same body."""
+    """K is in Pa, MPa and GPa, λ in N/m, N/mm and GN/m, for the same body."""
     nd = strings("primal").P.toarray().max()
     pascal = nd * 2.0**26  # F₀/l
     for units, factor in [("N, m", 1), ("N, mm", 2.0**-20), ("GN, m", 2.0**-30)]:

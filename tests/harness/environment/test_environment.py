@@ -1,4 +1,4 @@
-"""The environment says what times depend on, and nothing about who measured."""
+"""The environment contains what times depend on, and nothing about the user."""
 
 import copy
 import json
@@ -42,7 +42,7 @@ def pool(library="libopenblas", owner="system", threads=1):
 
 @pytest.fixture
 def quiet():
-    """An environment with nothing to complain about."""
+    """Return an environment without any warning."""
     return {
         "machine": {
             "cpu": "Some CPU", "physical_cores": 4, "logical_cores": 8,
@@ -60,7 +60,7 @@ def quiet():
 
 
 def changed(environment, path, value):
-    """Copy with the entry at the dotted path replaced."""
+    """Return a copy with the entry at a dotted path replaced."""
     result = copy.deepcopy(environment)
     *parents, last = path.split(".")
     entry = result
@@ -71,7 +71,7 @@ def changed(environment, path, value):
 
 
 @pytest.mark.parametrize("path", ["now.load", "now.available_memory_mib", "now.time"])
-def test_the_digest_ignores_what_changes_from_minute_to_minute(quiet, path):
+def test_the_digest_ignores_load_memory_and_time(quiet, path):
     assert digest(changed(quiet, path, 7)) == digest(quiet)
 
 
@@ -86,7 +86,7 @@ def test_the_digest_ignores_what_changes_from_minute_to_minute(quiet, path):
         ("source.dirty", True),
     ],
 )
-def test_the_digest_changes_with_what_times_depend_on(quiet, path, value):
+def test_the_digest_changes_with_everything_that_affects_times(quiet, path, value):
     assert digest(changed(quiet, path, value)) != digest(quiet)
 
 
@@ -101,7 +101,7 @@ def test_two_captures_in_a_row_have_one_digest_through_json():
     assert digest(first) == digest(second)
 
 
-def test_a_capture_tells_no_host_name_and_no_absolute_path(monkeypatch):
+def test_a_capture_contains_no_host_name_and_no_absolute_path(monkeypatch):
     host = "a-planted-host-name"
     planted = os.uname_result(("Linux", host, "6.1.0", "#1 SMP", "x86_64"))
     monkeypatch.setattr(os, "uname", lambda: planted)
@@ -135,7 +135,7 @@ def test_plugins_are_named_by_their_content(tmp_path):
 
 @pytest.fixture
 def checkout(tmp_path, monkeypatch):
-    """A repository with one commit."""
+    """Create a repository with one commit."""
     for who in ("AUTHOR", "COMMITTER"):
         monkeypatch.setenv(f"GIT_{who}_NAME", "A")
         monkeypatch.setenv(f"GIT_{who}_EMAIL", "a@example.org")
@@ -154,7 +154,7 @@ def test_a_checkout_as_committed_is_clean(checkout):
 
 
 @pytest.mark.parametrize("name", ["a.py", "new file.py"])
-def test_two_states_of_a_dirty_checkout_are_told_apart(checkout, name):
+def test_two_states_of_a_dirty_checkout_have_different_digests(checkout, name):
     states = []
     for text in ("x = 2\n", "x = 3\n", "x = 2\n"):
         (checkout / "harness" / name).write_text(text)
@@ -165,7 +165,7 @@ def test_two_states_of_a_dirty_checkout_are_told_apart(checkout, name):
     assert re.fullmatch("[0-9a-f]{12}", states[0]["changes"])
 
 
-def test_a_capture_holds_the_versions_that_the_modules_themselves_tell():
+def test_a_capture_contains_the_versions_that_the_modules_report():
     versions = capture()["versions"]
     assert versions["numpy"] == np.__version__
     assert versions["python"] == ".".join(map(str, sys.version_info[:3]))
@@ -237,7 +237,7 @@ def test_a_quiet_machine_gets_no_advice(quiet):
         ("versions.scikit-sparse", None, "make setup"),
     ],
 )
-def test_each_trouble_says_what_to_change(quiet, path, value, remedy):
+def test_each_problem_comes_with_advice(quiet, path, value, remedy):
     found = warnings(changed(quiet, path, value))
 
     assert any(remedy in check.advice for check in found)
@@ -253,18 +253,18 @@ def test_each_trouble_says_what_to_change(quiet, path, value, remedy):
         ({"one_pair": 0.3}, "noise floor"),
     ],
 )
-def test_a_clock_that_cannot_be_trusted_is_warned_of(quiet, change, name):
+def test_an_unreliable_clock_is_a_warning(quiet, change, name):
     (check,) = warnings(quiet, replace(QUIET_NOISE, **change))
 
     assert check.name == name
 
 
-def test_a_ratio_whose_interval_holds_one_is_no_difference(quiet):
+def test_a_ratio_whose_interval_contains_one_is_not_a_difference(quiet):
     wide = replace(QUIET_NOISE, ratio=1.05, low=0.95, high=1.15)
     assert warnings(quiet, wide) == []
 
 
-def test_what_cannot_be_read_is_unknown_and_no_reason_to_complain(quiet):
+def test_values_that_cannot_be_read_are_unknown_without_a_warning(quiet):
     paths = ("governor", "turbo", "smt")
     for path in paths:
         quiet = changed(quiet, f"machine.{path}", None)
@@ -300,7 +300,7 @@ def test_a_package_without_a_blas_of_its_own_uses_the_systems(quiet):
     ] * 2
 
 
-def test_the_values_stand_in_one_column_with_the_advice_below(quiet):
+def test_values_are_aligned_with_the_advice_below(quiet):
     environment = changed(quiet, "machine.governor", "powersave")
     lines = str(render(examine(environment, QUIET_NOISE), "0123456789ab")).splitlines()
     rows = [re.match(r"  (ok|warn) +\S+(?: \S+)* {2,}", line) for line in lines]
@@ -323,7 +323,7 @@ def test_a_perfect_clock_shows_no_noise_between_equal_arms():
 def test_a_steady_drift_hits_both_arms_alike():
     readings = (0.5 * k**2 + 100 * k for k in count())  # 1 % longer each time
     noise = noise_floor(30_000.0, clock=lambda: next(readings))
-    assert noise.one_pair > 0.003  # what pairs in one order would be off by
+    assert noise.one_pair > 0.003  # error of pairs that are all in one order
     assert noise.ratio == pytest.approx(1.0, abs=3e-4)  # a tenth of that
 
 

@@ -31,10 +31,10 @@ from mortarbench.harness.results.faults import (
     FAULTS,
     Fault,
     in_words,
-    left,
     read_faults,
+    remaining_faults,
 )
-from mortarbench.harness.results.folder import Held, refuse_foreign
+from mortarbench.harness.results.folder import FolderLock, refuse_foreign
 from mortarbench.registries import Registries
 from mortarbench.reports.data.evidence import read_evidence
 from mortarbench.reports.sections import Analysis
@@ -250,35 +250,35 @@ def test_what_writers_left_unfinished_goes_and_nothing_else(tmp_path):
 
 
 def test_a_folder_is_held_although_its_lock_is_deleted(tmp_path):
-    held = Held(tmp_path)
+    lock = FolderLock(tmp_path)
     (tmp_path / ".lock").unlink()
 
-    assert held.is_there()
+    assert lock.is_there()
     with pytest.raises(InputError, match="is being written by another run"):
-        Held(tmp_path)
-    held.close()
-    Held(tmp_path).close()
+        FolderLock(tmp_path)
+    lock.close()
+    FolderLock(tmp_path).close()
 
 
 def test_a_folder_that_another_run_took_when_the_lock_was_deleted_is_lost(tmp_path):
-    held = Held(tmp_path)
+    lock = FolderLock(tmp_path)
     (tmp_path / ".lock").unlink()
-    other = Held(tmp_path)
+    other = FolderLock(tmp_path)
 
     with pytest.raises(InputError, match="is being written by another run"):
-        held.is_there()
+        lock.is_there()
     assert other.is_there()
-    held.close()
+    lock.close()
     other.close()
 
 
 def test_a_run_that_was_cut_off_at_once_left_a_folder_that_is_known(tmp_path):
-    Held(tmp_path).close()
+    FolderLock(tmp_path).close()
     (tmp_path / "suite.toml").write_text("")  # and no environment.json yet
     refuse_foreign(tmp_path)
 
     (tmp_path / ".lock").write_text("somebody else's")
-    with pytest.raises(InputError, match="is no result folder"):
+    with pytest.raises(InputError, match="is not a result folder"):
         refuse_foreign(tmp_path)
 
 
@@ -291,10 +291,10 @@ def test_of_faults_the_last_of_each_measurement_that_is_missing_counts(tmp_path)
         partial.write('{"time')
 
     assert read_faults(tmp_path) == every
-    assert left(every, {"c"}) == [every[2], every[1]]
-    assert in_words(left(every, "abc")) == ""
-    assert in_words(left(every, "c")) == (
-        "2 measurements could not be made, by no fault of a solver: y, w"
+    assert remaining_faults(every, {"c"}) == [every[2], every[1]]
+    assert in_words(remaining_faults(every, "abc")) == ""
+    assert in_words(remaining_faults(every, "c")) == (
+        "2 measurements failed for reasons other than the solver: y, w"
     )
     assert read_faults(tmp_path / "no such folder") == []
 
@@ -354,11 +354,13 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
     def measured(worker, qp, record, request, **limits):
         if record.solver == "near":
             raise FaultError("the worker could not be started")
-        return remote.measured(worker, qp, record, request, **limits)
+        return remote.measure_and_judge(worker, qp, record, request, **limits)
 
-    monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
+    monkeypatch.setattr(
+        "mortarbench.harness.running.executor.measure_and_judge", measured
+    )
     code, out, err = cli("run", "toy.toml", "--out", "d")
-    told = "2 measurements could not be made, by no fault of a solver: the worker could"
+    told = "2 measurements failed for reasons other than the solver: the worker could"
 
     assert code == 1
     assert f"{told} not be started; the same command tries again\n" in out
@@ -369,7 +371,7 @@ def test_a_run_and_its_report_tell_what_faults_prevented(cli, monkeypatch, tmp_p
     monkeypatch.chdir(tmp_path)
     code, out, _ = cli("run", "toy.toml", "--out", "d")
     assert code == 0
-    assert "could not be made" not in out
+    assert "failed for reasons other than the solver" not in out
     assert told not in (tmp_path / "d" / "said").read_text()
 
 
@@ -379,7 +381,9 @@ def test_a_run_that_is_asked_to_end_says_so_and_ends_by_143(cli, monkeypatch):
     def measured(*_, **__):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
+    monkeypatch.setattr(
+        "mortarbench.harness.running.executor.measure_and_judge", measured
+    )
     with pytest.raises(SystemExit) as e:
         cli("run", "toy.toml", "--out", "d")
 

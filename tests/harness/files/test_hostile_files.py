@@ -114,9 +114,9 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
     """A request without a digest: the file may be anybody's."""
     hostile(tmp_path / "a.npz", "subprocess:call")
     program = (
-        "import os, sys; from mortarbench.harness.processes.worker import _Bench; "
+        "import os, sys; from mortarbench.harness.processes.worker import _SolverHost; "
         "qp, out = sys.argv[1:]; "
-        "bench = _Bench(None, {'subprocess:call': os.abort}); "
+        "bench = _SolverHost(None, {'subprocess:call': os.abort}); "
         "bench.answer({'qp': qp, 'out': out}, None)"
     )
     files = [str(tmp_path / name) for name in ("a.npz", "point.npz")]

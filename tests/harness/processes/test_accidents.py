@@ -1,4 +1,4 @@
-"""Solvers that disturb a run by accident: their verdicts, and their neighbours'."""
+"""Solvers that disturb a run by accident, and the verdicts of their neighbours."""
 
 import fcntl
 import itertools
@@ -20,14 +20,14 @@ from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.processes.measurement import (
-    _believed,
-    measured,
+    _plausible_cost,
+    measure_and_judge,
     scratch_folder,
 )
 from mortarbench.harness.processes.protocol import ForeignReplyError, event_of
-from mortarbench.harness.processes.reaper import lives, state
+from mortarbench.harness.processes.reaper import is_alive, state
 from mortarbench.harness.processes.supervisor import (
-    REPLACED,
+    REPLACEMENT_NOTE,
     Clock,
     Reply,
     WorkerProcess,
@@ -51,9 +51,9 @@ TINY = ACCIDENTS.problems["tiny"]
 CASE = assemble(TINY, {}, "plain")
 
 FOREIGN = "came, expected 'timed'"
-SUSPECT = "is kept between measurements"
-OURS = "the time is ours"
-#: verdict, and a pattern of the message
+SUSPECT = "results are cached between measurements"
+PARENTS_TIME = "the parent's time is recorded"
+#: expected verdict, and a pattern of the message
 OUTCOMES = {
     "writesnoise": (Verdict.FAILED, f"no JSON .*{FOREIGN}|no JSON .* a reply"),
     "writesendlessly": (Verdict.FAILED, "4 MiB came without an end of line"),
@@ -61,17 +61,17 @@ OUTCOMES = {
     "executeddaemon": (Verdict.VERIFIED, "^$"),
     "forkbomb": (Verdict.VERIFIED, "^$"),
     "hangswithadaemon": (Verdict.TIME_LIMIT, "killed after 1 s"),
-    "burns": (Verdict.VERIFIED, REPLACED),
+    "burns": (Verdict.VERIFIED, REPLACEMENT_NOTE),
     "pools": (Verdict.VERIFIED, "^$"),
     "hoardsinshm": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
     "sharespages": (Verdict.VERIFIED, "^$"),
     "hoardsinadaemon": (Verdict.MEMORY_LIMIT, "above the limit of 400 MiB"),
-    "patchestheclock": (Verdict.VERIFIED, OURS),
+    "patchestheclock": (Verdict.VERIFIED, PARENTS_TIME),
     "stopsitself": (Verdict.TIME_LIMIT, "killed after 1 s"),
     "killsitself": (Verdict.CRASHED, "^SIGKILL$"),
     "closesall": (Verdict.CRASHED, "Bad file descriptor"),
 }
-#: each kind once; the others are slow tests
+#: one of each kind; the others are slow tests
 QUICK = {
     "writesnoise", "writesendlessly", "daemon", "forkbomb", "burns", "hoardsinshm",
     "hoardsinadaemon", "closesall", "sharespages",
@@ -82,7 +82,7 @@ RUN_TOGETHER = ("daemon", "burns", "writesendlessly", "writesnoise", "patchesthe
 
 @pytest.fixture
 def watched(monkeypatch):
-    """Name this test to the processes that it starts."""
+    """Mark the processes that this test starts, by a variable of their environment."""
     name = secrets.token_hex(8)
     monkeypatch.setenv("WATCHED", name)
     return name
@@ -90,46 +90,49 @@ def watched(monkeypatch):
 
 @pytest.fixture(scope="module")
 def beside_a_witness(tmp_path_factory):
-    """Measure a solver beside one that lives on, and looks for what is left."""
+    """Measure a solver beside a witness, a worker that looks for leftover processes."""
     with pytest.MonkeyPatch.context() as patch:
         name = secrets.token_hex(8)
         patch.setenv("WATCHED", name)
         bench = Bench(tmp_path_factory.mktemp("accidents"))
         assert bench("witness").verdict is Verdict.VERIFIED
-        alone = left(name)
+        alone = processes_of(name)
         assert len(alone) == 2  # worker, sub-reaper
 
         def measured_beside(solver, time_limit):
             patch.setenv("WATCHED", name)
             try:
                 record = bench(solver, time_limit=time_limit)
-                assert len(set(left(name)) - set(alone)) in (0, 2)  # worker, sub-reaper
+                assert len(set(processes_of(name)) - set(alone)) in (
+                    0,
+                    2,
+                )  # worker, sub-reaper
                 assert bench("witness").verdict is Verdict.VERIFIED
                 return record
             finally:
                 bench.workers.pop(solver).close()
-                assert left(name) == alone
+                assert processes_of(name) == alone
                 assert not list(Path("/dev/shm").glob(f"{name}*"))
 
         yield measured_beside
         bench.close()
-    assert left(name) == []
+    assert processes_of(name) == []
 
 
-def left(watched):
-    """List the processes of a test that live, except this one."""
+def processes_of(watched):
+    """List the living processes of a test, except this one."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):
             environment = (entry / "environ").read_bytes().split(b"\0")
             mine = f"WATCHED={watched}".encode() in environment
-            if mine and int(entry.name) != os.getpid() and lives(int(entry.name)):
+            if mine and int(entry.name) != os.getpid() and is_alive(int(entry.name)):
                 found.append(int(entry.name))
     return found
 
 
 class Bench:
-    """Measure solvers on the tiny QP, each by a worker of its own."""
+    """Measuring of solvers on a tiny QP, each by a worker of its own."""
 
     def __init__(self, folder, *, memory_limit=400.0):
         self.folder, self.workers = folder, {}
@@ -150,7 +153,7 @@ class Bench:
             sample_seconds=SAMPLE_SECONDS,
         )  # fmt: skip
         worker = self.workers[solver]
-        return measured(
+        return measure_and_judge(
             worker, lambda: self.qp, record, request, time_limit=time_limit,
             memory_limit=self.memory_limit, prove=proves(reference_solution),
         )[0]  # fmt: skip
@@ -168,14 +171,14 @@ def bench(tmp_path, watched):
     bench = Bench(tmp_path)
     yield bench
     bench.close()
-    assert left(watched) == []
+    assert processes_of(watched) == []
 
 
 @pytest.mark.parametrize(
     "solver",
     [a if a in QUICK else pytest.param(a, marks=pytest.mark.slow) for a in OUTCOMES],
 )
-def test_an_accident_costs_its_own_verdict_and_nothing_of_it_is_left(
+def test_an_accident_costs_its_own_verdict_and_leaves_no_process(
     beside_a_witness, solver
 ):
     verdict, message = OUTCOMES[solver]
@@ -187,7 +190,7 @@ def test_an_accident_costs_its_own_verdict_and_nothing_of_it_is_left(
     assert len(record.message) < 500
 
 
-CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
+CLOCK = Clock(min_seconds=0.1, elapsed_seconds=0.15, max_seconds=0.2)
 
 
 @pytest.mark.parametrize(
@@ -195,13 +198,13 @@ CLOCK = Clock(least=0.1, seen=0.15, most=0.2)
     [
         (0.05, 0.06, None, 1, True),
         (0.001, 0.001, 0.1, 10, True),
-        (0.15, 0.06, None, 1, False),  # longer than from request to end
+        (0.15, 0.06, None, 1, False),  # longer than the wall time
         (0.05, 0.04, None, 1, False),  # shorter than the CPU time
         (0.001, 0.001, 0.01, 10, False),
         (-1e-6, -1e-6, 0.05, 10, False),
     ],
 )
-def test_a_time_is_believed_within_what_the_parent_knows(
+def test_a_time_is_accepted_within_the_bounds_of_the_parent(
     prepare, solve, first, inner, is_believed
 ):
     seconds = dict(
@@ -209,7 +212,7 @@ def test_a_time_is_believed_within_what_the_parent_knows(
         first_seconds=first, inner=inner,
     )  # fmt: skip
     reply = Reply(answer=ANSWER | seconds, clock=CLOCK)
-    m, *notes = _believed(reply)
+    m, *notes = _plausible_cost(reply)
 
     assert bool(notes) is not is_believed
     if is_believed:
@@ -270,7 +273,7 @@ def check_neighbours(tmp_path, watched, careless):
         assert found == [(Verdict.VERIFIED, "")] * 2
     for solver in careless:
         assert {r.verdict for r in got[solver]} == {OUTCOMES[solver][0]}
-    assert left(watched) == []
+    assert processes_of(watched) == []
 
 
 def test_neighbours_of_careless_solvers_keep_their_measurements_and_are_alone(
@@ -294,14 +297,14 @@ def test_a_pool_that_sleeps_may_stay_and_a_thread_that_burns_may_not(bench):
     assert bench.process("burns") == 0
 
 
-def test_a_time_that_the_clock_of_the_worker_denies_is_ours(bench):
+def test_a_time_that_the_parents_clock_contradicts_is_replaced(bench):
     record = bench("patchestheclock")
 
     assert record.total_seconds >= 0.002
     assert record.prepare_seconds is record.solve_seconds is None
 
 
-def test_what_is_done_in_declines_is_timed(bench):
+def test_work_in_declines_is_timed(bench):
     record = bench("worksindeclines")
 
     assert record.prepare_seconds >= 0.02
@@ -331,11 +334,11 @@ def test_a_kill_in_the_warm_up_costs_neither_the_warm_up_nor_the_measurement(
 
     assert (tmp_path / "killed").exists()
     assert record.verdict is Verdict.VERIFIED
-    assert record.threads is not None  # told by the warm-up
+    assert record.threads is not None  # reported by the warm-up
 
 
 @pytest.mark.parametrize(("limit", "is_fault"), [(float("inf"), True), (1.0, False)])
-def test_a_kill_for_want_of_memory_is_the_solvers_where_it_held_the_memory(
+def test_a_kill_for_lack_of_memory_is_attributed_to_a_solver_that_used_it(
     bench, monkeypatch, limit, is_fault
 ):
     counts = itertools.count()
@@ -353,7 +356,7 @@ def test_a_command_that_does_not_exist_is_a_fault(bench):
         bench("honest", command=["no-such-python"])
 
 
-def test_a_plug_in_that_dies_of_its_import_fails_by_itself(bench):
+def test_a_plug_in_that_dies_in_its_import_fails_alone(bench):
     record = bench("honest", command=[sys.executable, "-c", "raise SystemExit(3)"])
 
     assert record.verdict is Verdict.CRASHED
@@ -403,7 +406,7 @@ def test_a_worker_killed_while_it_is_idle_costs_nothing(bench):
     assert bench("honest").verdict is Verdict.VERIFIED
 
 
-#: it says what came of a measurement that ended early, and measures again
+#: reports on a measurement that ended early, and measures again
 RUNS = f"""
 import sys
 from pathlib import Path
@@ -420,17 +423,17 @@ def test_daemons_do_not_outlive_a_run_that_is_killed(tmp_path, watched):
     parent = subprocess.Popen([sys.executable, "-c", RUNS, str(tmp_path)], cwd=ROOT)
     try:
         # run, sub-reaper, worker, daemon
-        assert soon(lambda: len(left(watched)) == 4), "\n".join(
+        assert soon(lambda: len(processes_of(watched)) == 4), "\n".join(
             f"{process} {state(process)} waits in "
             + Path(f"/proc/{process}/wchan").read_text()
             + f": {Path(f'/proc/{process}/cmdline').read_bytes()[-60:]!r}"
-            for process in left(watched)
+            for process in processes_of(watched)
         )
     finally:
         parent.kill()
         parent.wait()
 
-    assert soon(lambda: left(watched) == [])
+    assert soon(lambda: processes_of(watched) == [])
 
 
 def test_scratch_of_a_killed_process_goes_at_the_next_start(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""Built cases on disk: found, shared, damaged."""
+"""Cache of built cases on disk: look-up, sharing and damage."""
 
 import json
 import time
@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from mortarbench.harness.processes.case_folder import entry
+from mortarbench.harness.processes.case_folder import find_or_build
 
 
 def name(**params):
@@ -15,7 +15,7 @@ def name(**params):
 
 @pytest.fixture
 def get(tmp_path):
-    """Ask for an entry; ``get.made`` lists what had to be built."""
+    """Return a function that looks up a case; its ``made`` lists those it built."""
 
     def get(case, *, environment="here", content=b"content", slowly=0.0):
         def make(path):
@@ -24,7 +24,7 @@ def get(tmp_path):
             path.write_bytes(content)
             return {"scale": 2.0}
 
-        return entry(tmp_path / "cases", [*case, environment], make)
+        return find_or_build(tmp_path / "cases", [*case, environment], make)
 
     get.made = []
     return get
@@ -46,7 +46,7 @@ def test_other_params_and_other_code_are_other_cases_of_maybe_equal_content(get)
     assert len({e.qp for e in entries}) == 1
 
 
-def test_of_many_that_ask_at_once_one_builds(get):
+def test_one_of_many_concurrent_callers_builds(get):
     with ThreadPoolExecutor(8) as pool:  # locks are between open files, not processes
         entries = list(pool.map(lambda _: get(name(n=1), slowly=0.1), range(8)))
 
@@ -77,7 +77,7 @@ def test_a_build_that_fails_leaves_no_entry(get, tmp_path):
         raise ZeroDivisionError
 
     with pytest.raises(ZeroDivisionError):
-        entry(tmp_path / "cases", [*name(n=1), "here"], fails)
+        find_or_build(tmp_path / "cases", [*name(n=1), "here"], fails)
 
     assert {p.suffix for p in (tmp_path / "cases").iterdir()} == {".lock"}
     assert get(name(n=1)).qp.read_bytes() == b"content"

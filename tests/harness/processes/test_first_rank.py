@@ -1,4 +1,4 @@
-"""Of ranks that die, the first one is named, whatever they print and the others do."""
+"""The first rank to end is named, whatever it prints and whatever the others do."""
 
 import json
 import os
@@ -14,8 +14,8 @@ from tests.support.dying_ranks import WAYS
 BURNS = "import select, sys\nwhile not select.select([sys.stdin], [], [], 0)[0]: pass"
 
 
-def wrongly_named(tmp_path, count, trials, seed):
-    """Trials in which another rank was named; what ranks print is in the same file."""
+def wrong_names(tmp_path, count, trials, seed):
+    """Return the trials that named another rank; the output of ranks is mixed in."""
     command = [sys.executable, str(SUPPORT / "dying_ranks.py")]
     with (tmp_path / "out").open("w+b") as out:
         subprocess.run(
@@ -28,7 +28,7 @@ def wrongly_named(tmp_path, count, trials, seed):
 
 
 def test_the_rank_that_ended_first_is_named_however_it_ended(tmp_path):
-    assert wrongly_named(tmp_path, 3, len(WAYS), seed=1) == []
+    assert wrong_names(tmp_path, 3, len(WAYS), seed=1) == []
 
 
 @pytest.mark.slow
@@ -37,7 +37,7 @@ def test_a_hundred_ranks_that_die_are_named_also_on_a_busy_machine(tmp_path, bur
     command = [sys.executable, "-S", "-c", BURNS]
     busy = [subprocess.Popen(command, stdin=subprocess.PIPE) for _ in range(burners)]
     try:
-        assert wrongly_named(tmp_path, 4, 100, seed=2 + burners) == []
+        assert wrong_names(tmp_path, 4, 100, seed=2 + burners) == []
     finally:
         for process in busy:
             process.kill()

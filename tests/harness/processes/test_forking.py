@@ -1,4 +1,4 @@
-"""Workers that are forks: as alone as those that a command starts, and as mortal."""
+"""Forked workers: isolated and killed like those that a command starts."""
 
 import json
 import os
@@ -10,14 +10,14 @@ import pytest
 from mortarbench.cli.main import main
 from mortarbench.harness.limits import ONE_THREAD, VARIABLE
 from mortarbench.harness.names import CaseId
-from mortarbench.harness.processes.reaper import lives
+from mortarbench.harness.processes.reaper import is_alive
 from mortarbench.harness.processes.supervisor import WorkerProcess
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 from tests.support.waiting import soon
 
-#: asks workers that are forks of it, prints what came of each, and is killed; a process
-#: of its own, since what forks safely has one thread
+#: asks forked workers, prints each result, and is then killed. It is a process of its
+#: own, since only a process with one thread forks safely
 PARENT = '''
 import atexit, json, os, signal, subprocess, sys, threading, time
 from contextlib import suppress
@@ -96,7 +96,7 @@ def beside_a_thread():
     finally:
         sleeps.set()
         thread.join()
-        for _ in range(2000):  # the kernel lets it go a little after that
+        for _ in range(2000):  # the kernel lists a joined thread a little longer
             if is_safe():
                 break
             time.sleep(0.01)
@@ -123,7 +123,7 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def results(folder):
-    """What came of workers, by what they did: pairs of verdict, message and answer."""
+    """Return verdict, message and answer of workers, by their behaviour."""
     done = subprocess.run(
         [sys.executable, "-P", "-c", PARENT, str(folder)],
         env=os.environ | {"SPECIAL": "known"}, stdout=subprocess.PIPE, text=True,
@@ -143,7 +143,7 @@ def test_a_fork_has_what_a_started_worker_has_and_nothing_of_its_parent(
     assert len(opened) == 5
     assert all(target.startswith("pipe:") for target in opened[3:])
     assert first["cpus"] == [max(os.sched_getaffinity(0))]
-    assert first["leads"] == [True, True]  # a session each, the sub-reaper and itself
+    assert first["leads"] == [True, True]  # sub-reaper and worker lead a session each
     assert first["signals"] == ["SIG_DFL", "SIG_IGN"]  # as in a new interpreter
     assert ONE_THREAD.items() <= first["environ"].items()
     assert (first["environ"]["SPECIAL"], first["environ"][VARIABLE]) == ("known", "inf")
@@ -154,15 +154,15 @@ def test_a_fork_runs_nothing_of_its_parent_to_its_end(results, folder):
     assert (folder / "held").read_text() == ""
 
 
-def test_what_has_a_second_thread_does_not_fork(results):
+def test_a_process_with_a_second_thread_does_not_fork(results):
     assert results["thread"] == [[None, "", {"how": "command"}]]
 
 
-def test_what_a_fork_starts_ends_with_its_measurement(results, folder):
+def test_processes_that_a_fork_starts_end_with_its_measurement(results, folder):
     (verdict, _, first), after = results["daemon"]
 
     assert (verdict, first["how"]) == (None, "fork")
-    assert not lives(int((folder / "daemon").read_text()))
+    assert not is_alive(int((folder / "daemon").read_text()))
     assert results["left"] == []
     assert after == [None, "", {"how": "command"}]
 
@@ -177,7 +177,7 @@ def test_a_fork_that_dies_is_replaced_by_a_worker_that_the_command_starts(result
 
 def test_a_fork_ends_when_its_parent_is_killed(results):
     ((_, _, answer),) = results["stay"]
-    assert soon(lambda: not lives(answer["process"]))
+    assert soon(lambda: not is_alive(answer["process"]))
 
 
 def test_the_command_forks_before_it_builds(monkeypatch, capsys):
@@ -198,7 +198,7 @@ def test_the_command_forks_before_it_builds(monkeypatch, capsys):
     assert events == ["fork", "build"]
 
 
-def test_where_code_of_others_is_loaded_the_command_does_not_fork(monkeypatch, capsys):
+def test_the_command_does_not_fork_once_plug_ins_are_loaded(monkeypatch, capsys):
     forked = []
     monkeypatch.setattr(WorkerProcess, "fork", lambda *_: forked.append(True))
     plugin = ["--plugin", str(TOY_PROBLEM)]

@@ -1,4 +1,4 @@
-"""What becomes of a measurement where one of its ranks fails, stage by stage."""
+"""Measurements in which one rank fails, stage by stage."""
 
 import json
 import os
@@ -34,7 +34,7 @@ params = {{ Nr = 4, Nh = 3, steps = 1, feti = 4 }}
 """
 MEASURING = ("emission", "prepare", "solve")
 EVALUATING = ("residuals", "certificate", "quantities")
-#: s that each stage may take: those before the planted one must come to their end
+#: s; limit of each stage, long enough for the stages before the planted failure
 LIMIT = 20
 KILLED = "rank 1 of 2 ranks ended: Killed"
 RAISED = "rank 1 of 2: ValueError: planted"
@@ -42,7 +42,7 @@ RAISED = "rank 1 of 2: ValueError: planted"
 
 @pytest.fixture
 def measured(tmp_path, monkeypatch):
-    """Measure once where one rank fails; no process may be left."""
+    """Measure once with a failing rank; assert that no process remains."""
 
     def run(stage, kind, rank="1", limit=LIMIT):
         monkeypatch.setenv("FAULT", str(tmp_path))
@@ -55,7 +55,7 @@ def measured(tmp_path, monkeypatch):
         suite = tmp_path / "ranks.toml"
         suite.write_text(SUITE.format(limit=limit))
         results = mb.run(suite, out=tmp_path / "out")
-        assert soon(lambda: not left(tmp_path))
+        assert soon(lambda: not processes_of(tmp_path))
         (record,) = results.records
         assert mb.load(tmp_path / "out").records == results.records
         return record
@@ -63,8 +63,8 @@ def measured(tmp_path, monkeypatch):
     return run
 
 
-def left(mark):
-    """Processes with the mark of a test in their environment, but for this one."""
+def processes_of(mark):
+    """List the other processes with the mark of a test in their environment."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -77,7 +77,7 @@ def left(mark):
 
 
 def test_records_of_ranks_do_not_mix(monkeypatch):
-    """Each is one line, written at once, and not longer than a pipe takes at once."""
+    """Each is one line, in one write of at most PIPE_BUF bytes, which is atomic."""
     written = []
     monkeypatch.setattr(os, "write", lambda fd, data: written.append((fd, data)))
     monkeypatch.setenv(failures.RECORD, "7")
@@ -98,7 +98,7 @@ def test_a_rank_that_hangs_while_it_emits_is_ended_at_the_time_limit(measured):
     assert record.message == "emission: killed after 2 s"
 
 
-def test_what_one_rank_cannot_certify_none_does_and_the_note_says_which(measured):
+def test_a_rank_that_cannot_certify_is_named_and_no_rank_certifies(measured):
     record = measured("certificate", "raises-after")
 
     assert record.verdict == "verified"
@@ -114,7 +114,7 @@ def test_a_killed_rank_ends_the_measurement_with_a_line_that_names_it(measured, 
 
     assert record.verdict == "crashed"
     assert KILLED in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -125,11 +125,11 @@ def test_a_rank_that_exits_with_0_before_the_others_is_named(measured, stage, ra
 
     assert record.verdict == "crashed"
     assert f"rank {rank} of 2 ranks ended: exit code 0" in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.parametrize("stage", ["solve"])
-def test_what_a_rank_prints_is_not_taken_for_the_reason(measured, stage):
+def test_output_of_a_rank_is_not_mistaken_for_the_reason(measured, stage):
     record = measured(stage, "prints")
 
     assert record.verdict == "crashed"
@@ -143,7 +143,7 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 
     assert record.verdict == "time_limit"
     assert f"killed after {LIMIT} s" in record.message
-    assert named(record.message, stage)
+    assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -153,13 +153,13 @@ def test_a_hanging_rank_is_ended_whatever_the_stage(measured, stage):
 def test_a_rank_that_raises_alone_does_not_leave_others_waiting(measured, stage, rank):
     record = measured(stage, "raises", rank=rank)
 
-    if rank == "0" and stage in ("prepare", "solve"):  # the solver of the parent's rank
+    if rank == "0" and stage in ("prepare", "solve"):  # the solver on rank 0
         assert (record.verdict, record.claimed) == ("failed", "failed")
         assert "ValueError: planted" in record.message
     else:
         assert record.verdict == "crashed"
         assert f"rank {rank} of 2: ValueError: planted" in record.message
-        assert named(record.message, stage)
+        assert names_stage(record.message, stage)
 
 
 @pytest.mark.slow
@@ -211,23 +211,23 @@ def test_a_run_that_is_killed_while_ranks_measure_is_continued(tmp_path):
         command, cwd=ROOT, env=environment, stderr=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
     )  # fmt: skip
-    assert soon(lambda: lines(out))
-    assert soon(lambda: any(is_rank(pid) for pid in left(tmp_path)))
+    assert soon(lambda: journal_lines(out))
+    assert soon(lambda: any(is_rank(pid) for pid in processes_of(tmp_path)))
     run.kill()
     run.wait()
-    assert soon(lambda: not left(tmp_path))
-    before = lines(out)
+    assert soon(lambda: not processes_of(tmp_path))
+    before = journal_lines(out)
 
     results = mb.run(suite, out=out)
 
-    assert lines(out)[: len(before)] == before
+    assert journal_lines(out)[: len(before)] == before
     assert sorted(r.repeat for r in results.records) == [0, 1, 2]
     assert {r.verdict for r in results.records} == {"verified"}
     assert len({r.qp for r in results.records}) == 1
 
 
-def lines(folder):
-    """The lines of a journal."""
+def journal_lines(folder):
+    """Return the lines of a journal."""
     files = sorted((folder / "journal").glob("*.jsonl"))
     return [line for file in files for line in file.read_text().splitlines()]
 
@@ -239,8 +239,8 @@ def is_rank(process):
     return False
 
 
-def named(message, stage):
-    """Whether a message says in which stage it was, where the clock did not run."""
+def names_stage(message, stage):
+    """Return True if the prefix of a message is that of the stage, or none."""
     if stage == "emission":
         return message.startswith("emission: ")
     return message.startswith("evaluation of the answer: ") == (stage in EVALUATING)

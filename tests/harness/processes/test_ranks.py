@@ -1,4 +1,4 @@
-"""One solve on several ranks of MPI: against one process, and when ranks end."""
+"""Solves on several MPI ranks: comparison with one process, and failing ranks."""
 
 import json
 import os
@@ -31,12 +31,12 @@ CASES = (
 CASE = "membranes/S=2/n=4/dual"
 SOLVE = ["solve", CASE, "--solver", "smalbe"]
 TOL = 1e-8
-LANCZOS = 8  #: products with F before the solve, at most
+LANCZOS = 8  #: largest number of products with F before the solve
 
 
 @pytest.fixture(scope="module", params=[2, pytest.param(4, marks=pytest.mark.slow)])
-def found(request):
-    """What several ranks found, of vectors and of two duals."""
+def rank_results(request):
+    """Return results of several ranks on vectors and on two duals."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",
@@ -48,39 +48,41 @@ def found(request):
     return json.loads(done.stdout)
 
 
-def test_reductions_of_distributed_vectors_are_those_of_the_whole(found):
-    for name, (got, known) in found["vectors"]["pairs"].items():
+def test_reductions_of_distributed_vectors_are_those_of_the_whole(rank_results):
+    for name, (got, known) in rank_results["vectors"]["pairs"].items():
         assert got == pytest.approx(known, abs=1e-12), name
 
 
-def test_what_would_see_a_slice_only_is_refused(found):
-    assert found["vectors"]["answered"] == []
-    assert found["vectors"]["kept"]
+def test_operations_on_a_slice_alone_are_refused(rank_results):
+    assert rank_results["vectors"]["answered"] == []
+    assert rank_results["vectors"]["kept"]
 
 
-def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(found):
-    for error, refused, shared in found["factors"]:
+def test_factors_of_a_sum_over_ranks_are_those_of_the_whole(rank_results):
+    for error, refused, shared in rank_results["factors"]:
         assert error < 1e-12
         assert refused  # on all ranks, though one alone has dependent rows
         assert shared == list(range(0, 24, 3))
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_ranks_multiply_and_precondition_as_one_process_does(found, case):
-    for errors in found[case]["errors"]:
+def test_ranks_multiply_and_precondition_as_one_process_does(rank_results, case):
+    for errors in rank_results[case]["errors"]:
         assert max(errors.values()) < 1e-13, errors
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(found, case):
-    of = found[case]
+def test_every_row_has_one_owner_and_no_rank_has_far_more_than_its_share(
+    rank_results, case
+):
+    of = rank_results[case]
     assert sum(of["rows"]) == of["size"]
     assert max(of["subdomains"]) <= 1.5 * np.mean(of["subdomains"])
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_solution_on_ranks_is_that_of_one_process(found, case):
-    of = found[case]
+def test_the_solution_on_ranks_is_that_of_one_process(rank_results, case):
+    of = rank_results[case]
     assert of["status"] == ["solved", "solved"]
     assert of["difference"] < 10 * TOL
     assert of["same_active"]
@@ -88,7 +90,7 @@ def test_the_solution_on_ranks_is_that_of_one_process(found, case):
 
 @pytest.fixture(scope="module")
 def answers():
-    """Two solves on two ranks, and one on one."""
+    """Solve twice on two ranks, and once on one."""
     case = mb.build(CASE)
     return [mb.solve(case, "smalbe", tol=TOL, ranks=n) for n in (2, 2, 1)]
 
@@ -104,18 +106,18 @@ def test_a_solve_on_ranks_is_verified_certified_and_says_so(answers):
     assert first.record.run_id != alone.record.run_id
 
 
-def test_faces_that_a_body_hardly_feels_have_a_factor_on_ranks():
-    """What free components leave of some rows is less than they cancel to."""
+def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
+    """On free components, some rows are smaller than the rounding of their sum."""
     case = "contact-patch/ratio=1e-10/feti=2/dual"
     answer = mb.solve(case, "smalbe", tol=TOL, ranks=2)
     assert answer.record.claimed in ("solved", "iteration_limit")
-    # no rank has the assembled K: the bound holds for any that rounding may store
+    # No rank has the assembled K, so the bound holds for every rounding of it.
     assert answer.energy_bound <= 1e-3
 
 
 @pytest.mark.parametrize("parts", [6, 20])
 def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts):
-    """Rows of node to segment do not feel it roll: equality rows are dependent."""
+    """Node-to-segment rows do not resist rolling, so equality rows are dependent."""
     description = described(tmp_path)
     text = description.read_text().replace('"mortar"', '"nts"')
     held = '[[supports]]\npoint = "axis"\nfix = ["x"]\n'
@@ -128,7 +130,7 @@ def test_a_disc_that_rolls_is_solved_on_ranks_as_by_one_process(tmp_path, parts)
     assert ranks.record.objective == pytest.approx(alone.record.objective, rel=1e-8)
 
 
-def test_records_tell_what_ranks_spent_on_the_solve(answers):
+def test_records_contain_the_cost_of_each_rank(answers):
     first, *_ = answers
     seconds, counts = first.record.rank_seconds, first.record.rank_counts
 
@@ -171,7 +173,7 @@ def test_more_ranks_than_subdomains_are_declined():
         (CASE, "clarabel", "runs in one process only"),
     ],
 )
-def test_what_cannot_be_shared_is_declined(case, solver, message):
+def test_qps_that_cannot_be_distributed_are_declined(case, solver, message):
     answer = mb.solve(case, solver, ranks=2)
 
     assert answer.verdict == "declined"
@@ -179,14 +181,14 @@ def test_what_cannot_be_shared_is_declined(case, solver, message):
 
 
 @pytest.mark.parametrize("count", ["0", "-1", "5000"])
-def test_no_number_of_ranks_is_refused_in_a_line(capfd, count):
+def test_a_wrong_number_of_ranks_is_refused_in_one_line(capfd, count):
     assert (
         main(Registries(), ["solve", CASE, "--solver", "smalbe", "--mpi", count]) == 2
     )
     assert "expected a number of ranks, 1 to 4096" in capfd.readouterr().err
 
 
-def test_a_missing_mpi_is_said_before_anything_is_built(monkeypatch, capfd):
+def test_a_missing_mpi_is_reported_before_anything_is_built(monkeypatch, capfd):
     monkeypatch.setattr(mpi, "find_spec", lambda name: None)
 
     assert main(Registries(), [*SOLVE, "--mpi", "2"]) == 2
@@ -212,7 +214,7 @@ params = { S = 2, n = 4 }
 """
 
 
-def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_path):
+def test_a_suite_measures_solvers_with_ranks_on_each_number_and_copies(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace("ranks =", "copies = true\nranks ="))
 
@@ -226,15 +228,17 @@ def test_a_suite_asks_those_that_can_for_each_number_of_ranks_and_copies(tmp_pat
     }  # fmt: skip
     assert found["smalbe ranks=2"].verdict == "verified"
     assert found["smalbe ranks=2"].qp.startswith(DISTRIBUTED_DIGEST)
-    # a copy does what one process alone does, to the last bit
+    # a copy computes the same bits as one process alone
     assert found["smalbe copies=2"].verdict == "verified"
     alone, copies = found["smalbe"], found["smalbe copies=2"]
     assert (copies.objective, copies.counts) == (alone.objective, alone.counts)
     assert copies.peak_mib > 1.5 * alone.peak_mib  # of both
 
 
-def test_ranks_tell_all_of_an_answer_and_nobody_builds_the_case(tmp_path, monkeypatch):
-    """In suites and alone; processes of ranks have the family as it is."""
+def test_ranks_evaluate_the_answer_and_no_process_builds_the_case(
+    tmp_path, monkeypatch
+):
+    """In suites and single solves; ranks use the original family."""
     suite, case = tmp_path / "ranks.toml", "beam-ring/Nr=4/Nh=3/steps=1/feti=4/dual"
     suite.write_text(
         SUITE.replace("[1, 2]", "[2]").replace("membranes", "beam-ring")
@@ -264,7 +268,7 @@ def test_ranks_tell_all_of_an_answer_and_nobody_builds_the_case(tmp_path, monkey
         ("ranks = [0]", "ranks = 0; expected a number of ranks"),
         ("ranks = [2, 2]", "expected distinct numbers"),
         ("ranks = 2", "ranks"),
-        ("ranks = [1]\ncopies = true", "copies = true: what copies reach is compared"),
+        ("ranks = [1]\ncopies = true", "copies = true: copies are compared with ranks"),
         ("ranks = [1, 2]\ncopies = 2", "copies = 2; expected true or false"),
     ],
 )
@@ -280,7 +284,7 @@ def test_a_suite_of_which_no_solver_runs_on_ranks_is_refused(tmp_path):
     suite = tmp_path / "ranks.toml"
     suite.write_text(SUITE.replace('["smalbe", "clarabel"]', '["clarabel"]'))
 
-    with pytest.raises(InputError, match="none of the solvers runs on several"):
+    with pytest.raises(InputError, match="no solver runs on several ranks"):
         mb.run(suite, out=tmp_path / "out")
 
 
@@ -293,12 +297,12 @@ def test_a_sequence_on_several_ranks_is_refused(tmp_path):
         ).replace("membranes", "beam-ring")
     )
 
-    with pytest.raises(InputError, match="one process drives a sequence"):
+    with pytest.raises(InputError, match="a sequence runs in one process"):
         mb.run(suite, out=tmp_path / "out")
 
 
-#: of two load steps, the first: one process emits it, so that a rank which has a share
-#: is preparing or solving
+#: first of two load steps; one process emits it, so a rank that has its share is
+#: preparing or solving
 LARGE = (
     SUITE.replace(
         "{ S = 2, n = 4 }", "{ Nr = 224, Nh = 128, steps = 2, step = 1, feti = 16 }"
@@ -306,7 +310,7 @@ LARGE = (
     .replace("ranks = [1, 2]", "ranks = [2]")
     .replace("membranes", "beam-ring")
 )
-WITH_A_SHARE = 110  #: MiB; a rank that waits for an order has 90
+WITH_A_SHARE = 110  #: MiB; a rank that waits for an order uses 90
 FAULTS = {
     "killed": (signal.SIGKILL, "", "crashed", r"rank 1 of 2 ranks ended: Killed"),
     "hung": (signal.SIGSTOP, "time_limit = 8", "time_limit", "killed after 8 s"),
@@ -331,8 +335,8 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
         stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     if sent is not None:
-        assert soon(lambda: busy(tmp_path) or run.poll() is not None)
-        os.kill(busy(tmp_path)[-1], sent)
+        assert soon(lambda: busy_rank(tmp_path) or run.poll() is not None)
+        os.kill(busy_rank(tmp_path)[-1], sent)
     assert run.wait() == 0
 
     (record,) = mb.load(tmp_path / "out").records
@@ -342,7 +346,7 @@ def test_a_rank_that_fails_ends_in_one_verdict_and_no_process_is_left(
 
 
 def processes(mark):
-    """Processes of a test, but for this one, with their commands."""
+    """List the other processes of a test, with their commands."""
     found = []
     for entry in Path("/proc").glob("[0-9]*"):
         try:
@@ -362,8 +366,8 @@ def resident_mib(pid):
     return 0.0
 
 
-def busy(mark):
-    """Rank 1, once it holds its share of the QP; in a list, which is empty before."""
+def busy_rank(mark):
+    """Return [rank 1] once it has its share of the QP, [] before that."""
     return [
         pid
         for pid, command, environment in processes(mark)
@@ -373,7 +377,7 @@ def busy(mark):
     ]
 
 
-def test_ranks_tell_how_fast_they_talk_to_one_another(answers):
+def test_records_contain_the_speed_of_communication(answers):
     first, _, alone = answers
     network = first.record.rank_network
     assert network.keys() == {

@@ -27,7 +27,7 @@ from tests.support.waiting import soon
 
 PLUGIN = ADVERSARIES
 
-#: a worker that tells how it was started instead of measuring
+#: a worker that reports how it was started instead of measuring
 SHOWS = """
 import json, os, sys
 requests, replies = map(int, sys.argv[1:])
@@ -61,7 +61,7 @@ def command(solver):
 
 
 def running(process):
-    """Whether a process exists and is no zombie."""
+    """Return True if a process exists and is not a zombie."""
     try:
         status = Path(f"/proc/{process}/status").read_text()
     except FileNotFoundError:
@@ -77,7 +77,7 @@ def ignores_sigterm(process):
 
 @pytest.fixture
 def ask(tmp_path):
-    """Start workers on demand and ask them to solve the tiny QP."""
+    """Return a function that starts a worker and lets it solve the tiny QP."""
     tiny = load_plugin(PLUGIN).problems["tiny"]
     qp = tmp_path / "qp.npz"
     save_qp(qp, tiny.build("plain", tiny.defaults, None).qp, {})
@@ -156,7 +156,7 @@ def test_a_solver_that_crashes_in_the_warm_up_crashes_in_its_measurement(ask):
     assert (reply.verdict, reply.message) == (Verdict.CRASHED, "SIGSEGV")
 
 
-def test_memory_is_limited_and_the_peak_is_told(ask):
+def test_memory_is_limited_and_the_peak_is_reported(ask):
     reply = ask("leaks", memory_limit=400.0)
 
     assert reply.verdict is Verdict.MEMORY_LIMIT
@@ -164,7 +164,7 @@ def test_memory_is_limited_and_the_peak_is_told(ask):
     assert "above the limit of 400 MiB" in reply.message
 
 
-def test_what_a_solver_prints_is_dropped_before_it_fills_the_disk(ask, tmp_path):
+def test_output_of_a_solver_is_dropped_before_it_fills_the_disk(ask, tmp_path):
     reply = ask("prints")
 
     assert reply.answer["claimed"] == "solved"
@@ -178,13 +178,13 @@ def test_children_of_a_solver_end_with_its_measurement(ask):
     assert ask("forks").answer["claimed"] == "solved"
 
 
-def test_of_a_solver_that_returns_twice_only_the_worker_itself_answers(ask):
+def test_a_fork_that_returns_from_a_solver_does_not_answer(ask):
     answers = [ask("returnstwice").answer for _ in range(2)]
 
     assert [a["counts"]["above"] for a in answers] == [os.getpid()] * 2
 
 
-def test_a_qp_that_a_solver_spoilt_is_whole_in_the_next_measurement(ask, tmp_path):
+def test_a_qp_that_a_solver_changed_is_intact_in_the_next_measurement(ask, tmp_path):
     answers = []
     for _ in range(2):
         ask("mutatesbyforce")
@@ -201,9 +201,7 @@ def test_a_worker_that_cannot_start_says_why(ask):
     assert reply.message == "before solving: exit code 1: no such plug-in"
 
 
-def test_a_worker_that_never_gets_ready_is_no_time_limit_of_the_solver(
-    ask, monkeypatch
-):
+def test_a_worker_that_is_never_ready_does_not_count_as_a_time_limit(ask, monkeypatch):
     monkeypatch.setattr(supervisor, "START_SECONDS", 0.2)
     start = [sys.executable, "-c", "import time; time.sleep(3600)"]
     reply = ask("slow", start=start)
@@ -231,7 +229,7 @@ def test_a_worker_dies_with_its_parent_in_the_middle_of_a_solve(tmp_path):
     assert soon(lambda: not running(worker))
 
 
-def test_a_machine_that_stands_still_meanwhile_spares_no_process(monkeypatch):
+def test_every_process_is_killed_even_if_the_machine_stalls(monkeypatch):
     clock = count(0, 1000)
     standing = SimpleNamespace(monotonic=lambda: next(clock), sleep=time.sleep)
     monkeypatch.setattr(reaper, "time", standing)
@@ -239,7 +237,7 @@ def test_a_machine_that_stands_still_meanwhile_spares_no_process(monkeypatch):
     try:
         while len(below := descendants(shell.pid)) < 2:
             pass
-        reaper.end_all(shell.pid)
+        reaper.kill_descendants(shell.pid)
 
         assert shell.wait(timeout=10) == 0  # it waits for both
         assert not any(map(running, below))
@@ -264,7 +262,7 @@ def test_a_machine_that_stands_still_meanwhile_spares_no_process(monkeypatch):
         ("step size could not be allocated a sign", 1.0, False),
     ],
 )
-def test_want_of_memory_is_told_from_the_peak_and_from_the_words(
+def test_lack_of_memory_is_recognised_by_the_peak_and_by_the_message(
     message, peak, expected
 ):
     assert out_of_memory(message, peak, 100.0) is expected

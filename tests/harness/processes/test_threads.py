@@ -1,4 +1,4 @@
-"""Threads that solve at the same time, forks, closed streams, and numbers of others."""
+"""Concurrent threads, forks, closed streams, and reused process numbers."""
 
 import json
 import os
@@ -13,15 +13,15 @@ from threading import Event, Thread
 import pytest
 
 from mortarbench.harness.processes import reaper
+from mortarbench.harness.processes.locks import ForkSafeLock
 from mortarbench.harness.processes.supervisor import WorkerProcess
-from mortarbench.harness.processes.turns import Turn
 from tests.harness.processes.test_supervisor import SHOWS
 from tests.support.waiting import soon
 
 LIMITS = {"time_limit": 30.0, "memory_limit": 2000.0}
 COMMAND = [sys.executable, "-c", SHOWS]
 CASE = "string/n=10/primal"
-#: solves by several threads in a session of its own, and prints what came of it
+#: solves in several threads, in a session of its own, and prints the results
 THREADS = """
 import gc, json, os, sys, tempfile
 from pathlib import Path
@@ -138,7 +138,7 @@ def test_threads_that_share_a_worker_or_close_it_get_an_answer_each(worker):
     assert [answer is not None for answer in answers] == [True] * 4
 
 
-def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
+def test_closing_twice_does_not_close_another_file(worker, tmp_path):
     worker.ask({}, **LIMITS)
     worker.close()
     others = [(tmp_path / f"{i}").open("w") for i in range(8)]
@@ -148,8 +148,8 @@ def test_what_is_closed_twice_closes_no_file_of_others(worker, tmp_path):
         file.close()
 
 
-def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
-    """From the start of a worker to its end, stops of others included."""
+def test_signals_are_sent_to_pidfds_only(worker, tmp_path, monkeypatch):
+    """From the start of a worker to its end, including stops of other workers."""
     other = WorkerProcess(COMMAND, tmp_path / "other")
 
     def refuse(*what):
@@ -163,16 +163,16 @@ def test_no_signal_goes_to_a_number(worker, tmp_path, monkeypatch):
         pid = other.ask({}, **LIMITS).answer["pid"]
     finally:
         other.close()
-    assert soon(lambda: not reaper.lives(pid))
+    assert soon(lambda: not reaper.is_alive(pid))
 
 
-def test_a_process_that_is_in_no_tree_of_ours_is_never_signalled(monkeypatch):
-    """Its number may have been that of one of ours a moment ago."""
+def test_a_process_outside_of_our_trees_is_never_signalled(monkeypatch):
+    """Its number may have belonged to one of ours a moment before."""
     sleep = partial(subprocess.Popen, ["sleep", "60"])
     with sleep() as root, sleep() as stranger:
         found = [[stranger.pid], [stranger.pid], []]
         monkeypatch.setattr(reaper, "descendants", lambda *_: found.pop(0))
-        reaper.end_all(root.pid)
+        reaper.kill_descendants(root.pid)
         assert found == []
         assert reaper.state(stranger.pid) in "SR"
         for process in (root, stranger):
@@ -183,7 +183,7 @@ def test_a_worker_whose_end_other_code_collected_is_replaced(worker):
     first = worker.ask({}, **LIMITS).answer["pid"]
     os.kill(first, signal.SIGKILL)
     with suppress(ChildProcessError):
-        os.waitpid(worker._process.pid, 0)  # as a handler of SIGCHLD does
+        os.waitpid(worker._process.pid, 0)  # a handler of SIGCHLD would do that
 
     second = worker.ask({}, **LIMITS)
     assert second.answer["pid"] != first
@@ -206,8 +206,8 @@ def test_a_fork_of_a_process_leaves_its_workers_alone(worker):
     assert worker.ask({}, **LIMITS).answer["pid"] == pid
 
 
-def test_a_fork_does_not_wait_for_a_thread_that_is_not_in_it():
-    turn, taken, done = Turn(), Event(), Event()
+def test_a_fork_does_not_wait_for_a_thread_of_its_parent():
+    turn, taken, done = ForkSafeLock(), Event(), Event()
 
     def hold():
         with turn:
@@ -256,7 +256,7 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
          "--plugin", str(plugin)],
         env=env(tmp_path) | {"STARTED": str(tmp_path / "started")},
         stderr=subprocess.PIPE, text=True,
-        # a shell that runs the tests in the background has them ignore Ctrl-C
+        # a shell that runs the tests in the background makes them ignore Ctrl-C
         preexec_fn=partial(signal.signal, number, signal.SIG_DFL),
     )  # fmt: skip
     assert soon((tmp_path / "started").exists)
@@ -268,7 +268,7 @@ def test_a_solve_that_is_asked_to_end_cleans_up_and_says_so(tmp_path, number, co
     assert solve.returncode == code
     assert len(said.splitlines()) == 1, said
     assert not list(tmp_path.glob("mortarbench-*"))
-    assert soon(lambda: not reaper.lives(process))
+    assert soon(lambda: not reaper.is_alive(process))
 
 
 HANGS = """
@@ -294,7 +294,7 @@ SOLVERS = {"hangs": Hangs()}
 
 
 def test_a_signal_that_is_ignored_stays_so(tmp_path):
-    """As nohup does with SIGHUP."""
+    """Test with SIGHUP, which nohup ignores."""
     script = (
         "import os, signal; from mortarbench.harness.processes.termination import *\n"
         "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
@@ -308,7 +308,7 @@ def test_a_signal_that_is_ignored_stays_so(tmp_path):
 
 
 def test_an_export_that_is_asked_to_end_says_so_and_leaves_no_file(tmp_path):
-    """While its case is built."""
+    """The signal arrives while its case is built."""
     plugin, out, started = (tmp_path / n for n in ("slow.py", "out", "started"))
     plugin.write_text(SLOW)
     out.mkdir()
@@ -346,8 +346,8 @@ PROBLEMS = {"slow": Slow()}
 """
 
 
-#: a worker that creates a System V segment of 64 MiB, fills it, and writes which it is:
-#: other programs of the machine create segments meanwhile
+#: a worker that creates and fills a System V segment of 64 MiB, and writes its number,
+#: since other programs create segments at the same time
 SEGMENT = SHOWS.replace(
     '    reply(event="start")\n',
     '    reply(event="start")\n'
@@ -364,7 +364,7 @@ SEGMENT = SHOWS.replace(
 
 @pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
 @pytest.mark.parametrize("memory_limit", [2000.0, 60.0])
-def test_segments_of_a_worker_count_for_its_limit_and_go_with_it(
+def test_segments_of_a_worker_count_for_its_limit_and_are_removed_with_it(
     tmp_path, memory_limit
 ):
     file = tmp_path / "segment"
@@ -376,10 +376,10 @@ def test_segments_of_a_worker_count_for_its_limit_and_go_with_it(
             assert reply.verdict == "memory_limit"
         else:
             assert reply.peak_mib > 64
-            assert int(file.read_text()) in reaper.segments()
+            assert int(file.read_text()) in reaper.shared_segments()
     finally:
         worker.close()
-    assert int(file.read_text()) not in reaper.segments()
+    assert int(file.read_text()) not in reaper.shared_segments()
 
 
 @pytest.mark.skipif(not Path(reaper.SEGMENTS).exists(), reason="no System V segments")
@@ -395,4 +395,4 @@ def test_segments_of_a_worker_go_when_its_parent_is_killed(tmp_path):
         "import os; os.kill(os.getpid(), 9)\n"
     )
     subprocess.run([sys.executable, "-c", asks, str(tmp_path / "log")])
-    assert soon(lambda: int(file.read_text()) not in reaper.segments())
+    assert soon(lambda: int(file.read_text()) not in reaper.shared_segments())

@@ -1,4 +1,4 @@
-"""Seconds of dualising are those of a process that has dualised before."""
+"""Times of dualising exclude first calls: the first dual case is built twice."""
 
 import time
 from dataclasses import dataclass, field
@@ -14,7 +14,7 @@ from mortarbench.harness.processes.case_worker import CaseWorker
 
 @dataclass(frozen=True)
 class Slow(Family):
-    """A family whose first dual case takes longer, as first calls do."""
+    """Family whose first dual case takes longer, because of first calls."""
 
     name: str = "slow"
     forms: tuple = ("primal", "dual")
@@ -62,6 +62,6 @@ def test_the_first_dual_case_of_a_process_is_built_twice_and_the_second_counts(b
 
 
 def test_a_case_that_takes_long_is_not_built_twice(build, monkeypatch):
-    monkeypatch.setattr(case_worker, "WARM_UP", 0.02)
+    monkeypatch.setattr(case_worker, "MAX_WARM_UP_SECONDS", 0.02)
     assert build("dual", n=2) == 0.01
     assert build.family.built == ["dual"]

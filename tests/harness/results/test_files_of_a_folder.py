@@ -1,4 +1,4 @@
-"""Every file of a result folder, in place of which something else lies."""
+"""Commands on result folders in which one file is replaced by something else."""
 
 import os
 import shutil
@@ -32,12 +32,12 @@ forms = ["dual"]
 family = "file"
 params = {{ path = "{}" }}
 """
-SPARSE = 3 * 2**30  #: bytes that a file declares, of which none is on the disk
+SPARSE = 3 * 2**30  #: size of a sparse file, which occupies no disk space
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory, svg_only):
-    """A folder that has every kind of file, and lacks one measurement of its suite."""
+def folder_of_run(tmp_path_factory, svg_only):
+    """Create a folder with every kind of file, without one measurement of its suite."""
     folder = tmp_path_factory.mktemp("whole") / "run"
     suite = folder.with_name("s.toml")
     np.savez(folder.with_name("qp.npz"), P=np.eye(2), q=-np.ones(2), lb=np.zeros(2))
@@ -60,14 +60,14 @@ def whole(tmp_path_factory, svg_only):
 
 
 def kinds_of_files(folder):
-    """One path for each kind of file there is: by folder and ending; of reports one."""
-    found = {}
+    """Return one path for each kind of file (folder and ending), and one report."""
+    paths = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file():
             name = path.relative_to(folder)
             suffix = name.suffix if name.parts[0] != "report" else ""
-            found[name.parts[0], suffix] = name
-    return [str(path) for path in found.values()]
+            paths[name.parts[0], suffix] = name
+    return [str(path) for path in paths.values()]
 
 
 def sparse(path, _outside):
@@ -75,14 +75,14 @@ def sparse(path, _outside):
         file.truncate(SPARSE)
 
 
-def grown(path, _outside):
-    """What was there, and then zeros: by themselves the first lines are sound."""
+def with_zeros(path, _outside):
+    """Append zeros to a file, whose first lines stay valid."""
     with path.open("r+b") as file:
         file.truncate(SPARSE)
 
 
-def lesser(path, _outside):
-    """Below the limit of data files, above that of a line."""
+def below_the_limit(path, _outside):
+    """Write a file below the limit of data files, but above that of a line."""
     with path.open("r+b") as file:
         file.truncate(2**31 - 2**20)
 
@@ -116,16 +116,26 @@ def empty(path, _outside):
     path.write_bytes(b"")
 
 
-KINDS = (sparse, grown, lesser, pipe, a_folder, dangling, foreign, endless, empty)
+KINDS = (
+    sparse,
+    with_zeros,
+    below_the_limit,
+    pipe,
+    a_folder,
+    dangling,
+    foreign,
+    endless,
+    empty,
+)
 
 
 @pytest.fixture
-def read_by_every_command(whole, tmp_path, capsys, monkeypatch, only_svg):
-    """Run every command that reads a folder, within bounds; none may raise."""
+def read_by_every_command(folder_of_run, tmp_path, capsys, monkeypatch, only_svg):
+    """Run every command that reads a folder, with resource limits; none may raise."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     suite = tmp_path / "s.toml"
-    shutil.copy(whole.with_name("s.toml"), suite)
+    shutil.copy(folder_of_run.with_name("s.toml"), suite)
 
     def read(folder, run_ids):
         for arguments in (
@@ -148,9 +158,9 @@ def read_by_every_command(whole, tmp_path, capsys, monkeypatch, only_svg):
     return read
 
 
-def tried(whole, tmp_path, name, kind, read):
+def try_commands(folder_of_run, tmp_path, name, kind, read):
     folder, outside = tmp_path / "run", tmp_path / "outside"
-    shutil.copytree(whole, folder)
+    shutil.copytree(folder_of_run, folder)
     outside.mkdir()
     (outside / "precious").write_text("precious")
     run_ids = [record.run_id for record in read_journal(folder)]
@@ -164,22 +174,30 @@ def tried(whole, tmp_path, name, kind, read):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_faults_of_any_kind_are_read_or_refused_by_every_command(
-    whole, tmp_path, kind, read_by_every_command
+    folder_of_run, tmp_path, kind, read_by_every_command
 ):
-    tried(whole, tmp_path, FAULTS, kind, read_by_every_command)
+    try_commands(folder_of_run, tmp_path, FAULTS, kind, read_by_every_command)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_copies_of_files_are_read_or_refused_where_the_original_is_missing(
-    whole, tmp_path, kind, read_by_every_command
+    folder_of_run, tmp_path, kind, read_by_every_command
 ):
-    original = whole.with_name("qp.npz")
+    original = folder_of_run.with_name("qp.npz")
     original.rename(tmp_path / "away.npz")
-    names = [name for name in kinds_of_files(whole) if name.startswith("files/")]
+    names = [
+        name for name in kinds_of_files(folder_of_run) if name.startswith("files/")
+    ]
     try:
         assert len(names) == 2
         for name in names:
-            tried(whole, tmp_path / Path(name).stem, name, kind, read_by_every_command)
+            try_commands(
+                folder_of_run,
+                tmp_path / Path(name).stem,
+                name,
+                kind,
+                read_by_every_command,
+            )
     finally:
         (tmp_path / "away.npz").rename(original)
 
@@ -187,29 +205,31 @@ def test_copies_of_files_are_read_or_refused_where_the_original_is_missing(
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_file_of_a_folder_is_read_or_refused_by_every_command(
-    whole, tmp_path, kind, read_by_every_command
+    folder_of_run, tmp_path, kind, read_by_every_command
 ):
-    names = kinds_of_files(whole)
+    names = kinds_of_files(folder_of_run)
     assert {name.partition("/")[0].partition(".")[0] for name in names} >= {
         "journal", "vectors", "cases", "references", "report", "environments",
         "environment", "suite", "faults", "validation", "discretisation", "", "files",
     }  # fmt: skip
     for i, name in enumerate(names):
-        tried(whole, tmp_path / str(i), name, kind, read_by_every_command)
+        try_commands(
+            folder_of_run, tmp_path / str(i), name, kind, read_by_every_command
+        )
 
 
 @pytest.fixture
-def copied(whole, tmp_path):
-    """A copy that is removed by rm: pytest's own way of doing so recurses."""
+def folder_copy(folder_of_run, tmp_path):
+    """Copy a folder, and remove it by rm, because pytest's removal is recursive."""
     folder = tmp_path / "run"
-    shutil.copytree(whole, folder)
+    shutil.copytree(folder_of_run, folder)
     yield folder
     subprocess.run(["rm", "-rf", folder], check=True)
 
 
 @pytest.mark.parametrize("part", ["vectors", "report", "cases", "journal", ".scratch"])
-def test_folders_nested_without_end_are_refused_in_one_line(copied, part, capsys):
-    folder = copied
+def test_folders_nested_without_end_are_refused_in_one_line(folder_copy, part, capsys):
+    folder = folder_copy
     (folder / part).mkdir(exist_ok=True)
     here = os.open(folder / part, os.O_RDONLY)
     for _ in range(3000):

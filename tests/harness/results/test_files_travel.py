@@ -1,4 +1,4 @@
-"""Files of QPs travel with the result folder: whoever has only that goes on."""
+"""Files of QPs are copied into the result folder, which suffices to continue a run."""
 
 import json
 import shutil
@@ -30,7 +30,7 @@ params = {{ path = {} }}
 
 
 def write_qp(path, bound):
-    """min ½xᵀx - 3·1ᵀx, x ≤ bound < 3: x is the bound in both components."""
+    """Write  min ½xᵀx − 3·1ᵀx, x ≤ bound < 3;  both components of x are the bound."""
     path.parent.mkdir(parents=True, exist_ok=True)
     np.savez(path, P=np.eye(2), q=-3 * np.ones(2), ub=np.full(2, bound))
 
@@ -41,7 +41,7 @@ def digest(path):
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """A folder with a suite, its QP and the results, which no test may write to."""
+    """Create a folder with a suite, its QP and results; tests must not change it."""
     folder = tmp_path_factory.mktemp("there")
     write_qp(folder / "qps" / "qp.npz", 0.5)
     (folder / "s.toml").write_text(SUITE.format('"qps/qp.npz"'))
@@ -53,7 +53,7 @@ def measured(tmp_path_factory):
 
 @pytest.fixture
 def here(measured, tmp_path, monkeypatch):
-    """An empty working directory, to which only the result folder was sent."""
+    """Change to an empty directory that contains only the result folder."""
     shutil.copytree(measured / "run", tmp_path / "run")
     monkeypatch.chdir(tmp_path)
     return tmp_path
@@ -212,7 +212,7 @@ def test_a_damaged_copy_is_replaced_where_the_original_is_here(measured, here, c
     assert copy.read_bytes() == right
 
 
-def test_what_is_too_large_stays_and_is_named(tmp_path, monkeypatch):
+def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Path("large.npz").open("wb") as file:
         file.truncate(70 * 2**20)
@@ -367,7 +367,7 @@ def test_a_link_among_copies_is_refused(here, copy, cli):
         assert f"{copy.name} is not a regular file" in said
 
 
-def test_a_list_of_the_user_is_no_concern_of_a_run_without_files(tmp_path, monkeypatch):
+def test_a_list_of_the_user_does_not_affect_a_run_without_files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "files").mkdir()
     (tmp_path / "files" / "copies.json").write_text("mine")

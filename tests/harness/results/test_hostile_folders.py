@@ -1,4 +1,4 @@
-"""Result folders that somebody sent: they run nothing, and lead nowhere else."""
+"""Result folders from others execute no code and give no access to other files."""
 
 import os
 
@@ -30,7 +30,7 @@ FIELDS = {
 
 
 def record(path, **changes):
-    """A verified measurement of a QP from a file."""
+    """Return a verified measurement of a QP from a file."""
     given = dict(
         run_id="a1", case=f"file:{path}", family="file", params={"path": str(path)},
         form="qp", sizes={"variables": 2}, solver="clarabel", options={}, tol=1e-6,
@@ -74,7 +74,7 @@ def command(capsys, monkeypatch, tmp_path):
 
 
 def everything(folder):
-    """Names and content of all that lies in a folder, links as they are."""
+    """Return names and content of all files in a folder, without following links."""
     return {
         path.relative_to(folder): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
@@ -119,7 +119,7 @@ def test_no_command_runs_what_a_case_of_the_folder_names(sent, command, tmp_path
     "digest",
     ["../../outside", "/etc/passwd", "a\0b", "", "A" * 16, "\ud800", "x" * 5000],
 )
-def test_what_is_no_digest_leads_nowhere(tmp_path, digest):
+def test_malformed_digests_open_no_file(tmp_path, digest):
     folder = tmp_path / "a" / "b"
     save(folder, FIELDS)
     np.savez(tmp_path / "outside.npz", **FIELDS)
@@ -130,10 +130,10 @@ def test_what_is_no_digest_leads_nowhere(tmp_path, digest):
 
 
 @pytest.mark.parametrize("digest", ["../environment", "/etc/x", "a\0b", "", "x" * 5000])
-def test_an_environment_lies_in_the_folder(tmp_path, digest):
+def test_malformed_digests_lead_to_no_environment(tmp_path, digest):
     (tmp_path / "environment.json").write_text('{"digest": "e1"}')
 
-    with pytest.raises(InputError, match="no environment's digest"):
+    with pytest.raises(InputError, match="is not the digest of an environment"):
         environment_of(tmp_path, digest)
 
 

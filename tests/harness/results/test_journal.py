@@ -28,7 +28,7 @@ def ids(folder):
     return [r.run_id for r in read_journal(folder)]
 
 
-def test_what_is_appended_is_read_back_in_order(tmp_path):
+def test_appended_records_are_read_back_in_order(tmp_path):
     first, second = record("a", gap=1e-9), record("b", verdict=Verdict.WRONG)
     with Journal(tmp_path, "here") as journal:
         journal.append(first)
@@ -93,7 +93,7 @@ def test_a_journal_cut_at_any_byte_loses_only_the_line_that_was_cut(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [b'{"schema', b"", b"\xff"])
-def test_of_a_damaged_line_it_is_said_what_would_be_right(tmp_path, bad):
+def test_the_message_on_a_damaged_line_contains_the_remedy(tmp_path, bad):
     file = tmp_path / "journal" / "here.jsonl"
     file.parent.mkdir()
     file.write_bytes(bad + b"\n")
@@ -140,7 +140,7 @@ def test_a_field_of_the_wrong_type_is_named_with_its_line(
 
 
 def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
-    """Its residuals have other scales: they are kept, and so is what they decided."""
+    """Its residuals have other scales; they are kept, and so is the verdict."""
     row = json.loads(record("a", claimed="solved", primal=2e-8).to_json())
     for name in ("decided_by", "optimum_error"):
         del row[name]
@@ -157,7 +157,7 @@ def test_a_line_of_the_first_schema_is_read_as_it_was_meant(tmp_path):
 
 
 def test_a_measurement_has_the_name_that_older_folders_give_it():
-    """Or a folder that goes on would measure everything once more."""
+    """Otherwise a continued run would repeat all measurements."""
     box = SimpleNamespace(name="box", defaults={"n": 1}, forms=("dual",))
     made = new_record(
         assemble(as_family(box), {"n": 3}, "dual"),
@@ -169,7 +169,7 @@ def test_a_measurement_has_the_name_that_older_folders_give_it():
 
 
 def test_old_lines_are_written_as_they_were_read():
-    """To the byte: the names of the fields, their order, and their values."""
+    """Names, order and values of the fields are equal to the byte."""
     (old,) = (Path(__file__).parents[2] / "data/results-2026-11/journal").iterdir()
     lines = old.read_text().splitlines()
 
@@ -182,7 +182,7 @@ def test_a_folder_without_journal_is_named(tmp_path):
         read_journal(tmp_path)
 
 
-def test_what_is_no_folder_is_said_to_be_missing_or_a_file(tmp_path):
+def test_a_path_that_is_not_a_folder_is_reported_as_missing_or_a_file(tmp_path):
     (tmp_path / "file").touch()
     for name, wrong in (("nowhere", "no such folder"), ("file", "a file")):
         with pytest.raises(InputError) as e:

@@ -1,4 +1,4 @@
-"""A stored measurement, made again: what must be the same, what must be told."""
+"""Replay of stored measurements: comparison of verdicts, points and times."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from mortarbench.harness.results.journal import read_journal
 from mortarbench.registries import Registries
 from tests.support import TOY_PROBLEM
 
-#: one process has the run that all replay
+#: one process makes the run that all tests replay
 pytestmark = pytest.mark.together
 
 PLUGIN = load_plugin(TOY_PROBLEM)
@@ -54,7 +54,7 @@ def registries():
 
 @pytest.fixture(scope="module")
 def finished(registries, tmp_path_factory):
-    """The folder of a run, which no test may write to."""
+    """Return the folder of a run; tests must not change it."""
     folder = tmp_path_factory.mktemp("finished")
     suite = folder / "toy.toml"
     suite.write_text(SUITE)
@@ -64,7 +64,7 @@ def finished(registries, tmp_path_factory):
 
 @pytest.fixture
 def cli(registries, capsys, monkeypatch, tmp_path):
-    """Run a command line in an empty folder; returns its code, stdout and stderr."""
+    """Run a command line in an empty folder; return its code, stdout and stderr."""
     monkeypatch.chdir(tmp_path)
 
     def cli(*argv, registries=registries):
@@ -76,7 +76,7 @@ def cli(registries, capsys, monkeypatch, tmp_path):
 
 @pytest.fixture
 def stored(finished, tmp_path):
-    """The records of a run, by solver, depth and repeat, in the folder `done`."""
+    """Return the records of the run in folder `done`, by solver, depth and repeat."""
     shutil.copytree(finished, tmp_path / "done")
     records = read_journal(tmp_path / "done")
     return {(r.solver, r.params["depth"], r.repeat): r for r in records}
@@ -107,8 +107,8 @@ def test_the_point_and_the_times_are_compared_with_what_is_stored(cli, stored):
     assert least + greatest == pytest.approx(2)  # two repeats about their median
 
 
-def test_the_ratio_of_times_says_what_it_is_of(cli, stored):
-    """Not of the time beside it, which is that of one of the stored repeats."""
+def test_the_ratio_of_times_names_its_times(cli, stored):
+    """The median of the repeats, not the time of the stored repeat beside it."""
     then = stored["half", 1, 0]
     out = cli("replay", "done", then.run_id)[1]
     (row,) = [line for line in out.splitlines() if line.startswith("solve, s")]
@@ -132,7 +132,7 @@ def test_a_replay_leaves_the_folder_as_it_was(cli, stored, tmp_path):
 
 
 def rewrite(record, **changes):
-    """Replace a record in the journal as if it had been measured so."""
+    """Replace a record in the journal."""
     (journal,) = Path("done/journal").glob("*.jsonl")
     others = [
         line
@@ -142,7 +142,7 @@ def rewrite(record, **changes):
     journal.write_text("\n".join([*others, record.replace(**changes).to_json()]) + "\n")
 
 
-def test_another_verdict_is_told_and_counts_as_no(cli, stored):
+def test_another_verdict_is_reported_and_exits_with_1(cli, stored):
     then = stored["exact", 1, 0]
     rewrite(then, verdict="wrong")
     code, out, _ = cli("replay", "done", then.run_id)
@@ -151,7 +151,7 @@ def test_another_verdict_is_told_and_counts_as_no(cli, stored):
     assert out.endswith("Not reproduced: wrong then, verified now.\n")
 
 
-def test_another_qp_is_told_and_counts_as_no(cli, stored):
+def test_another_qp_is_reported_and_exits_with_1(cli, stored):
     then = stored["exact", 1, 0]
     rewrite(then, qp="0123456789abcdef")
     code, out, _ = cli("replay", "done", then.run_id)
@@ -160,7 +160,7 @@ def test_another_qp_is_told_and_counts_as_no(cli, stored):
     assert "another QP" in out
 
 
-def test_a_journal_without_digests_of_qps_is_no_reason_to_complain(cli, stored):
+def test_a_journal_without_digests_of_qps_is_not_a_problem(cli, stored):
     then = stored["exact", 1, 0]
     rewrite(then, qp=None)
     code, out, _ = cli("replay", "done", then.run_id)
@@ -196,7 +196,7 @@ def test_a_step_of_a_sequence_is_made_again_after_those_before(cli, tmp_path, so
     assert told["now"]["params"]["depth"] == 3
 
 
-def test_what_differs_in_the_environment_is_named(cli, stored, tmp_path):
+def test_differences_of_the_environment_are_named(cli, stored, tmp_path):
     path = tmp_path / "done" / "environment.json"
     environment = json.loads(path.read_text())
     environment["versions"]["numpy"] = "1.2.3"
@@ -221,7 +221,7 @@ def test_the_first_digits_of_a_run_id_suffice(cli, stored):
     assert then in cli("replay", "done", short)[1]
 
 
-def test_a_run_id_that_is_none_is_one_line_with_the_nearest(cli, stored):
+def test_an_unknown_run_id_is_one_line_with_the_nearest(cli, stored):
     then = stored["exact", 1, 0].run_id
     other = "x" + then[1:]
     code, out, err = cli("replay", "done", other)

@@ -30,7 +30,7 @@ if find_spec("distributed") is None:
     pytest.skip("no distributed", allow_module_level=True)
 
 PLUGIN = load_plugin(TOY_PROBLEM)
-SOLVERS = 4  #: measurements of a whole block
+SOLVERS = 4  #: measurements per block
 SUITE = """
 name = "toy_problem"
 repeats = {repeats}
@@ -44,7 +44,7 @@ forms = ["dual"]
 
 
 class Cluster:
-    """A scheduler, and workers that can be killed."""
+    """Dask scheduler with workers that can be killed."""
 
     def __init__(self, folder, forks, *options):
         self.folder = folder
@@ -82,7 +82,7 @@ class Cluster:
         return self._forks.dask(arguments, self._env, serves)
 
     def started_solvers(self):
-        """The process of every start of a slow solve, in order."""
+        """Return the processes that started a slow solve, in order."""
         return [int(line.split()[0]) for line in self.starts.read_text().splitlines()]
 
     def close(self):
@@ -122,15 +122,15 @@ def cli(capsys, monkeypatch, tmp_path):
 
 
 def measured(folder):
-    """Every run_id in a journal with its verdict; fails on one that is there twice."""
+    """Return the verdicts in a journal by run_id; assert that none is there twice."""
     records = read_journal(Path(folder))
     found = {r.run_id: r.verdict for r in records}
     assert len(found) == len(records)
     return found
 
 
-def halved(folder):
-    """The numbers of blocks of which some measurements are in a journal, not all."""
+def partial_blocks(folder):
+    """Return the numbers of blocks that are only partly in a journal."""
     with suppress(InputError):
         counts = Counter(r.block for r in read_journal(Path(folder)))
         return [number for number, count in counts.items() if count < SOLVERS]
@@ -138,13 +138,13 @@ def halved(folder):
 
 
 def node_of(solver):
-    """The Dask worker that a solver process works for: its sub-reaper's parent."""
+    """Return the Dask worker of a solver process, the parent of its sub-reaper."""
     reaper = parent(solver)
     return None if reaper is None else parent(reaper)
 
 
 def parent(process):
-    """The parent of a process; None when it has ended."""
+    """Return the parent of a process; None if the process has ended."""
     with suppress(OSError):
         return int(
             Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[1]
@@ -161,7 +161,7 @@ def meanwhile(action):
 
 @pytest.fixture
 def all_cpus():
-    """Every CPU of the machine may be used, not only those of a worker of pytest."""
+    """Allow all CPUs of the machine, instead of those of a worker of pytest."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, range(os.cpu_count()))
     yield
@@ -202,15 +202,15 @@ def test_two_workers_one_killed_in_the_middle_measure_what_one_machine_does(
         assert len({r.case for r in records if r.block == number}) == 1
 
 
-def test_what_a_lost_worker_had_measured_is_kept_and_the_rest_is_another_block(
+def test_results_of_a_lost_worker_are_kept_and_the_rest_is_another_block(
     cli, cluster, tmp_path
 ):
     victim = cluster.join()
     cut = []
 
     def kill():
-        assert soon(lambda: cut or cut.extend(halved("d")))
-        victim.kill()  # what it had given back of that block is in the journal
+        assert soon(lambda: cut or cut.extend(partial_blocks("d")))
+        victim.kill()  # the turns that it returned are in the journal
         cluster.join()
 
     with meanwhile(kill):
@@ -241,7 +241,7 @@ def test_a_worker_that_takes_two_blocks_at_a_time_is_refused(cli, cluster):
     assert "--nthreads 1" in err.splitlines()[-1]
 
 
-def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
+def test_an_address_without_a_scheduler_is_one_line(cli, monkeypatch):
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "ucx://x", ""):
         code, _, err = cli("run", "toy.toml", "--out", "d", "--dask", address)
@@ -250,8 +250,8 @@ def test_an_address_where_no_scheduler_is_takes_one_line(cli, monkeypatch):
         assert not Path("d").exists()
 
 
-def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeypatch):
-    """Not even with --fresh, which forgets what a folder holds."""
+def test_an_address_without_a_scheduler_leaves_the_folder_unchanged(cli, monkeypatch):
+    """Not even with --fresh, which deletes the content of a folder."""
     monkeypatch.setattr("mortarbench.harness.running.cluster.CONNECT_SECONDS", 0.5)
     assert cli("run", "toy.toml", "--out", "d", "--solver", "exact")[0] == 0
     before = measured("d")
@@ -263,20 +263,20 @@ def test_an_address_where_no_scheduler_is_costs_nothing_of_a_folder(cli, monkeyp
 
 
 @pytest.fixture
-def heeded():
-    """Ctrl-C interrupts, although what a shell starts in the background ignores it."""
+def ctrl_c_enabled():
+    """Restore the effect of Ctrl-C, which is ignored in a shell's background jobs."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.usefixtures("heeded")
+@pytest.mark.usefixtures("ctrl_c_enabled")
 def test_ctrl_c_while_a_local_cluster_starts_is_put_off_and_kept_from_its_processes():
-    from mortarbench.harness.running.cluster import _interrupted_later
+    from mortarbench.harness.running.cluster import _delay_interrupt
 
     start = multiprocessing.get_context("spawn").Process  # as Dask does
     child = start(target=time.sleep, args=(60,))
-    with pytest.raises(KeyboardInterrupt), _interrupted_later():  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), _delay_interrupt():  # noqa: PT012
         os.kill(os.getpid(), signal.SIGINT)
         child.start()
 
@@ -304,7 +304,7 @@ def test_a_scheduler_that_goes_away_ends_the_run_and_the_same_command_continues(
     cluster.join()
 
     def kill():
-        assert soon(lambda: halved("d"))  # a worker is in the middle of a block
+        assert soon(lambda: partial_blocks("d"))  # a worker is in the middle of a block
         cluster.scheduler.kill()
 
     with meanwhile(kill):
@@ -344,8 +344,8 @@ def test_when_a_run_ends_nothing_of_it_is_left_on_the_nodes(cli, cluster):
     assert soon(lambda: set(descendants(worker.pid)) == before)
 
 
-def started(*arguments):
-    """Start a run of the toy problem in a process of its own."""
+def start(*arguments):
+    """Start a run of the toy problem in a separate process."""
     program = (
         "import sys; sys.path.insert(0, sys.argv[1]); import toy_problem; "
         "from mortarbench.cli.main import main; "
@@ -366,8 +366,8 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
     cli, cluster, tmp_path
 ):
     worker = cluster.join(serves=False)
-    run = started("--out", "d", "--dask", cluster.address)
-    assert soon(lambda: halved("d"))  # the worker is in the middle of a block
+    run = start("--out", "d", "--dask", cluster.address)
+    assert soon(lambda: partial_blocks("d"))  # the worker is in the middle of a block
     run.kill()
     run.wait()
     before = measured("d")
@@ -382,7 +382,7 @@ def test_when_the_parent_is_killed_the_next_run_clears_up_and_goes_on(
 
 @pytest.fixture
 def one_cpu():
-    """What is started may use one CPU, as a worker of pytest does."""
+    """Restrict processes started here to one CPU."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {max(before)})
     yield
@@ -399,8 +399,8 @@ def test_a_worker_with_one_cpu_serves_a_run_beside_one_whose_parent_is_not_misse
     A parent that stands still looks the same to it.
     """
     worker = cluster.join(serves=False)
-    run = started("--out", "d", "--dask", cluster.address)
-    assert soon(lambda: halved("d"))
+    run = start("--out", "d", "--dask", cluster.address)
+    assert soon(lambda: partial_blocks("d"))
     run.send_signal(signal.SIGSTOP)
     try:
         code, _, err = cli("run", "toy.toml", "--out", "e", "--dask", cluster.address)
@@ -425,7 +425,7 @@ except mb.InputError as e:
 """
 
 
-def test_a_script_that_would_run_in_the_workers_too_is_refused_in_a_line(tmp_path):
+def test_a_script_that_would_also_run_in_the_workers_is_refused_in_one_line(tmp_path):
     (tmp_path / "script.py").write_text(UNGUARDED)
     text = (
         SUITE.format(repeats=1).replace("well", "string").replace('"dual"', '"primal"')
@@ -469,7 +469,7 @@ def test_a_block_that_kills_every_worker_is_given_up_and_the_others_are_measured
 
 @pytest.fixture
 def meet():
-    """What a parent does with the environment of a node; what it keeps and says."""
+    """Pass the environment of a node to `Nodes`; record its files and warnings."""
     from mortarbench.harness.running.cluster import Nodes
 
     kept, said = {}, []
@@ -479,18 +479,18 @@ def meet():
     def meet(change):
         there = json.loads(json.dumps(here))
         change(there)
-        nodes.meet("node07", digest(there), there)
+        nodes.add("node07", digest(there), there)
         return kept, said
 
     return meet
 
 
-def test_an_equal_node_is_kept_in_silence(meet):
+def test_an_equal_node_is_stored_without_a_warning(meet):
     kept, said = meet(lambda there: there["now"].update(load=3.0))
     assert (len(kept), said) == (1, [])
 
 
-def test_another_environment_is_kept_and_told_once(meet):
+def test_another_environment_is_stored_and_warned_of_once(meet):
     for _ in range(2):
         kept, said = meet(lambda there: there["machine"].update(cpu="Another"))
     assert len(kept) == 1
@@ -502,7 +502,7 @@ def test_another_environment_is_kept_and_told_once(meet):
     )
 
 
-def test_workers_that_share_a_machine_are_told_in_words(meet):
+def test_workers_that_share_a_machine_are_named_in_the_warning(meet):
     _, said = meet(lambda there: there["machine"].update(shared_by_workers=2))
     assert "(Dask workers that share the machine: none here, 2 there)" in said[0]
 

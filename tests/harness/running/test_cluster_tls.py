@@ -1,4 +1,4 @@
-"""Runs on a Dask scheduler that wants certificates, by Dask's own configuration."""
+"""Runs on a Dask scheduler with certificates, set by Dask's own configuration."""
 
 import subprocess
 import sys
@@ -26,7 +26,7 @@ forms = ["dual"]
 
 
 def certificates(folder):
-    """Make an authority and a certificate of it; the keys of Dask's configuration."""
+    """Create an authority and a certificate; return keys of Dask's configuration."""
     names = {n: str(folder / n) for n in ("ca.key", "ca.crt", "our.key", "our.crt")}
 
     def openssl(*arguments):

@@ -1,4 +1,4 @@
-"""Locks of CPUs lie where all users of a machine may write: nobody else plants them."""
+"""Locks of CPUs are in a folder that all users may write; others cannot plant them."""
 
 import os
 import tempfile
@@ -9,15 +9,15 @@ import pytest
 from mortarbench.harness import InputError
 
 
-def own_cpu(stack):
-    from mortarbench.harness.running.dask_worker import own_cpu  # late: it takes long
+def claim_cpu(stack):
+    from mortarbench.harness.running.dask_worker import claim_cpu  # late: it takes long
 
-    return own_cpu(stack)
+    return claim_cpu(stack)
 
 
 @pytest.fixture
 def shared(tmp_path, monkeypatch):
-    """A folder of temporary files of this test alone."""
+    """Set a folder of temporary files that only this test uses."""
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     return tmp_path
 
@@ -29,16 +29,16 @@ def ours(shared):
 def test_stations_on_one_machine_have_different_cpus_until_there_are_none(shared):
     usable = os.sched_getaffinity(0)
     with ExitStack() as stack:
-        assert {own_cpu(stack) for _ in usable} == usable
+        assert {claim_cpu(stack) for _ in usable} == usable
         with pytest.raises(InputError, match="start fewer"):
-            own_cpu(stack)
+            claim_cpu(stack)
     with ExitStack() as stack:
-        assert own_cpu(stack) in usable
+        assert claim_cpu(stack) in usable
 
 
 def test_only_this_user_can_enter_the_folder_of_locks(shared):
     with ExitStack() as stack:
-        own_cpu(stack)
+        claim_cpu(stack)
     assert ours(shared).stat().st_mode & 0o777 == 0o700
 
 
@@ -62,7 +62,7 @@ def test_a_folder_of_locks_that_others_may_have_planted_is_refused(shared, plant
     plant(ours(shared), elsewhere)
 
     with ExitStack() as stack, pytest.raises(InputError, match="this user's alone"):
-        own_cpu(stack)
+        claim_cpu(stack)
     assert not list(elsewhere.iterdir())
 
 
@@ -72,7 +72,7 @@ def test_a_folder_of_locks_of_another_user_is_refused(shared, monkeypatch):
     ours(shared).mkdir(mode=0o700)  # which is ours, not that other user's
 
     with ExitStack() as stack, pytest.raises(InputError, match="this user's alone"):
-        own_cpu(stack)
+        claim_cpu(stack)
 
 
 def test_a_lock_that_is_a_link_is_not_followed(shared):
@@ -82,5 +82,5 @@ def test_a_lock_that_is_a_link_is_not_followed(shared):
         (ours(shared) / f"cpu{cpu}.lock").symlink_to(victim)
 
     with ExitStack() as stack, pytest.raises(OSError, match="symbolic links"):
-        own_cpu(stack)
+        claim_cpu(stack)
     assert not victim.exists()

@@ -1,4 +1,4 @@
-"""Runs that are killed, or run out of disk, at random instants, and continued."""
+"""Runs that are killed, or run out of disk space, at random instants, and continued."""
 
 import os
 import random
@@ -31,7 +31,7 @@ family = "tiny"
 sequence = "h"
 params = {{ h = [0.5, 1.0, 1.5] }}
 """
-#: a run in a process of its own: suite, folder
+#: program of a run in a separate process; arguments: suite, folder
 RUNS = f"""
 import sys
 from pathlib import Path
@@ -63,23 +63,23 @@ except InputError as e:
 except KeyboardInterrupt:
     sys.exit(130)
 """
-#: how a run may end that was asked to, before its first line or later
+#: exit codes of a run by signal, before its first line or later
 ASKED = {
     signal.SIGINT: (130, -signal.SIGINT, 1, 0),
     signal.SIGTERM: (143, -signal.SIGTERM, 0),
 }
 
 
-def started(suite, out):
-    """Start a run; its processes are forks, whose server is the first that it has."""
+def start(suite, out):
+    """Start a run; its first child is the server that forks its processes."""
     return subprocess.Popen(
         [sys.executable, "-P", "-c", RUNS, str(suite), str(out), INSTALL],
         stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
 
 
-def ended(run):
-    """How a run ended, and the last line that it said."""
+def end_of(run):
+    """Return the exit code of a run, and its last line."""
     said = run.communicate()[1].splitlines()
     return run.returncode, said[-1] if said else ""
 
@@ -92,7 +92,7 @@ def children(process):
 
 
 def family(process):
-    """A process, then those that it started, and those that these did."""
+    """Yield a process and all of its descendants."""
     yield process
     for child in children(process):
         yield from family(child)
@@ -112,12 +112,12 @@ def ask_to_end(run, rng, out):
     """Send what Ctrl-C or a batch system sends."""
     number = rng.choice(list(ASKED))
     run.send_signal(number)
-    assert ended(run)[0] in ASKED[number]
+    assert end_of(run)[0] in ASKED[number]
 
 
 def fill_by_limit(run, rng, out):
-    """Have no process of the run write another byte into a file."""
-    for process in family(run.pid):  # which those that they start inherit
+    """Set a file size limit of zero for all processes of the run."""
+    for process in family(run.pid):  # processes that they start inherit the limit
         with suppress(ProcessLookupError, PermissionError):
             hard = resource.prlimit(process, resource.RLIMIT_FSIZE)[1]
             resource.prlimit(process, resource.RLIMIT_FSIZE, (0, hard))
@@ -137,16 +137,16 @@ def fill_by_files(run, rng, out):
 
 
 def assert_told(run):
-    """A run on a full disk ends, in one line, unless it had nothing left to write."""
-    code, said = ended(run)
+    """Assert that a run on a full disk ends with one line, or had nothing to write."""
+    code, said = end_of(run)
     assert code in (0, 2), (code, said)
     if code == 2:
         assert said.endswith("free some space, and the same command continues")
 
 
-def disturbed(suite, out, events, rng, longest):
-    """Have all of `events` happen to runs, at random instants; then let one end."""
-    run = started(suite, out)
+def disturb(suite, out, events, rng, longest):
+    """Apply all `events` to runs at random instants, then let one run finish."""
+    run = start(suite, out)
     for event in events:
         with suppress(subprocess.TimeoutExpired):
             run.wait(rng.uniform(0.0, longest))
@@ -155,17 +155,17 @@ def disturbed(suite, out, events, rng, longest):
         if run.poll() is None:
             continue
         if not run.stderr.closed:  # it ended by itself
-            assert ended(run) == (0, ANY)
-        run = started(suite, out)
-    assert ended(run)[0] == 0
-    assert ended(started(suite, out))[0] == 0  # what could not be built, again
+            assert end_of(run) == (0, ANY)
+        run = start(suite, out)
+    assert end_of(run)[0] == 0
+    assert end_of(start(suite, out))[0] == 0  # what could not be built, again
 
 
 def check(tmp_path, events, seed, out=None, repeats=4):
     suite = tmp_path / "suite.toml"
     suite.write_text(SUITE.format(repeats=repeats))
     begin = time.monotonic()
-    assert ended(started(suite, tmp_path / "whole"))[0] == 0
+    assert end_of(start(suite, tmp_path / "whole"))[0] == 0
     longest = (time.monotonic() - begin) / 2
     whole = read_journal(tmp_path / "whole")
     assert len(whole) == 5 * (4 * repeats + 1)
@@ -173,7 +173,7 @@ def check(tmp_path, events, seed, out=None, repeats=4):
     rng = random.Random(seed)
     rng.shuffle(events)
     out = out or tmp_path / "disturbed"
-    disturbed(suite, out, events, rng, longest)
+    disturb(suite, out, events, rng, longest)
     got = read_journal(out)
 
     assert len({r.run_id for r in got}) == len(got)  # exactly once
@@ -221,9 +221,9 @@ def test_a_run_that_is_asked_to_end_twenty_times_continues(tmp_path):
 
 @pytest.fixture
 def small_disk(tmp_path):
-    """A folder with a file system ``disk`` of 8 MiB, and what fills that.
+    """Create a folder with a file system ``disk`` of 8 MiB; return it with its filler.
 
-    Who may not mount one gets a limit of the size of files instead.
+    Users who may not mount one get a limit of file sizes instead.
     """
     disk = tmp_path / "disk"
     disk.mkdir()

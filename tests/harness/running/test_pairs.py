@@ -1,11 +1,14 @@
-"""Intervals of ratios of times, against Student's tables by hand."""
+"""Intervals of ratios of times, compared with Student's tables."""
+
+import doctest
 
 import numpy as np
 import pytest
 
+from mortarbench.harness.running import pairs
 from mortarbench.harness.running.pairs import paired_ratio, ratio_of, unpaired_ratio
 
-#: Student's t of 97.5 %, by degrees of freedom
+#: 97.5 % quantile of Student's t, by degrees of freedom
 STUDENT = {1: 12.706204736, 2: 4.302652730, 3: 3.182446305}
 
 
@@ -17,7 +20,7 @@ def interval(middle, half):
     return pytest.approx([middle - half, middle, middle + half], rel=1e-8)
 
 
-def test_of_two_pairs_the_interval_is_that_of_one_degree_of_freedom():
+def test_the_interval_of_two_pairs_has_one_degree_of_freedom():
     """Logarithms 0 and 2 of the ratios: mean 1, standard error 1."""
     ratio = paired_ratio({0: 1.0, 1: 5 * np.exp(2)}, {0: 1.0, 1: 5.0})
 
@@ -26,7 +29,7 @@ def test_of_two_pairs_the_interval_is_that_of_one_degree_of_freedom():
     assert ratio.pairs == 2
 
 
-def test_of_equally_scattered_samples_welchs_interval_is_students():
+def test_welchs_interval_of_equally_scattered_samples_is_students():
     """Logarithms 0, 2 and 10, 12: variances of the means 1 and 1, so 2 of freedom."""
     ratio = unpaired_ratio(np.exp([0.0, 2.0]), np.exp([10.0, 12.0]))
 
@@ -62,3 +65,7 @@ def test_solvers_of_different_sessions_are_compared_as_samples():
 
     assert ratio_of(here, there) == unpaired_ratio(here.values(), there.values())
     assert ratio_of(here, here).paired
+
+
+def test_the_example_of_the_documentation_holds():
+    assert doctest.testmod(pairs).failed == 0

@@ -1,4 +1,4 @@
-"""Whole runs: of solvers that misbehave, interrupted, resumed, on shared folders."""
+"""Complete runs: misbehaving solvers, interruption, resumption, shared folders."""
 
 import errno
 import json
@@ -22,7 +22,7 @@ from mortarbench.harness.names import assemble
 from mortarbench.harness.processes import measurement as remote
 from mortarbench.harness.processes import supervisor
 from mortarbench.harness.registry import SolverSpec, load_plugin, resolve
-from mortarbench.harness.results.faults import left, read_faults
+from mortarbench.harness.results.faults import read_faults, remaining_faults
 from mortarbench.harness.results.journal import read_journal
 from mortarbench.harness.results.work_unit import Commands
 from mortarbench.harness.running.run import run
@@ -39,7 +39,7 @@ FAMILIES = load_plugin(PLUGIN).problems
 
 
 class Watcher:
-    """A progress that remembers what it was told, and may act after some records."""
+    """Progress that records its calls, and may act after some records."""
 
     def __init__(self, interrupt_after=None, after=None, act=None):
         self.total = None
@@ -86,7 +86,7 @@ def suite(*solvers, cases=({},), **changes):
 
 @pytest.fixture
 def measure(tmp_path):
-    """Run a suite in worker processes and return what it told while doing so."""
+    """Run a suite in worker processes, and return the watcher of its progress."""
 
     def measure(
         suite,
@@ -190,9 +190,7 @@ def test_every_misbehaviour_is_one_record_and_the_next_measurement_is_intact(
                 assert message in (None, said)
 
 
-def test_a_verified_record_holds_what_was_measured_and_what_the_case_says(
-    measure, tmp_path
-):
+def test_a_verified_record_contains_costs_and_quantities(measure, tmp_path):
     measure(suite("honest", cases=[{"h": 0.5}]))
     (r,) = read_journal(tmp_path)
 
@@ -215,7 +213,7 @@ def test_the_answer_to_another_problem_is_wrong(measure, tmp_path):
     assert verdicts == [Verdict.VERIFIED, Verdict.WRONG]
 
 
-def test_a_record_tells_its_phases_and_where_it_was_measured(measure, tmp_path):
+def test_a_record_contains_phases_and_the_place_of_measurement(measure, tmp_path):
     measure(suite("honest", "sleeps", repeats=5))
     records = read_journal(tmp_path)
 
@@ -270,10 +268,8 @@ def test_a_sequence_and_the_same_case_cold_are_two_measurements(measure, tmp_pat
     assert all(len(o.records) == 1 for o in evidence.flat)
 
 
-def test_the_steps_of_a_sequence_that_tightens_are_solved_to_what_they_are_worth(
-    measure, tmp_path
-):
-    """max(tol, θ·unsettled), at most 1e-2: here unsettled is 1e-3·h."""
+def test_steps_of_a_tightening_sequence_have_their_own_tolerance(measure, tmp_path):
+    """The tolerance is max(tol, θ·δ), at most 1e-2; here δ is 1e-3·h."""
     names = [assemble(FAMILIES["tiny"], {"h": h}, "plain") for h in (500, 1.0, 1e-3)]
     solvers = ("tightens", "chains", "honest")
     asked = suite(
@@ -297,7 +293,7 @@ def test_the_steps_of_a_sequence_that_tightens_are_solved_to_what_they_are_worth
     assert {r.asked_tol for r in records if r.accuracy is None} == {1e-2, 1e-4, 1e-6}
 
 
-def test_a_sequence_that_asks_for_more_than_there_is_ends_there(measure, tmp_path):
+def test_a_sequence_with_too_many_steps_ends_at_the_last_problem(measure, tmp_path):
     cases = ({"h": 0.5}, {"h": 1.0}, {"fault": "end"}, {"fault": "end", "h": 0.5})
     names = tuple(assemble(FAMILIES["tiny"], case, "plain") for case in cases)
     asked = suite("chains", "honest", cases=(), sequences=(names,))
@@ -312,7 +308,7 @@ def test_a_sequence_that_asks_for_more_than_there_is_ends_there(measure, tmp_pat
     assert len(read_journal(tmp_path)) == 8  # nothing is left to be measured
 
 
-def test_a_sequence_that_breaks_says_where(measure, tmp_path):
+def test_a_broken_sequence_names_the_step(measure, tmp_path):
     measure(three_steps("breaksitschain"))
 
     records = read_journal(tmp_path)
@@ -322,7 +318,7 @@ def test_a_sequence_that_breaks_says_where(measure, tmp_path):
     assert records[2].message == "the sequence ended at tiny/plain: exit code 9"
 
 
-def test_a_sequence_cut_off_is_driven_again_from_its_first_step(measure, tmp_path):
+def test_an_interrupted_sequence_is_repeated_from_its_first_step(measure, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         measure(three_steps("chains"), interrupt_after=2)
     measure(three_steps("chains"))
@@ -438,7 +434,9 @@ def test_the_schedule_is_the_same_every_time(measure, tmp_path):
     assert orders[0] == orders[1]
 
 
-def test_run_ids_tell_every_cell_apart_and_equal_cells_alike(measure, tmp_path):
+def test_run_ids_are_distinct_for_distinct_cells_and_equal_for_equal_ones(
+    measure, tmp_path
+):
     cells = suite(
         "honest", cases=[{}, {"h": 0.5}], tolerances=(1e-4, 1e-6), repeats=2,
         solvers=(
@@ -458,7 +456,7 @@ def test_run_ids_tell_every_cell_apart_and_equal_cells_alike(measure, tmp_path):
 
 
 @pytest.mark.parametrize("cut", [1, 50, 3000])
-def test_a_run_cut_off_continues_with_each_measurement_exactly_once(
+def test_an_interrupted_run_continues_with_each_measurement_exactly_once(
     measure, tmp_path, cut
 ):
     whole = suite("honest", "dies", "declines", repeats=2, cases=[{}, {"h": 0.5}])
@@ -506,7 +504,7 @@ def test_blocks_of_a_continued_run_are_new_ones(measure, tmp_path):
         ("exit", "SystemExit: 3"),
     ],
 )
-def test_a_case_that_cannot_be_built_is_said_and_tried_again(
+def test_a_case_that_cannot_be_built_is_reported_and_retried(
     measure, tmp_path, caplog, fault, reason
 ):
     whole = suite("honest", "zero", cases=[{"fault": fault}, {}], repeats=2)
@@ -531,7 +529,7 @@ def test_a_case_that_cannot_be_built_is_said_and_tried_again(
         ("fields", "no fields: ZeroDivisionError: no field"),
     ],
 )
-def test_what_a_case_cannot_evaluate_costs_a_note(measure, tmp_path, fault, note):
+def test_a_failing_evaluation_costs_a_note_only(measure, tmp_path, fault, note):
     measure(suite("honest", cases=[{"fault": fault}]))
     (r,) = read_journal(tmp_path)
 
@@ -539,7 +537,7 @@ def test_what_a_case_cannot_evaluate_costs_a_note(measure, tmp_path, fault, note
     assert r.vectors is not None
 
 
-def test_the_folder_tells_suite_and_environment(measure, tmp_path):
+def test_the_folder_contains_suite_and_environment(measure, tmp_path):
     measure(suite("honest"))
 
     assert (tmp_path / "suite.toml").read_text() == 'name = "test"\n'
@@ -548,7 +546,7 @@ def test_the_folder_tells_suite_and_environment(measure, tmp_path):
     assert (tmp_path / "journal" / "here.jsonl").exists()
 
 
-def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_path):
+def test_another_suite_or_environment_is_refused_unless_fresh(measure, tmp_path):
     measure(suite("honest"))
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "validation.json").write_text("{}")  # what was concluded from it
@@ -568,7 +566,7 @@ def test_another_suite_or_environment_is_refused_and_fresh_forgets(measure, tmp_
     assert not (tmp_path / "references").exists()
 
 
-def test_another_environment_is_refused_with_what_differs(measure):
+def test_another_environment_is_refused_with_the_differences(measure):
     machine = {"cpu": "A", "cores": 2, "kernel": "6.1", "governor": None}
     now = {"now": {"load": 1.0}, "plugins": {}}
     measure(suite("honest"), environment={"machine": machine, **now})
@@ -593,7 +591,7 @@ def test_another_environment_is_refused_with_what_differs(measure):
     assert expected in str(e.value)
 
 
-def test_a_comment_makes_no_other_suite(measure, tmp_path):
+def test_a_comment_does_not_change_a_suite(measure, tmp_path):
     measure(suite("honest"))
     commented = suite("honest", text='name = "test"  # for tests\n')
 
@@ -612,7 +610,7 @@ def test_a_folder_with_other_things_under_our_names_is_left_alone(
     mine.parent.mkdir(parents=True)
     mine.write_text("mine")
 
-    with pytest.raises(InputError, match="but is no result folder"):
+    with pytest.raises(InputError, match="but is not a result folder"):
         measure(suite("honest"), out=tmp_path / "home", fresh=fresh)
 
     files = [p for p in (tmp_path / "home").rglob("*") if p.is_file()]
@@ -657,8 +655,9 @@ def test_a_second_run_on_a_folder_is_refused_while_the_first_is_running(
 ):
     hold = (
         "import sys; from pathlib import Path\n"
-        "from mortarbench.harness.results.folder import locked\n"
-        "with locked(Path(sys.argv[1])): print('held', flush=True); sys.stdin.read()"
+        "from mortarbench.harness.results.folder import lock_folder\n"
+        "with lock_folder(Path(sys.argv[1])):\n"
+        "    print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
         [sys.executable, "-P", "-c", hold, str(tmp_path)],
@@ -688,7 +687,7 @@ def once_each(folder, count):
 
 
 @pytest.mark.parametrize("lost", ["journal", "vectors", "cases", ".scratch", ".lock"])
-def test_what_is_deleted_during_a_run_costs_no_measurement(measure, tmp_path, lost):
+def test_files_deleted_during_a_run_cost_no_measurement(measure, tmp_path, lost):
     def delete():
         path = tmp_path / lost
         path.unlink() if path.is_file() else shutil.rmtree(path)
@@ -758,8 +757,10 @@ def test_wherever_the_disk_is_full_a_run_ends_in_one_line_and_continues(
 
 
 @pytest.mark.parametrize("size", [600, 4000])
-def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, size):
-    """A point takes more than 600 bytes, a case more than 4000; the rest less."""
+def test_a_full_disk_of_case_worker_or_worker_yields_no_verdict(
+    measure, tmp_path, size
+):
+    """A point needs more than 600 bytes, a case more than 4000; other files less."""
     whole = suite("honest", "prints")
     if size == 600:
         measure(suite("zero"))
@@ -780,20 +781,22 @@ def test_a_full_disk_of_generator_or_worker_is_no_verdict(measure, tmp_path, siz
 
 @pytest.fixture
 def faults(monkeypatch):
-    """Have the measurements of which `prevented` is true end by a fault of ours."""
+    """Let measurements for which `prevented` returns True fail by a fault."""
 
     def faults(prevented):
         def measured(worker, qp, record, request, **limits):
             if prevented(record):
                 raise FaultError("the worker was killed before its solve")
-            return remote.measured(worker, qp, record, request, **limits)
+            return remote.measure_and_judge(worker, qp, record, request, **limits)
 
-        monkeypatch.setattr("mortarbench.harness.running.executor.measured", measured)
+        monkeypatch.setattr(
+            "mortarbench.harness.running.executor.measure_and_judge", measured
+        )
 
     return faults
 
 
-def test_a_measurement_that_a_fault_prevents_is_made_again_at_once(
+def test_a_measurement_prevented_by_a_fault_is_retried_at_once(
     measure, tmp_path, faults
 ):
     tries = []
@@ -809,7 +812,7 @@ def test_a_measurement_that_a_fault_prevents_is_made_again_at_once(
     assert len(watched.records) == 2
 
 
-def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
+def test_a_measurement_prevented_twice_is_left_to_the_next_run(
     measure, tmp_path, faults
 ):
     whole = suite("honest", "zero", repeats=2)
@@ -827,10 +830,15 @@ def test_a_measurement_that_faults_prevent_twice_is_left_to_the_same_command(
     assert again.faults == []
     assert len(again.records) == 1
     once_each(tmp_path, 4)
-    assert left(read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]) == []
+    assert (
+        remaining_faults(
+            read_faults(tmp_path), [r.run_id for r in read_journal(tmp_path)]
+        )
+        == []
+    )
 
 
-def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
+def test_after_a_fault_a_sequence_is_repeated_from_its_first_step(
     measure, tmp_path, faults
 ):
     tries = []
@@ -843,7 +851,7 @@ def test_after_a_fault_a_sequence_is_driven_again_from_its_first_step(
 
 
 def family(process):
-    """A process, then those that it started, and those that these did."""
+    """Yield a process and all of its descendants."""
     yield process
     for tasks in Path(f"/proc/{process}/task").glob("*/children"):
         with suppress(OSError):
@@ -853,12 +861,12 @@ def family(process):
 
 @pytest.fixture
 def own_interpreters(monkeypatch):
-    """Processes are started as a run does: forks show no command in /proc."""
+    """Start processes by their commands: forks show no command in /proc."""
     monkeypatch.setattr(supervisor, "subprocess", subprocess)
 
 
 def kill_worker(solver):
-    """Kill what serves a solver: our processes with its name as an argument."""
+    """Kill the worker of a solver, a process with its name as an argument."""
     for process in list(family(os.getpid()))[1:]:
         with suppress(OSError):
             words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
@@ -875,7 +883,7 @@ def test_a_worker_that_is_killed_between_two_steps_of_a_sequence_costs_none(
     assert [f.tried_again for f in read_faults(tmp_path)] == [True]
 
 
-def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
+def test_measured_steps_of_a_sequence_prevented_by_faults_are_kept(
     measure, tmp_path, faults
 ):
     faults(lambda record: record.params["h"] == 1.0)
@@ -888,7 +896,7 @@ def test_of_a_sequence_that_faults_prevent_the_steps_that_were_made_are_kept(
     assert [r.iterations for r in once_each(tmp_path, 3)] == [1, 2, 3]
 
 
-def test_what_a_killed_run_left_unfinished_goes_when_the_next_begins(measure, tmp_path):
+def test_unfinished_files_of_a_killed_run_are_removed_by_the_next(measure, tmp_path):
     measure(suite("honest"))
     stale = [
         tmp_path / name

@@ -1,4 +1,4 @@
-"""When there are enough blocks, and how sure one is of a ratio of times."""
+"""Stopping rule of the schedule, and intervals of ratios of times."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ from mortarbench.harness import Verdict
 from mortarbench.harness.names import assemble
 from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
-from mortarbench.harness.running.pairs import paired_ratio, widest
+from mortarbench.harness.running.pairs import largest_half_width, paired_ratio
 from mortarbench.harness.running.schedule import Schedule
 from mortarbench.harness.suite.suite import Suite
 
@@ -37,8 +37,8 @@ class Quiet:
         self.said.append(text)
 
 
-def planned(**changes):
-    """Plan three repeats of one case by the solvers a and b, but for the changes."""
+def schedule_of(**changes):
+    """Return a schedule of three repeats of one case by solvers a and b, or changed."""
     suite = Suite(
         name="s", tolerances=(1e-6,), repeats=3, time_limit=1.0, memory_limit=1.0,
         solvers=tuple(SolverSpec(name=s, label=s) for s in "ab"),
@@ -51,26 +51,26 @@ def planned(**changes):
     )  # fmt: skip
 
 
-def carried_out(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
-    """Carry out a suite whose measured times are 1, 2 and 4 s but for some noise."""
+def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
+    """Execute a suite with measured times of 1, 2 and 4 s, up to some noise."""
     rng = np.random.default_rng(seed)
-    schedule = planned(**changes)
+    schedule = schedule_of(**changes)
     made = []
     for block in schedule.blocks():
         for (record,) in block.turns:
             seconds = {"a": 1.0, "b": 2.0, "c": 4.0}[record.solver]
             seconds *= float(np.exp(noise * rng.standard_normal()))
-            record = record.replace(verdict=verdict, total_seconds=seconds)
-            schedule.note(record)
+            record = record.but(verdict=verdict, total_seconds=seconds)
+            schedule.add(record)
             made.append(record)
     assert len(made) + schedule.progress.skipped == schedule.cells
     return made
 
 
-def test_who_was_first_in_a_block_is_last_in_the_next():
-    """So no place in a block favours anybody; pairs of blocks differ by chance."""
+def test_the_order_of_a_block_is_reversed_in_the_next():
+    """No position in a block favours a solver; pairs of blocks have random orders."""
     solvers = tuple(SolverSpec(name=s, label=s) for s in "abcdef")
-    blocks = list(planned(solvers=solvers, repeats=6).blocks())
+    blocks = list(schedule_of(solvers=solvers, repeats=6).blocks())
     orders = ["".join(turn[0].solver for turn in b.turns) for b in blocks]
 
     assert [order[::-1] for order in orders[::2]] == orders[1::2]
@@ -78,11 +78,11 @@ def test_who_was_first_in_a_block_is_last_in_the_next():
     assert len(set(orders)) == 6
 
 
-def test_of_a_sequence_the_whole_is_compared():
-    """Its steps are noisy, but what one takes longer the other takes less."""
+def test_sequences_are_compared_by_their_total_time():
+    """Its steps are noisy, but their errors cancel in the sum."""
     rng = np.random.default_rng(161803)
     steps = cases_of(1, 2)
-    schedule = planned(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
+    schedule = schedule_of(cases=(), sequences=(steps,), precision=0.05, max_repeats=50)
     blocks = 0
     for block in schedule.blocks():
         blocks += 1
@@ -90,8 +90,8 @@ def test_of_a_sequence_the_whole_is_compared():
             whole = {"a": 1.0, "b": 2.0}[turn[0].solver]
             part = whole * rng.uniform(0.2, 0.8)
             for record, seconds in zip(turn, (part, whole - part), strict=True):
-                timed = record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
-                schedule.note(timed)
+                timed = record.but(verdict=Verdict.VERIFIED, total_seconds=seconds)
+                schedule.add(timed)
 
         assert block.is_sequence
 
@@ -103,18 +103,18 @@ def records_of(blocks):
 
 
 def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
-    """After every number of measurements; blocks keep their numbers apart."""
+    """For every number of measurements before; block numbers stay distinct."""
     suite = dict(
         tolerances=(1e-4, 1e-6), repeats=2,
         cases=cases_of(1, 2),
     )  # fmt: skip
-    every = records_of(planned(**suite).blocks())
-    assert len({r.run_id for r in every}) == planned(**suite).cells == 2 * 2 * 2 * 2
+    every = records_of(schedule_of(**suite).blocks())
+    assert len({r.run_id for r in every}) == schedule_of(**suite).cells == 2 * 2 * 2 * 2
 
     for done in range(len(every) + 1):
-        resumed = planned(**suite)
+        resumed = schedule_of(**suite)
         for record in every[:done]:
-            resumed.note(record)
+            resumed.add(record)
         left = records_of(resumed.blocks())
         assert {r.run_id for r in left} == {r.run_id for r in every[done:]}
         assert len(left) + resumed.progress.skipped == resumed.cells
@@ -124,20 +124,20 @@ def test_a_resumed_run_measures_what_is_left_and_nothing_twice():
 
 
 def test_a_solver_that_declined_a_case_is_not_asked_again():
-    schedule = planned()
+    schedule = schedule_of()
     asked = []
     for block in schedule.blocks():
         for (record,) in block.turns:
             asked.append(record.solver)
             verdict = Verdict.DECLINED if record.solver == "a" else Verdict.VERIFIED
-            schedule.note(record.replace(verdict=verdict, total_seconds=1.0))
+            schedule.add(record.but(verdict=verdict, total_seconds=1.0))
 
     assert (asked.count("a"), asked.count("b")) == (1, 3)
 
 
 def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     cases = cases_of(1, 2)
-    schedule = planned(cases=cases)
+    schedule = schedule_of(cases=cases)
     blocks = schedule.blocks()
     failed = next(blocks)
 
@@ -146,8 +146,8 @@ def test_a_case_that_cannot_be_built_is_left_out_from_then_on():
     assert [b.cases for b in blocks] == 3 * [("f/n=2/p",)]
 
 
-def test_each_block_says_what_it_is_before_it_starts():
-    schedule = planned(repeats=2)
+def test_each_block_is_announced_before_it_starts():
+    schedule = schedule_of(repeats=2)
     list(schedule.blocks())
 
     assert schedule.progress.said == [
@@ -156,69 +156,67 @@ def test_each_block_says_what_it_is_before_it_starts():
     ]
 
 
-def test_without_a_precision_there_are_the_repeats_of_the_suite():
-    assert len(carried_out(0.5)) == 2 * 3
+def test_without_a_precision_the_repeats_of_the_suite_are_measured():
+    assert len(records_after(0.5)) == 2 * 3
 
 
 def test_quiet_times_are_enough_after_the_repeats_of_the_suite():
-    assert len(carried_out(1e-4, precision=0.05)) == 2 * 3
+    assert len(records_after(1e-4, precision=0.05)) == 2 * 3
 
 
 @pytest.mark.parametrize("solvers", ["ab", "abc"])
-def test_blocks_go_on_until_the_ratio_is_known_as_well_as_asked(solvers):
+def test_blocks_continue_until_the_ratio_has_the_requested_precision(solvers):
     specs = tuple(SolverSpec(name=s, label=s) for s in solvers)
-    made = carried_out(0.1, solvers=specs, precision=0.05, max_repeats=200)
+    made = records_after(0.1, solvers=specs, precision=0.05, max_repeats=200)
     times = {
         s: {r.repeat: r.total_seconds for r in made if r.solver == s} for s in solvers
     }
     before = {s: {k: v for k, v in t.items() if k < max(t)} for s, t in times.items()}
 
     assert len(solvers) * 3 < len(made) < len(solvers) * 200
-    assert widest(times) <= 0.05 < widest(before)
+    assert largest_half_width(times) <= 0.05 < largest_half_width(before)
 
 
-def test_blocks_end_at_the_most_repeats_and_at_the_budget():
-    assert len(carried_out(2.0, precision=0.01, max_repeats=7)) == 2 * 7
-    spent = carried_out(0.1, precision=0.001, max_repeats=99, budget=30.0)
+def test_blocks_end_at_the_largest_number_of_repeats_and_at_the_budget():
+    assert len(records_after(2.0, precision=0.01, max_repeats=7)) == 2 * 7
+    spent = records_after(0.1, precision=0.001, max_repeats=99, budget=30.0)
 
     assert 30 <= sum(r.total_seconds for r in spent) < 36
 
 
-def test_what_has_no_time_spends_no_budget():
-    """One solver fails, and has none; the others are told apart after many blocks."""
+def test_records_without_a_time_spend_no_budget():
+    """A failing solver has no time; the others are distinguished after many blocks."""
     specs = tuple(SolverSpec(name=s, label=s) for s in "abc")
-    schedule = planned(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
+    schedule = schedule_of(solvers=specs, precision=1e-9, max_repeats=20, budget=30.0)
     rng = np.random.default_rng(271828)
     spent = 0.0
     for block in schedule.blocks():
         for (record,) in block.turns:
             if record.solver == "c":
-                schedule.note(record.replace(verdict=Verdict.FAILED))
+                schedule.add(record.but(verdict=Verdict.FAILED))
                 continue
             seconds = float(rng.uniform(0.9, 1.1))
             spent += seconds
-            schedule.note(
-                record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
-            )
+            schedule.add(record.but(verdict=Verdict.VERIFIED, total_seconds=seconds))
 
     assert 30 <= spent < 33
 
 
-def test_parts_of_a_block_keep_a_number_each():
-    schedule = planned()
+def test_each_part_of_a_block_has_its_own_number():
+    schedule = schedule_of()
     first = next(schedule.blocks()).number
-    numbers = [schedule.number_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
+    numbers = [schedule.block_of_part(*key) for key in ((0, 1), (0, 2), (1, 1))]
 
     assert len({first, *numbers}) == 4
-    assert schedule.number_of_part(0, 2) == numbers[1]
+    assert schedule.block_of_part(0, 2) == numbers[1]
     assert next(schedule.blocks()).number not in numbers
 
 
-def test_solvers_that_fail_are_no_reason_to_go_on():
-    assert len(carried_out(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
+def test_failing_solvers_do_not_prolong_the_measurement():
+    assert len(records_after(2.0, precision=0.01, verdict=Verdict.WRONG)) == 2 * 3
 
 
-def test_the_paired_interval_covers_as_often_as_it_says():
+def test_the_paired_interval_has_its_nominal_coverage():
     rng = np.random.default_rng(314159)
     hits = 0
     for _ in range(2000):
@@ -230,7 +228,7 @@ def test_the_paired_interval_covers_as_often_as_it_says():
     assert hits / 2000 == pytest.approx(0.95, abs=0.015)
 
 
-def test_only_blocks_that_both_were_in_are_compared():
+def test_only_common_blocks_are_compared():
     r = paired_ratio({0: 2.0, 1: 8.0, 5: 1e9}, {0: 1.0, 1: 4.0, 7: 1e-9})
 
     assert (r.value, r.pairs) == (pytest.approx(2.0), 2)

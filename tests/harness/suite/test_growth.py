@@ -1,8 +1,8 @@
-"""A suite may ask for more while its folder lasts, and for nothing else."""
+"""A suite with a result folder may only ask for more measurements."""
 
 import pytest
 
-from mortarbench.harness.suite.growth import refused
+from mortarbench.harness.suite.growth import incompatibility
 
 SUITE = {
     "name": "s", "tolerances": [1e-6, 1e-8], "repeats": 3, "time_limit": 60,
@@ -23,7 +23,7 @@ SUITE = {
     ],
 )
 def test_a_suite_that_asks_for_more_is_the_same(more):
-    assert refused(SUITE, SUITE | more) == ""
+    assert incompatibility(SUITE, SUITE | more) == ""
 
 
 @pytest.mark.parametrize(
@@ -42,15 +42,18 @@ def test_a_suite_that_asks_for_more_is_the_same(more):
         ),
     ],
 )
-def test_what_was_measured_may_not_become_something_else(change, said):
-    assert refused(SUITE, SUITE | change) == said
+def test_settings_of_past_measurements_may_not_change(change, said):
+    assert incompatibility(SUITE, SUITE | change) == said
 
 
 def test_a_stopping_rule_may_become_stricter_and_not_laxer():
     ruled = SUITE | {"precision": 0.1, "null_arm": "a"}
 
-    assert refused(ruled, ruled | {"precision": 0.05}) == ""
+    assert incompatibility(ruled, ruled | {"precision": 0.05}) == ""
     said = "precision was 0.1, now 0.2; it may only become finer"
-    assert refused(ruled, ruled | {"precision": 0.2}) == said
-    assert refused(ruled, SUITE).startswith("precision was 0.1, now not set")
-    assert refused(ruled, ruled | {"null_arm": None}) == "null_arm was 'a', now not set"
+    assert incompatibility(ruled, ruled | {"precision": 0.2}) == said
+    assert incompatibility(ruled, SUITE).startswith("precision was 0.1, now not set")
+    assert (
+        incompatibility(ruled, ruled | {"null_arm": None})
+        == "null_arm was 'a', now not set"
+    )

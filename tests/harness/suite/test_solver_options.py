@@ -1,4 +1,4 @@
-"""Options of solvers from the command line: read by type, swept, told apart."""
+"""Options of solvers from the command line: types, sweeps and labels."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 from mortarbench.harness import InputError
 from mortarbench.harness.registry import SolverSpec, resolve
 from mortarbench.harness.suite.solver_options import (
-    as_given,
-    given_options,
+    options_as_texts,
     options_for,
-    swept,
+    parse_options,
+    sweep,
     without_options,
 )
 
@@ -85,7 +85,10 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
         ("scaling=1", "--option: method: scaling = '1'; expected true or false"),
         ("mode=slow", "--option: method: mode = 'slow'; expected fast or exact"),
         ("seed=x", "--option: method: seed = 'x'; expected an integer or none"),
-        ("shape=1", "--option: method: shape = '1'; expected what only a suite can"),
+        (
+            "shape=1",
+            "--option: method: shape = '1'; expected a value that only a suite can",
+        ),
         ("max_iter", "--option 'max_iter'; expected KEY=VALUE, such as max_iter=50"),
         ("max_iter=", "--option 'max_iter='; expected KEY=VALUE"),
         ("max_iter=5,", "--option 'max_iter=5,'; expected KEY=VALUE"),
@@ -93,7 +96,7 @@ def test_a_value_is_read_as_the_type_of_its_field(text, value):
         ("max_iter=5,6", "--option: max_iter has 2 values; expected one, only `run`"),
     ],
 )
-def test_what_is_no_option_of_a_solver_is_refused(text, message):
+def test_unknown_options_and_values_are_refused(text, message):
     with pytest.raises(InputError) as e:
         options_for("method", [text], SOLVERS)
 
@@ -101,11 +104,11 @@ def test_what_is_no_option_of_a_solver_is_refused(text, message):
 
 
 def labels(*texts, specs=SPECS):
-    return [spec.label for spec in swept(specs, given_options(texts), SOLVERS)]
+    return [spec.label for spec in sweep(specs, parse_options(texts), SOLVERS)]
 
 
 def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
-    """As a list, or given again; who has no such option is measured as it is."""
+    """Values as a list or repeated; a solver without the option stays unchanged."""
     assert labels("max_iter=5,6", "scaling=false") == [
         "method max_iter=5 scaling=false", "method max_iter=6 scaling=false", "plain"
     ]  # fmt: skip
@@ -114,13 +117,13 @@ def test_lists_span_a_grid_of_the_solvers_that_have_the_option():
     assert labels() == ["method", "plain"]
 
 
-def test_labels_say_the_value_however_it_is_written():
+def test_labels_contain_the_value_in_canonical_form():
     assert labels("alpha=1e-3") == labels("alpha=0.001")
 
 
 def test_an_option_goes_before_that_of_the_suite():
     own = SolverSpec(name="method", label="mine", options={"max_iter": 9, "alpha": 2.0})
-    (changed,) = swept([own], {"max_iter": ["5"]}, SOLVERS)
+    (changed,) = sweep([own], {"max_iter": ["5"]}, SOLVERS)
 
     assert changed.label == "mine max_iter=5"
     assert resolve(changed, SOLVERS) == Method(max_iter=5, alpha=2.0)
@@ -128,7 +131,7 @@ def test_an_option_goes_before_that_of_the_suite():
 
 def test_a_null_arm_has_the_options_of_its_twin():
     null = SolverSpec(name="method", label="method (A/A)", role="null")
-    found = swept([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
+    found = sweep([*SPECS[:1], null], {"max_iter": ["5"]}, SOLVERS)
 
     assert [(s.label, s.role) for s in found] == [
         ("method max_iter=5", ""), ("method max_iter=5 (A/A)", "null")
@@ -139,8 +142,8 @@ def test_a_null_arm_has_the_options_of_its_twin():
     ("texts", "message"),
     [
         (["max_itr=5"], "--option: unknown option 'max_itr'; did you mean 'max_iter'?"),
-        (["max_iter=5,5"], "--option: 'method max_iter=5' is asked for twice"),
-        (["alpha=1,1.0"], "--option: 'method alpha=1.0' is asked for twice"),
+        (["max_iter=5,5"], "--option: 'method max_iter=5' occurs twice"),
+        (["alpha=1,1.0"], "--option: 'method alpha=1.0' occurs twice"),
         (["max_iter=0"], "--option: method: max_iter must be positive"),
         (["mode=fast,slow"], "--option: method: mode = 'slow'; expected fast or exact"),
         (
@@ -150,7 +153,7 @@ def test_a_null_arm_has_the_options_of_its_twin():
         ),
     ],
 )  # fmt: skip
-def test_a_sweep_that_makes_no_sense_is_refused(texts, message):
+def test_a_contradictory_sweep_is_refused(texts, message):
     with pytest.raises(InputError) as e:
         labels(*texts)
 
@@ -160,7 +163,7 @@ def test_a_sweep_that_makes_no_sense_is_refused(texts, message):
 def test_options_of_a_program_are_those_of_the_command_line():
     values = {"max_iter": [5, 6], "scaling": False, "mode": "exact", "seed": None}
 
-    assert as_given(values) == given_options(
+    assert options_as_texts(values) == parse_options(
         ["max_iter=5,6", "scaling=false", "mode=exact", "seed=none"]
     )
 
@@ -185,13 +188,13 @@ def test_an_integer_default_does_not_narrow_a_float(solver, text, value):
     registry = {"sized": solver}
     specs = [SolverSpec(name="sized", label="sized")]
     one = options_for("sized", [f"rho={text}"], registry)
-    (spec,) = swept(specs, {"rho": [text]}, registry)
+    (spec,) = sweep(specs, {"rho": [text]}, registry)
 
     assert one == {"rho": value}
     assert resolve(spec, registry).rho == value
 
 
-def test_a_default_decides_where_the_annotation_leaves_it_open():
+def test_the_default_determines_the_type_if_the_annotation_does_not():
     assert options_for("sized", ["start=3"], {"sized": Sized()}) == {"start": 3}
     with pytest.raises(InputError, match=r"start = '0\.5'; expected an integer"):
         options_for("sized", ["start=0.5"], {"sized": Sized()})

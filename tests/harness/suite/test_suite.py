@@ -1,4 +1,4 @@
-"""Suites: what a TOML asks for, and what is wrong with it."""
+"""Suites: content of their TOML, and messages on mistakes."""
 
 import tomllib
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def names(suite):
     return [case.name for case in suite.cases]
 
 
-def test_what_is_left_out_takes_its_default(load):
+def test_missing_keys_take_their_defaults(load):
     suite = load(MINIMAL)
 
     assert suite.name == "demo"
@@ -76,7 +76,7 @@ def test_what_is_left_out_takes_its_default(load):
     assert suite.text == MINIMAL
 
 
-def test_what_is_given_is_what_is_measured(load):
+def test_a_suite_contains_the_given_values(load):
     suite = load(
         """
         name = "demo"
@@ -163,9 +163,12 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ("name = 3\nsolvers = ['osqp']\n" + BLOCK, "name = 3; expected a text"),
         (
             "name = 'a/b'\nsolvers = ['osqp']\n" + BLOCK,
-            "name = 'a/b' is no name of a f",
+            "name = 'a/b' is not a valid folder n",
         ),
-        ("name = '..'\nsolvers = ['osqp']\n" + BLOCK, "name = '..' is no name of a fo"),
+        (
+            "name = '..'\nsolvers = ['osqp']\n" + BLOCK,
+            "name = '..' is not a valid folder na",
+        ),
         ("name = 'a'\n" + BLOCK, "solvers is missing"),
         ("name = 'a'\nsolvers = []\n" + BLOCK, "solvers is empty; expected at least"),
         ("name = 'a'\nsolvers = 'osqp'\n" + BLOCK, "solvers = 'osqp'; expected a list"),
@@ -204,10 +207,14 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         (MINIMAL + "params = { n = 0 }", "problems[0]: well: n=0 must be at least 1"),
         (MINIMAL + BLOCK + "params = { n = [2, 0] }", "problems[1]: well: n=0 must be"),
         (MINIMAL + "zip = ['n']", "problems[0]: zip = 'n'; expected a list"),
-        (MINIMAL + "zip = [['n', 'm']]", "problems[0]: zip: 'n' is no list in params"),
+        (
+            MINIMAL + "zip = [['n', 'm']]",
+            "problems[0]: zip: 'n' is not a list in params",
+        ),
         (
             MINIMAL + "zip = [['n', 'n']]\nparams = { n = [2, 3] }",
-            "problems[0]: zip: 'n' is no list in params, or is paired twice; expected",
+            "problems[0]: zip: 'n' is not a list in params, or is paired twice; "
+            "expected",
         ),
         (
             MINIMAL + "zip = [['n', 'm']]\nparams = { n = [2, 3], m = [2, 3, 4] }",
@@ -219,7 +226,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ),
     ],
 )
-def test_what_is_wrong_is_said_with_file_place_and_remedy(
+def test_mistakes_are_reported_with_file_place_and_remedy(
     load, tmp_path, text, message
 ):
     with pytest.raises(InputError) as e:
@@ -248,7 +255,7 @@ def test_what_is_wrong_is_said_with_file_place_and_remedy(
         ),
     ],
 )
-def test_what_is_wrong_with_a_solver_is_said_with_its_place(load, entry, message):
+def test_mistakes_in_solvers_are_reported_with_their_place(load, entry, message):
     with pytest.raises(InputError) as e:
         load(f"name = 'a'\nsolvers = ['osqp', {entry}]\n{BLOCK}")
 
@@ -311,7 +318,7 @@ def test_a_case_may_be_named_in_any_way_that_parses(narrowed, written):
     assert names(narrowed(cases=[written])) == ["well/n=2/dual"]
 
 
-def test_a_pattern_in_vain_is_told_what_there_is(narrowed):
+def test_a_pattern_without_a_match_is_refused_with_the_cases(narrowed):
     with pytest.raises(InputError) as e:
         narrowed(cases=["well/n=3/dual"])
 
@@ -359,7 +366,7 @@ def test_a_limit_of_the_suite_is_no_option_of_a_solver(load, head):
         (dict(memory_limit=-1.0), "--memory-limit = -1.0; expected a positive number"),
     ],
 )
-def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
+def test_a_contradictory_override_is_refused(narrowed, changes, message):
     with pytest.raises(InputError, match=message):
         narrowed(**changes)
 
@@ -368,7 +375,7 @@ def test_an_override_that_makes_no_sense_is_refused(narrowed, changes, message):
     ("name", "cases"),
     [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6)],
 )
-def test_the_suites_of_the_checkout_are_what_was_promised(name, cases):
+def test_the_suites_of_the_checkout_keep_their_promises(name, cases):
     path = ROOT / "suites" / f"{name}.toml"
     suite = load_suite(path, problems.PROBLEMS, solvers.SOLVERS)
 
@@ -412,7 +419,7 @@ def test_the_files_of_a_suite_lie_beside_it_unless_they_are_here(tmp_path, monke
 
 
 def folder_of_files(folder, monkeypatch, *, here=True):
-    """Write a suite beside some files; work there, or elsewhere."""
+    """Write a suite beside some files, and change to its folder or another one."""
     (folder / "set" / "more.qps").mkdir(parents=True)
     (folder / "elsewhere").mkdir()
     for name in ("b.qps", "a.qps", "c[1].qps", "d.txt", "more.qps/e.qps"):
@@ -488,8 +495,8 @@ def test_a_sequence_may_run_along_zipped_keys():
 
 
 @pytest.mark.parametrize("name", BEYOND)
-def test_what_the_paper_lacks_is_measured_by_suites_that_can_be_narrowed(name):
-    """Six repeats are the fewest whose median has a 95 % interval."""
+def test_suites_beyond_the_paper_can_be_narrowed(name):
+    """Six is the smallest number of repeats whose median has a 95 % interval."""
     suite = shipped(name)
     narrowed = with_overrides(
         suite, problems.PROBLEMS, solvers.SOLVERS, **BEYOND[name]
@@ -519,7 +526,7 @@ def test_the_suite_of_the_paper_has_a_null_arm_and_a_precision():
     assert [s.label for s in kept.solvers] == ["smalbe", "smalbe (A/A)"]
 
 
-def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
+def test_a_pattern_keeps_all_steps_of_a_sequence_or_none():
     kept = with_overrides(
         shipped("path"), problems.PROBLEMS, solvers.SOLVERS, cases=["*/step=3/dual"]
     )
@@ -538,7 +545,7 @@ def test_of_a_sequence_a_pattern_keeps_all_steps_or_none():
         ("null_arm = 'smalb'", "unknown null_arm 'smalb'.*smalbe"),
     ],
 )
-def test_a_schedule_that_makes_no_sense_is_refused(tmp_path, line, message):
+def test_a_contradictory_schedule_is_refused(tmp_path, line, message):
     file = tmp_path / "s.toml"
     file.write_text(
         f"name = 's'\nsolvers = ['smalbe']\n{line}\n[[problems]]\nfamily = 'obstacle'\n"
@@ -556,11 +563,11 @@ SEQUENCE = "sequence = 'n'\nparams = { n = [4, 8] }"
         ("tighten = 0.1", SEQUENCE, "tighten = 0.1; expected a list"),
         ("tighten = [1]", SEQUENCE, r"tighten = \[1\]; expected distinct numbers"),
         ("tighten = [0.1, 0.1]", SEQUENCE, "expected distinct numbers"),
-        ("tighten = [0.1]", "", "no problems are a sequence; expected sequence"),
+        ("tighten = [0.1]", "", "there is no sequence; expected sequence"),
         ("tighten = [0.1]\naccuracy = 1e-6", SEQUENCE, "only one of the two"),
     ],
 )
-def test_tightening_that_cannot_be_is_refused(tmp_path, line, block, message):
+def test_impossible_tightening_is_refused(tmp_path, line, block, message):
     file = tmp_path / "s.toml"
     file.write_text(
         f"name = 's'\nsolvers = ['smalbe']\n{line}\n"

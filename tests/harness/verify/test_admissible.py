@@ -7,7 +7,7 @@ from scipy.sparse import csr_array
 from mortarbench.harness.mechanics import Exact, Real
 from mortarbench.harness.verify import admissible as module
 from mortarbench.harness.verify.admissible import admissible, feasible_at_rows
-from tests.support.held_by_contact import disc_between_plates
+from tests.support.supported_by_contact import disc_between_plates
 
 
 def moved(B, c, u, *, R=None, softness=None, closed=None):

@@ -25,7 +25,7 @@ from mortarbench.harness.verify.substructured import Rounding, Undivided, length
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.held_by_contact import disc_between_plates, stored_solution
+from tests.support.supported_by_contact import disc_between_plates, stored_solution
 
 ROUNDED = 1 + 1e-9
 

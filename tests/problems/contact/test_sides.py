@@ -14,8 +14,8 @@ from mortarbench.problems.fem.mesh import nodal_lengths
 from mortarbench.problems.models.patch import PRESSURE, model
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.held_by_contact import PRESSURE as PRESS
-from tests.support.held_by_contact import disc_between_plates
+from tests.support.supported_by_contact import PRESSURE as PRESS
+from tests.support.supported_by_contact import disc_between_plates
 
 METHODS = [("nts", "dual"), ("mortar", "dual"), ("mortar", "standard")]
 

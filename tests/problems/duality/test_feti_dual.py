@@ -16,7 +16,7 @@ from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.decomposed_bodies import labelled_subdivision, torn_by
+from tests.support.decomposed_bodies import decompose_by_labels, labelled_subdivision
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")
@@ -35,7 +35,9 @@ def posed(law):
 def dual_of(primal, friction, rows):
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 2))
-    pair = torn_by(BODIES, labelled_subdivision(BODIES, label), primal, friction, rows)
+    pair = decompose_by_labels(
+        BODIES, labelled_subdivision(BODIES, label), primal, friction, rows
+    )
     return pair, feti_dual(pair, primal, friction)
 
 

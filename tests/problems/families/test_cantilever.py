@@ -121,7 +121,9 @@ def test_forms_pose_the_same_iteration():
     name = "cantilever/slenderness=4/ny=2/load=2/newton=2"
     primal, dual = (emitted(f"{name}/{form}") for form in ("primal", "dual"))
 
-    u, v = (case.made.recover(answer.solution) for case, answer in (primal, dual))
+    u, v = (
+        case.family_case.recover(answer.solution) for case, answer in (primal, dual)
+    )
 
     assert np.abs(u - v).max() < 1e-6 * np.abs(u).max()
     assert primal[1].quantities["newton"] == 2

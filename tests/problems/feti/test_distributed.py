@@ -28,7 +28,7 @@ from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import DualOperator
 from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import torn_pair
+from tests.support.decomposed_bodies import decomposed_pair
 from tests.support.threads import on_threads, without_lock
 
 
@@ -154,8 +154,8 @@ def ranks_do_not_lock_one_another_out(monkeypatch):
     scope="module",
     params=[
         lambda: on_one_process(Membranes(2, 3).in_subdomains("redundant")).decomposed,
-        lambda: torn_pair("chain", most=4)[2],
-        lambda: torn_pair("orthonormal", most=4)[2],
+        lambda: decomposed_pair("chain", most=4)[2],
+        lambda: decomposed_pair("orthonormal", most=4)[2],
     ],
     ids=["membranes", "chain", "orthonormal"],
 )

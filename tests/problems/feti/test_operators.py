@@ -23,7 +23,7 @@ from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import labelled_subdivision, torn_by
+from tests.support.decomposed_bodies import decompose_by_labels, labelled_subdivision
 
 pytestmark = pytest.mark.together
 
@@ -39,7 +39,9 @@ def beam_and_ring(rows="orthonormal"):
     )
     beam = blocks((16, 2), 2)
     label = np.append(beam, beam.max() + 1 + blocks((24, 4), 4))
-    return torn_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)
+    return decompose_by_labels(
+        bodies, labelled_subdivision(bodies, label), primal, rows=rows
+    )
 
 
 def membranes(rows="orthonormal"):

@@ -29,7 +29,11 @@ from mortarbench.problems.feti.spectrum import (
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
 from mortarbench.problems.models.beam_ring import bodies as of_beam_ring
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import labelled_subdivision, parts_by, torn_pair
+from tests.support.decomposed_bodies import (
+    decomposed_pair,
+    labelled_subdivision,
+    parts_by,
+)
 from tests.support.threads import on_threads, without_lock
 
 
@@ -107,7 +111,7 @@ def projector_of(dual: LocalDual) -> Callable[[Vector], Vector]:
 
 @pytest.mark.parametrize("rows", ["orthonormal", "chain", "redundant"])
 def test_the_projector_is_onto_what_equations_and_rows_leave(rows: str) -> None:
-    bodies, primal, _ = torn_pair(rows)
+    bodies, primal, _ = decomposed_pair(rows)
     label = of_beam_ring(4, 3, 6, "strain").shape.layout(2).label
     primal = replace(primal, G=no_rows(primal.q.size), h=np.zeros(0))
     parts = parts_by(bodies, labelled_subdivision(bodies, label), primal, rows=rows)

@@ -6,13 +6,13 @@ from numpy.testing import assert_allclose
 from scipy.linalg import block_diag, null_space
 
 from mortarbench.problems.feti.substructures import LocalProblems
-from tests.support.decomposed_bodies import torn_pair
+from tests.support.decomposed_bodies import decomposed_pair
 
 
 @pytest.fixture(scope="module")
 def parts() -> LocalProblems:
     """The beam on its ring in subdomains of 4² cells at most."""
-    return LocalProblems(torn_pair(most=8)[2])
+    return LocalProblems(decomposed_pair(most=8)[2])
 
 
 def dense(parts: LocalProblems) -> np.ndarray:

@@ -19,7 +19,7 @@ from mortarbench.problems.feti.subdomains import (
     on_one_process,
 )
 from mortarbench.problems.feti.tearing import blocks, compact_blocks, label_blocks
-from tests.support.decomposed_bodies import torn_pair
+from tests.support.decomposed_bodies import decomposed_pair
 from tests.support.glued import decompose, glue, structured_bodies
 
 GLUING = ("orthonormal", "chain", "redundant")
@@ -130,27 +130,27 @@ def test_a_mirror_image_is_of_another_kind() -> None:
 
 
 def test_rectangles_are_of_one_kind_and_each_layer_of_the_ring_is_of_one() -> None:
-    _, _, pair = torn_pair()
+    _, _, pair = decomposed_pair()
     assert len(pair.classes) == 1 + 3
     assert pair.class_of.size == 16 * 2 + 18 * 3
 
 
 def test_the_torn_stiffness_of_all_subdomains_is_that_of_the_whole() -> None:
-    bodies, _, pair = torn_pair()
+    bodies, _, pair = decomposed_pair()
     K = block_diag([pair.classes[k].K for k in pair.class_of])
     assembled = pair.spread.T @ K @ pair.spread
     assert abs(assembled - bodies.K).max() < 1e-12 * abs(bodies.K).max()
 
 
 def test_motions_of_the_kernel_are_orthonormal_and_cost_no_energy() -> None:
-    for kind in torn_pair()[2].classes:
+    for kind in decomposed_pair()[2].classes:
         assert_allclose(kind.R.T @ kind.R, np.eye(3), atol=1e-14)
         assert abs(kind.K @ kind.R).max() < 1e-13 * abs(kind.K).max()
 
 
 @pytest.mark.parametrize("rows", GLUING)
 def test_rows_hold_exactly_what_is_whole_and_supported(rows: str) -> None:
-    bodies, primal, pair = torn_pair(rows)
+    bodies, primal, pair = decomposed_pair(rows)
     u = np.sin(np.arange(bodies.mesh.dofs) ** 2)
     u[bodies.B_D.indices] = 0
     held = pair.B @ (pair.spread @ u)
@@ -170,12 +170,12 @@ def test_rows_hold_exactly_what_is_whole_and_supported(rows: str) -> None:
 
 @pytest.mark.parametrize("rows", GLUING)
 def test_the_load_is_that_of_the_whole(rows: str) -> None:
-    _, primal, pair = torn_pair(rows)
+    _, primal, pair = decomposed_pair(rows)
     assert_allclose(pair.spread.T @ pair.f, -primal.q, atol=1e-15)
 
 
 def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
-    _, _, pair = torn_pair()
+    _, _, pair = decomposed_pair()
     E = pair.equalities
     root_E = np.linalg.norm(pair.B.toarray(), axis=1)
     B = np.diag(1 / root_E) @ pair.B.toarray()
@@ -185,7 +185,7 @@ def test_orthonormal_rows_are_that_and_of_full_rank() -> None:
 
 
 def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
-    _, _, pair = torn_pair(most=4)
+    _, _, pair = decomposed_pair(most=4)
     beam = pair.classes[0]  # 4 × 4 cells
     assert beam.boundary.size == 2 * 16
     assert_allclose(beam.stiffness, 4000.0)  # E l/F₀
@@ -195,7 +195,7 @@ def test_a_kind_knows_its_boundary_and_what_it_is_made_of() -> None:
 @pytest.mark.parametrize("rows", GLUING)
 def test_rows_are_those_that_sparse_algebra_makes_of_the_whole(rows: str) -> None:
     """Supports, gluing and contact in the same order, with the same signs."""
-    bodies, primal, found = torn_pair(rows)
+    bodies, primal, found = decomposed_pair(rows)
     label = structured_bodies([(32, 4), (36, 6)], 2)
     parts = decompose(bodies.mesh.points, bodies.mesh.cells, label, bodies.body)
     D, E = bodies.elasticity * (bodies.length / bodies.force), bodies.moduli

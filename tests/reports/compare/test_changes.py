@@ -83,13 +83,13 @@ def only(c):
 
 def test_residuals_of_different_definitions_are_said_to_be_so(changed):
     old = [replace(r, schema=1) for r in suite(1, cases=1)]
-    said = "Residuals are defined differently: journal schema 1 before, 2 after."
+    said = "The definition of the residuals differs: journal schema 1 before, 2 after."
 
     for c in (changed(old, suite(2, cases=1)),):
         assert any(line.startswith(said) for line in verdict_lines(c))
         assert said in " ".join(compose(c).sections[0].prose)
     for same in (changed(old, old), changed(suite(1, cases=1), suite(2, cases=1))):
-        assert not any("defined differently" in line for line in verdict_lines(same))
+        assert not any("definition of the" in line for line in verdict_lines(same))
 
 
 # times
@@ -186,7 +186,7 @@ def test_folders_that_share_no_cell_are_told_so_in_one_sentence(changed):
     c = changed([record("one")], [record("two", case=k) for k in range(2)])
 
     (line,) = verdict_lines(c)
-    assert line.startswith("No cell is in both folders")
+    assert line.startswith("No cell (a solver on a case at a tolerance) is in both")
     assert "1 cell before, 2 after" in line
 
 
@@ -285,8 +285,8 @@ def test_another_version_on_the_same_machine_is_what_one_compares(folders):
     said, _ = write_comparison(*folders(HERE, other, after=after), ["csv"])
 
     assert said[0] == (
-        "The machine is the same; what differs is versions.osqp. A change below may be "
-        "due to that, or to the run."
+        "The machine is the same, but the environments differ in versions.osqp. A "
+        "change below may be due to this, or to the run."
     )
     assert any("two: 1.5" in line and "slower" in line for line in said)
 
@@ -299,7 +299,7 @@ def test_times_of_another_machine_are_not_compared_and_that_is_said_first(folder
     said, _ = write_comparison(a, b, ["md", "csv"])
 
     assert said[0].startswith("Environments differ (machine.cpu)")
-    assert "Times of 0 of 12 cells are compared" in said[0]
+    assert "Times are compared for 0 of 12 cells" in said[0]
     assert said[1].startswith("Times: no cell")
     assert not any("slower" in line for line in said)
     frame = pd.read_csv(b / "report/against-a/tables/changes.csv")
@@ -345,7 +345,7 @@ def test_the_nodes_of_a_cluster_are_compared_node_by_node(folders):
     said, _ = write_comparison(a, b, ["csv"])
     frame = pd.read_csv(b / "report/against-a/tables/changes.csv")
 
-    assert "Times of 6 of 12 cells are compared" in said[0]
+    assert "Times are compared for 6 of 12 cells" in said[0]
     assert set(frame.case[frame.ratio.isna()]) == {"box/n=2/dual", "box/n=3/dual"}
 
 
@@ -365,7 +365,7 @@ def test_another_qp_under_the_same_name_is_flagged(changed):
     )
 
     for c in (bits, sizes):
-        assert "1 cell had another QP" in markdown(compose(c))
+        assert "The QPs of 1 cell are not bitwise identical" in markdown(compose(c))
     assert only(bits).ratio is not None
     assert only(sizes).ratio is None
     assert "another QP" not in markdown(compose(changed(before, before)))
@@ -422,7 +422,7 @@ def test_verified_answers_that_differ_are_named(changed, energy, status, other):
     c = changed([record()], [after])
 
     assert only(c).other_answer is other
-    assert any("another answer" in line for line in verdict_lines(c)) is other
+    assert any("different answers" in line for line in verdict_lines(c)) is other
 
 
 def test_objectives_stand_in_where_there_is_no_energy(changed):

@@ -162,7 +162,7 @@ def test_where_nothing_can_be_judged_it_is_said_why(changed, tmp_path):
     def elsewhere(made):
         return [r.replace(environment="f") for r in made]
 
-    assert why(solvers=("one",)).endswith("add one that does not change")
+    assert why(solvers=("one",)).endswith("add a solver that does not change")
 
     def wrong(*solvers):
         def spoil(made):

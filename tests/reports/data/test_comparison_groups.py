@@ -85,7 +85,9 @@ def test_fewer_than_six_cases_or_one_solver_make_no_statement_and_it_is_said(
     for section in over_cases(page):
         assert (section.tables, section.pictures) == ((), ())
         (text,) = section.prose
-        assert text.startswith(f"Nothing is compared here: {said} At least 6 cases of")
+        assert text.startswith(
+            f"Nothing is compared here: {said} A comparison needs at least 6 cases of"
+        )
         assert "--pool-forms" not in text
 
 
@@ -121,7 +123,7 @@ def test_pooled_forms_are_cases_of_one_group(record, evidence):
         assert len(section.tables) == 1
     table = over_cases(page)[0].tables[0]
     assert "all forms, tol 1e-6: 6 cases" in table.caption
-    assert "Forms together: dual 3 cases, primal 3 cases." in table.legend
+    assert "Pooled forms: dual 3 cases, primal 3 cases." in table.legend
     assert [row[3].value for row in table.rows] == pytest.approx([0.1, 0.3])
     assert not any("--pool-forms" in text for s in page.sections for text in s.prose)
 
@@ -206,7 +208,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     (found,) = comparison_groups(evidence(records))
     assert found.solvers == ("s00", "s01", "some")
     assert np.isinf(found.times[:2, 2]).all()
-    assert found.notes == ("Declined all of them: never.",)
+    assert found.notes == ("All cases declined by: never.",)
 
 
 def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
@@ -218,8 +220,8 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
     assert len(found.cases) == 6
     assert found.solvers == ("late", "s00", "s01")
     assert found.notes == (
-        "Measured on fewer than half of them: rare.",
-        "Not measured by all, left out: 2 cases.",
+        "Left out, measured on less than half of the cases: rare.",
+        "Left out, not measured with all solvers: 2 cases.",
     )
 
 
@@ -313,7 +315,10 @@ def test_a_liar_is_named_as_depending_on_the_convention(record, evidence):
     assert cells["liar"]["claimed"].kind == "over"
     assert cells["liar"]["all"].text == "1–3"
     assert cells["liar"]["reading"].text == "depends on the convention"
-    assert "turn the order of 2, among them 2 that are told apart" in found.points[0]
+    assert (
+        "reverse the order of 2 pairs, 2 of them significantly different"
+        in found.points[0]
+    )
 
 
 def test_equal_solvers_are_ties(record, evidence):
@@ -324,17 +329,22 @@ def test_equal_solvers_are_ties(record, evidence):
         for case in range(12)
     ]
     found = section(compose(evidence(records)), "ranking")
-    assert "4 solvers in 1 tier; of 6 pairs 0 told apart" in found.points[0]
+    assert (
+        "4 solvers in 1 tier; 0 of 6 pairs significantly different" in found.points[0]
+    )
     cells = rows(found.tables[0]).values()
-    assert {row["inside the noise"].text for row in cells} == {"1–4"}
-    assert all("inside the noise" in row["reading"].text for row in cells)
+    assert {row["rank interval"].text for row in cells} == {"1–4"}
+    assert all("not significant" in row["reading"].text for row in cells)
 
 
 def test_ranks_that_nothing_changes_are_said_to_be_so(record, evidence):
     found = section(compose(evidence(some_records(record, 2))), "ranking")
-    assert found.points[0].endswith("1 told apart; no convention turns an order.")
+    assert found.points[0].endswith(
+        "1 of 1 pair significantly different; no convention reverses the order of a "
+        "pair."
+    )
     assert {row["reading"].text for row in rows(found.tables[0]).values()} == {
-        "the same under all"
+        "same under all conventions"
     }
 
 
@@ -346,7 +356,11 @@ def test_no_mean_is_printed_without_its_interval(record, evidence):
 
 def test_the_sections_render(record, evidence):
     text = markdown(compose(evidence(some_records(record, 7))))
-    for title in ("Means over cases", "What ranks depend on", "Profiles"):
+    for title in (
+        "Means over cases",
+        "Dependence of the ranks on conventions",
+        "Profiles",
+    ):
         assert f"## {title}" in text
 
 
@@ -459,7 +473,7 @@ def test_growth_is_told_from_none_and_predictions_end_with_the_sizes(record, evi
     assert found["short"]["iterations"].text == "grow"
     assert found["few"]["iterations"].text == "too few sizes"
     assert found["flat"][at].value == pytest.approx(1e-6 * 6**1.5)
-    assert found["short"][at].text == "refused"
+    assert found["short"][at].text == "no prediction"
     assert found["few"][at].value is None
 
 
@@ -646,7 +660,7 @@ def test_who_was_measured_in_another_session_is_named_and_marked(evidence, recor
     said = markdown(compose(evidence(of_two_sessions(record, 1.1))))
 
     assert (
-        "told apart only where the unpaired interval excludes 1 on every case: c"
+        "is significant only if the unpaired interval excludes 1 on every case: c"
         in (" ".join(said.split()))
     )
     assert "n = 8, other session" in said

@@ -91,7 +91,7 @@ def test_one_run_has_a_value_and_no_interval():
 def test_the_model_recovers_known_work_latency_and_bandwidth(strong):
     model = strong.model
     assert model.work == pytest.approx(WORK * DOFS)
-    assert model.alike == pytest.approx(ALIKE)
+    assert model.repeated == pytest.approx(ALIKE)
     assert model.slowdown == pytest.approx(SLOWDOWN)
     on_four = 2 * REDUCTIONS * REDUCTION, 3 * MESSAGES * MESSAGE, BYTES * BYTE
     assert model.communication == pytest.approx(on_four)
@@ -203,7 +203,9 @@ def test_the_section_names_what_is_a_model_and_never_mixes_it_with_measurements(
 ):
     section = ranks(Analysis(manufactured))
     (model,) = (p for p in section.pictures if p.name == "ranks-model")
-    assert model.caption.startswith("Model, not measured")
+    assert model.caption.startswith(
+        "Predicted speed-up of the solve on more ranks (dashed; not m"
+    )
     for panel in model.figure.panels:
         assert any(t.text == "model, not measured" for t in panel.texts)
         (edge,) = panel.rules

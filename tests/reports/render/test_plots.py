@@ -294,7 +294,7 @@ def test_a_figure_is_plain_data_that_can_be_compared_and_sent_to_a_process():
     ],
 )
 def test_points_whose_numbers_do_not_fit_are_refused(broken):
-    with pytest.raises(ValueError, match=r"differ in number|lists of runs"):
+    with pytest.raises(ValueError, match=r"differ in length|lists of runs"):
         Series(**{"x": (1, 2, 3), "y": (1, 2, 3), "look": look(0), **broken})
 
 

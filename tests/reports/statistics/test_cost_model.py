@@ -21,18 +21,18 @@ def sent_on(N):
     )
 
 
-def modelled(N, work=2.0, alike=0.1, slowdown=1.0, sent=SENT):
+def modelled(N, work=2.0, repeated=0.1, slowdown=1.0, sent=SENT):
     """Do the sum of the model by hand."""
     depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
     waits = 300 * 5e-6 * depth + 120 * 2e-6 * neighbours + (N > 1) * 4e6 / 2e9
-    return (slowdown if N > 1 else 1.0) * (work / N + alike) + waits
+    return (slowdown if N > 1 else 1.0) * (work / N + repeated) + waits
 
 
 @pytest.mark.parametrize("ranks", [(1, 2), (1, 2, 4), (1, 2, 3, 5, 8)])
 def test_known_work_is_recovered_and_predicted_beyond(ranks):
     found = cost_model({N: [modelled(N)] * 3 for N in ranks}, {}, [sent_on(ranks[-1])])
     assert found.work == pytest.approx(2.0)
-    assert found.alike == pytest.approx(0.1)
+    assert found.repeated == pytest.approx(0.1)
     assert found.misfit < 1e-12
     assert found.speed_up(64).value == pytest.approx(2.1 / modelled(64))
 
@@ -41,7 +41,7 @@ def test_ranks_that_slow_one_another_down_are_told_by_copies():
     times = {N: [modelled(N, slowdown=1.25)] * 3 for N in (1, 2, 4)}
     copies = {N: [1.25 * 2.1] * 3 for N in (2, 4)}
     found = cost_model(times, copies, [sent_on(4)])
-    assert (found.work, found.alike) == pytest.approx((2.0, 0.1))
+    assert (found.work, found.repeated) == pytest.approx((2.0, 0.1))
     assert found.slowdown == pytest.approx(1.25)
     assert found.speed_up(16).value == pytest.approx(2.1 / modelled(16, slowdown=1.25))
 
@@ -49,10 +49,10 @@ def test_ranks_that_slow_one_another_down_are_told_by_copies():
 @pytest.mark.parametrize("copies", [1.3, 1.6, 4.0])
 def test_copies_that_disturb_one_another_more_than_ranks_do_are_no_measure(copies):
     """Ranks that slow each other down by 1.25, C = 0: no larger s leaves C ≥ 0."""
-    times = {N: [modelled(N, alike=0.0, slowdown=1.25)] * 3 for N in (1, 2)}
+    times = {N: [modelled(N, repeated=0.0, slowdown=1.25)] * 3 for N in (1, 2)}
     found = cost_model(times, {2: [copies * 2.0] * 3}, [SENT])
     assert (found.slowdown, found.work) == pytest.approx((1.25, 2.0))
-    assert found.alike == pytest.approx(0.0, abs=1e-12)
+    assert found.repeated == pytest.approx(0.0, abs=1e-12)
     assert found.misfit < 1e-12
 
 
@@ -72,13 +72,13 @@ def test_a_network_whose_speed_is_not_known_widens_the_band():
 
 
 def test_what_was_sent_on_other_ranks_is_no_basis():
-    with pytest.raises(ValueError, match="what 4 ranks have sent"):
+    with pytest.raises(ValueError, match="the communication on 4 ranks"):
         cost_model({N: [modelled(N)] for N in (1, 2, 4)}, {}, [SENT])
 
 
 def test_better_than_shared_work_is_never_negative_work():
     faster = cost_model({1: [1.0] * 2, 2: [0.3] * 2}, {}, [SENT])  # super-linear
-    assert faster.alike == 0
+    assert faster.repeated == 0
     assert faster.misfit > 0.2  # so it is not asked about more ranks
     slower = cost_model({1: [1.0] * 2, 2: [3.0] * 2}, {}, [SENT])
     assert slower.work == 0

@@ -15,7 +15,7 @@ from mortarbench.reports.data.aggregation import (
     ranking_of,
     ranks,
 )
-from mortarbench.reports.data.comparison_groups import ComparisonGroup, Kind
+from mortarbench.reports.data.comparison_groups import ComparisonGroup, GroupKey
 from mortarbench.reports.statistics.censoring import restricted_mean
 from mortarbench.reports.statistics.growth import Trend, growth_of
 from mortarbench.reports.statistics.profiles import (
@@ -27,8 +27,8 @@ from mortarbench.reports.statistics.profiles import (
 from mortarbench.reports.statistics.resampling import (
     firsts,
     limits,
+    significantly_faster,
     symmetric_interval,
-    told_apart,
     weights,
 )
 
@@ -39,7 +39,7 @@ def group(times, *, claimed=None, limit=60.0, solvers=None):
     times = np.asarray(times, dtype=float)
     cases, count = times.shape
     return ComparisonGroup(
-        kind=Kind(sweep=False, mode="cold", form="dual", at=1e-6),
+        key=GroupKey(sweep=False, mode="cold", form="dual", at=1e-6),
         cases=tuple(f"case {i}" for i in range(cases)),
         solvers=tuple(solvers or (f"s{i}" for i in range(count))),
         times=times,
@@ -182,14 +182,17 @@ def test_equal_solvers_are_told_apart_once_in_twenty_sets_at_most(
     for _ in range(250):
         logs = rng.normal(0, 1, (cases, 1)) + rng.exponential(0.5, (cases, solvers))
         logs[rng.random(logs.shape) < failing] = 9.0
-        found += told_apart(logs, names).any()
+        found += significantly_faster(logs, names).any()
     assert found / 250 <= 0.05 + 3 * (0.05 * 0.95 / 250) ** 0.5
 
 
 def test_five_cases_tell_nobody_apart_and_six_do():
     logs = np.log([[1.0, 100.0]] * 6)
-    assert not told_apart(logs[:5], list("abcde")).any()
-    assert told_apart(logs, list("abcdef")).tolist() == [[False, True], [False, False]]
+    assert not significantly_faster(logs[:5], list("abcde")).any()
+    assert significantly_faster(logs, list("abcdef")).tolist() == [
+        [False, True],
+        [False, False],
+    ]
 
 
 def test_two_failures_do_not_hide_who_is_slower_on_all_cases():
@@ -197,7 +200,7 @@ def test_two_failures_do_not_hide_who_is_slower_on_all_cases():
     logs = rng.normal(0, 1, (12, 1)) + rng.normal(0, 0.3, (12, 8))
     logs[:, 3] += 1.5
     logs[:2, 3] = 16
-    faster = told_apart(logs, [str(i) for i in range(12)])
+    faster = significantly_faster(logs, [str(i) for i in range(12)])
     assert np.delete(faster[:, 3], 3).all()
     assert faster.sum() == 7
 
@@ -209,7 +212,7 @@ def test_who_fails_twice_is_not_told_to_be_slower_if_faster_otherwise():
     logs[:, 1] -= 0.7
     logs[:2, 1] = 9
     assert logs[:, 1].mean() > logs[:, 0].mean()
-    assert not told_apart(logs, [str(i) for i in range(20)]).any()
+    assert not significantly_faster(logs, [str(i) for i in range(20)]).any()
 
 
 def test_equal_solvers_share_one_tier_and_every_rank():

@@ -1,4 +1,4 @@
-"""Bounded least squares of scipy: what it takes, and that it is exact."""
+"""Bounded least squares of scipy: declines, exactness, limits."""
 
 from dataclasses import replace
 
@@ -53,7 +53,7 @@ def test_scaling_the_objective_changes_nothing(manufactured, exponent):
         assert large.x == pytest.approx(plain.x, rel=1e-12, abs=1e-14)
 
 
-def test_what_it_cannot_take_is_declined(manufactured, monkeypatch):
+def test_qps_outside_its_scope_are_declined(manufactured, monkeypatch):
     qp, _ = manufactured("box")
     operator = replace(qp, P=aslinearoperator(qp.P))
     singular = replace(qp, P=csr_array(np.diag([0.0] + [1.0] * 19)))
@@ -61,8 +61,8 @@ def test_what_it_cannot_take_is_declined(manufactured, monkeypatch):
     assert BVLS().declines(manufactured("equalities")[0]) == "takes bounds only"
     assert BVLS().declines(operator) == "needs explicit matrices"
     assert BVLS().declines(singular) == "needs a positive definite P"
-    monkeypatch.setattr(bvls, "LARGEST", 19)
-    assert BVLS().declines(qp) == "makes P dense; takes at most 19 components"
+    monkeypatch.setattr(bvls, "MAX_COMPONENTS", 19)
+    assert BVLS().declines(qp) == "converts P to dense; takes at most 19 components"
 
 
 @pytest.mark.parametrize("shape", ["bounds", "box"])

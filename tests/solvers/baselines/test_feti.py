@@ -1,4 +1,4 @@
-"""FETI for linear problems: published counts, projectors, declines."""
+"""FETI for linear problems: published step counts, projectors, declines."""
 
 from dataclasses import replace
 
@@ -86,7 +86,7 @@ def test_without_rows_it_is_conjugate_gradients():
     ],
 )
 def test_counts_of_a_clamped_beam(subdomains, n, glue, kind, steps):
-    """To ‖P(d − Fλ)‖ ≤ 1e-8 of its first value, as another code of ours needed."""
+    """Steps to ‖P(d − Fλ)‖ ≤ 1e-8 of its first value, from an independent code."""
     Sx, Sy = subdomains
     qp = plate(Sx=Sx, Sy=Sy, n=n, glue=glue, **BEAM)
     s = FETI(preconditioner=kind, scaling="multiplicity").prepare(qp, 1e-8)()
@@ -100,7 +100,7 @@ def test_counts_of_a_clamped_beam(subdomains, n, glue, kind, steps):
     ("jump", "identity", "weighted"), [(1e-2, 15, 8), (1e-3, 18, 9), (1e-5, 32, 9)]
 )
 def test_counts_where_stiffnesses_jump(jump, identity, weighted):
-    """MSolve's, to 1e-5: at most two more."""
+    """At most two steps more than MSolve to 1e-5."""
     qp = plate(pattern="column", jump=jump, **PLATE)
     most = {"identity": identity, "preconditioner": weighted}
     for Q, steps in most.items():
@@ -123,7 +123,7 @@ def test_weights_without_stiffness_take_more_steps_and_reach_the_tolerance(jump)
     assert runs[0].iterations < runs[1].iterations
 
 
-def test_what_it_does_not_take(random):
+def test_qps_outside_its_scope_are_declined(random):
     lower = np.where(np.arange(30) == 7, 0.0, -np.inf)
     small = plate(Sx=2, Sy=2, n=2)
 
@@ -138,12 +138,12 @@ def test_what_it_does_not_take(random):
 @pytest.mark.parametrize(
     "wrong", [dict(preconditioner="ilu"), dict(scaling="E"), dict(Q="M")], ids=str
 )
-def test_options_that_there_are_not_are_refused(wrong):
+def test_unknown_options_are_refused(wrong):
     with pytest.raises(ValueError, match=f"{next(iter(wrong))} = .*; expected"):
         FETI(**wrong)
 
 
-def test_rows_that_depend_on_each_other_are_a_reason(random):
+def test_dependent_rows_are_a_failure_with_a_reason(random):
     A = csr_array(np.vstack([random.A.toarray(), random.A.toarray()[:1]]))
     s = FETI().prepare(replace(random, A=A, b=np.append(random.b, random.b[0])), 1e-8)()
 
@@ -151,14 +151,14 @@ def test_rows_that_depend_on_each_other_are_a_reason(random):
     assert "depend" in s.message
 
 
-def test_a_cost_without_end_is_no_solution():
+def test_an_unbounded_objective_is_not_claimed_solved():
     P = np.diag([1.0, 0.0])
     s = FETI().prepare(equalities(P, np.ones(2), no_rows(2), np.zeros(0)), 1e-8)()
 
     assert s.status is Status.ITERATION_LIMIT
 
 
-def test_the_step_limit_is_told(random):
+def test_the_step_limit_is_reported(random):
     s = FETI(max_iter=3).prepare(random, 1e-9)()
 
     assert (s.status, s.iterations) == (Status.ITERATION_LIMIT, 3)

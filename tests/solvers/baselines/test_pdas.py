@@ -11,8 +11,8 @@ from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.baselines.infeasibility_certificate import (
-    contradicts,
-    descends,
+    proves_infeasible,
+    proves_unbounded,
 )
 from mortarbench.solvers.baselines.pdas import PDAS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -99,7 +99,7 @@ def test_a_fixed_variable_is_never_released():
     assert "set_changes" not in s.counts
 
 
-def test_a_row_that_only_a_stiff_variable_is_left_to_meet_gets_a_larger_weight():
+def test_a_row_whose_only_free_variable_is_stiff_gets_a_larger_weight():
     """x₁ is at its bound; with the weight for x₁'s softness x₂ would never arrive."""
     qp = quadratic(np.diag([1.0, 1e8]), [1.0, 0], A=[[1, 1]], b=[1.0], ub=[0.0, np.inf])
     s = solve(qp)
@@ -118,7 +118,7 @@ def test_a_cycle_is_left_by_single_exchanges(cycling):
     assert s.x == pytest.approx(exact.x, abs=1e-7)
 
 
-def test_the_step_limit_is_reported_with_what_was_reached(cycling):
+def test_the_step_limit_is_reported_with_the_point_reached(cycling):
     s = PDAS(max_iter=5).prepare(cycling, 1e-9)()
 
     assert s.status is Status.ITERATION_LIMIT
@@ -166,7 +166,7 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
 @pytest.mark.parametrize(
-    ("given", "x"),
+    ("arrays", "x"),
     [
         (dict(P=np.eye(3), q=np.zeros(3), lb=0.0), [0, 0, 0]),
         (dict(P=np.eye(3), q=np.ones(3), lb=0.0), [0, 0, 0]),
@@ -183,8 +183,8 @@ def test_scaled_repeated_and_zero_rows_change_no_answer():
     ids=["q = 0", "all active", "none active", "shifted bound", "fixed", "all fixed",
          "row", "singular", "linear"],
 )  # fmt: skip
-def test_degenerate_problems_have_their_solutions(given, x, store):
-    qp = quadratic(**given, store=store)
+def test_degenerate_problems_have_their_solutions(arrays, x, store):
+    qp = quadratic(**arrays, store=store)
     s = solve(qp)
 
     assert s.status is Status.SOLVED
@@ -212,12 +212,12 @@ def test_problems_without_a_feasible_point_are_reported(qp):
 
 
 @pytest.mark.parametrize("store", [np.asarray, csr_array], ids=["dense", "sparse"])
-def test_a_cost_that_falls_without_end_is_reported(store):
+def test_an_unbounded_objective_is_reported(store):
     qp = quadratic([[1, 0], [0, 0]], [1.0, -1], lb=[0, 0], store=store)
     s = solve(qp)
 
     assert s.status is Status.INFEASIBLE
-    assert "without end" in s.message
+    assert "unbounded below" in s.message
 
 
 def test_an_indefinite_P_is_a_failure():
@@ -232,23 +232,23 @@ def test_a_certificate_must_hold():
     feasible = replace(qp, b=np.array([1.0]))
     y, none = np.array([1.0]), np.zeros(0)
 
-    assert contradicts(qp, y, none)
-    assert not contradicts(qp, -y, none)
-    assert not contradicts(feasible, y, none)
-    assert not contradicts(replace(qp, lb=np.array([0, -np.inf])), y, none)
+    assert proves_infeasible(qp, y, none)
+    assert not proves_infeasible(qp, -y, none)
+    assert not proves_infeasible(feasible, y, none)
+    assert not proves_infeasible(replace(qp, lb=np.array([0, -np.inf])), y, none)
 
 
 def test_a_direction_of_descent_must_be_free_of_curvature_and_constraints():
     qp = quadratic(np.diag([1.0, 0]), [-1.0, -1], lb=0.0)
     down = np.array([0.0, 1])
 
-    assert descends(qp, down)
-    assert not descends(qp, -down)
-    assert not descends(replace(qp, q=np.array([-1.0, 1])), down)
-    assert not descends(qp, np.array([1.0, 0]))
-    assert not descends(replace(qp, ub=np.full(2, 5.0)), down)
+    assert proves_unbounded(qp, down)
+    assert not proves_unbounded(qp, -down)
+    assert not proves_unbounded(replace(qp, q=np.array([-1.0, 1])), down)
+    assert not proves_unbounded(qp, np.array([1.0, 0]))
+    assert not proves_unbounded(replace(qp, ub=np.full(2, 5.0)), down)
     row = replace(qp, A=np.array([[0.0, 1]]), b=np.zeros(1))
-    assert not descends(row, down)
+    assert not proves_unbounded(row, down)
 
 
 def test_a_sequence_starts_from_the_last_active_set():

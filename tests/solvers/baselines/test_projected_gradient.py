@@ -50,7 +50,7 @@ def test_degenerate_problems_have_their_solutions(qp, x):
     assert kkt_residuals(qp, s).worst <= 5e-9
 
 
-def test_the_first_step_is_the_exact_one():
+def test_the_first_step_is_that_of_the_exact_line_search():
     """With P = cI one step of length 1/c ends at the minimiser."""
     s = solve(boxed(7 * np.eye(3), [1.0, -2, 3]))
 
@@ -59,7 +59,7 @@ def test_the_first_step_is_the_exact_one():
 
 
 def test_the_lengths_are_those_of_barzilai_and_borwein():
-    """Without bounds every length is the Cauchy one of the gradient before."""
+    """Without bounds, every length is the Cauchy length of the previous gradient."""
     P, g, x = np.diag([1.0, 4]), np.array([1.0, 4]), np.zeros(2)
     qp = boxed(P, g)
     length = g @ g / (g @ P @ g)
@@ -130,8 +130,8 @@ def test_operators_are_taken_and_rows_are_not(manufactured):
     )
 
 
-def test_a_cost_that_falls_without_end_is_reported():
+def test_an_unbounded_objective_is_reported():
     s = solve(boxed([[1, 0], [0, 0]], [1.0, -1], lb=0.0))
 
     assert s.status is Status.INFEASIBLE
-    assert "without end" in s.message
+    assert "unbounded below" in s.message

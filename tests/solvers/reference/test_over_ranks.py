@@ -43,18 +43,18 @@ def balance(q, force, moment):
     )  # fmt: skip
 
 
-def test_contacts_that_hold_a_body_have_its_load():
-    """Force 3 and moment 1 leave (t, 2 − 2t, 1 + t), which q is nearest to at t = ½."""
+def test_contacts_that_support_a_body_carry_its_load():
+    """With force 3 and moment 1, x = (t, 2 − 2t, 1 + t); −q is nearest at t = ½."""
     q = np.array([-0.5, -1.0, -1.5])
 
-    found = reference_over_ranks(balance(q, 3.0, 1.0))
+    solution = reference_over_ranks(balance(q, 3.0, 1.0))
 
-    np.testing.assert_allclose(np.asarray(found.x), -q, atol=1e-12)
+    np.testing.assert_allclose(np.asarray(solution.x), -q, atol=1e-12)
 
 
-def test_a_face_that_leaves_a_body_without_hold_is_named_in_one_line():
+def test_a_face_that_leaves_a_body_unsupported_is_refused_in_one_line():
     """Without bounds x = (−2/3, 7/3, −2/3): one contact is left, for two motions."""
-    with pytest.raises(ArithmeticError, match="without hold") as refused:
+    with pytest.raises(ArithmeticError, match="is not supported") as refused:
         reference_over_ranks(balance([1.0, -2.0, 1.0], 1.0, 0.0))
 
     assert "\n" not in str(refused.value)

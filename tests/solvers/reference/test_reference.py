@@ -1,4 +1,4 @@
-"""The reference solve: solutions known to the last digit, in every shape and unit."""
+"""Reference solves: exact solutions to the last digit, in every shape and unit."""
 
 import subprocess
 import sys
@@ -20,9 +20,9 @@ from mortarbench.harness.conformance.manufactured import (
 )
 from mortarbench.harness.names import completed
 from mortarbench.problems import PROBLEMS
-from mortarbench.solvers.reference.equilibrate import equilibrated
+from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import interior_point
-from mortarbench.solvers.reference.polish import polished
+from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.solve import reference_solution
 
 EPS = np.finfo(float).eps
@@ -32,12 +32,13 @@ def in_integers(
     *, seed, dense, n=20, m=4, p=8, rank=None, copies=0, weak=0.3, vertex=False,
     rows=0, columns=0, units=(0, 0),
 ):  # fmt: skip
-    """A QP of integers times powers of two, and its solution: nothing is rounded.
+    """Return a QP of integers times powers of two and its solution, without rounding.
 
-    copies : last rows of A and of G that are sums of other rows
-    weak : probability of a multiplier of an active constraint to be zero
-    vertex : every variable is at a bound
-    rows, columns : binary exponents of their units, at most; units : of x, objective
+    copies : number of last rows of A and of G that are sums of other rows
+    weak : probability that the multiplier of an active constraint is zero
+    vertex : True puts every variable at a bound
+    rows, columns : largest binary exponents of their units
+    units : binary exponents of the units of x and of the objective
     """
     rng = np.random.default_rng(seed)
     M = rng.integers(-4, 5, (n, n if rank is None else rank)).astype(float)
@@ -91,7 +92,7 @@ EXACT = {
 
 
 def seeds(first, few, all_):
-    """Give so many seeds by default, and the others to a slow test."""
+    """Parametrise with `few` seeds, and with the other `all_ - few` in a slow test."""
     return pytest.mark.parametrize(
         "seeds",
         [
@@ -106,7 +107,7 @@ def seeds(first, few, all_):
 @pytest.mark.parametrize("dense", [False, True], ids=["sparse", "dense"])
 @pytest.mark.parametrize("kind", EXACT.values(), ids=EXACT)
 def test_a_solution_in_integers_is_found_to_the_last_digit(kind, dense, seeds):
-    """A component that is not zero has all of its digits."""
+    """Every component that is not zero is exact."""
     for seed in seeds:
         qp, x, X = in_integers(seed=seed, dense=dense, **kind)
         s = reference_solution(qp)
@@ -163,7 +164,7 @@ def test_every_kind_of_multiplier_has_its_sign_and_size():
 
 
 def test_the_multipliers_of_repeated_constraints_share_the_force():
-    """x = 1 is held by its bound, by two rows and by an equation, against q = −9."""
+    """x = 1 by its bound, by two rows and by an equation, against q = −9."""
     qp = QP(
         P=np.eye(1), q=np.array([-9.0]), A=np.ones((1, 1)), b=np.ones(1),
         G=np.array([[1.0], [2.0]]), h=np.array([1.0, 2.0]),
@@ -191,14 +192,14 @@ CASES = [
 
 
 def objective(qp, x):
-    """Evaluate ½xᵀPx + qᵀx in extended precision: sums of doubles lose 7e-13 of it."""
+    """Return ½xᵀPx + qᵀx in extended precision; in doubles it is wrong by 7e-13."""
     P = qp.P.toarray() if hasattr(qp.P, "toarray") else np.asarray(qp.P)
     P, q, x = (v.astype(np.longdouble) for v in (P, qp.q, x))
     return x @ (P @ x) / 2 + q @ x
 
 
 def rounding(qp, s):
-    """What rounding x to doubles, and the products with P, leave of the residuals."""
+    """Return the residual that rounding of x and of products with P may cause."""
     Px, size = qp.P @ s.x, abs(qp.P) @ abs(s.x)
     return 4 * EPS * max(
         size.max() / max(abs(Px).max(), abs(qp.q).max()),
@@ -206,13 +207,13 @@ def rounding(qp, s):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(("name", "given", "forms", "rel"), CASES)
-def test_all_forms_of_a_contact_problem_have_one_energy(name, given, forms, rel):
-    """To what rounding leaves of K, and of F = BK⁺Bᵀ: it is worst for slender bodies
-    and for stiff ones on soft ones."""
+@pytest.mark.parametrize(("name", "params", "forms", "rel"), CASES)
+def test_all_forms_of_a_contact_problem_have_one_energy(name, params, forms, rel):
+    """Up to the rounding of K and of F = BK⁺Bᵀ, which is worst for slender bodies and
+    for stiff bodies on soft ones."""
     family, energies = PROBLEMS[name], []
     for form in forms:
-        case = family.build(form, completed(family, given), reference_solution)
+        case = family.build(form, completed(family, params), reference_solution)
         s = reference_solution(case.qp)
         energies.append(float(case.scale * objective(case.qp, s.x) + case.constant))
 
@@ -224,7 +225,7 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, given, forms, rel)
 
 
 @pytest.mark.parametrize(
-    ("name", "given", "form", "energy"),
+    ("name", "params", "form", "energy"),
     [
         # half the work of the pressure p = 1 MPa at the displacement (1 − ν²)p/E
         ("contact-patch", {}, "primal", -0.5 * 1e6 * 1e6 * 0.91 / 10e6),
@@ -234,9 +235,9 @@ def test_all_forms_of_a_contact_problem_have_one_energy(name, given, forms, rel)
         ("obstacle", dict(dim=1, n=12), "dual-bounds", 1 / 3 + 0.25**2 / 6),
     ],
 )
-def test_energies_known_by_hand_are_reached(name, given, form, energy):
+def test_energies_known_by_hand_are_reached(name, params, form, energy):
     family = PROBLEMS[name]
-    case = family.build(form, completed(family, given), reference_solution)
+    case = family.build(form, completed(family, params), reference_solution)
     s = reference_solution(case.qp)
 
     assert case.scale * case.qp.objective(s.x) + case.constant == pytest.approx(
@@ -250,20 +251,20 @@ def test_energies_known_by_hand_are_reached(name, given, form, energy):
 @pytest.mark.parametrize(
     ("steps", "tip", "force"), [(1, -0.303750, 0.0), (10, -0.297282, -2.840e7)]
 )
-def test_the_beam_sinks_by_what_a_prototype_found(form, steps, tip, force):
+def test_the_beam_deflects_as_in_an_independent_prototype(form, steps, tip, force):
     """Nr = 20, Nh = 10; the load in one or ten linearisations; 11 844 displacements."""
     family = PROBLEMS["beam-ring"]
-    given = completed(family, dict(Nr=20, Nh=10, steps=steps))
-    case = family.build(form, given, reference_solution)
+    params = completed(family, dict(Nr=20, Nh=10, steps=steps))
+    case = family.build(form, params, reference_solution)
     s = reference_solution(case.qp)
-    got = case.quantities(s)
+    quantities = case.quantities(s)
 
     assert kkt_residuals(case.qp, s).worst <= 1e-15 + rounding(case.qp, s)
-    assert got["tip"][1] == pytest.approx(tip, abs=5e-7)
-    assert abs(got["contact_force"][0]) == pytest.approx(abs(force), abs=5e3)
+    assert quantities["tip"][1] == pytest.approx(tip, abs=5e-7)
+    assert abs(quantities["contact_force"][0]) == pytest.approx(abs(force), abs=5e3)
 
 
-def test_rows_without_entries_hold_nothing():
+def test_rows_of_zeros_change_no_solution():
     qp, exact = manufactured("everything", dense=True)
     empty = np.zeros((1, 20))
     more = replace(
@@ -277,7 +278,7 @@ def test_rows_without_entries_hold_nothing():
 
 
 @pytest.mark.parametrize("size", [1e10, 1e20, 1e100])
-def test_a_far_bound_is_as_none(size):
+def test_a_far_bound_changes_no_solution(size):
     qp, exact = manufactured("some bounds")
     far = replace(
         qp, lb=np.maximum(qp.lb, -size), ub=np.minimum(qp.ub, size),
@@ -288,7 +289,7 @@ def test_a_far_bound_is_as_none(size):
 
 
 @pytest.mark.parametrize("noise", [1e-16, 1e-12, 1e-9, 1e-6])
-def test_rows_that_are_almost_the_same_do_no_harm(noise):
+def test_nearly_parallel_rows_leave_the_solution_accurate(noise):
     qp, exact = manufactured("everything", dense=True)
     wobble = 1 + noise * np.random.default_rng(31415).standard_normal(qp.G.shape)
     G = np.vstack([qp.G, qp.G * wobble])
@@ -315,10 +316,10 @@ def test_ill_conditioning_costs_no_digit_of_the_residuals(digits):
     assert kkt_residuals(qp, reference_solution(qp)).worst <= 1e-13
 
 
-def test_few_iterations_tell_the_active_constraints_and_one_factor_gives_the_digits():
-    qp = equilibrated(membrane(40)).qp
+def test_few_iterations_identify_the_active_set_and_one_factor_is_enough_to_refine():
+    qp = equilibrate(membrane(40)).qp
     start = interior_point(qp)
-    points = list(polished(qp, start))
+    points = list(polish(qp, start))
 
     assert start.iterations <= 15
     assert 1e-15 < kkt_residuals(qp, start).worst <= 1e-11
@@ -328,10 +329,10 @@ def test_few_iterations_tell_the_active_constraints_and_one_factor_gives_the_dig
 
 def test_a_wrong_active_set_is_corrected():
     """From x = 0 with no active constraint; a membrane on an obstacle."""
-    qp = equilibrated(membrane(12)).qp
+    qp = equilibrate(membrane(12)).qp
     exact = reference_solution(qp)
     start = replace(exact, x=0 * exact.x, z_box=0 * exact.x)
-    *_, last = polished(qp, start)
+    *_, last = polish(qp, start)
 
     assert (exact.z_box < 0).sum() > 10
     assert last.x == pytest.approx(exact.x, rel=1e-15)
@@ -339,7 +340,7 @@ def test_a_wrong_active_set_is_corrected():
 
 def test_the_scaled_qp_has_entries_of_about_one_and_the_same_points():
     qp, x, _ = in_integers(seed=1, dense=False, rows=20, columns=10, units=(26, -30))
-    scaled = equilibrated(qp)
+    scaled = equilibrate(qp)
     s = reference_solution(scaled.qp)
 
     for M in (scaled.qp.P, scaled.qp.A, scaled.qp.G):
@@ -362,7 +363,7 @@ def test_a_large_operator_is_refused_in_one_line_and_a_small_one_multiplied_out(
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_a_matrix_that_holds_no_numbers_is_refused_in_one_line(bad):
+def test_a_matrix_with_nan_or_inf_is_refused_in_one_line(bad):
     qp, _ = manufactured("bounds", dense=True)
 
     with pytest.raises(ValueError, match="needs finite matrices"):
@@ -370,19 +371,19 @@ def test_a_matrix_that_holds_no_numbers_is_refused_in_one_line(bad):
 
 
 def contradicting():
-    """x₀ = 1 and x₀ = 2."""
+    """Return a QP with the equations x₀ = 1 and x₀ = 2."""
     qp, _ = manufactured("unconstrained")
     return replace(qp, A=csr_array(np.eye(20)[[0, 0]]), b=np.array([1.0, 2.0]))
 
 
 def crossing():
-    """x₀ ≤ −1 by a row, x₀ ≥ 0 by a bound."""
+    """Return a QP with x₀ ≤ −1 by a row and x₀ ≥ 0 by a bound."""
     qp, _ = manufactured("bounds", dense=True)
     return replace(qp, G=np.eye(1, 20), h=-np.ones(1), lb=np.zeros(20))
 
 
 def falling():
-    """A slope and no curvature, no constraint."""
+    """Return an unconstrained QP with a gradient but no curvature."""
     qp = membrane(4)
     return replace(qp, P=0 * qp.P, lb=np.full(16, -np.inf))
 
@@ -390,13 +391,13 @@ def falling():
 @pytest.mark.parametrize(
     "make", [infeasible, unbounded, contradicting, crossing, falling]
 )
-def test_where_there_is_no_solution_none_is_told(make):
+def test_a_qp_without_a_solution_raises(make):
     with pytest.raises(ArithmeticError, match="found no optimal point") as e:
         reference_solution(make())
     assert "\n" not in str(e.value)
 
 
-def test_nothing_to_decide_is_decided():
+def test_a_qp_whose_variables_are_all_fixed_is_solved():
     fixed = QP(
         P=np.eye(2), q=np.ones(2), A=no_rows(2), b=np.zeros(0), G=no_rows(2),
         h=np.zeros(0), lb=np.ones(2), ub=np.ones(2),
@@ -446,7 +447,7 @@ def test_no_solver_under_test_and_no_foreign_one_takes_part():
 
 
 def test_a_qp_without_variables_has_the_empty_solution():
-    """As is asked for where no side can touch another; scipy's nnls would crash."""
+    """Such QPs arise if no sides can touch; scipy's nnls would crash on them."""
     nothing = np.zeros(0)
     qp = QP(
         P=np.zeros((0, 0)), q=nothing, A=no_rows(0), b=nothing, G=no_rows(0),

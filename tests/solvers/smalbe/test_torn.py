@@ -9,7 +9,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe import rows as rows_module
 from mortarbench.solvers.smalbe.rows import SparseRows, equality_rows
 from mortarbench.solvers.smalbe.solver import SMALBE
-from tests.support.held_by_contact import torn_disc_between_plates
+from tests.support.supported_by_contact import dual_of_disc_between_plates
 
 pytestmark = pytest.mark.together
 
@@ -83,7 +83,7 @@ def test_a_sequence_is_warm():
 def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
     """As on ranks, with sparse rows: G_F G_Fᵀ has an eigenvalue that is rounding."""
     monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
-    qp = torn_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
+    qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
     assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)
     s = SMALBE().prepare(qp, 1e-8)()
     assert s.status is Status.SOLVED

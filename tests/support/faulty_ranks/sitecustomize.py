@@ -47,7 +47,7 @@ def failing(work):
 
 
 def in_stage(work):
-    """Make what fails in the stage; solvers warm up on QPs that no ranks share."""
+    """Return a function that fails in the stage, except in the solver's warm-up."""
     if STAGE not in ("prepare", "solve"):
         return failing(work)
 

@@ -1,1 +1,1 @@
-"""SMALBE and MPRGP as a textbook has them, in NumPy: what tests compare ours with."""
+"""Textbook versions of SMALBE and MPRGP in NumPy, as oracles of tests."""

@@ -1,4 +1,4 @@
-"""The textbook's loop in the place of `solvers.smalbe.driver.outer_loop`."""
+"""Textbook replacement of `solvers.smalbe.driver.outer_loop`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ KEPT = 200  #: directions of CG on a face
 
 @dataclass(frozen=True, eq=False)
 class TextbookLoop:
-    """The outer loop as it is written."""
+    """Outer loop in textbook form."""
 
     problem: Projected
     constants: Constants
@@ -53,7 +53,7 @@ class TextbookLoop:
 def outer_loop(
     problem: Any, qp: QP, options: Options, history: History | None = None
 ) -> TextbookLoop:
-    """Do what `solvers.smalbe.driver.outer_loop` does, as it is written."""
+    """Run the textbook version of `solvers.smalbe.driver.outer_loop`."""
     fields = vars(problem)
     problem = Projected(**fields)
     kept = KEPT if options.recycle and not issparse(qp.P) else 0
@@ -85,7 +85,7 @@ def _watched(history: History, problem: Projected, outer: int, rhs: Vector) -> W
 def face_preconditioner(
     problem: Projected, qp: QP, kind: Preconditioner
 ) -> Callable[[float], Precondition | None]:
-    """Set up once; the result makes, for each ρ, what `mprgp` takes."""
+    """Return a function from ρ to the preconditioner that `mprgp` takes."""
     if kind == "none":
         return lambda rho: None
     if kind == "model":

@@ -41,7 +41,7 @@ class BoxModel(Protocol):
 
 
 class Tilted(NamedTuple):
-    """What s(y) is at some y."""
+    """The minimiser s(y) at some y."""
 
     s: Vector  #: of the components that are looked at
     piece: NDArray[np.int8]  #: at which bounds x + s is, of these
@@ -58,12 +58,12 @@ class Model:
 
     @classmethod
     def of_norm(cls, norm: float, n: int) -> Model:
-        """B = norm·I: what is known of an H (n, n) of which only the norm is known."""
+        """Return B = norm·I, a model of H (n, n) with the given norm."""
         return cls(norm, np.zeros((0, n)), np.zeros(0))
 
     @property
     def has_directions(self) -> bool:
-        """Whether it knows more of H than a norm."""
+        """Return True if the model has directions besides the norm of H."""
         return bool(len(self.U))
 
     def step(self, x: Vector, g: Vector, bounds: tuple[Vector, Vector]) -> Vector:

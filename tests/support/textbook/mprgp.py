@@ -23,7 +23,7 @@ before and along which the cost falls.
 Every step but projcg's lessens the cost, and by the model τI as much as the rate of the
 book needs. Expansion never frees a component that the
 half step left at a bound, but for the first expansion by a model of directions: from
-one proportioning to the next the active set only grows. docs/smalbe.md: what follows.
+one proportioning to the next the active set only grows. See docs/smalbe-theory.md.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ EXPANSIONS, PROPORTIONINGS = get_args(Expansion), get_args(Proportioning)
 
 @dataclass(frozen=True)
 class Rules:
-    """How MPRGP moves between faces."""
+    """Rules by which MPRGP moves between faces."""
 
     Gamma: float = 1.0  #: proportioning constant Γ > 0
     expansion: Expansion = "model"
@@ -155,7 +155,7 @@ class Progress(NamedTuple):
     cost: float = math.inf  #: twice the cost then
 
     def with_gradient(self, square: float) -> Progress:
-        """Take note of ‖g^P‖² at one more point."""
+        """Add ‖g^P‖² at one more point."""
         return self._replace(least=min(self.least, square))
 
     def stagnates(self, cost: float, terms: float) -> bool:
@@ -167,12 +167,12 @@ class Progress(NamedTuple):
         return not falls and 4 * self.least > self.before
 
     def from_here(self, cost: float) -> Progress:
-        """Begin anew at this cost."""
+        """Return the progress restarted at this cost."""
         return Progress(before=min(self.least, self.before), cost=cost)
 
 
 class Minimum(NamedTuple):
-    """Where MPRGP stopped."""
+    """Result of MPRGP."""
 
     x: Vector
     g: Vector  #: Hx − b
@@ -325,7 +325,7 @@ def split(at: Point, bounds: tuple[Vector, Vector]) -> Face:
 
 
 def _disproportional(task: _Task, at: Point, face: Face, B: BoxModel) -> bool:
-    """Whether more is to be gained on the bounds than in the face."""
+    """Return True if ‖β‖ is large relative to ‖φ‖: the face is to be left."""
     if face.beta_square == 0:
         return False
     free_square = face.phi_square

@@ -66,13 +66,13 @@ class Constants:
 
 @dataclass(frozen=True, eq=False)
 class InnerSolver:
-    """How the inner problems are solved, for each ρ."""
+    """Settings of the solver of inner problems, for each ρ."""
 
     rules: Rules
     model: Callable[[float], BoxModel]
     precondition: Callable[[float], Precondition | None]
     watch: Callable[[int, Vector], Watch] | None = None
-    """Makes the observer of outer iteration k with that right-hand side."""
+    """Return the observer of outer iteration k with that right-hand side."""
 
 
 class Iterate(NamedTuple):
@@ -94,7 +94,7 @@ class Iterate(NamedTuple):
 
     @property
     def stalled(self) -> bool:
-        """Whether neither of the last two outer iterations halved ‖Cν‖."""
+        """True if neither of the last two outer iterations halved ‖Cν‖."""
         errors = [o.infeasibility for o in self.outer[-3:]]
         return len(errors) == 3 and errors[2] > errors[1] / 2 > errors[0] / 4
 
@@ -119,7 +119,7 @@ def smalbe(
     tol: float,
     at: Iterate,
 ) -> Iterate:
-    """Run the outer loop on from `at`."""
+    """Continue the outer loop from `at`."""
     C, b = problem.rows.C, problem.b
     b_size = _norm(b) or _norm(at.g)
     left = constants.max_steps - len(at.steps) - len(at.outer)
@@ -164,7 +164,7 @@ def smalbe(
 def _accuracy(
     problem: Projected, tol: float, b_size: float, energy: float
 ) -> Callable[[Point, Face], bool]:
-    """Make the test that ends the outer loop."""
+    """Return the stopping test of the outer loop."""
     most = 0  # products, once all but the energy is as accurate as asked for
 
     def reached(here: Point, face: Face) -> bool:
@@ -184,7 +184,7 @@ def _accuracy(
 
 
 def _after_stall(problem: Projected, at: Iterate, *, met: bool) -> Iterate | None:
-    """Be stricter with the rows, or, where they are `met`, with the gradient."""
+    """Increase ρ or, if the rows are `met`, tighten the gradient."""
     if met:
         return at._replace(M=at.M / 10)
     if at.rho >= MOST_RHO:
@@ -199,7 +199,7 @@ def _updated(
     run: Minimum,
     before: float,
 ) -> Iterate:
-    """Do steps 2 and 3 after an inner run; `before` is the Lagrangian of the last."""
+    """Update M, ρ and μ (steps 2 and 3); `before` is the previous Lagrangian."""
     C, rho = problem.rows.C, at.rho
     Cnu = C @ run.x
     lagrangian = float(0.5 * run.x @ (run.g - problem.b + C.T @ at.mu))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal, eigvalsh_tridiagonal
 
 from mortarbench.harness import QP, Vector
-from mortarbench.solvers.common.conversion import boxed
+from mortarbench.solvers.common.conversion import has_bound
 from mortarbench.solvers.smalbe import projected
 from mortarbench.solvers.smalbe import rows as given
 from mortarbench.solvers.smalbe.compiled import Product, Reduction, Rows
@@ -100,7 +100,7 @@ def projected_problem(
     """Homogenise, project and normalise; one product with F and those of `find`."""
     F = Product(qp.P, qp.q.size)
     if is_sparse(qp.A):
-        rows = equality_rows(qp.A, qp.b, boxed(qp))
+        rows = equality_rows(qp.A, qp.b, has_bound(qp))
     else:
         rows = orthonormal_rows(qp.A, qp.b)
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)

@@ -114,7 +114,7 @@ class PenaltyModel:
         return s
 
     def raised(self, s: Vector, sHs: float) -> BoxModel:
-        """As `Model.raised`."""
+        """Raise τ like `Model.raised`."""
         Cs = self.rows.C @ s
         part, square = float(Cs @ Cs), float(s @ s)
         rest = square - part
@@ -127,7 +127,7 @@ class PenaltyModel:
         return PenaltyModel(tau, self.rows, w)
 
     def relaxed(self, factor: float) -> PenaltyModel:
-        """As `Model.relaxed`."""
+        """Divide τ like `Model.relaxed`."""
         return replace(self, tau=self.tau / factor)
 
     def inverse_in(self, free: Mask) -> Callable[[Vector], Vector]:

@@ -1,8 +1,8 @@
-"""Bodies that contact alone holds, and solutions to twice the digits of doubles.
+"""Bodies supported by contact alone, and solutions with twice the digits of doubles.
 
 The solutions come from the KKT equations of the stored data for given closed rows:
-Gaussian elimination in extended precision, refined with residuals in fractions. None of
-the code under test has a part in that, but for the guess of which rows are closed.
+Gaussian elimination in extended precision, refined with residuals in fractions. Of
+the code under test, only the guess of the closed rows is used.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mortarbench.problems.duality.problem import elastic_bodies_of
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, join, nodal_lengths, prefixed, rectangle
 from mortarbench.problems.feti.subdomains import DecomposedProblem
-from tests.support.decomposed_bodies import parts_by, torn_by
+from tests.support.decomposed_bodies import decompose_by_labels, parts_by
 
 PRESSURE = 1e7  #: Pa
 
@@ -51,7 +51,7 @@ def disc_between_plates(
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
 ) -> Case:
-    """Press a disc of radius 1 m between a plate that is held and one that is not.
+    """Press a disc of radius 1 m between a supported plate and a free one.
 
     n : cells across the disc
     rollers : at the left side of the upper plate
@@ -83,14 +83,14 @@ def disc_in_parts(
     push: float = 0.0,
     E: tuple[float, float, float] = (70e9, 200e9, 70e9),
 ) -> DecomposedProblem:
-    """Describe the dual of `disc_between_plates`, cut into so many parts by METIS."""
+    """Describe the dual of `disc_between_plates`, decomposed by METIS."""
     bodies = _disc_and_plates(n, disc_is_slave, rollers, turn, tilt, push, E)
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     return parts_by(bodies, elastic_bodies_of(bodies).shape.layout(parts), primal)
 
 
-def torn_disc_between_plates(
+def dual_of_disc_between_plates(
     n: int = 4,
     *,
     parts: int = 6,
@@ -103,7 +103,7 @@ def torn_disc_between_plates(
     rows = linearisation(bodies, contact, basis)(np.zeros(bodies.mesh.dofs))
     primal = primal_qp(bodies, rows)
     layout = elastic_bodies_of(bodies).shape.layout(parts)
-    return feti_dual(torn_by(bodies, layout, primal), primal)
+    return feti_dual(decompose_by_labels(bodies, layout, primal), primal)
 
 
 def _disc_and_plates(
@@ -200,7 +200,7 @@ def stored_solution(
 
 
 def _loose(rows: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the motions among R that these rows do not feel."""
+    """Return the motions among R in the kernel of these rows."""
     _, sizes, turn = np.linalg.svd(rows @ R)
     count = int((sizes > 1e-9 * sizes.max(initial=0.0)).sum())
     return np.asarray(R @ turn[count:].T)

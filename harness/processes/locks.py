@@ -1,0 +1,31 @@
+"""Locks between threads of a process that may fork."""
+
+from __future__ import annotations
+
+import os
+from contextlib import ContextDecorator
+from threading import RLock
+
+
+class ForkSafeLock(ContextDecorator):
+    """Reentrant lock, used as a context manager or as a decorator.
+
+    It is released in a child forked while another thread held it: that thread does not
+    exist in the child and could never release it.
+    """
+
+    def __init__(self) -> None:
+        self._lock = RLock()
+        os.register_at_fork(after_in_child=self._release_in_child)
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+
+    def __exit__(self, *_: object) -> None:
+        self._lock.release()
+
+    def _release_in_child(self) -> None:
+        if self._lock.acquire(blocking=False):  # free, or held by the forking thread
+            self._lock.release()
+        else:
+            self._lock = RLock()

@@ -1,0 +1,54 @@
+"""The counts of products that the documents show agree with runs."""
+
+import re
+import sys
+
+import pytest
+
+from tests.support import ROOT
+
+sys.path.append(str(ROOT / "tools"))
+import products  # what writes the tables
+
+LINES = products.PAGE.read_text("utf-8").splitlines()
+CELLS = [
+    pytest.param(case, head, int(LINES[index].split("|")[column]), id=f"{case} {head}")
+    for index, case, column, head in products.cells(LINES)
+]
+#: cases that take a fraction of a second
+SHORT = re.compile(
+    r"beam-ring/Nr=4/.*step=\d+/|greco/n=16/|membranes/S=[12]/n=[48]/|string/n=100/"
+)
+QUICK = [cell for cell in CELLS if SHORT.match(cell.values[0])]
+
+
+def test_the_page_has_measured_tables_of_every_kind():
+    modes = {products.HEAD.fullmatch(cell.values[1])[3] for cell in CELLS}
+
+    assert modes == {None, "warm", "tightened"}
+    assert len(CELLS) >= 200
+    assert len(QUICK) >= 20
+
+
+@pytest.mark.parametrize(("case", "head", "shown"), QUICK)
+def test_a_short_count_is_the_one_shown(case, head, shown):
+    """Up to what another BLAS changes by rounding."""
+    assert products.products(case, head) == pytest.approx(shown, abs=1, rel=0.03)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("case", "head", "shown"), CELLS)
+def test_a_count_is_the_one_shown(case, head, shown):
+    """Rounding changes long runs by up to a third, and short ones by a few steps."""
+    assert products.products(case, head) == pytest.approx(shown, abs=3, rel=0.35)
+
+
+def test_smalbe_needs_at_most_half_of_the_products_of_permon_on_the_benchmark():
+    """The sentence above the first table, read off that table."""
+    rows = [line.split("|") for line in LINES if line.startswith("| `beam-ring/")][:10]
+
+    assert len(rows) == 10
+    for row in rows:
+        permon, smalbe = (int(row[2]), int(row[5])), (int(row[3]), int(row[6]))
+        assert 2 * smalbe[0] <= permon[0]
+        assert 2 * smalbe[1] <= permon[1]

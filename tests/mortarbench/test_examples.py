@@ -1,0 +1,38 @@
+"""Examples in the docstrings of exported functions run and print what they show."""
+
+import doctest
+
+import pytest
+
+import mortarbench as mb
+from mortarbench.listing import problems, solvers
+from mortarbench.solvers.reference.solve import reference_solution
+
+EXAMPLES = {
+    "mortarbench": mb,
+    "plot": mb.Answer.plot,
+    "problems": problems,
+    "reference_solution": reference_solution,
+    "solvers": solvers,
+    **{
+        name: getattr(mb, name)
+        for name in (
+            "build", "export", "load", "replay", "report", "run", "solve", "suites",
+            "test_solver", "validate", "verify",
+        )
+    },
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_the_examples_of_a_docstring_are_true(name, tmp_path, monkeypatch, capsys):
+    """Each in an empty working directory, so that none relies on another."""
+    function = EXAMPLES[name]
+    monkeypatch.chdir(tmp_path)
+    names = {"reference_solution": reference_solution}
+    test = doctest.DocTestParser().get_doctest(function.__doc__, names, name, None, 0)
+
+    result = doctest.DocTestRunner().run(test)
+
+    assert result.attempted > 1
+    assert result.failed == 0, capsys.readouterr().out
