@@ -1,6 +1,6 @@
 """Costs of SMALBE besides its products: tables of docs/performance-smalbe.md.
 
-    python -m benchmarks.smalbe_costs dense|sparse|kept
+    python -m benchmarks.smalbe_costs dense|sparse|incomplete|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
 * dense: preparing and solving duals, in units of products with F. A solve is compared
@@ -8,6 +8,7 @@
   whichever is faster) plus 100 µs.
 * sparse: time of a solve per product, in units of one product and five passes w += v
   over vectors.
+* incomplete: sparse problems with and without incomplete factors.
 * kept: the same solves with and without recycling of CG directions.
 * race: preparing and solving a case by several solvers; answers are verified.
 
@@ -46,6 +47,18 @@ LARGE = {
     "obstacle": {"dim": 2, "n": 257, "shape": "hemisphere"},
     "torsion": {"n": 100},
 }
+INCOMPLETE = {
+    "journal-bearing": [
+        {"n": 50, "eccentricity": 0.9}, {"n": 100, "eccentricity": 0.9},
+        {"n": 200, "eccentricity": 0.9}, {"n": 300},
+    ],
+    "string": [{"n": 1000}, {"n": 1000, "half": True}, {"n": 10_000}],
+    "obstacle": [
+        {"dim": 2, "n": 40, "shape": "flat"},
+        {"dim": 2, "n": 257, "shape": "hemisphere"},
+    ],
+    "torsion": [{"n": 30}, {"n": 100}, {"n": 200}],
+}  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
 REPEATS = 20  #: repeats of a product, which is too short to be timed alone
 
@@ -170,6 +183,48 @@ def _sparse(name: str, qp: QP, solver: Solver, tol: float) -> None:
         )
 
 
+def incomplete(tol: float = 1e-6) -> None:
+    """Solve sparse problems with bounds, preconditioned by factors and not."""
+    print("case | products, factors, ms | without: products, ms | ratio of times")
+    for name, several in INCOMPLETE.items():
+        for params in several:
+            given = {key: value for key, value in params.items() if key != "half"}
+            family = PROBLEMS[name]
+            qp = family.build("primal", family.complete(given), reference_solution).qp
+            if "half" in params:
+                qp = _on_half(qp)
+            _incomplete(f"{name} {params}", qp, tol)
+
+
+def _on_half(qp: QP) -> QP:
+    """Leave out the lower bounds of the second half of the variables."""
+    lb = qp.lb.copy()
+    lb[qp.q.size // 2 :] = -np.inf
+    return QP(P=qp.P, q=qp.q, A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=lb, ub=qp.ub)
+
+
+def _incomplete(name: str, qp: QP, tol: float) -> None:
+    solvers = {
+        "factors": SOLVERS["smalbe"],
+        "without": replace(SOLVERS["smalbe"], preconditioner="model"),
+    }
+    counts = {name: s.prepare(qp, tol)().counts for name, s in solvers.items()}
+    times = in_turn(
+        5 if qp.q.size > 20_000 else 30,
+        **{
+            name: timed(lambda s=s: s.prepare(qp, tol)()) for name, s in solvers.items()
+        },
+    )
+    (ms, _), (before, _) = times["factors"], times["without"]
+    with_factors, without = counts["factors"], counts["without"]
+    print(
+        f"{name} | {with_factors['P_products']}, {with_factors['factorisations']}, "
+        f"{1e3 * ms:.3g} | {without['P_products']}, {1e3 * before:.3g} | "
+        f"{ms / before:.2f}",
+        flush=True,
+    )
+
+
 def kept() -> None:
     """Print times of duals with and without recycling of CG directions."""
     for form, *size in KEPT:
@@ -251,7 +306,7 @@ def main() -> None:
     """Parse the command line and print the table."""
     parser = ArgumentParser(description="What a solve of SMALBE costs.")
     tables = parser.add_subparsers(dest="table", required=True)
-    for name in ("dense", "sparse", "kept"):
+    for name in ("dense", "sparse", "incomplete", "kept"):
         tables.add_parser(name)
     race_parser = tables.add_parser("race", help="compare several solvers on a case")
     race_parser.add_argument("case")
@@ -259,7 +314,10 @@ def main() -> None:
     race_parser.add_argument("rounds", type=int)
     race_parser.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
     arguments = vars(parser.parse_args())
-    functions = {"dense": dense, "sparse": sparse, "kept": kept, "race": race}
+    functions = {
+        "dense": dense, "sparse": sparse, "incomplete": incomplete, "kept": kept,
+        "race": race,
+    }  # fmt: skip
     try:
         functions[arguments.pop("table")](**arguments)
     except InputError as e:

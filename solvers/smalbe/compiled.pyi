@@ -31,6 +31,31 @@ class Rows:
     def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
     def met(self, nu: Vector, tol: float, least: float) -> bool: ...
 
+def pairs_of_columns(matrix: Matrix) -> float: ...
+def scaled_by_diagonal(
+    matrix: Matrix, scale: Vector
+) -> tuple[Array, float, float, float]: ...
+
+class IncompleteFactor:
+    keep: float
+    shift: float
+    factorisations: int
+    solves: int
+    def __init__(
+        self, matrix: Matrix, weights: Vector, scale: Vector, keep: bool = True
+    ) -> None: ...
+    def solve(self, free: NDArray[np.bool_], v: Vector) -> Vector: ...
+
+class Judge:
+    def __init__(
+        self,
+        qp: QP,
+        scaled: QP,
+        root: Vector | None,
+        diagonal: Vector,
+        norm: float,
+    ) -> None: ...
+
 class SMALBE:
     def __init__(
         self,

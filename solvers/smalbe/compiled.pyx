@@ -10,7 +10,10 @@ factors and preconditioners call back into Python.
 * box.pxi: the feasible set: steps to its boundary, projections, parts of the gradient
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
+* incomplete.pxi: incomplete Cholesky factors of the free part of a sparse P
+* judge.pxi: KKT residuals of the problem as given, from the gradient
 * mprgp.pxi: the inner loop
+* release.pxi: its proportioning by such a factor
 * outer.pxi: the outer loop and the recovery of x and its multipliers
 * residuals.pxi: an upper bound of the KKT residuals of the QP
 
@@ -150,10 +153,45 @@ cdef extern from "vectors.h" nogil:
                        const double *own_size, const double *size, Py_ssize_t m,
                        Py_ssize_t n, double *missed, double *own, double *known)
 
+cdef extern from "incomplete.h" nogil:
+    int RUN
+    ctypedef struct incomplete:
+        Py_ssize_t n, half, reach, count
+        const int *start
+        const int *row
+        const Py_ssize_t *pair
+        const int *target
+        const double *below
+        const double *diagonal
+        const double *scale
+        Py_ssize_t width
+        const Py_ssize_t *offset
+        const int *between
+        int *from_ "from"
+        int *to
+        double *L
+        double *pivot
+        double *inverse
+        double *bands
+        double *y
+    void find_runs(incomplete *F, const double *free, Py_ssize_t most)
+    bint factorise_incompletely(incomplete *F, const double *free, double keep,
+                                double shift, double least)
+    double solve_incompletely(const incomplete *F, const double *v, const double *along,
+                              double *z)
+    double projected_step(const double *x, const double *z, const double *g,
+                          const double *lower, const double *upper, double *s,
+                          Py_ssize_t n)
+    void scaled_matrix(const int *indptr, const int *indices, const double *data,
+                       const double *s, double *scaled, Py_ssize_t n, double *told)
+
 include "operations.pxi"
 include "preparation.pxi"
 include "box.pxi"
 include "model.pxi"
+include "incomplete.pxi"
+include "judge.pxi"
 include "mprgp.pxi"
+include "release.pxi"
 include "outer.pxi"
 include "residuals.pxi"

@@ -114,11 +114,11 @@ cdef class Reduction:
             memcpy(address(own), terms, k * sizeof(double))
         if least:
             address(own)[k] = least[0]
-        everyones = self.ranks.everyones(own)
-        of_rank = address(everyones)
+        parts = self.ranks.gather_all(own)
+        of_rank = address(parts)
         for i in range(k):
             terms[i] = 0.0
-        for p in range(len(everyones)):
+        for p in range(len(parts)):
             for i in range(k):
                 terms[i] += of_rank[p * width + i]
             if least:

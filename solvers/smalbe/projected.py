@@ -56,6 +56,10 @@ class Projected:
     diagonal: Vector  #: of F; empty for an operator without one
     #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
+    #: of the free part of a sparse F in scaled variables; None for none
+    factor: compiled.IncompleteFactor | None = None
+    #: of KKT residuals of the QP as given; None where ‖g^P‖ decides when to stop
+    judge: compiled.Judge | None = None
 
 
 class OuterIteration(NamedTuple):

@@ -1,0 +1,469 @@
+/* Incomplete Cholesky factors of principal submatrices of a sparse symmetric matrix.
+
+   M = (I + L) D (I + L)' in an order of elimination, with the entries of L where P has
+   some. What elimination would put elsewhere is dropped; `keep` times that is added to the
+   two diagonal entries of its row and column, so that row sums are kept for keep = 1
+   (Gustafsson 1978, modified incomplete Cholesky; Meijerink and van der Vorst 1977 for
+   keep = 0; survey: Benzi 2002).
+
+   The order is 0, 1, ... up to `half`, then n - 1, n - 2, ... down to it. Each column of
+   the first part, and of the second up to the distance `reach` of its last entries, waits
+   for the one before, which takes as long as a division or some multiplications, but not
+   for the other part: both are done in turn, in the time of one (twisted factorisation).
+
+   Only components that are free take part. Where P lies on few diagonals, L is stored by
+   these, too: then only entries next to the diagonal are a recurrence, and the others are
+   taken off some hundred rows at once. */
+
+#ifndef INCOMPLETE_H
+#define INCOMPLETE_H
+
+enum {
+    RUN = 256 /* most components of a run: what stays in the nearest cache */
+};
+
+typedef struct {
+    Py_ssize_t n, half, reach, count; /* count: of diagonals on one side, 0 without */
+    Py_ssize_t runs, first_of_second, first_of_tail;
+    Py_ssize_t width;            /* of a diagonal: n, and the reach */
+    const int *start, *row;      /* (n + 1,), (nnz,) later rows of each column */
+    const Py_ssize_t *pair;      /* (n,) the first pair of entries of each column */
+    const int *target;           /* of each pair: the entry it changes, -1 if dropped */
+    const double *below, *diagonal; /* the matrix, stored as L is */
+    const double *scale;         /* (n,) S of the inverse S M^-1 S */
+    const Py_ssize_t *offset;    /* (count,) of the diagonals, ascending */
+    const int *between;          /* the diagonal with the distance of two, or -1 */
+    int *from, *to;              /* (runs,) intervals of free components, in the order of
+                                    elimination: first part, second part, its tail */
+    double *L, *bands;           /* the factor by columns, or by diagonals */
+    double *pivot, *inverse, *y;
+} incomplete;
+
+/* Append the intervals of free components of [a, b), ascending or descending. */
+static void
+append_runs(incomplete *F, in free, Py_ssize_t a, Py_ssize_t b, int down, Py_ssize_t most)
+{
+    Py_ssize_t i = down ? b - 1 : a, step = down ? -1 : 1, size;
+    while (i >= a && i < b) {
+        while (i >= a && i < b && free[i] == 0)
+            i += step;
+        for (size = 0; i >= a && i < b && free[i] != 0 && size < most; size++)
+            i += step;
+        if (size) {
+            F->from[F->runs] = (int) (down ? i + 1 : i - size);
+            F->to[F->runs++] = (int) (down ? i + 1 + size : i);
+        }
+    }
+}
+
+/* Intervals of free components, none longer than `most`. */
+static void find_runs(incomplete *F, in free, Py_ssize_t most)
+{
+    Py_ssize_t tail = F->half + F->reach < F->n ? F->half + F->reach : F->n;
+    F->runs = 0;
+    append_runs(F, free, 0, F->half, 0, most);
+    F->first_of_second = F->runs;
+    append_runs(F, free, tail, F->n, 1, most);
+    F->first_of_tail = F->runs;
+    append_runs(F, free, F->half, tail, 1, most);
+}
+
+/* Eliminate column j, and say whether its pivot is good. */
+INLINE int eliminate_column(const incomplete *F, Py_ssize_t j, double keep, double least)
+{
+    const int *restrict row = F->row, *restrict target = F->target;
+    double *L = F->L, *pivot = F->pivot, p = pivot[j], inverse = 1 / p;
+    int first = F->start[j], last = F->start[j + 1];
+    Py_ssize_t t = F->pair[j];
+    F->inverse[j] = inverse;
+    for (int k = first; k < last; k++) { /* all but the product with 1/p is known */
+        double l = L[k], dropped = 0;
+        for (int m = k + 1; m < last; m++, t++) {
+            double fill = l * L[m];
+            if (target[t] >= 0) {
+                L[target[t]] -= fill * inverse;
+            } else {
+                dropped += fill;
+                pivot[row[m]] -= keep * fill * inverse;
+            }
+        }
+        pivot[row[k]] -= (l * l + keep * dropped) * inverse;
+    }
+    for (int k = first; k < last; k++)
+        L[k] *= inverse;
+    return (p > least * F->diagonal[j]) & (p < INFINITY);
+}
+
+/* The same by diagonals, of which there are `count`, a number that the compiler knows: an
+   entry that P does not have is zero. */
+INLINE int eliminate_by_bands(const incomplete *F, Py_ssize_t j, Py_ssize_t count,
+                              double keep, double least)
+{
+    Py_ssize_t n = F->width, half = F->half, sign = j < half ? 1 : -1;
+    double *pivot = F->pivot, p = pivot[j], inverse = 1 / p;
+    double l[MAX_DIAGONALS], taken[MAX_DIAGONALS];
+    F->inverse[j] = inverse;
+    for (Py_ssize_t c = 0; c < count; c++) {
+        l[c] = F->bands[c * n + j];
+        taken[c] = l[c] * l[c];
+    }
+#pragma GCC unroll 4
+    for (Py_ssize_t c = 0; c < count; c++)
+#pragma GCC unroll 4
+        for (Py_ssize_t d = c + 1; d < count; d++) {
+            double fill = l[c] * l[d];
+            int e = F->between[c * MAX_DIAGONALS + d];
+            if (e >= 0) { /* in the column of the row that is eliminated first */
+                Py_ssize_t near = j + sign * F->offset[c], far = j + sign * F->offset[d];
+                Py_ssize_t column = sign > 0 && near >= half ? far : near;
+                F->bands[e * n + column] -= fill * inverse;
+            } else {
+                taken[c] += keep * fill;
+                taken[d] += keep * fill;
+            }
+        }
+    for (Py_ssize_t c = 0; c < count; c++) {
+        pivot[j + sign * F->offset[c]] -= taken[c] * inverse;
+        F->bands[c * n + j] = l[c] * inverse;
+    }
+    return (p > least * F->diagonal[j]) & (p < INFINITY);
+}
+
+INLINE int eliminate(const incomplete *F, Py_ssize_t j, Py_ssize_t count, double keep,
+                     double least)
+{
+    return count ? eliminate_by_bands(F, j, count, keep, least)
+                 : eliminate_column(F, j, keep, least);
+}
+
+/* Eliminate the columns of all runs, those of both parts in turn. */
+INLINE int eliminate_all(incomplete *F, Py_ssize_t count, double keep, double least)
+{
+    Py_ssize_t a = 0, b = F->first_of_second, i, j;
+    int good = 1;
+    i = a < F->first_of_second ? F->from[a] : 0;
+    j = b < F->first_of_tail ? F->to[b] - 1 : 0;
+    while (a < F->first_of_second && b < F->first_of_tail) {
+        good &= eliminate(F, i, count, keep, least);
+        good &= eliminate(F, j, count, keep, least);
+        if (++i == F->to[a] && ++a < F->first_of_second)
+            i = F->from[a];
+        if (--j < F->from[b] && ++b < F->first_of_tail)
+            j = F->to[b] - 1;
+    }
+    while (a < F->first_of_second) {
+        good &= eliminate(F, i, count, keep, least);
+        if (++i == F->to[a] && ++a < F->first_of_second)
+            i = F->from[a];
+    }
+    if (b < F->first_of_tail)
+        for (; j >= F->from[b]; j--)
+            good &= eliminate(F, j, count, keep, least);
+    for (b += b < F->first_of_tail; b < F->runs; b++)
+        for (j = F->to[b] - 1; j >= F->from[b]; j--)
+            good &= eliminate(F, j, count, keep, least);
+    return good;
+}
+
+/* Factorise P_FF, its diagonal multiplied by 1 + shift; whether all pivots are at least
+   `least` of that. */
+TWICE static int
+factorise_incompletely(incomplete *F, in free, double keep, double shift, double least)
+{
+    const int *restrict start = F->start, *restrict row = F->row;
+    Py_ssize_t n = F->width;
+    memset(F->inverse, 0, F->n * sizeof(double));
+    memset(F->y, 0, F->n * sizeof(double)); /* stays zero where nothing is free */
+    memset(F->L, 0, (F->count ? F->count * n : start[F->n]) * sizeof(double));
+    for (Py_ssize_t r = 0; r < F->runs; r++) {
+        Py_ssize_t a = F->from[r], b = F->to[r], sign = a < F->half ? 1 : -1;
+        for (Py_ssize_t j = a; j < b; j++)
+            F->pivot[j] = (1 + shift) * F->diagonal[j];
+        for (Py_ssize_t c = 0; c < F->count; c++) {
+            Py_ssize_t o = sign * F->offset[c];
+            Py_ssize_t first = o < 0 && a < -o ? -o : a;
+            Py_ssize_t last = o > 0 && b > F->n - o ? F->n - o : b;
+            for (Py_ssize_t j = first; j < last; j++)
+                F->bands[c * n + j] = F->below[c * n + j] * free[j + o];
+        }
+        for (Py_ssize_t j = F->count ? b : a; j < b; j++)
+            for (int k = start[j]; k < start[j + 1]; k++)
+                F->L[k] = F->below[k] * free[row[k]];
+    }
+    switch (F->count) {
+    case 0: return eliminate_all(F, 0, keep, least);
+    case 1: return eliminate_all(F, 1, keep, least);
+    case 2: return eliminate_all(F, 2, keep, least);
+    case 4: return eliminate_all(F, 4, keep, least);
+    default: return eliminate_all(F, F->count, keep, least);
+    }
+}
+
+/* y = S v less what rows of L in columns before take off it, but for the recurrence with
+   the one next to the diagonal, of a run [a, b). */
+INLINE void before_forward(const incomplete *F, Py_ssize_t a, Py_ssize_t b, in v)
+{
+    double *y = F->y;
+    in s = F->scale;
+    int second = a >= F->half;
+    for (Py_ssize_t i = a; i < b; i++)
+        y[i] = s[i] * v[i];
+    for (Py_ssize_t c = 0; c < F->count; c++) {
+        Py_ssize_t o = F->offset[c], first, last;
+        const double *band = F->bands + c * F->width;
+        if (second) { /* columns of the first part, then of the second */
+            last = b < F->half + o ? b : F->half + o;
+            for (Py_ssize_t i = a; i < last; i++)
+                y[i] -= band[i - o] * y[i - o];
+            last = b < F->n - o ? b : F->n - o;
+            if (o > 1)
+#pragma GCC ivdep /* a run is no longer than the offset */
+                for (Py_ssize_t i = a; i < last; i++)
+                    y[i] -= band[i + o] * y[i + o];
+        } else if (o > 1) {
+            first = a > o ? a : o;
+#pragma GCC ivdep
+            for (Py_ssize_t i = first; i < b; i++)
+                y[i] -= band[i - o] * y[i - o];
+        }
+    }
+}
+
+/* The same of y = D^-1 y and L', from the last column on. */
+INLINE void before_backward(const incomplete *F, Py_ssize_t a, Py_ssize_t b)
+{
+    double *y = F->y;
+    int second = a >= F->half;
+    for (Py_ssize_t i = a; i < b; i++)
+        y[i] *= F->inverse[i];
+    for (Py_ssize_t c = 0; c < F->count; c++) {
+        Py_ssize_t o = F->offset[c], first, last;
+        const double *band = F->bands + c * F->width;
+        if (second) {
+            first = a > F->half + o ? a : F->half + o;
+            if (o > 1)
+#pragma GCC ivdep
+                for (Py_ssize_t i = first; i < b; i++)
+                    y[i] -= band[i] * y[i - o];
+            continue;
+        }
+        last = b < F->n - o ? b : F->n - o;
+        if (o > 1) {
+#pragma GCC ivdep
+            for (Py_ssize_t i = a; i < last; i++)
+                y[i] -= band[i] * y[i + o];
+        } else if (b == F->half && b < F->n) { /* the recurrence begins in the other part */
+            y[b - 1] -= band[b - 1] * y[b];
+        }
+    }
+}
+
+/* A recurrence y_i = y_i - l y_before of a run: where it begins, and with what. */
+typedef struct {
+    Py_ssize_t at, left, step;
+    const double *l;
+    double last;
+} recurrence;
+
+/* Forward: up in the first part, down in the second. Backward: the other way. */
+INLINE recurrence
+begin_recurrence(const incomplete *F, Py_ssize_t a, Py_ssize_t b, int backward)
+{
+    int second = a >= F->half, down = second != backward;
+    recurrence c = {down ? b - 1 : a, b - a, down ? -1 : 1, F->bands, 0};
+    Py_ssize_t before = c.at - c.step;
+    /* the entry is stored with the column that is eliminated first */
+    c.l += backward ? 0 : -c.step;
+    if (second ? before >= F->half && before < F->n : before >= 0 && before < F->half)
+        c.last = F->y[before];
+    return c;
+}
+
+INLINE void go_on(recurrence *c, double *y, Py_ssize_t size)
+{
+    Py_ssize_t i = c->at, step = c->step;
+    double last = c->last;
+    const double *l = c->l;
+    if (size) { /* there may be none before: its entry is not read where that is zero */
+        last = y[i] - (last != 0 ? l[i] * last : 0);
+        y[i] = last;
+        i += step;
+    }
+    for (Py_ssize_t k = 1; k < size; k++, i += step) {
+        last = y[i] - l[i] * last;
+        y[i] = last;
+    }
+    c->at = i;
+    c->last = last;
+    c->left -= size;
+}
+
+/* Two of them in turn, for neither waits for the other. */
+INLINE void go_on_together(recurrence *c, recurrence *d, double *y)
+{
+    Py_ssize_t size = c->left < d->left ? c->left : d->left;
+    Py_ssize_t i = c->at, j = d->at, up = c->step, down = d->step;
+    double first = c->last, second = d->last;
+    const double *l = c->l, *m = d->l;
+    if (size) { /* the ones before may be none */
+        go_on(c, y, 1);
+        go_on(d, y, 1);
+        i = c->at, j = d->at, first = c->last, second = d->last;
+        for (Py_ssize_t k = 1; k < size; k++, i += up, j += down) {
+            first = y[i] - l[i] * first;
+            second = y[j] - m[j] * second;
+            y[i] = first;
+            y[j] = second;
+        }
+        c->at = i, d->at = j, c->last = first, d->last = second;
+        c->left -= size - 1, d->left -= size - 1;
+    }
+    go_on(c, y, c->left);
+    go_on(d, y, d->left);
+}
+
+/* z = S M^-1 S v by diagonals. */
+INLINE void solve_by_bands(const incomplete *F, in v)
+{
+    int chained = F->offset[0] == 1;
+    Py_ssize_t a = 0, b = F->first_of_second, second = b, tail = F->first_of_tail;
+    recurrence c, d;
+    for (; a < second || b < F->runs; a++, b++) {
+        int one = a < second, other = b < tail || (a >= second && b < F->runs);
+        if (one)
+            before_forward(F, F->from[a], F->to[a], v);
+        if (other)
+            before_forward(F, F->from[b], F->to[b], v);
+        else
+            b--;
+        if (!chained)
+            continue;
+        if (one)
+            c = begin_recurrence(F, F->from[a], F->to[a], 0);
+        if (other)
+            d = begin_recurrence(F, F->from[b], F->to[b], 0);
+        if (one && other)
+            go_on_together(&c, &d, F->y);
+        else if (one)
+            go_on(&c, F->y, c.left);
+        else if (other)
+            go_on(&d, F->y, d.left);
+    }
+    for (b = F->runs - 1; b >= tail; b--) {
+        before_backward(F, F->from[b], F->to[b]);
+        if (chained) {
+            d = begin_recurrence(F, F->from[b], F->to[b], 1);
+            go_on(&d, F->y, d.left);
+        }
+    }
+    for (a = second - 1; a >= 0 || b >= second; a--, b--) {
+        int one = a >= 0, other = b >= second;
+        if (one)
+            before_backward(F, F->from[a], F->to[a]);
+        if (other)
+            before_backward(F, F->from[b], F->to[b]);
+        if (!chained)
+            continue;
+        if (one)
+            c = begin_recurrence(F, F->from[a], F->to[a], 1);
+        if (other)
+            d = begin_recurrence(F, F->from[b], F->to[b], 1);
+        if (one && other)
+            go_on_together(&c, &d, F->y);
+        else if (one)
+            go_on(&c, F->y, c.left);
+        else
+            go_on(&d, F->y, d.left);
+    }
+}
+
+INLINE void forward_column(const incomplete *F, Py_ssize_t j, in v)
+{
+    double *y = F->y, done = y[j] + F->scale[j] * v[j];
+    y[j] = done;
+    for (int k = F->start[j]; k < F->start[j + 1]; k++)
+        y[F->row[k]] -= F->L[k] * done; /* L is zero where a row is not free */
+}
+
+INLINE void backward_column(const incomplete *F, Py_ssize_t j)
+{
+    double *y = F->y, rest = y[j] * F->inverse[j];
+    for (int k = F->start[j]; k < F->start[j + 1]; k++)
+        rest -= F->L[k] * y[F->row[k]];
+    y[j] = rest;
+}
+
+/* z = S M^-1 S v for v that is zero where nothing is free; the sum of z along. */
+TWICE static double solve_incompletely(const incomplete *F, in v, in along, out z)
+{
+    double *y = F->y, sum = 0;
+    in s = F->scale;
+    memset(z, 0, F->n * sizeof(double));
+    if (F->count) {
+        solve_by_bands(F, v);
+    } else {
+        for (Py_ssize_t r = 0; r < F->runs; r++)
+            memset(y + F->from[r], 0, (F->to[r] - F->from[r]) * sizeof(double));
+        for (Py_ssize_t r = 0; r < F->first_of_second; r++)
+            for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++)
+                forward_column(F, j, v);
+        for (Py_ssize_t r = F->first_of_second; r < F->runs; r++)
+            for (Py_ssize_t j = F->to[r] - 1; j >= F->from[r]; j--)
+                forward_column(F, j, v);
+        for (Py_ssize_t r = F->runs - 1; r >= F->first_of_second; r--)
+            for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++)
+                backward_column(F, j);
+        for (Py_ssize_t r = F->first_of_second - 1; r >= 0; r--)
+            for (Py_ssize_t j = F->to[r] - 1; j >= F->from[r]; j--)
+                backward_column(F, j);
+    }
+    for (Py_ssize_t r = 0; r < F->runs; r++)
+        for (Py_ssize_t j = F->from[r]; j < F->to[r]; j++) {
+            z[j] = s[j] * y[j];
+            sum += z[j] * along[j];
+        }
+    return sum;
+}
+
+/* s = P(x - z) - x, P the projection on lower <= x <= upper; g's. */
+TWICE static double
+projected_step(in x, in z, in g, in lower, in upper, out s, Py_ssize_t n)
+{
+    double slope = 0;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double to = x[i] - z[i];
+        to = to > lower[i] ? to : lower[i];
+        to = to < upper[i] ? to : upper[i];
+        s[i] = to - x[i];
+        slope += g[i] * s[i];
+    }
+    return slope;
+}
+
+/* S P S for P by rows, S diagonal: its entries, the largest sum of absolute values of a
+   row, and the least sums of rows of P and of S P S, in units of the diagonal. */
+TWICE static void
+scaled_matrix(const int *indptr, const int *indices, in data, in s, out scaled,
+              Py_ssize_t n, out told)
+{
+    double norm = 0, least = INFINITY, least_scaled = INFINITY;
+    for (Py_ssize_t i = 0; i < n; i++) {
+        double size = 0, sum = 0, sum_scaled = 0;
+        for (int k = indptr[i]; k < indptr[i + 1]; k++) {
+            double a = s[i] * data[k] * s[indices[k]];
+            scaled[k] = a;
+            size += fabs(a);
+            sum += data[k];
+            sum_scaled += a;
+        }
+        sum *= s[i] * s[i];
+        norm = norm > size ? norm : size;
+        least = least < sum ? least : sum;
+        least_scaled = least_scaled < sum_scaled ? least_scaled : sum_scaled;
+    }
+    told[0] = norm;
+    told[1] = least;
+    told[2] = least_scaled;
+}
+
+#endif

@@ -1,0 +1,80 @@
+# KKT residuals of a QP with bounds only, of which MPRGP solves a scaled and normalised
+# form: no product is needed, for the gradient is known.
+
+
+@cython.final
+cdef class Judge:
+    """Bound the worst KKT residual of a QP at a point of its normalised form.
+
+    With x = y/d (d the scale of the variables, x on its bound where y is) and the gradient
+    g of the normalised form, Px + q = ‖H‖ d g. What follows is `residual_bound`.
+
+    qp : as given
+    scaled : the QP in y = d x
+    root : d (n,), None for ones
+    diagonal : of P (n,), as given
+    norm : ‖H‖, by which the scaled one is divided
+    """
+
+    cdef Py_ssize_t n
+    cdef double norm
+    cdef const double *q
+    cdef const double *lb
+    cdef const double *ub
+    cdef const double *low
+    cdef const double *high
+    cdef const double *root
+    cdef const double *diagonal
+    cdef double *x
+    cdef double *Px
+    cdef double *forces
+    cdef double *size
+    cdef double *z
+    cdef Room room
+    cdef list held
+
+    def __init__(self, qp, scaled, root, diagonal, double norm):
+        cdef Py_ssize_t n = len(diagonal)
+        self.n, self.norm, self.held = n, norm, []
+        self.q, self.lb = read(qp.q, self.held), read(qp.lb, self.held)
+        self.ub = read(qp.ub, self.held)
+        if root is not None:
+            self.root = read(root, self.held)
+        self.low, self.high = read(scaled.lb, self.held), read(scaled.ub, self.held)
+        self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
+        self.x = self.room.at
+        self.Px, self.forces = self.x + n, self.x + 2 * n
+        self.size, self.z = self.x + 3 * n, self.x + 4 * n
+
+    cdef double residual(self, const double *y, const double *g) noexcept:
+        """Return the bound at y (n,) with its gradient g (n,); inf without an energy."""
+        cdef Py_ssize_t i, n = self.n
+        cdef double sums[3]
+        cdef double most[2]
+        cdef double least, energy, worst, r, d, x, z
+        for i in range(n):
+            d = self.root[i] if self.root else 1.0
+            r = self.norm * d * g[i]
+            self.Px[i] = r - self.q[i]
+            x = y[i] / d
+            x = x if x > self.lb[i] else self.lb[i]
+            x = x if x < self.ub[i] else self.ub[i]
+            z = 0.0
+            if y[i] >= self.high[i]:
+                x, z = self.ub[i], -r if r < 0 else 0.0
+            if y[i] <= self.low[i]:
+                x = self.lb[i]
+                z -= r if r > 0 else 0.0
+            self.x[i], self.z[i] = x, z
+        memcpy(self.forces, self.z, n * sizeof(double))
+        least = terms_of_energy(self.q, self.diagonal, self.x, self.z, self.Px, self.lb,
+                                self.ub, self.forces, self.size, n, sums, most)
+        energy = scales.energy_scale(sums[0], sums[1], sums[2])
+        if least < 0 or not energy > 0:
+            return INFINITY
+        worst = fmax(most[0], fabs(sums[0] + sums[1] + sums[2])) / energy
+        worst = worst_of_forces(
+            energy, fmax(most[1], sqrt(energy * least)), self.q, self.diagonal, self.x,
+            self.Px, self.lb, self.ub, self.size, self.forces, n, worst
+        )
+        return worst if isfinite(worst) else INFINITY

@@ -1,0 +1,77 @@
+"""Variables of a sparse QP scaled by the roots of its diagonal, and the way back.
+
+With D = diag(P) and y = D¹ᐟ²x the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ², whose diagonal is
+one (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all diagonal
+scalings it has nearly the least condition number). Bounds stay bounds. KKT residuals
+are those of the QP as given (`compiled.Judge`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from mortarbench.harness import QP, Matrix, Solution, Vector
+from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diagonal
+from mortarbench.solvers.smalbe.projected import Spectrum
+
+#: Sums Σⱼ Pᵢⱼwⱼ below zero by no more than this, relative to Pᵢᵢwᵢ, are rounding.
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A QP in scaled variables, factors of its matrix, and the way back."""
+
+    given: QP
+    P: Matrix  #: of that, sorted, by rows or columns
+    qp: QP  #: in y = D¹ᐟ²x
+    root: Vector  #: (n,) D¹ᐟ²
+    norm: float  #: the largest sum Σⱼ|Hᵢⱼ| of a row: an upper bound for ‖H‖
+    weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
+    has_weights: bool
+    with_factor: bool  #: whether to precondition by a factor
+
+    @classmethod
+    def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
+        """Scale a QP for which `solvers.smalbe.preconditioner.scalable` holds."""
+        P = _canonical(qp.P)
+        root = np.sqrt(P.diagonal())
+        inverse = 1 / root
+        data, norm, least, least_scaled = scaled_by_diagonal(P, inverse)
+        scaled = QP(
+            P=csr_array((data, P.indices, P.indptr), shape=P.shape), q=qp.q * inverse,
+            A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=qp.lb * root, ub=qp.ub * root,
+        )  # fmt: skip
+        weights, has_weights = np.ones(root.size), True
+        if least < -ROUNDING:
+            weights, has_weights = inverse, least_scaled >= -ROUNDING
+        return cls(qp, P, scaled, root, norm, weights, has_weights, with_factor)
+
+    def spectrum(self) -> Spectrum:
+        """Bound the norm of the matrix by Gershgorin's theorem, without a product."""
+        return Spectrum(self.norm, None)
+
+    def factor(self) -> IncompleteFactor:
+        """Set up the incomplete factor of H/norm."""
+        scale = np.sqrt(self.norm) * self.root * self.weights
+        return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
+
+    def recovered(self, s: Solution) -> Solution:
+        """Return the point of the QP as given; where y is at a bound, x is."""
+        x = np.clip(s.x / self.root, self.given.lb, self.given.ub)
+        x = np.where(s.x <= self.qp.lb, self.given.lb, x)
+        x = np.where(s.x >= self.qp.ub, self.given.ub, x)
+        return replace(s, x=x, z_box=s.z_box * self.root)
+
+
+def _canonical(P: Matrix) -> Matrix:
+    """Return a symmetric P by rows or columns, sorted and without repetitions."""
+    if P.format not in ("csc", "csr"):
+        P = csr_array(P)
+    if not P.has_canonical_format:
+        P = P.copy()
+        P.sum_duplicates()
+    return P
