@@ -16,7 +16,7 @@ from mortarbench.problems.duality.monolithic import primal_qp
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.reference.solve import reference_solution
-from tests.support.decomposed_bodies import decompose_by_labels, labelled_subdivision
+from tests.support.decomposed_bodies import decompose_by_labels, labelled
 
 GLUING = ("orthonormal", "chain", "redundant")
 BODIES = model(2, 2, 4, "strain")

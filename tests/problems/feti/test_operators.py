@@ -23,7 +23,7 @@ from mortarbench.problems.feti.subdomains import on_one_process
 from mortarbench.problems.feti.tearing import blocks
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.membranes import Membranes
-from tests.support.decomposed_bodies import decompose_by_labels, labelled_subdivision
+from tests.support.decomposed_bodies import decompose_by_labels, labelled
 
 pytestmark = pytest.mark.together
 

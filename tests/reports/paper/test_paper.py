@@ -520,8 +520,8 @@ def test_contestants_take_turns_and_every_lap_is_a_row():
 
 def test_rounds_end_when_time_is_spent_but_not_before_the_least():
     calls = []
-    race({"a": timed_as_one(lambda: calls.append(1))}, Rounds(most=9, least=4, seconds=-1),
-         warm=False)  # fmt: skip
+    entrant = {"a": timed_as_one(lambda: calls.append(1))}
+    race(entrant, Rounds(most=9, least=4, seconds=-1), warm=False)
 
     assert len(calls) == 4
 
