@@ -385,7 +385,7 @@ class ParallelSolver:
         if product.parts < self._ranks.size:
             return (
                 f"{self._ranks.size} ranks for {product.parts} subdomains; expected at "
-                "most one rank for each"
+                "most one rank per subdomain"
             )
         return self._solver.declines(qp)
 

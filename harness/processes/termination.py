@@ -18,11 +18,11 @@ class TerminatedError(BaseException):
 
 @contextmanager
 def ended_by_signals() -> Iterator[None]:
-    """Raise `TerminatedError` at SIGTERM or SIGHUP, then exit with 128 + its number.
+    """Raise `TerminatedError` on SIGTERM or SIGHUP; exit with 128 + signal number.
 
     Signals that are handled elsewhere, or ignored (nohup ignores SIGHUP), keep their
-    disposition. Outside the main thread nothing changes: Python allows signal handlers
-    to be set only there.
+    disposition. Outside the main thread nothing changes, because Python allows signal
+    handlers to be set only in the main thread.
     """
     numbers = [
         number

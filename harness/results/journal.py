@@ -119,8 +119,8 @@ def read_journal(
                 )
                 raise InputError(
                     f"{repeated[-1]}: the record of run_id {shown(record.run_id)} "
-                    f"differs from that at {place}; expected one line for each; delete "
-                    "the one that is wrong"
+                    f"differs from that at {place}; expected one line per run_id; "
+                    "delete the wrong one"
                 )
     if repeated:
         lines = "line repeats" if len(repeated) == 1 else "lines repeat"

@@ -376,12 +376,12 @@ def _refuse_unguarded_script() -> None:
     trial.join()
     if trial.exitcode == _UNGUARDED_SCRIPT_CODE:
         raise InputError(
-            "the processes of Dask import the main script, which starts this run once "
-            'more there; put what runs below `if __name__ == "__main__":`'
+            "the processes of Dask import the main script, which starts this run "
+            'again; move its statements below `if __name__ == "__main__":`'
         )
     if trial.exitcode:
         raise InputError(
-            "the processes of Dask import the main script, which fails there (exit "
+            "the processes of Dask import the main script, and this import fails (exit "
             f"code {trial.exitcode})"
         )
 

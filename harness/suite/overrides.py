@@ -97,7 +97,7 @@ def _chosen_cases(
         if not matches:
             raise InputError(
                 f"--case {pattern!r} matches none of the {len(names)} cases of suite "
-                f"{suite.name!r}; there are {some(names)}"
+                f"{suite.name!r}; its cases are {some(names)}"
             )
         selected.update(matches)
 

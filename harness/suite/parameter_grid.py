@@ -175,7 +175,7 @@ def _along(key: object, params: Mapping[str, Any]) -> str | None:
     values = params.get(checked.text("sequence", key))
     if not isinstance(values, list) or len(values) < 2:
         lists = [k for k, v in params.items() if isinstance(v, list)]
-        hint = f"; there are {some(lists)}" if lists else ""
+        hint = f"; the lists are {some(lists)}" if lists else ""
         raise InputError(
             f"sequence = {shown(key)} is not a list in params; expected the key whose "
             f"values are the steps{hint}"

@@ -49,10 +49,10 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
 
 
 def unconstrained_guess(mechanics: Mechanics) -> States:
-    """Guess that the rows are closed that the displacement without contact violates.
+    """Guess the states from the displacement without contact: violated rows close.
 
-    If contact alone supports a body, all rows are guessed to be closed. Friction is
-    guessed to stick.
+    If only contact supports a body, all rows are guessed to be closed. Friction rows
+    are guessed to stick.
     """
     exact = mechanics.exact
     if mechanics.inverse.kernel.shape[1]:

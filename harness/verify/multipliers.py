@@ -57,10 +57,10 @@ class _Scales(NamedTuple):
     E: float  #: of complementarity, divides
 
     def reach(self) -> float:
-        """Return τ = E/S² of a natural map, with the largest force S.
+        """Return the parameter τ = E/S² of the natural map, with the largest force S.
 
-        At a distance of x from a limit that τf bridges, the error is divided equally
-        between stationarity and complementarity.
+        If τf bridges the distance of x from a limit, the natural map divides the error
+        equally between stationarity and complementarity.
         """
         return float(self.E * self.w.min(initial=np.inf) ** 2)
 
@@ -139,7 +139,7 @@ class _Bearing:
     #: apply the derivative to the residual as well: this converges more slowly than
     #: Newton's method, but from farther away
     is_careful: bool = True
-    #: leave the part of a force that the natural map leaves, rather than none of it
+    #: leave the part of a force that the natural map leaves, instead of none of it
     is_shared: bool = False
 
     def borne(self, force: Vector, *, shared: bool = True) -> Vector:

@@ -111,7 +111,7 @@ def load_steps(
 
 
 class LinearisedProblem(Protocol):
-    """A linearised contact problem, whose dual takes any bound of friction."""
+    """A linearised contact problem, whose dual accepts any friction bound."""
 
     @property
     def friction(self) -> Friction:
@@ -134,7 +134,7 @@ P = TypeVar("P", bound=LinearisedProblem)
 
 
 class Iterate(NamedTuple, Generic[P]):
-    """Iterate of the fixed point of a stage: its problem and a bound of friction."""
+    """Iterate of the fixed-point iteration of a stage: problem and friction bound."""
 
     problem: P
     friction: Friction  #: with the bound of this iterate

@@ -129,8 +129,8 @@ def balanced_partition(
     """
     if work.size < ranks:
         raise InputError(
-            f"{ranks} ranks for {work.size} subdomains; expected at most one rank for "
-            "each"
+            f"{ranks} ranks for {work.size} subdomains; expected at most one rank per "
+            "subdomain"
         )
     if ranks == 1:
         return np.zeros(work.size, dtype=np.int64)

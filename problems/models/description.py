@@ -199,7 +199,7 @@ def remarks(path: Path) -> tuple[str, ...]:
 def _each(
     table: Mapping[str, Any], key: str, read: Callable[[dict[str, Any]], Any]
 ) -> list[Any]:
-    """Read every entry of a list of tables; errors name the number of the entry."""
+    """Read every entry of a list of tables; errors state the index of the entry."""
     values = []
     for i, entry in enumerate(checked.filled_list(key, table[key])):
         with located(f"{key}[{i}]"):

@@ -80,7 +80,7 @@ class CVXPY:
     about: ClassVar[About] = About(
         title="cvxpy",
         method="that of the backend NAME",
-        licence="Apache-2.0; each backend its own",
+        licence="Apache-2.0; backends have their own licences",
         package="cvxpy",
         linear_solver="the backend's",
         phases="preparing compiles the model to the backend's data; solving is the "

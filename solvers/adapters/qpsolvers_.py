@@ -103,11 +103,11 @@ class QPSolvers:
     about: ClassVar[About] = About(
         title="qpsolvers",
         method="that of the backend NAME",
-        licence="LGPL-3.0-or-later; each backend its own",
+        licence="LGPL-3.0-or-later; backends have their own licences",
         package="qpsolvers",
         linear_solver="the backend's",
-        phases="preparing converts only; setup and factorisation of every backend are "
-        "solving",
+        phases="preparing converts only; the backend's setup and factorisation count "
+        "as solving",
         limits=(
             "For clarabel, qtqp and scs qpsolvers solves unconstrained QPs by code of "
             "its own, which claims that a strictly convex one is unbounded "

@@ -48,7 +48,7 @@ class ProjectedGradient:
     about: ClassVar[About] = About(
         title="Spectral projected gradient (ours)", licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
-        linear_solver="none: products with P",
+        linear_solver="none (products with P)",
         phases="everything happens in solving",
         limits=("irregular: 45 to 546 products over the load steps of the benchmark",),
     )  # fmt: skip

@@ -98,6 +98,6 @@ def _largest(M: Matrix, axis: int) -> Vector:
 
 
 def _root(largest: Vector) -> Exponents:
-    """Return the rounded exponent of 1/√largest in base 2; 0 for an empty row."""
+    """Return log₂(1/√largest), rounded to an integer; 0 for an empty row."""
     filled = np.where((largest > 0) & np.isfinite(largest), largest, 1.0)
     return np.rint(-0.5 * np.log2(filled)).astype(np.int64)

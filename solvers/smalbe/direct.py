@@ -56,8 +56,8 @@ class Direct:
         phases="preparing orthonormalises rows and factorises the free block",
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
-            f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P `smalbe` is "
-            "the faster one from about 300 on",
+            f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P, `smalbe` "
+            "is faster from about 300 unknowns on",
         ),
     )  # fmt: skip
 

@@ -39,8 +39,8 @@ class SMALBE(Options):
     about: ClassVar[About] = About(
         title="SMALBE (ours)", licence="BSD-3-Clause",
         method="augmented Lagrangian with an active-set method inside (MPRGP)",
-        linear_solver="none: products with P, small dense systems of its model, "
-        "incomplete factors of a sparse P",
+        linear_solver="none (products with P, small dense systems of its model, "
+        "incomplete factors of a sparse P)",
         phases="preparing orthonormalises rows and runs the Lanczos process",
         sequence="point, multipliers, Ritz pairs, factor of the free block",
         limits=(

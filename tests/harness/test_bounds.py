@@ -144,7 +144,7 @@ def test_two_lines_that_tell_different_things_of_one_measurement_are_refused(jou
     with pytest.raises(InputError) as e:
         read_journal(folder)
     assert "line 3: the record of run_id 'a' differs from that at " in str(e.value)
-    assert "here.jsonl, line 2; expected one line for each" in str(e.value)
+    assert "here.jsonl, line 2; expected one line per run_id" in str(e.value)
 
 
 def test_report_tells_of_repeated_lines_and_refuses_contradicting_ones(

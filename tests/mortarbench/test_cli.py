@@ -561,7 +561,7 @@ WRONG = {
     ),
     "pattern of run": (
         ("run", "tiny", "--case", "*/duel"),
-        "the 2 cases of suite 'tiny'; there are well/primal, well/dual",
+        "the 2 cases of suite 'tiny'; its cases are well/primal, well/dual",
     ),
 }
 

@@ -331,7 +331,7 @@ def test_the_text_says_what_an_interval_presumes_and_how_weak_it_is(measured, pa
     three = section(page([measured("a", i) for i in range(3)]), "times")
     text = " ".join(three.prose)
     assert "independent and identically distributed" in text
-    assert "with 3 repeats, an interval misses the true median once in 4 times" in text
+    assert "with 3 repeats, one interval in 4 misses the true median" in text
     assert "75 %" in text
     seven = section(page([measured("a", i) for i in range(7)]), "times")
     assert "weak" not in " ".join(seven.prose)
