@@ -409,8 +409,8 @@ def _tightening(table: Mapping[str, Any], sequences: object) -> tuple[float, ...
         )
     if any(thetas) and not sequences:
         raise InputError(
-            f"tighten = {shown(thetas)}: there is no sequence; expected sequence = KEY "
-            "in one of the problems"
+            f"tighten = {shown(thetas)} needs a sequence; expected sequence = KEY in "
+            "one of the problems"
         )
     if any(thetas) and table["accuracy"] is not None:
         raise InputError(

@@ -566,7 +566,7 @@ SEQUENCE = "sequence = 'n'\nparams = { n = [4, 8] }"
         ("tighten = 0.1", SEQUENCE, "tighten = 0.1; expected a list"),
         ("tighten = [1]", SEQUENCE, r"tighten = \[1\]; expected distinct numbers"),
         ("tighten = [0.1, 0.1]", SEQUENCE, "expected distinct numbers"),
-        ("tighten = [0.1]", "", "there is no sequence; expected sequence"),
+        ("tighten = [0.1]", "", "needs a sequence; expected sequence"),
         ("tighten = [0.1]\naccuracy = 1e-6", SEQUENCE, "only one of the two"),
     ],
 )
