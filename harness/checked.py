@@ -57,12 +57,12 @@ def is_number(value: object) -> bool:
 
 
 def text(where: str, value: object) -> str:
-    """Return a nonempty text without control characters."""
+    """Return a nonempty string without control characters."""
     if not isinstance(value, str) or not value:
-        raise InputError(f"{where} = {shown(value)}; expected a text, not empty")
+        raise InputError(f"{where} = {shown(value)}; expected a nonempty string")
     if has_control(value):
         raise InputError(
-            f"{where} = {shown(value)}; expected a text without control characters"
+            f"{where} = {shown(value)}; expected a string without control characters"
         )
     return value
 
@@ -102,7 +102,7 @@ def path(where: str, value: object) -> Path:
     if not isinstance(value, str | os.PathLike) or not isinstance(
         text := os.fspath(value), str
     ):
-        raise InputError(f"{where} = {shown(value)}; expected a path, a str or a Path")
+        raise InputError(f"{where} = {shown(value)}; expected a path (str or Path)")
     if not text:
         raise InputError(f"{where} is empty; expected a path")
     try:
@@ -116,12 +116,12 @@ def path(where: str, value: object) -> Path:
 
 
 def texts(where: str, value: object) -> tuple[str, ...]:
-    """Return a tuple of texts; a single text is refused, being a sequence itself."""
+    """Return a tuple of strings; refuse a single string, which is also a sequence."""
     if isinstance(value, Iterable) and not isinstance(value, str | bytes | Mapping):
         entries = tuple(value)
         if all(isinstance(each, str) for each in entries):
             return entries
-    raise InputError(f"{where} = {shown(value)}; expected a list of texts")
+    raise InputError(f"{where} = {shown(value)}; expected a list of strings")
 
 
 def flag(where: str, value: object) -> bool:

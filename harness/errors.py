@@ -41,7 +41,7 @@ class FaultError(Exception):
 
 
 def shown(value: object) -> str:
-    """Return the repr of a value for a message, without its middle if it is long."""
+    """Return the repr of a value for a message; abridge it in the middle if long."""
     try:
         return shortened(repr(value))
     except (

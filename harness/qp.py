@@ -282,8 +282,8 @@ def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:
         shared = one.block[taken[one.block]]
         if shared.size:
             raise ValueError(
-                f"QP.sets: variable {shared[0]} is in two sets, or in one and bounded; "
-                "expected blocks without common variables"
+                f"QP.sets: variable {shared[0]} is in two sets, or in a set and has "
+                "bounds; expected disjoint blocks of unbounded variables"
             )
         taken[one.block] = True
 

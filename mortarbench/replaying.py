@@ -58,7 +58,7 @@ class Replay:
 
     @property
     def reproduced(self) -> bool:
-        """True if the same QP has the same verdict."""
+        """True if the verdict is the same and the QP is not known to differ."""
         return self.same_qp is not False and self.then.verdict is self.now.verdict
 
     def __repr__(self) -> str:

@@ -71,7 +71,7 @@ def first_sentence(thing: object) -> str:
 
 
 def first_comment(path: Path) -> str:
-    """Return the comment in the first line of a suite; empty if there is none."""
+    """Return the comment in the first line of a suite, or an empty string."""
     line = path.read_text("utf-8").partition("\n")[0]
     return line.removeprefix("#").strip() if line.startswith("#") else ""
 

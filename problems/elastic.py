@@ -1,7 +1,7 @@
 """Building blocks of elastic families in plug-ins; the names in `__all__` are stable.
 
 Mesh the bodies, `join` them, `assemble` them with supports, load and contact pairs, and
-emit the QP by `one_step`. docs/plugins.md has a complete family. Lengths are in m,
+emit the QP by `one_step`. See docs/plugins.md for a complete family. Lengths are in m,
 moduli and tractions in Pa, forces in N per m of thickness.
 
 A block of steel, pressed onto another one::

@@ -275,7 +275,7 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
 
 
 def refuse_friction(family: str, params: Mapping[str, Value]) -> None:
-    """Raise InputError for friction on arcs, whose polygons refinement changes."""
+    """Raise InputError for friction on arcs: refinement changes their polygons."""
     if params["friction"] != "none":
         raise InputError(
             f"{family}: friction={params['friction']} on curved sides, whose slip "

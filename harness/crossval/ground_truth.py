@@ -50,7 +50,7 @@ class StoredAnswer:
     case: Case
     solution: Solution
     remarks: tuple[str, ...] = ()  #: anomalies of the point itself
-    twin: str = ""  #: another case with exactly the same point; empty if there is none
+    twin: str = ""  #: another case with exactly the same point, or empty
 
 
 class GroundTruth(NamedTuple):

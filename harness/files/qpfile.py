@@ -174,7 +174,7 @@ def load_qp(
     try:
         array = arrays["meta"]
         if array.dtype.kind != "U" or array.size != 1:
-            raise ValueError("meta is not a text")
+            raise ValueError("meta is not a string")
         meta = json_object(str(array.item()))
         vectors: dict[str, Any] = {name: _vector(arrays, name) for name in _VECTORS}
         matrices = {name: _matrix(arrays, name) for name in _MATRICES}
@@ -250,7 +250,7 @@ def listed_dense(meta: Mapping[str, Any]) -> set[str]:
     Raises
     ------
     ValueError
-        When they are not a list of texts.
+        When they are not a list of strings.
 
     """
     names = meta.get("dense", [])

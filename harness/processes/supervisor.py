@@ -1,4 +1,4 @@
-"""Parent's side of a worker process: requests, limits, and the diagnosis of its end.
+"""Parent's side of a worker process: requests, limits and diagnosis of its exit.
 
 Only SIGKILL to all processes of a worker stops every solver: C code ignores alarms, and
 some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker

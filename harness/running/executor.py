@@ -293,7 +293,7 @@ class Executor:
         return reply.answer
 
     def _optimum(self, entry: StoredCase, qp: QP) -> Optimum | None:
-        """Prove the optimum of the QP of a case, once."""
+        """Return the proven optimum of the QP of a case, from the cache if possible."""
         if entry.digest not in self._optima:
             optimum = proven_optimum(qp, partial(self._reference, entry))
             while len(self._optima) >= _MAX_STORED_OPTIMA:

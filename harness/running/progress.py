@@ -26,4 +26,4 @@ class Progress(Protocol):
         """Show a problem, in a line that stays visible."""
 
     def advance(self, record: Record | None) -> None:
-        """Count a cell as done, with its record; None if it was not measured."""
+        """Count a cell as done; `record` is None if the cell was not measured."""

@@ -163,7 +163,7 @@ class _Recorder:
     _faults: dict[str, Fault] = field(default_factory=dict)  # last one, by run id
 
     def take(self, outcome: Outcome) -> None:
-        """Write one result, or the reason why there is none.
+        """Write one result, or the reason why it is missing.
 
         Raises
         ------

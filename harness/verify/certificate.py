@@ -267,7 +267,7 @@ def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
 
 
 def _proved(split: Undivided, *pair: Any) -> Certificate | str:
-    """Return the certificate of a pair, or the reason why there is none."""
+    """Return the certificate of a pair, or the reason why it has no certificate."""
     try:
         return proof(split, *pair)
     except UncertifiableError as e:

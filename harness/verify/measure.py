@@ -148,7 +148,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
     ------
     ReasonError
         When `accepts` is not a tuple of classes, or `declines` returns neither None nor
-        a text, such as False.
+        a string, such as False.
 
     """
     accepted = getattr(solver, "accepts", (Box,))
@@ -166,7 +166,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
         return reason
     is_plain = isinstance(reason, bool | Real | np.generic)
     got = shown(reason) if is_plain else type(reason).__name__
-    raise ReasonError(f"declines returned {got}; expected None or a text")
+    raise ReasonError(f"declines returned {got}; expected None or a string")
 
 
 def _explicit(qp: QP) -> QP:
@@ -174,8 +174,8 @@ def _explicit(qp: QP) -> QP:
     n = qp.q.size
     if n > MAX_ASSEMBLED_ROWS or too_large(n, 3):
         raise _DeclinedError(
-            f"{NEEDS_MATRICES}; P is an operator of {n} rows, and is multiplied out up "
-            f"to {MAX_ASSEMBLED_ROWS} where memory allows"
+            f"{NEEDS_MATRICES}; P is an operator with {n} rows; operators are "
+            f"assembled up to {MAX_ASSEMBLED_ROWS} rows, if memory allows"
         )
     return replace(qp, P=assembled(qp.P))
 

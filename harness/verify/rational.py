@@ -47,7 +47,7 @@ def solutions(M: Any, b: Any) -> Callable[[Any], Any] | None:
 
 
 def nonnegative_solution(M: Any, b: Any) -> Any | None:
-    """Return w ≥ 0 with Mw = b from the simplex method, or None if there is none.
+    """Return w ≥ 0 with Mw = b from the simplex method, or None if none exists.
 
     It is phase one, which minimises the sum of an artificial variable per row. Bland's
     rule (1977) takes the first column with a negative cost and, of the binding rows,

@@ -339,7 +339,7 @@ class Reduction(Protocol):
         """Return the coefficients of the local rigid motions among all (r,)."""
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
-        """Return  M − Sᵀ diag(scale) S  (r, r), with M and S summed over all.
+        """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.
 
         S : (t, local) with rows for the components `at`
         """

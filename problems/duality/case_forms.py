@@ -142,7 +142,7 @@ def contact_case(
         certify an answer
     quantities : physical results of a solution of the primal problem; its z holds the
         multipliers of the contact rows, then those of friction
-    friction : with a given bound; its work is part of the objective
+    friction : friction law with a prescribed bound; its work is part of the objective
     parts : the decomposed problem; if given, its dual is returned
 
     """

@@ -77,7 +77,7 @@ def dualise(
     primal : QP with P = K and no finite bounds
     inverse : K⁺ with an orthonormal basis R of ker K (no columns for a regular K)
     free : K⁺f (n,), if already computed
-    friction : with a given bound; its rows follow those of the contact
+    friction : law with a prescribed bound; its rows follow those of the contact
 
     """
     f, m_E = -primal.q, primal.b.size
@@ -128,7 +128,7 @@ def dual_bounds(
     primal : QP whose equality rows are unit vectors with zero right-hand side
     clamped : K⁺ that is zero at these components
     free : K⁺f (n,), if already computed
-    friction : with a given bound; its rows follow those of the contact
+    friction : law with a prescribed bound; its rows follow those of the contact
 
     """
     f = -primal.q

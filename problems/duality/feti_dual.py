@@ -38,9 +38,10 @@ def feti_dual(
 
     Parameters
     ----------
-    bodies : their last rows are the contact rows of `primal`, then of friction
+    bodies : decomposed bodies; their last constraint rows are the contact rows of
+        `primal`, followed by those of friction
     primal : the problem of the undivided bodies
-    friction : with a given bound
+    friction : friction law with a prescribed bound
 
     """
     domains, R, T = bodies.domains, bodies.domains.kernel, bodies.spread

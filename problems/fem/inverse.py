@@ -97,7 +97,7 @@ class CholeskyInverse:
 
 @dataclass(frozen=True, eq=False)
 class CondensedInverse:
-    """K⁺ by a multifrontal factor, with its block (K⁺)_cc on the interface stored."""
+    """K⁺ from a multifrontal factor; stores its block (K⁺)_cc on the interface."""
 
     factor: Multifrontal
     interface: Nodes  #: c, components with entries in constraint rows, ascending

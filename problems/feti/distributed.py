@@ -365,10 +365,10 @@ class RankOperator:
     def _gram_inverse(self, part: csr_array) -> Callable[[Dense], Dense]:
         """Return x ↦ (B W Bᵀ)⁻¹x on owned rows, for the sum of the parts of all ranks.
 
-        Most equality rows are uncoupled (all of them if gluing is orthonormal) and take
-        a division. The coupled ones are solved for redundantly on all ranks. Contact
-        rows are coupled along the contact: their system is factorised in distributed
-        form, or redundantly if ranks share many of them.
+        Most equality rows are uncoupled (all of them if gluing is orthonormal) and only
+        need a division. The system of the coupled ones is solved redundantly on all
+        ranks. Contact rows are coupled along the contact: their system is factorised in
+        distributed form, or redundantly if ranks share many of these rows.
 
         part : (t, t) contribution of the local subdomains to B W Bᵀ
         """

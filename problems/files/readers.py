@@ -29,14 +29,14 @@ _COPIES = 16  #: memory of a parsed QPS text relative to the file, as Python obj
 
 
 def read(path: Path) -> Loaded:
-    """Read a QP in the format given by the suffix of its path; .gz may follow it.
+    """Read a QP in the format indicated by the suffix of its path (also before .gz).
 
     Raises
     ------
     InputError
         If the file is damaged or its QP is not convex.
     KeyError
-        For another suffix.
+        If the suffix is not supported.
 
     """
     qp, scale, constant = _READERS[format_of(path)](path)

@@ -73,7 +73,7 @@ class Pair:
 
     @property
     def change(self) -> int:
-        """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
+        """1: slower, -1: faster, 0: the interval contains 1 or is missing."""
         return side(self.ratio)
 
     @property
@@ -263,7 +263,7 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
 
 
 def side(interval: Ratio | Mean | None) -> int:
-    """1: slower, -1: faster, 0: the interval holds 1 or there is none."""
+    """1: slower, -1: faster, 0: the interval contains 1 or is missing."""
     if interval is None:
         return 0
     return int(interval.low > 1) - int(interval.high < 1)

@@ -126,7 +126,7 @@ def cell_name(pair: Pair) -> str:
 
 
 def ratio_text(ratio: Ratio | Mean) -> str:
-    """Print a ratio with its interval, or without one where there is none."""
+    """Print a ratio, with its interval if known."""
     if ratio.low == 0:
         return f"{ratio.value:.3f} [too few cells]"
     return fixed(ratio)

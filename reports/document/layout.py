@@ -35,18 +35,18 @@ class Cell:
 
     @classmethod
     def name(cls, name: str) -> Cell:
-        """Return a cell of a possibly long name, shown in full on hovering."""
+        """Return a cell with a name; a long name is shown in full on hovering."""
         shown = clean(name)
         return cls(text=shown, title="" if shown == name else clean(name, 2000))
 
     @classmethod
     def label(cls, text: str, limit: int = 40, title: str = "") -> Cell:
-        """Return a cell of foreign text in one line of at most `limit` characters."""
+        """Return a one-line cell of sanitised text, at most `limit` characters long."""
         return cls(text=clean(text, limit), title=title)
 
     @classmethod
     def words(cls, text: str, title: str = "") -> Cell:
-        """Return a cell of words, which is aligned to the left."""
+        """Return a left-aligned cell of words."""
         return cls(text=text, kind="words", title=title)
 
     @classmethod

@@ -42,10 +42,10 @@ _ALIKE = Look(colour=INK, width=0.8)  #: the line where times are equal
 def fastest_figure(
     found: Sequence[FastestSolver], solvers: Sequence[str], most: int = SOLVERS
 ) -> Figure | None:
-    """Draw a panel per form and in it a row per solver; None without an answer.
+    """Draw a panel per form with a row per solver; return None without answers.
 
-    solvers : of the whole report, which their looks go by
-    most : rows of a panel
+    solvers : all solvers of the report; they determine colours and markers
+    most : largest number of rows in a panel
     """
     shown = [f for f in found if f.cases and (f.competitors or f.others)]
     if not shown:
@@ -118,14 +118,14 @@ def _name(c: Competitor) -> str:
 
 
 def _short(name: str) -> str:
-    """Leave out the middle of a long name, in letters that the font has."""
+    """Omit the middle of a long name, and replace characters missing in the font."""
     text = clean(name)
     half = _NAME // 2 - 1
     return legible(text if len(text) <= _NAME else f"{text[:half]}..{text[-half:]}")
 
 
 def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
-    """Scale all ratios alike, on an axis that contains 0.8 and 2."""
+    """Use the same axis limits, with 0.8 and 2 inside, in all panels of ratios."""
     ratios = [p for p in panels if p.x.log]
     if not ratios:
         return list(panels)

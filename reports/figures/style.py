@@ -41,7 +41,7 @@ TITLE = 0.24  #: height of the title of a figure, inches
 
 
 def legible(label: str, limit: int = 32) -> str:
-    """Make a foreign name fit for a figure: letters that the font has, no mathematics.
+    """Sanitise a name for a figure: replace missing characters, prevent formulas.
 
     matplotlib reads $…$ as a formula and hides labels that begin with an underscore.
     """

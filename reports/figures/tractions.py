@@ -31,7 +31,7 @@ LOOKS = {"open": _NODE} | {
 
 
 def traction_figure(fields: Fields) -> Figure | None:
-    """Draw each contact that carries load, a row of panels; None where there is none.
+    """Draw a row of panels per loaded contact; return None if no contact is loaded.
 
     Sides of bodies in space have no length to draw them along.
 

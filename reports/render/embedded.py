@@ -119,7 +119,7 @@ def cell(c: Cell, rows: Rows) -> Any:
 
 
 def runs_of(c: Cell, rows: Rows) -> list[int]:
-    """Return the packed indices of the measurements that a cell names."""
+    """Return the packed indices of the measurements listed in the title of a cell."""
     return spans(named(c.title), rows)
 
 
@@ -135,7 +135,7 @@ def spans(ids: Iterable[str], rows: Rows) -> list[int]:
 
 
 def _keys(records: Sequence[Record]) -> Data:
-    """Return the columns that filters use, and the run_ids that links name."""
+    """Return the columns used by filters, and the run_ids used by links."""
     shown: dict[str, Callable[[Record], str]] = {
         "case": lambda r: clean(r.case),
         "tol": lambda r: tolerance(r.tol),

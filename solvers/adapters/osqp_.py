@@ -61,9 +61,9 @@ class OSQP:
         sequence="`update` of vectors keeps the factor; starts from the last point",
         limits=(
             "Polishing made residuals worse on QPs with a small objective: without "
-            "the scaling, a dual residual of 3e-3 where 1e-6 was asked for "
-            "(tests/solvers/test_solvers.py, energies of 1e-6), and a gap of 3e-7 for "
-            "1e-9 on beam-ring/Nr=4/Nh=3/primal.",
+            "the scaling, a dual residual of 3e-3 at a tolerance of 1e-6 "
+            "(tests/solvers/test_solvers.py, energies of 1e-6), and a gap of 3e-7 at a "
+            "tolerance of 1e-9 on beam-ring/Nr=4/Nh=3/primal.",
         ),
     )
 

@@ -142,7 +142,10 @@ def test_bounds_are_exchanged_and_other_sets_kept():
     ("sets", "message"),
     [
         ((BALLS, BALLS), "QP.sets: variable 1 is in two sets"),
-        ((BOX, BALLS), "QP.sets: variable 1 is in two sets, or in one and bounded"),
+        (
+            (BOX, BALLS),
+            "QP.sets: variable 1 is in two sets, or in a set and has bounds",
+        ),
         ((Balls(np.array([[0, N]]), np.ones(1)),), "an index too large"),
         ((Box(-np.ones(3), np.ones(3)),), r"QP.lb has shape \(3,\), expected \(8,\)"),
     ],

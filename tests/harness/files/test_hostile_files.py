@@ -352,7 +352,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("QP.q holds NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
         declared("bounds hold NaN", {"lb": np.full(6, np.nan)}),
         declared("QP.h has shape", {"h": np.ones((2, 1))}),
-        declared("meta is not a text", {"meta": np.array([1, 2])}),
+        declared("meta is not a string", {"meta": np.array([1, 2])}),
         declared("meta is not a JSON object", {"meta": text([])}),
         declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
         declared("constant are no finite", {"meta": text({"scale": 10**400})}),

@@ -142,7 +142,7 @@ def test_what_declines_returns_is_none_or_a_text(qp, reason, got):
     s = measure(Vague(), qp, 1e-6).solution
 
     assert s.status is Status.FAILED
-    assert s.message == f"declines returned {got}; expected None or a text"
+    assert s.message == f"declines returned {got}; expected None or a string"
 
 
 def test_both_phases_are_timed_and_add_up(qp):
@@ -363,8 +363,8 @@ def test_a_large_operator_is_not_multiplied_out(by_products, monkeypatch):
 
     assert s.status is Status.DECLINED
     assert s.message == (
-        "needs explicit matrices; P is an operator of 3 rows, and is multiplied out up "
-        "to 2 where memory allows"
+        "needs explicit matrices; P is an operator with 3 rows; operators are "
+        "assembled up to 2 rows, if memory allows"
     )
 
 
