@@ -57,12 +57,12 @@ def is_number(value: object) -> bool:
 
 
 def text(where: str, value: object) -> str:
-    """Return a nonempty text without control characters."""
+    """Return a nonempty string without control characters."""
     if not isinstance(value, str) or not value:
-        raise InputError(f"{where} = {shown(value)}; expected a text, not empty")
+        raise InputError(f"{where} = {shown(value)}; expected a string, not empty")
     if has_control(value):
         raise InputError(
-            f"{where} = {shown(value)}; expected a text without control characters"
+            f"{where} = {shown(value)}; expected a string without control characters"
         )
     return value
 
@@ -121,7 +121,7 @@ def texts(where: str, value: object) -> tuple[str, ...]:
         entries = tuple(value)
         if all(isinstance(each, str) for each in entries):
             return entries
-    raise InputError(f"{where} = {shown(value)}; expected a list of texts")
+    raise InputError(f"{where} = {shown(value)}; expected a list of strings")
 
 
 def flag(where: str, value: object) -> bool:

@@ -87,7 +87,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     """
     if not isinstance(text, str):
         raise InputError(
-            f"case = {shown(text)}; expected its name as a text, such as "
+            f"case = {shown(text)}; expected its name as a string, such as "
             "beam-ring/Nr=4/Nh=3/dual, or file:PATH"
         )
     head = re.split("[:/]", text, maxsplit=1)[0]

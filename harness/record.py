@@ -356,7 +356,7 @@ def _check(r: Record) -> None:
     if r.schema not in READABLE:
         raise ValueError(_WRONG_SCHEMA)
     if not r.run_id:
-        raise ValueError("run_id is empty; expected a text")
+        raise ValueError("run_id is empty; expected a string")
     for name, at in (
         ("tol", r.tol), ("accuracy", r.accuracy), ("step_tol", r.step_tol)
     ):  # fmt: skip
@@ -420,7 +420,7 @@ def _check_values(params: Mapping[str, Any]) -> None:
     for key, value in params.items():
         if isinstance(value, dict | list):
             raise ValueError(
-                f"params.{key} = {shown(value)}; expected a number or a text"
+                f"params.{key} = {shown(value)}; expected a number or a string"
             )
 
 

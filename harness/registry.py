@@ -700,14 +700,14 @@ def _check_names(where: str, family: Any) -> None:
     ):
         raise InputError(
             f"{where}: defaults = {defaults!r}; "
-            "expected a dict from texts to integers, floats or texts"
+            "expected a dict from strings to integers, floats or strings"
         )
     if (
         not isinstance(forms, tuple | list)
         or not forms
         or not all(isinstance(form, str) and form for form in forms)
     ):
-        raise InputError(f"{where}: forms = {forms!r}; expected a tuple of texts")
+        raise InputError(f"{where}: forms = {forms!r}; expected a tuple of strings")
 
 
 def _import_error(where: str, e: BaseException) -> InputError:

@@ -167,6 +167,6 @@ def _column(name: object, values: object) -> NDArray[Any]:
     if kind == "U" and column.dtype.itemsize <= 4 * _MAX_TEXT:
         return column
     if kind not in _STORED_AS:
-        expected = f"numbers or texts of up to {_MAX_TEXT} characters"
+        expected = f"numbers or strings of up to {_MAX_TEXT} characters"
         raise ValueError(f"{name} has dtype {column.dtype}, expected {expected}")
     return column.astype(_STORED_AS[kind])

@@ -278,7 +278,7 @@ class Registries:
         except TypeError:
             raise InputError(
                 f"{spec.name}: options {shown(dict(spec.options))}; expected numbers, "
-                "texts, true or false, or lists and dicts of these"
+                "strings, true or false, or lists and dicts of these"
             ) from None
 
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:

@@ -200,7 +200,7 @@ def keep_copies(
 def merge_copies(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None]
 ) -> None:
-    """Copy the copies of several result folders to another, each content once."""
+    """Merge the copies in several result folders into `out`, without duplicates."""
     writer = _Writer(out, tell)
     for source in sources:
         paths: dict[str, str] = {}
@@ -222,7 +222,7 @@ def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
 
 
 def remove_copies(folder: Path) -> None:
-    """Delete the copies of a result folder, but no other files beside them."""
+    """Delete the copies in a result folder, and no other files."""
     for name in filter(is_copy, _names(folder / FOLDER)):
         (folder / FOLDER / name).unlink(missing_ok=True)
 

@@ -205,7 +205,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
     try:
         text = np.asarray(arrays.get("meta", "{}"))
         if text.dtype.kind != "U" or text.size != 1:
-            raise ValueError("meta is not a text")
+            raise ValueError("meta is not a string")
         meta = json_object(str(text.item()))
         for name in _MATRICES:
             if not np.isfinite(matrices[name].data).all():

@@ -79,7 +79,7 @@ def options_as_texts(options: Mapping[str, Any]) -> dict[str, list[str]]:
         values = value if isinstance(value, list | tuple) else [value]
         if not values or not all(isinstance(v, _PLAIN) for v in values):
             raise InputError(
-                f"options: {key} = {shown(value)}; expected a number, a text, True, "
+                f"options: {key} = {shown(value)}; expected a number, a string, True, "
                 "False or None, or a list of these"
             )
         texts[key] = [*map(_text, values)]
@@ -257,7 +257,7 @@ def _expected(kind: Any, default: object) -> Iterator[str]:
     elif kind in _NUMBERS:
         yield _NUMBERS[kind][1]
     elif kind is str:
-        yield "a text"
+        yield "a string"
     elif kind is not NoneType:
         yield "a value that only a suite can contain, as `options` of a solver"
     if default is None:

@@ -245,7 +245,7 @@ def suite_text(suite: Mapping[str, Any]) -> str:
 
 def _toml_key(key: object) -> str:
     if not isinstance(key, str):
-        raise InputError(f"key {shown(key)}; expected a text")
+        raise InputError(f"key {shown(key)}; expected a string")
     return json.dumps(key) if re.search(r"[^\w-]|^$", key, re.ASCII) else key
 
 
@@ -273,7 +273,7 @@ def _toml_value(where: str, value: Any) -> str:
             entries = [_toml_value(f"{where}[{i}]", v) for i, v in enumerate(value)]
             return f"[{', '.join(entries)}]"
     raise InputError(
-        f"{where} = {shown(value)}; expected a text, a number, true or false, a list "
+        f"{where} = {shown(value)}; expected a string, a number, true or false, a list "
         "or a dict; leave out keys without a value"
     )
 

@@ -166,7 +166,7 @@ def reason_to_decline(solver: Solver, qp: QP) -> str | None:
         return reason
     is_plain = isinstance(reason, bool | Real | np.generic)
     got = shown(reason) if is_plain else type(reason).__name__
-    raise ReasonError(f"declines returned {got}; expected None or a text")
+    raise ReasonError(f"declines returned {got}; expected None or a string")
 
 
 def _explicit(qp: QP) -> QP:

@@ -217,7 +217,7 @@ FAMILY = (
         (FAMILY.format("['n']", "('a',)"), "PROBLEMS['a']: defaults = ['n']; expected"),
         (
             FAMILY.format("{'n': None}", "('a',)"),
-            "PROBLEMS['a']: defaults = {'n': None}; expected a dict from texts to int",
+            "PROBLEMS['a']: defaults = {'n': None}; expected a dict from strings to i",
         ),
         (FAMILY.format("{'n': True}", "('a',)"), "PROBLEMS['a']: defaults = {'n': T"),
         (FAMILY.format("{1: 1}", "('a',)"), "PROBLEMS['a']: defaults = {1: 1}; expe"),

@@ -365,8 +365,8 @@ def test_a_suite_may_be_a_dict(results):
     ("suite", "message"),
     [
         ({}, "suite: name is missing"),
-        ({"name": None}, "suite: name = None; expected a text, .*leave out keys"),
-        ({5: 5}, "suite: key 5; expected a text"),
+        ({"name": None}, "suite: name = None; expected a string, .*leave out keys"),
+        ({5: 5}, "suite: key 5; expected a string"),
         ({"name": "a", "solvers": [object()]}, r"suite: solvers\[0\] = <object"),
         ({"name": "a", "problem": []}, "suite: unknown key 'problem'; did you mean"),
         (
@@ -520,7 +520,7 @@ def test_plug_ins_find_what_they_need_and_a_built_case_is_a_case(tmp_path):
         (lambda: mb.export(5, "a.npz"), "case = 5; expected the name of a case"),
         (lambda: mb.replay("nowhere", "abc"), "nowhere"),
         (lambda: mb.replay(None, "abc"), "folder = None; expected a path"),
-        (lambda: mb.replay("nowhere", 5), "run_id = 5; expected a text"),
+        (lambda: mb.replay("nowhere", 5), "run_id = 5; expected a string"),
         (lambda: mb.test_solver(5), "solver = 5; expected the name of a solver"),
         (lambda: mb.test_solver("clarable"), "did you mean 'clarabel'"),
     ],

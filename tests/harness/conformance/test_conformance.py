@@ -554,7 +554,7 @@ def test_failures_are_reported_with_exit_code_1(plugin, capsys, monkeypatch):
         "gives multipliers our signs",
     ]  # fmt: skip
     monkeypatch.setattr(conformance, "CHECKS", few)
-    wrong = "declines returned False; expected None or a text"
+    wrong = "declines returned False; expected None or a string"
 
     assert command("test-solver", "false", "--plugin", plugin) == 1
     out, err = capsys.readouterr()

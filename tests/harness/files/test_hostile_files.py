@@ -352,7 +352,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("QP.q holds NaN or inf", {"q": np.full(6, np.longdouble("1e400"))}),
         declared("bounds hold NaN", {"lb": np.full(6, np.nan)}),
         declared("QP.h has shape", {"h": np.ones((2, 1))}),
-        declared("meta is not a text", {"meta": np.array([1, 2])}),
+        declared("meta is not a string", {"meta": np.array([1, 2])}),
         declared("meta is not a JSON object", {"meta": text([])}),
         declared("nested too deeply", {"meta": text('{"a": ' + "[" * 10**5)}),
         declared("constant are no finite", {"meta": text({"scale": 10**400})}),
@@ -363,7 +363,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
-        declared("do not fit each other", {"fixed": np.array([9]), **ONE_BY_ONE}),
+        declared("K, B, fixed and q are inc", {"fixed": np.array([9]), **ONE_BY_ONE}),
     ],
 )  # fmt: skip
 def test_numbers_that_make_no_qp_are_named(tmp_path, cheaply, write, message):

@@ -160,7 +160,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
         ("tolerances = ['a']\n" + MINIMAL, "tolerances = ['a']; expected distinct num"),
         ("tolerances = [0.1, 0.1]\n" + MINIMAL, "tolerances = [0.1, 0.1]; expected d"),
         (BLOCK, "name is missing"),
-        ("name = 3\nsolvers = ['osqp']\n" + BLOCK, "name = 3; expected a text"),
+        ("name = 3\nsolvers = ['osqp']\n" + BLOCK, "name = 3; expected a string"),
         (
             "name = 'a/b'\nsolvers = ['osqp']\n" + BLOCK,
             "name = 'a/b' is not a valid folder n",
@@ -181,7 +181,7 @@ def test_a_case_of_two_blocks_is_measured_once(load):
             "problems[0]: unknown key 'form'; did you mean 'forms'",
         ),
         (MINIMAL + "forms = []", "problems[0]: forms is empty; expected at least one"),
-        (MINIMAL + "forms = [1]", "problems[0]: forms = 1; expected a text"),
+        (MINIMAL + "forms = [1]", "problems[0]: forms = 1; expected a string"),
         (MINIMAL + "forms = ['duel']", "problems[0]: well: unknown form 'duel'; did y"),
         (MINIMAL + "params = 3", "problems[0]: params = 3; expected a table"),
         (MINIMAL + "params = { n = [] }", "problems[0]: params.n is empty; expected"),
@@ -243,7 +243,7 @@ def test_mistakes_are_reported_with_file_place_and_remedy(
         ("3", "solvers[1]: entry = 3; expected a name or a table"),
         ("{ label = 'a' }", "solvers[1]: name is missing"),
         ("{ name = 'osqp', lable = 'a' }", "solvers[1]: unknown key 'lable'; did you"),
-        ("{ name = 'osqp', label = 3 }", "solvers[1]: label = 3; expected a text, not"),
+        ("{ name = 'osqp', label = 3 }", "solvers[1]: label = 3; expected a string, n"),
         (
             "{ name = 'osqp', label = 'b', options = 3 }",
             "solvers[1]: options = 3; expe",

@@ -142,7 +142,7 @@ def test_what_declines_returns_is_none_or_a_text(qp, reason, got):
     s = measure(Vague(), qp, 1e-6).solution
 
     assert s.status is Status.FAILED
-    assert s.message == f"declines returned {got}; expected None or a text"
+    assert s.message == f"declines returned {got}; expected None or a string"
 
 
 def test_both_phases_are_timed_and_add_up(qp):
