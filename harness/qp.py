@@ -488,7 +488,7 @@ def _matrix(name: str, value: Any, rows: int | None, n: int) -> Matrix:
 def _rows(
     name: str, M: Any, side: str, rhs: ArrayLike | None, n: int
 ) -> dict[str, Matrix]:
-    """Return constraint rows and their right-hand side by name; no rows for None."""
+    """Return constraint rows and right-hand side by name; zero rows if M is None."""
     if M is None:
         return {name: no_rows(n), side: np.zeros(0)}
     matrix = _matrix(name, M, None, n)

@@ -105,7 +105,7 @@ class Copies:
         Raises
         ------
         InputError
-            When it is neither here nor in the list, or the list has several contents.
+            When it is neither at its path nor listed, or listed with several contents.
 
         """
         if os.path.lexists(path):
@@ -115,9 +115,9 @@ class Copies:
             return content_digest(Path(path))  # raises: no such file
         if len(digests) > 1:
             raise InputError(
-                f"{path} is not here, and {self._folder} has {len(digests)} contents "
-                f"of that name (sha256 {some(sorted(digests))}); put the right one at "
-                f"{path}"
+                f"{path} does not exist, and {self._folder} has {len(digests)} "
+                f"versions of it (sha256 {some(sorted(digests))}); put the right one "
+                f"at {path}"
             )
         return digests.pop()
 
@@ -126,15 +126,15 @@ class Copies:
         return sorted({entry.path for entry in _entries(self._folder)})
 
     def _missing(self, path: str, digest: str, here: str | None) -> InputError:
-        """Return the error for a file that is neither here nor among the copies."""
+        """Return the error for a file that is neither at its path nor copied."""
         sizes = {e.size for e in _entries(self._folder) if e.sha256 == digest}
         why = f"has no copy in {self._folder}"
         if sizes and (size := max(sizes)) > MAX_FILE_MIB * MIB:
             why = f"was too large to travel with the results ({_mib(size)})"
         other = f" (the file changed: it has {here})" if here is not None else ""
         return InputError(
-            f"{Path(path).name} (sha256 {digest}) is not here{other} and {why}: put it "
-            f"at {path}"
+            f"{Path(path).name} (sha256 {digest}) is not available{other} and {why}: "
+            f"put it at {path}"
         )
 
 
@@ -200,7 +200,7 @@ def keep_copies(
 def merge_copies(
     sources: Sequence[Path], out: Path, tell: Callable[[str], None]
 ) -> None:
-    """Copy the copies of several result folders to another, each content once."""
+    """Merge the copies in several result folders into `out`, without duplicates."""
     writer = _Writer(out, tell)
     for source in sources:
         paths: dict[str, str] = {}
@@ -222,7 +222,7 @@ def copies_in(folder: Path) -> list[tuple[Path, str, str]]:
 
 
 def remove_copies(folder: Path) -> None:
-    """Delete the copies of a result folder, but no other files beside them."""
+    """Delete the copies in a result folder, and no other files."""
     for name in filter(is_copy, _names(folder / FOLDER)):
         (folder / FOLDER / name).unlink(missing_ok=True)
 

@@ -117,7 +117,7 @@ def save_qp(
 
 
 def qp_digest(qp: QP, *, serialised: bool = False) -> str:
-    """Return the digest of the coefficients of a QP, see `save_qp`."""
+    """Return the digest of the coefficients of a QP (see `save_qp`)."""
     return digest_of(_parts(qp, serialised=serialised)[0])
 
 
@@ -294,7 +294,7 @@ def _structure(arrays: Mapping[str, NDArray[Any]]) -> Structure:
     K, B = _matrix(arrays, "K"), _matrix(arrays, "B")
     N = K.shape[0]
     if K.shape != (N, N) or B.shape != (arrays["q"].size, N) or fixed.ndim != 1:
-        raise ValueError("K, B and fixed do not fit each other, or q")
+        raise ValueError("the shapes of K, B, fixed and q are inconsistent")
     if ((fixed < 0) | (fixed >= N)).any():
         raise ValueError(f"fixed holds indices out of range; expected 0 … {N - 1}")
     return Structure(K=K, B=B, fixed=fixed)
@@ -339,7 +339,7 @@ def compressed(
     Raises
     ------
     ValueError, TypeError, OverflowError
-        When they do not fit each other or `shape`.
+        When they are inconsistent with each other or with `shape`.
 
     """
     # SciPy (1.17.1) checks differences, which may overflow

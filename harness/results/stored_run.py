@@ -49,7 +49,7 @@ def open_stored_run(
 ) -> StoredRun:
     """Find a measurement, and resolve its case and solver in the current registries.
 
-    run_id : a run_id, or an unambiguous beginning of one
+    run_id : a run_id, or an unambiguous prefix of one
 
     Raises
     ------

@@ -441,7 +441,7 @@ def _with_layers(layout: Subdivision, subdomains: Nodes, layers: int) -> _Patch:
 
 
 def _cells_of(layout: Subdivision, subdomains: Nodes) -> tuple[Nodes, Nodes]:
-    """Return the nodes of subdomains, and their cells (E, 4) as places in them."""
+    """Return the nodes of subdomains, and their cells (E, 4) as indices into them."""
     torn = layout.subdomain_nodes(subdomains)
     nodes, place = np.unique(torn.number, return_inverse=True)
     cells = [

@@ -189,8 +189,8 @@ def _read(path: Path) -> Any:
         or not (abs(points) < MAX_COORDINATE).all()
     ):
         raise InputError(
-            f"{path}: coordinates beyond {MAX_COORDINATE:g}, or none; expected nodes "
-            "with finite coordinates"
+            f"{path}: coordinates are missing or not below {MAX_COORDINATE:g} in "
+            "magnitude; expected nodes with finite coordinates"
         )
     # node numbers start at 1; meshio would take −1 as an index from the end
     if numbers is not None and (numbers < 1).any():

@@ -106,9 +106,9 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
 
 
 def _facet_size(facets: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the length of edges (k, 2, 2), or the root of the area of faces (k, 4, 3).
+    """Return lengths of edges (k, 2, 2), or square roots of areas of faces (k, 4, 3).
 
-    For a warped face this is the area of its largest projection onto a plane.
+    The area of a warped face is that of its largest projection onto a plane.
     """
     if facets.shape[2] == 2:
         return np.asarray(np.linalg.norm(facets[:, 0] - facets[:, 1], axis=1))

@@ -185,7 +185,7 @@ class Layout:
         ]
 
     def cells(self, subdomain: int) -> Nodes:
-        """Return the cells (E, 4) of a block, as places in its list of nodes."""
+        """Return the cells (E, 4) of a block, as indices into its nodes."""
         _, _, columns, rows = self.corner(np.array([subdomain]))
         return cells_of_block(int(columns[0]), int(rows[0]))
 

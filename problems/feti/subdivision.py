@@ -67,7 +67,7 @@ class Subdivision(Protocol):
         """Return the points (n, 2) of the nodes of some subdomains."""
 
     def cells(self, subdomain: int) -> Nodes:
-        """Return the cells (E, 4) of a subdomain, as places in its list of nodes."""
+        """Return the cells (E, 4) of a subdomain, as indices into its nodes."""
 
     @property
     def label(self) -> NDArray[np.int64]:
@@ -158,7 +158,7 @@ class ListedSubdivision:
         return [self.position(self.part(int(s))[0]) for s in subdomains]
 
     def cells(self, subdomain: int) -> Nodes:
-        """Return the cells (E, 4) of a subdomain, as places in its list of nodes."""
+        """Return the cells (E, 4) of a subdomain, as indices into its nodes."""
         return self.part(subdomain)[1]
 
     def _place(self, node: Nodes) -> Nodes:

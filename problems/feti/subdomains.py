@@ -176,7 +176,7 @@ class LocalSubdomains:
 
     @cached_property
     def _distinct(self) -> tuple[Nodes, Nodes]:
-        """Global nodes on this rank, and the place of each torn node among them."""
+        """Global nodes on this rank, and the index of each torn node among them."""
         return np.unique(self.nodes.number, return_inverse=True)
 
     @property
@@ -186,7 +186,7 @@ class LocalSubdomains:
 
     @property
     def place(self) -> Nodes:
-        """Place of each torn unknown among `components`, (N_p,)."""
+        """Index of each torn unknown in `components`, (N_p,)."""
         return self._of_nodes(self._distinct[1])[self.free]
 
     def _of_nodes(self, node: Nodes) -> Nodes:

@@ -194,7 +194,7 @@ def _header(model: _QPSModel, section: str, words: list[str]) -> None:
 
 def _data(model: _QPSModel, section: str, words: list[str]) -> None:
     if section not in _SECTIONS:
-        raise InputError(f"{words[0]!r} is outside of every section; expected ROWS")
+        raise InputError(f"{words[0]!r} is outside every section; expected ROWS")
     _SECTIONS[section](model, words)
 
 

@@ -81,7 +81,7 @@ def elastica(load: float) -> Elastica:
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
-    """Return the QP of one Newton iteration of a load step in one form."""
+    """Return the QP of one Newton iteration of a load step in the given form."""
     p: Any = params
     path = _path(
         p["slenderness"], p["load"], (p["nx"], p["ny"]), p["nu"], p["material"],

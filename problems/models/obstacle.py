@@ -314,7 +314,7 @@ def nodes(dim: int, n: int, shape: str = "flat") -> Vector:
 
 
 def cells(dim: int, n: int) -> NDArray[np.int64]:
-    """Return the corners of the cells, (n, 2) or (n², 4)."""
+    """Return the corner nodes of each cell, (n, 2) or (n², 4)."""
     i = np.arange(n)
     if dim == 1:
         return np.stack([i, i + 1], axis=-1)

@@ -48,7 +48,7 @@ class SizeSeries:
         return _law((s, i and sum(i) / 2) for s, i in counted)
 
     def counts(self, solver: str) -> tuple[str, ...]:
-        """Return the names of the counts that one solver reports on every size."""
+        """Return the names of the counts that a solver reports for every size."""
         named = [list(o.first.counts) for _, o in self.curve(solver)]
         return tuple(c for c in named[0] if all(c in n for n in named)) if named else ()
 

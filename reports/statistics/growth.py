@@ -79,13 +79,13 @@ class Growth:
         Raises
         ------
         ValueError
-            Outside of the measured range, where no data support the law.
+            Outside the measured range, where no data support the law.
 
         """
         low, high = min(self.sizes), max(self.sizes)
         if not low <= n <= high:
             raise ValueError(
-                f"n = {n:g} is outside of the measured {low:g} to {high:g}"
+                f"n = {n:g} is outside the measured range {low:g} to {high:g}"
             )
         x = np.log(self.sizes)
         k = x.size

@@ -68,11 +68,12 @@ CLAIMS = {
 class CVXPY:
     """One backend of cvxpy; compilation is preparing, the backend's setup solving.
 
-    The tolerance is passed by the backend's own keywords (`CALLS`), as the relative one
-    if there are two; a backend that is not listed there runs with cvxpy's defaults. As
-    in the native adapters the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the
-    backend's test is absolute (HIGHS, DAQP). Backends to which cvxpy passes a cone
-    program are declined, and ProxQP, whose test of the gap cvxpy cannot enable.
+    The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
+    where a test adds an absolute and a relative tolerance. A backend that is not listed
+    there runs with cvxpy's defaults. As in the native adapters, the objective is scaled
+    to ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (HIGHS, DAQP). Backends to
+    which cvxpy passes a cone program are declined, and so is ProxQP, whose test of the
+    gap cvxpy cannot enable.
     """
 
     backend: str = ""  #: the NAME in cvxpy:NAME

@@ -35,11 +35,11 @@ class QOCO:
     """https://qoco-org.github.io/qoco.
 
     QOCO stops when the max norms of the residuals are below abstol + reltol·(their
-    largest term) and the gap is below abstol + reltol·max(1, |objective|). So abstol is
-    negligible, reltol = tol, and the objective is scaled to ‖q‖∞ = 1e4, where the 1 has
-    no effect. QOCO computes no certificates: on an unbounded QP its iterates grow until
-    every relative residual is small, which it claims as solved. So a claim with
-    ‖x‖∞ > 1e12 counts as failed.
+    largest term) and the gap is below abstol + reltol·max(1, |objective|). Therefore
+    abstol is set to a negligible value, reltol to tol, and the objective is scaled to
+    ‖q‖∞ = 1e4, where the 1 has no effect. QOCO computes no certificates: on an
+    unbounded QP its iterates grow until every relative residual is small, and QOCO
+    reports success. A claim with ‖x‖∞ > 1e12 therefore counts as failed.
     """
 
     max_iter: int = 200

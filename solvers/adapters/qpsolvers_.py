@@ -91,11 +91,12 @@ STATUS_PATTERNS = (
 class QPSolvers:
     """One backend of qpsolvers; everything but the conversion is timed as solving.
 
-    The tolerance is passed by the backend's own keywords (`CALLS`), as the relative one
-    if there are two; a backend that is not listed there runs with its defaults. As in
-    the native adapters the objective is scaled to ‖q‖∞ = 1e4, or to 1 if the backend's
-    test is absolute (highs, daqp). Backends for dense and sparse matrices get dense
-    ones if P is dense. qpsolvers reports the iterations of some backends only.
+    The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
+    where a test adds an absolute and a relative tolerance. A backend that is not listed
+    there runs with its defaults. As in the native adapters, the objective is scaled to
+    ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (highs, daqp). Backends that
+    accept both dense and sparse matrices get dense ones if P is dense. qpsolvers
+    reports the iterations of some backends only.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME

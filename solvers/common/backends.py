@@ -20,7 +20,7 @@ from mortarbench.solvers.common.conversion import OBJECTIVE_SIZE
 
 @dataclass(frozen=True)
 class Call:
-    """Keyword arguments and scaling for one backend of a library of solvers."""
+    """Keyword arguments and scaling for one backend of a solver library."""
 
     tolerances: tuple[str, ...] = ()  #: keywords set to max(tighter·tol, floor)
     fixed: Mapping[str, Any] = field(default_factory=dict)  #: other keywords

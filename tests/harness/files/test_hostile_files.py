@@ -363,7 +363,7 @@ ONE_BY_ONE = {f"{M}_{part}": value for M in "KB" for part, value in ONE}
         declared("dense is not a list", {"meta": text({"dense": [["P"]]})}),
         declared("A, dense and 1099511627776 × 6, would take", {
             "A_shape": np.array([2**40, 6]), "meta": text({"dense": ["A"]})}),
-        declared("do not fit each other", {"fixed": np.array([9]), **ONE_BY_ONE}),
+        declared("K, B, fixed and q are inc", {"fixed": np.array([9]), **ONE_BY_ONE}),
     ],
 )  # fmt: skip
 def test_numbers_that_make_no_qp_are_named(tmp_path, cheaply, write, message):
@@ -549,9 +549,9 @@ def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path)
         (b"2 5 4", b"2 5 77", "not a .msh|not in the file"),
         (b"1 2 5 4", b"1 2 5 0", "node numbers below 1"),
         (b"1 2 5 4", b"1 2 5 -1", "node numbers below 1"),
-        (b"6 2 1 0", b"6 inf 1 0", "coordinates beyond"),
-        (b"6 2 1 0", b"6 1e308 1 0", "coordinates beyond"),
-        (b"6 2 1 0", b"6 nan 1 0", "coordinates beyond"),
+        (b"6 2 1 0", b"6 inf 1 0", "coordinates are missing or not below"),
+        (b"6 2 1 0", b"6 1e308 1 0", "coordinates are missing or not below"),
+        (b"6 2 1 0", b"6 nan 1 0", "coordinates are missing or not below"),
         (b"6 2 1 0", b"6 1 1 0", "not convex"),
         (b"2 3 6 5", b"2 6 3 5", "no area.* in their order"),
         (b"2 3 6 5", b"2 2 2 2", "no area"),

@@ -188,8 +188,8 @@ def test_a_file_that_is_nowhere_is_named_with_its_digest(here, copy, cli):
         last = said.splitlines()[-1]
         assert code == 2
         assert (
-            f"qp.npz (sha256 {right}) is not here and has no copy in run/files: put "
-            "it at qps/qp.npz"
+            f"qp.npz (sha256 {right}) is not available and has no copy in "
+            "run/files: put it at qps/qp.npz"
         ) in last
 
 
@@ -232,8 +232,8 @@ def test_files_that_are_too_large_are_not_copied_but_named(tmp_path, monkeypatch
     with pytest.raises(InputError) as refused:
         Copies(tmp_path / "run").locate(source)
     assert str(refused.value) == (
-        f"large.npz (sha256 {source.sha256}) is not here and was too large to travel "
-        "with the results (70 MiB): put it at large.npz"
+        f"large.npz (sha256 {source.sha256}) is not available and was too large to "
+        "travel with the results (70 MiB): put it at large.npz"
     )
 
 

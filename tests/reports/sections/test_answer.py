@@ -234,7 +234,7 @@ def test_a_case_that_nobody_solved_counts_against_nobody_and_is_told(record, ope
     ]
     statement = opened(records)["dual"]
     assert statement.claims[0].startswith("fast was the fastest over 7 cases")
-    assert "Solved by no solver: 1 further case." in statement.remarks
+    assert "No solver solved 1 further case." in statement.remarks
 
 
 def test_a_single_solver_has_nobody_to_be_faster_than(record, opened):

@@ -490,7 +490,7 @@ def test_nothing_is_predicted_beyond_the_measured_sizes():
     found = growth_of(n, 2e-6 * n**1.5)
     assert found.at(800).value == pytest.approx(2e-6 * 800**1.5)
     for outside in (99, 6401):
-        with pytest.raises(ValueError, match="outside of the measured"):
+        with pytest.raises(ValueError, match="outside the measured range"):
             found.at(outside)
 
 
