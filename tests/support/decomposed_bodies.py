@@ -44,9 +44,7 @@ def decompose_by_labels(
     rows: str = "orthonormal",
 ) -> DecomposedBodies:
     """Decompose bodies with their QP, with friction."""
-    return on_one_process(
-        parts_by(bodies, layout, primal, friction, rows)
-    ).decomposed_bodies
+    return on_one_process(parts_by(bodies, layout, primal, friction, rows)).decomposed
 
 
 def parts_by(
@@ -68,7 +66,7 @@ def parts_of(name: str) -> DecomposedProblem:
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
-            case.family.elastic_bodies_of(case.params),
+            case.family.contact_problem(case.params),
             qp_choice("dual", case.params),
         )
         path = monolithic_path(problem, reference_solution)

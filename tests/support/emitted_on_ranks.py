@@ -62,7 +62,7 @@ def own_subdomains(name, ranks):
     case = parse(name, PROBLEMS)
     if isinstance(case.family, ContactFamily):
         problem, choice = (
-            case.family.stated(case.params),
+            case.family.contact_problem(case.params),
             qp_choice("dual", case.params),
         )
         path = decomposed_path(problem, choice, ranks, reference_over_ranks)

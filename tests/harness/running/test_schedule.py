@@ -60,7 +60,7 @@ def records_after(noise, *, seed=271828, verdict=Verdict.VERIFIED, **changes):
         for (record,) in block.turns:
             seconds = {"a": 1.0, "b": 2.0, "c": 4.0}[record.solver]
             seconds *= float(np.exp(noise * rng.standard_normal()))
-            record = record.but(verdict=verdict, total_seconds=seconds)
+            record = record.replace(verdict=verdict, total_seconds=seconds)
             schedule.add(record)
             made.append(record)
     assert len(made) + schedule.progress.skipped == schedule.cells
@@ -90,7 +90,7 @@ def test_sequences_are_compared_by_their_total_time():
             whole = {"a": 1.0, "b": 2.0}[turn[0].solver]
             part = whole * rng.uniform(0.2, 0.8)
             for record, seconds in zip(turn, (part, whole - part), strict=True):
-                timed = record.but(verdict=Verdict.VERIFIED, total_seconds=seconds)
+                timed = record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
                 schedule.add(timed)
 
         assert block.is_sequence
@@ -130,7 +130,7 @@ def test_a_solver_that_declined_a_case_is_not_asked_again():
         for (record,) in block.turns:
             asked.append(record.solver)
             verdict = Verdict.DECLINED if record.solver == "a" else Verdict.VERIFIED
-            schedule.add(record.but(verdict=verdict, total_seconds=1.0))
+            schedule.add(record.replace(verdict=verdict, total_seconds=1.0))
 
     assert (asked.count("a"), asked.count("b")) == (1, 3)
 
@@ -193,11 +193,13 @@ def test_records_without_a_time_spend_no_budget():
     for block in schedule.blocks():
         for (record,) in block.turns:
             if record.solver == "c":
-                schedule.add(record.but(verdict=Verdict.FAILED))
+                schedule.add(record.replace(verdict=Verdict.FAILED))
                 continue
             seconds = float(rng.uniform(0.9, 1.1))
             spent += seconds
-            schedule.add(record.but(verdict=Verdict.VERIFIED, total_seconds=seconds))
+            schedule.add(
+                record.replace(verdict=Verdict.VERIFIED, total_seconds=seconds)
+            )
 
     assert 30 <= spent < 33
 

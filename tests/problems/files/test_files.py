@@ -221,7 +221,7 @@ def test_what_qps_would_take_for_infinite_is_not_written(tmp_path):
     qp = replace(awkward(np.random.default_rng(33)), h=np.array([0.0, 1.0, 1e20]))
 
     with pytest.raises(
-        InputError, match=r"h holds 1e\+20, and QPS takes what is 1e\+20"
+        InputError, match=r"h holds 1e\+20, but QPS treats 1e\+20 or more as infinite"
     ):
         save_qps(tmp_path / "a.qps", qp, {})
     assert [*tmp_path.iterdir()] == []
@@ -318,7 +318,7 @@ def test_a_maximised_objective_is_minus_a_minimised_one(written):
         ("COLUMNS\n", "COLUMNS\n M 'MARKER' 'INTORG'\n", "line 11: integer variables"),
         ("c2        c2 ", "c2 c1 ", "line 32: entry 'c2', 'c1' is given twice"),
         ("QUADOBJ", "QSECTION r1", "line 29: QSECTION r1 is of a constraint"),
-        ("ENDATA\n", "", "no ENDATA; the file is cut off"),
+        ("ENDATA\n", "", "no ENDATA; the file is truncated"),
         (" N  obj\n", " G  obj\n", None),
         ("MI bnd       c4", "LO bnd c4 1e20", "the limits of variable 3 (from 0)"),
         ("FX bnd       c5  ", "UP bnd c5 1\n LO bnd c5 ", "the limits of variable 4"),
