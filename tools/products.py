@@ -107,7 +107,7 @@ def _cases(sequence: str) -> tuple[Case, ...]:
         names = [
             SEQUENCE.sub(rf"\g<1>={k}", name, count=1) for name in names for k in values
         ]
-    return tuple(build(name).made for name in names)
+    return tuple(build(name).family_case for name in names)
 
 
 if __name__ == "__main__":
