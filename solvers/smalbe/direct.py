@@ -57,7 +57,7 @@ class Direct:
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
             f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P `smalbe` is "
-            "the faster one from about 300 on",
+            "the faster one from 100 to 200 on",
         ),
     )  # fmt: skip
 
