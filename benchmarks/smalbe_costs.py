@@ -6,8 +6,8 @@
 * dense: preparing and solving duals, in units of products with F. A solve is compared
   with a bound: 1.5 times the time of its products (by `smalbe` or `dsymv` of BLAS,
   whichever is faster) plus 100 µs.
-* sparse: time of a solve per product, in units of one product and five passes w += v
-  over vectors.
+* sparse: time of a solve per product, without a preconditioner, in units of one product
+  and five passes w += v over vectors.
 * incomplete: sparse problems with and without incomplete factors.
 * kept: the same solves with and without recycling of CG directions.
 * race: preparing and solving a case by several solvers; answers are verified.
@@ -139,8 +139,8 @@ def _products_of_preparing(qp: QP, tol: float) -> int:
 
 
 def sparse(tol: float = 1e-6) -> None:
-    """Print times of large sparse problems per product, in units of a bare product."""
-    solver = SOLVERS["smalbe"]
+    """Print times of large sparse problems per product, without a factor."""
+    solver = replace(SOLVERS["smalbe"], preconditioner="model")
     for name, params in LARGE.items():
         family = PROBLEMS[name]
         case = family.build(

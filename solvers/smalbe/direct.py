@@ -57,7 +57,7 @@ class Direct:
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
             f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P, `smalbe` "
-            "is faster from about 300 unknowns on",
+            "is faster from 100 to 200 unknowns on",
         ),
     )  # fmt: skip
 

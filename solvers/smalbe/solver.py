@@ -46,7 +46,7 @@ class SMALBE(Options):
         limits=(
             "inequality rows are declined; the dual forms of a problem have none",
             "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
-            "parallel rows, tolerances to 1e-12) 3 ended as `iteration_limit`",
+            "parallel rows, tolerances to 1e-12) 1 ended as `iteration_limit`",
         ),
     )  # fmt: skip
 

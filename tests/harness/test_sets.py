@@ -219,7 +219,7 @@ def test_a_planted_solution_has_no_residual_and_others_have(seed):
 def test_equivalent_qps_with_balls_have_the_same_residuals(seed):
     qp, s = with_solution(seed)
     order = np.random.default_rng(seed).permutation(qp.q.size)
-    new = change_units(qp, unknown=8.0, objective=2.0).then(
+    new = change_units(qp, unknown=8.0, objective=2.0).followed_by(
         lambda other: permute_unknowns(other, order)
     )
     x, z_box = s.x[order] / 8, s.z_box[order] * 16

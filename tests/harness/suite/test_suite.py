@@ -326,7 +326,7 @@ def test_a_pattern_without_a_match_is_refused_with_the_cases(narrowed):
         narrowed(cases=["well/n=3/dual"])
 
     assert str(e.value).endswith(
-        "there are well/n=2/primal, well/n=2/dual, well/n=12/primal and 1 more"
+        "its cases are well/n=2/primal, well/n=2/dual, well/n=12/primal and 1 more"
     )
 
 

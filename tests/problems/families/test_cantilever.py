@@ -59,9 +59,8 @@ def test_a_slender_beam_ends_where_the_elastica_does(load, ny):
     assert values["residual"] < 1e-8
     # at the end of Newton's method the model of the QP is the potential itself
     s = answer.solution
-    objective = (
-        case.family_case.scale * case.qp.objective(s.x) + case.family_case.constant
-    )
+    emitted_case = case.family_case
+    objective = emitted_case.scale * case.qp.objective(s.x) + emitted_case.constant
     assert objective == pytest.approx(values["energy"], rel=1e-9)
 
 
