@@ -1,4 +1,4 @@
-"""What `make setup` does to a system: it names, asks, and works wherever it lies."""
+"""Effects of `make setup` on a system: announced, confirmed, in any folder."""
 
 import os
 import pty

@@ -1,1 +1,1 @@
-"""Figures as values: what is drawn, how it looks, and the measurements behind it."""
+"""Figures as values: content, style and the measurements behind each point."""

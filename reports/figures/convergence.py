@@ -30,20 +30,20 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import VERDICTS, tolerance
 from mortarbench.reports.figures.style import TITLE, below, legible, look
 
-#: letter of a step, its name, and its mark; the others, CG above all, are bare
+#: letter, name and marker of a kind of step; other steps, mostly CG, have no marker
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
-WIDE = 10.0  #: ratio of the longest run to the shortest that makes their axis log
-CLOSEST = 5.0  #: distance of marks of one kind on a curve, in points
-COLUMNS = 4  #: of a legend
-FLOOR = 1e-5  #: times the tolerance: less is rounding, and not shown
-_BESIDE = 0.8  #: width of what is left of the axes, inches
+WIDE = 10.0  #: ratio of longest to shortest run beyond which the axis is logarithmic
+CLOSEST = 5.0  #: least distance of markers of one kind on a curve, points
+COLUMNS = 4  #: columns of a legend
+FLOOR = 1e-5  #: times the tolerance; smaller values are rounding and are not shown
+_BESIDE = 0.8  #: width of the labels left of the axes, inches
 _TOLERANCE = Look(colour=INK, width=0.6, dash=(1, 2))
 
 Curves = Sequence[tuple[SolverRun, Vector]]
 
 
 def convergence_figure(c: CaseHistories) -> Figure | None:
-    """Draw projected gradient and infeasibility over the work; None without either."""
+    """Plot projected gradient and infeasibility against work; None without either."""
     gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
     errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
     rows = []
@@ -66,7 +66,7 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
         for run, values in gradients or errors
         for mark in _steps(c, run, values, upper, height)
     ]
-    ends = limits([upper], "y")  # marks beyond them are not shown
+    ends = limits([upper], "y")  # markers beyond the limits are not shown
     panel = replace(
         upper,
         marks=(*upper.marks, *steps),
@@ -77,16 +77,16 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
 
 
 def active_set_figure(c: CaseHistories) -> Figure | None:
-    """Draw the number of active bounds over the work; None if nobody counts them.
+    """Plot the number of active bounds against work; return None if none is recorded.
 
-    Below them those of components between two bounds, where there are some.
+    A second panel shows active components with two bounds, if any are recorded.
     """
     if all(run.numbers("active") is None for run in c.runs):
         return None
     rows = []
     for name, label, height in (
         ("active", "active bounds", 2.2),
-        ("two_sided", "of two bounds", 1.6),
+        ("two_sided", "active, two-sided", 1.6),
     ):
         counts = [(run, n) for run in c.runs if (n := run.numbers(name)) is not None]
         if counts:
@@ -100,7 +100,7 @@ def active_set_figure(c: CaseHistories) -> Figure | None:
 
 
 def marked(c: CaseHistories) -> list[str]:
-    """Name the kinds of steps that `convergence_figure` marks."""
+    """Return the names of the kinds of steps that `convergence_figure` marks."""
     return [name for letter, name, _ in KINDS if c.taken(letter)]
 
 
@@ -110,7 +110,7 @@ def _figure(
     runs: Sequence[SolverRun],
     kinds: Sequence[tuple[str, str, str]] = (),
 ) -> Figure:
-    """Stack panels over one axis of work, with a strip for outer iterations below."""
+    """Stack panels above a common axis of work and a strip of outer iterations."""
     outer = [run for run in c.runs if run.outer_ends.any()]
     stack = list(rows)
     if outer:
@@ -138,7 +138,7 @@ def _figure(
 
 
 def _work(c: CaseHistories) -> Axis:
-    """Make the axis of work: logarithmic where runs differ much in length."""
+    """Return the axis of work, logarithmic if runs differ much in length."""
     label = "products with $P$" if c.counted else "iterations"
     spent = [c.work(run) for run in c.runs]
     ends = [float(work.max()) for work in spent]
@@ -150,7 +150,7 @@ def _work(c: CaseHistories) -> Axis:
 
 
 def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
-    """Put a tick where an outer iteration ends, a row for each solver."""
+    """Mark the ends of outer iterations, one row per solver."""
     marks = tuple(
         Segments(
             ends=tuple(
@@ -167,10 +167,10 @@ def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
 
 
 def _curves(c: CaseHistories, drawn: Curves, label: str, **more: Any) -> Panel:
-    """Draw curves of positive values on a logarithmic axis, and what else is shown."""
+    """Return a panel of curves of positive values on a logarithmic axis."""
     marks = []
     for run, values in drawn:
-        seen = values > 0  # NaN is not
+        seen = values > 0  # excludes NaN
         marks.append(_line(c, run, c.work(run)[seen], values[seen]))
     axis = Axis(label=label, log=True, most=8)
     panel = Panel(x=_work(c), y=axis, marks=tuple(marks), **more)
@@ -189,8 +189,8 @@ def _line(c: CaseHistories, run: SolverRun, x: Vector, y: Vector) -> Series:
 def _steps(
     c: CaseHistories, run: SolverRun, values: Vector, panel: Panel, height: float
 ) -> list[Series]:
-    """Mark the kinds of steps on a curve, except where marks would overlap."""
-    made = []
+    """Mark the kinds of steps on a curve, omitting overlapping markers."""
+    markers = []
     ends = limits([panel], "x"), limits([panel], "y")
     sizes = 72 * (WIDTH - _BESIDE), 72 * height  # points
     for letter, _, marker in KINDS:
@@ -213,12 +213,12 @@ def _steps(
                 kept.append(i)
         if kept:
             style = _mark(marker, _style(c, run).colour)
-            made.append(replace(_line(c, run, *xy[kept].T), look=style))
-    return made
+            markers.append(replace(_line(c, run, *xy[kept].T), look=style))
+    return markers
 
 
 def _style(c: CaseHistories, run: SolverRun) -> Look:
-    """Colour and dashes of a solver, without the marker: that tells the step."""
+    """Return colour and dashes of a solver; markers are reserved for kinds of steps."""
     return replace(look(c.solvers.index(run.outcome.solver)), marker="")
 
 

@@ -1,4 +1,4 @@
-"""Deformed bodies: meshes, their outlines, their stress, the forces between them."""
+"""Deformed bodies: mesh, outlines, stress and contact forces."""
 
 from __future__ import annotations
 
@@ -25,38 +25,41 @@ from mortarbench.reports.document.fields import (
 )
 from mortarbench.reports.document.figure import INK, Look
 
-PERCENTILE = 99.5  #: where colours are clipped: stresses are singular at corners
-SCALE = 1.0  #: of the displacement: the bodies are where the computation puts them
-#: Displacements below this part of the size of the bodies cannot be seen, and are drawn
-#: larger, so that the largest takes about `SHOWN` of it.
+#: of the nodal stresses, where colours end: stresses are singular at corners
+PERCENTILE = 99.5
+SCALE = 1.0  #: factor of the displacement in figures drawn to scale
+#: Displacements below `SEEN` times the size of the bodies are not visible. They are
+#: magnified such that the largest is about `SHOWN` times that size.
 SEEN, SHOWN = 0.01, 0.05
-_MESH_SHOWN = 6000  #: cells; the lines of a finer mesh would hide the colours
-_ACTIVE = 1e-6  #: a contact node is loaded if its force exceeds this times the largest
+#: largest number of cells with mesh lines; more lines would hide the colours
+_MESH_SHOWN = 6000
+_ACTIVE = 1e-6  #: of the largest force: contact nodes with larger forces are loaded
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
-_ARROW = "#101214"  #: dark on every page: arrows stand on the bodies' colours
-#: arrows of nodes by what friction does; of pairs without it they are dark
+_ARROW = "#101214"  #: dark on any page, as arrows are drawn on coloured bodies
+#: colours of arrows by friction state; arrows of frictionless pairs are dark
 FRICTION = {
     "stick": ("#0b5fa5", "blue"),
     "slip": ("#b3261e", "red"),
     SLIDING: ("#e08a00", "orange"),
 }
-_TOUCHING = ("", "stick", "slip")  #: states of nodes that press
-_BAND = 2.2  #: points, of the line along nodes that slide without contact
-_WIDTH = 5.62  #: of the panels, inches, beside the colour bar and its label
-_TALLEST = 7.5  #: inches, of the panel of tall bodies
-_FLAT = 0.34  #: height over width of the enlargement
+_TOUCHING = ("", "stick", "slip")  #: states of nodes under pressure
+_BAND = 2.2  #: width of the line along nodes that slide without contact, points
+_WIDTH = 5.62  #: width of the panels without colour bar and label, inches
+_TALLEST = 7.5  #: largest height of the panel of all bodies, inches
+_FLAT = 0.34  #: ratio of height to width of an enlargement
 _PLAIN = ColourScale(colours="Greys", low=0, high=1)
-#: most subdomains that are numbered, by size of the numbers; those of more would cover
-#: each other
+#: font size of subdomain numbers → largest number of subdomains; the labels of more
+#: subdomains would overlap
 _NUMBERED = {9.5: 16, 6.5: 100}
 _TORN = Look(colour="white", width=0.9)  #: borders of subdomains
-_OPEN = "#6b7480"  #: arrows of open nodes that take a part of their neighbours' forces
+#: arrows of open nodes that carry a share of their neighbours' forces
+_OPEN = "#6b7480"
 _OUTLINE = Look(colour=INK, width=0.7)
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return the end of the colours and the largest stress, Pa; None without stress."""
+    """Return end of colour scale and largest stress, Pa; None without stresses."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -64,57 +67,59 @@ def clipped_at(fields: Fields) -> tuple[float, float] | None:
 
 
 class _Loaded(NamedTuple):
-    """The slave nodes of one contact that carry load, or slide without contact."""
+    """Slave nodes of one contact pair under load or sliding without contact."""
 
-    name: str  #: of the pair; empty where the fields tell of no pairs
+    name: str  #: name of the pair; empty if the fields do not distinguish pairs
     nodes: NDArray[np.int64]  #: (k,)
-    forces: Points  #: on them, N/m
-    friction: NDArray[np.str_]  #: (k,) of `ContactSide`; "" without friction
-    #: (j, 2) neighbours along the side; the first slides without contact
+    forces: Points  #: nodal forces, N/m
+    friction: NDArray[np.str_]  #: (k,) states of `ContactSide`; "" without friction
+    #: (j, 2) pairs of adjacent nodes; the first slides without contact
     sliding: NDArray[np.int64]
 
     @property
     def closed(self) -> NDArray[np.bool_]:
-        """(k,) whether a node presses; others carry shear by Tresca's law alone."""
+        """(k,) mask of nodes under pressure; others carry shear only (Tresca's law)."""
         touching = np.isin(self.friction, _TOUCHING)
         return touching if touching.any() else ~touching
 
 
 def automatic_scale(fields: Fields) -> float:
-    """Choose a factor 1, 2 or 5 times a power of ten that shows the displacement.
+    """Return a magnification of the displacement: 1, 2 or 5 times a power of ten.
 
-    Displacements that can be seen are drawn as they are.
+    Visible displacements are not magnified.
     """
     largest = float(np.abs(fields.displacement).max(initial=0.0))
     span = float(np.ptp(fields.points, axis=0).max())
     if largest == 0 or largest >= SEEN * span:
         return SCALE
-    wanted = SHOWN * span / largest
-    power = 10.0 ** np.floor(np.log10(wanted))
-    if not np.isfinite(power):  # of displacements that are rounding
+    target = SHOWN * span / largest
+    power = 10.0 ** np.floor(np.log10(target))
+    if not np.isfinite(power):  # displacements of the size of rounding
         return SCALE
-    return float(max(step * power for step in (1, 2, 5) if step * power <= wanted))
+    return float(max(step * power for step in (1, 2, 5) if step * power <= target))
 
 
 def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
-    """Show all bodies, and each contact that carries load enlarged.
+    """Show all bodies and an enlargement of each contact under load.
 
-    scale : of the displacement, as drawn; None: `automatic_scale`
+    scale : magnification of the displacement; None: `automatic_scale`
 
     Raises
     ------
     InputError
-        When displacement or stress is not finite, or the bodies have no extent or are
-        in space.
+        When displacement or stress is not finite, when the bodies have zero extent, or
+        in three dimensions.
 
     """
     if fields.dim != 2:
-        raise InputError("bodies in space: expected a .vtu, there is no picture")
+        raise InputError("bodies in space cannot be drawn: expected a .vtu")
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
-        raise InputError("displacement or stress holds NaN or inf: there is no picture")
+        raise InputError(
+            "displacement or stress contains NaN or inf: expected finite values"
+        )
     if not np.ptp(fields.points, axis=0).all():
-        raise InputError("bodies of no width or no height: there is no picture")
+        raise InputError("bodies have no width or no height and cannot be drawn")
     scale = automatic_scale(fields) if scale is None else scale
     points = moved(fields, scale)
     loaded = _loaded(fields)
@@ -133,9 +138,8 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     corners = low - pad, high + pad
     span = float((high - low).max())
     letters = [f"({chr(ord('b') + i)})" for i in range(len(loaded))]
-    frames = list[
-        FieldMark
-    ]()  # outlines of the enlargements, as far as they lie within
+    # outlines of the enlargements, clipped to the overview
+    frames = list[FieldMark]()
     for letter, contact in zip(letters, loaded, strict=True):
         window = _window(points[contact.nodes[contact.closed]], span)
         (x0, y0), (x1, y1) = (
@@ -151,7 +155,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
                   colour=_ARROW, cased=True),
         ]  # fmt: skip
     bands = [mark for contact in loaded for mark in _bands(contact, points)]
-    there = moved(fields)  # enlarged by more, bodies in contact would overlap
+    there = moved(fields)  # magnified bodies would overlap in contact
     near = (
         *_bodies(fields, there, colours),
         *(Path(points=there[o], look=_OUTLINE) for o in outlines(fields.cells)),
@@ -179,12 +183,12 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 
 def moved(fields: Fields, scale: float = SCALE) -> Points:
-    """(n, 2) where `scale` times the displacement puts the nodes."""
+    """Return the nodes displaced by `scale` times the displacement, (n, 2)."""
     return cast(Points, fields.points + scale * fields.displacement)
 
 
 def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
-    """Outline the subdomains of torn bodies, and number them where that is legible."""
+    """Outline the subdomains of torn bodies; number them if the labels are legible."""
     if fields.subdomains is None:
         return []
     numbers = np.unique(fields.subdomains)
@@ -196,7 +200,7 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
         if size is not None:
             centres = points[cells].mean(axis=1)
             middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
-            place = _pair(centres[middle])  # in a cell: a centroid may lie outside
+            place = _pair(centres[middle])  # a cell: the centroid may lie outside
             marks.append(
                 Label(
                     text=f"{number}", place=place, align=("center", "center"),
@@ -211,7 +215,7 @@ def _pair(point: Vector) -> tuple[float, float]:
 
 
 def _scale(fields: Fields) -> ColourScale | None:
-    """One scale in Pa, shared by all bodies."""
+    """Return the colour scale in Pa common to all bodies, or None without stress."""
     limits = clipped_at(fields)
     if limits is None:
         return None
@@ -225,15 +229,15 @@ def _scale(fields: Fields) -> ColourScale | None:
 
 
 def prefixed(value: float) -> tuple[float, str]:
-    """Choose the unit prefix in which `value` is between 1 and 1000."""
-    known = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
-    return next((p for p in known if value >= p[0]), (1.0, ""))
+    """Return factor and prefix of the unit in which `value` is between 1 and 1000."""
+    prefixes = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+    return next((p for p in prefixes if value >= p[0]), (1.0, ""))
 
 
 def _bodies(
     fields: Fields, points: Points, scale: ColourScale | None
 ) -> list[FieldMark]:
-    """Show every body: stress and mesh, deformed."""
+    """Draw stress and mesh of every deformed body."""
     stress = np.full(len(points), 0.3) if scale is None else fields.nodal["von_mises"]
     marks: list[FieldMark] = []
     for body in np.unique(fields.bodies):
@@ -255,25 +259,25 @@ def _bodies(
 
 
 def triangles(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Halve quadrilaterals, keep triangles: node numbers (t, 3)."""
+    """Split quadrilaterals into triangles; return node numbers (t, 3)."""
     halves = cells[cells[:, 2] != cells[:, 3]]
     return np.vstack([cells[:, [0, 1, 2]], halves[:, [0, 2, 3]]])
 
 
 def edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Every edge of cells once, (k, 2) node numbers."""
+    """Return the distinct edges of cells, (k, 2) node numbers."""
     edges: NDArray[np.int64] = np.unique(np.sort(_sides(cells), axis=1), axis=0)
     return edges
 
 
 def _sides(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """List the directed sides of every cell, (s, 2) node numbers."""
+    """Return the directed sides of all cells, (s, 2) node numbers."""
     sides = np.stack([cells, np.roll(cells, -1, axis=1)], axis=2).reshape(-1, 2)
     return np.asarray(sides[sides[:, 0] != sides[:, 1]])
 
 
 def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Follow the sides that belong to one cell only to closed loops of node numbers."""
+    """Return the boundary of cells as closed loops of node numbers."""
     sides = _sides(cells)
     _, back, count = np.unique(
         np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
@@ -295,25 +299,25 @@ def outlines(cells: NDArray[np.int64]) -> list[NDArray[np.int64]]:
 
 
 def length_unit(span: float) -> tuple[float, str]:
-    """Choose m, mm or µm for a length in m: its size, m, and its name."""
+    """Return size in m and name of the unit for a length: m, mm or µm."""
     return next((u for u in _LENGTHS if span >= 0.1 * u[0]), _LENGTHS[-1])
 
 
 def _axes(span: float) -> dict[str, Any]:
-    """Choose m, mm or µm for the axes of bodies of this size."""
+    """Return labels and unit of the axes for bodies of size `span`, m."""
     unit, name = length_unit(span)
     return {"xlabel": f"$x$ in {name}", "ylabel": f"$y$ in {name}", "unit": unit}
 
 
 def _loaded(fields: Fields) -> list[_Loaded]:
-    """List the contacts that carry load; as one where fields do not part them."""
+    """List the contacts under load, as one if the fields do not distinguish pairs."""
     sides = [
         (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
     ]
     if not sides and fields.contact_nodes is not None:
         assert fields.contact_forces is not None
         sides = [("", fields.contact_nodes, fields.contact_forces, None)]
-    found = []
+    contacts = []
     for name, nodes, forces, friction in sides:
         states = np.full(len(nodes), "") if friction is None else friction
         size, apart = np.hypot(*forces.T), states == SLIDING
@@ -322,14 +326,14 @@ def _loaded(fields: Fields) -> list[_Loaded]:
             active |= apart
             pairs = np.column_stack([nodes[:-1], nodes[1:]])
             sliding = np.vstack([pairs[apart[:-1]], pairs[apart[1:]][:, ::-1]])
-            found.append(
+            contacts.append(
                 _Loaded(name, nodes[active], forces[active], states[active], sliding)
             )
-    return found
+    return contacts
 
 
 def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
-    """Colour a side where it slides without contact: arrows of shear are short."""
+    """Mark the nodes that slide without contact, as arrows of shear are short."""
     if not len(contact.sliding):
         return []
     at, beside = points[contact.sliding[:, 0]], points[contact.sliding[:, 1]]
@@ -338,7 +342,10 @@ def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
 
 
 def _window(places: Points, span: float) -> tuple[Vector, Vector]:
-    """Lower left and upper right corner of an enlargement; span: size of all bodies."""
+    """Return lower left and upper right corner of an enlargement.
+
+    span : size of all bodies, m
+    """
     low, high = places.min(axis=0), places.max(axis=0)
     reach = max(0.75 * float((high - low).max()), 0.06 * span)
     half = np.array([reach, _FLAT * reach])
@@ -348,7 +355,7 @@ def _window(places: Points, span: float) -> tuple[Vector, Vector]:
 def _enlarged(
     bodies: Sequence[FieldMark], title: str, contact: _Loaded, tips: Points, span: float
 ) -> FieldPanel:
-    """Zoom to the loaded nodes of a contact and show the force on each as an arrow."""
+    """Enlarge a contact and show the force on each loaded node as an arrow."""
     forces, closed = contact.forces, contact.closed
     low, high = _window(tips[closed], span)
     shown = closed | ((tips >= low) & (tips <= high)).all(axis=1)
@@ -376,7 +383,7 @@ def _enlarged(
     factor, prefix = prefixed(largest)
     return FieldPanel(
         low=_pair(low), high=_pair(high), marks=(*bodies, *arrows), axes="frame",
-        title=f"{title}contact forces on the slave nodes; the largest is "
+        title=f"{title}contact forces on the slave nodes, largest "
         f"{largest / factor:.3g} {prefix}N/m{key}",
         **_axes(span),
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The times of all solvers over that of the first, form by form, and who failed."""
+"""Times relative to the fastest solver, for each form, and failures."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import VERDICTS, clean
 from mortarbench.reports.figures.style import curve, legible, look
 
-PANELS = 4  #: forms that are drawn
-SOLVERS = 12  #: of a panel
-_NAME = 28  #: letters of a name beside an axis
-_ROW = 0.3  #: height of a solver, inches
-_BESIDE = 0.24  #: from a mean to the cases that it is of, rows
-_TALL = 0.38  #: where ratios and a verdict share one, inches
-_RAISED, _BELOW = 0.16, 0.32  #: of ratios above a verdict, and it below them, rows
+PANELS = 4  #: largest number of forms in a figure
+SOLVERS = 12  #: largest number of solvers in a panel
+_NAME = 28  #: characters of a name beside an axis
+_ROW = 0.3  #: height of a row, inches
+_BESIDE = 0.24  #: distance of a mean from the ratios of its cases, rows
+_TALL = 0.38  #: height of rows with ratios and a verdict, inches
+_RAISED, _BELOW = 0.16, 0.32  #: offsets of ratios above and of a verdict below, rows
 _BARS = {"cap": 0.0, "width": 1.1}
-_ALIKE = Look(colour=INK, width=0.8)  #: the line where times are equal
+_ALIKE = Look(colour=INK, width=0.8)  #: line of equal times
 
 
 def fastest_figure(
     found: Sequence[FastestSolver], solvers: Sequence[str], most: int = SOLVERS
 ) -> Figure | None:
-    """Draw a panel per form with a row per solver; return None without answers.
+    """Draw a panel for each form with a row for each solver; None without answers.
 
-    solvers : all solvers of the report; they determine colours and markers
+    solvers : all solvers of the report, whose order determines colours and markers
     most : largest number of rows in a panel
     """
     shown = [f for f in found if f.cases and (f.competitors or f.others)]
@@ -60,7 +60,7 @@ def fastest_figure(
 
 
 def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
-    """Choose the first competitors; the best of every form is among them."""
+    """Return the first competitors, including the best one of every form."""
     every = (*f.competitors, *f.others)
     best = {c.form: c for c in reversed(every)}.values()
     late = [c for c in every[most:] if any(c is one for one in best)]
@@ -68,13 +68,13 @@ def _rows(f: FastestSolver, most: int) -> tuple[Competitor, ...]:
 
 
 def _height(f: FastestSolver, most: int) -> float:
-    """Height of all rows, inches."""
+    """Return the height of all rows, inches."""
     shared = _has_reference(f) and any(c.compared for c in f.others)
     return max(len(_rows(f, most)), 4) * (_TALL if shared else _ROW)
 
 
 def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
-    """Draw the first solver uppermost, at 1, and everybody's ratios to it."""
+    """Draw times relative to the fastest solver, which is in the top row."""
     marks: list[Mark] = []
     texts = []
     for k, c in enumerate(_rows(f, most)):
@@ -108,8 +108,8 @@ def _cases(f: FastestSolver) -> str:
 def _ratios(f: FastestSolver) -> Axis:
     if not _has_reference(f):
         return Axis(low=0.0, high=1.0, ticks=())
-    what = "time from the mesh" if f.first.form else "time"
-    label = f"{what} / that of {legible(_name(f.first), 44)}"
+    time = "time from the mesh" if f.first.form else "time"
+    label = f"{time} relative to {legible(_name(f.first), 44)}"
     return Axis(label=label, log=True, plain=True, span=2.0, shared="ratios")
 
 
@@ -118,14 +118,14 @@ def _name(c: Competitor) -> str:
 
 
 def _short(name: str) -> str:
-    """Omit the middle of a long name, and replace characters missing in the font."""
+    """Abbreviate a long name in the middle; replace characters missing in the font."""
     text = clean(name)
     half = _NAME // 2 - 1
     return legible(text if len(text) <= _NAME else f"{text[:half]}..{text[-half:]}")
 
 
 def _on_one_scale(panels: Sequence[Panel]) -> list[Panel]:
-    """Use the same axis limits, with 0.8 and 2 inside, in all panels of ratios."""
+    """Scale the ratios of all panels equally, on an axis that contains 0.8 and 2."""
     ratios = [p for p in panels if p.x.log]
     if not ratios:
         return list(panels)
@@ -141,7 +141,7 @@ def _has_reference(f: FastestSolver) -> bool:
 
 
 def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]:
-    """Mark the ratios of one solver to the first, case by case and over the cases."""
+    """Mark the ratios of one solver to the fastest, by case and over all cases."""
     if c is f.first:
         return [*curve([(1.0, y, _behind(c, f.cases))], style, c.solver, clipped=False)]
     count = len(c.compared)
@@ -162,12 +162,12 @@ def _marks(y: float, c: Competitor, f: FastestSolver, style: Look) -> list[Mark]
 
 
 def _behind(c: Competitor, cases: Iterable[str]) -> tuple[str, ...]:
-    """Name the measurements of a solver on some cases."""
+    """Return the run ids of a solver on `cases`."""
     return tuple(name for case in cases for name in c.outcomes[case].run_ids)
 
 
 def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
-    """Ratio of a case: of medians where cases are averaged, else within blocks."""
+    """Return the ratio of medians if cases are averaged, else that within blocks."""
     if case in c.by_case and not f.over_cases:
         return c.by_case[case]
     mine, its = time_of(c.outcomes[case]), time_of(f.first.outcomes[case])
@@ -175,7 +175,7 @@ def _ratio(c: Competitor, f: FastestSolver, case: str) -> Ratio | float:
 
 
 def _failure(c: Competitor) -> str:
-    """Name the most frequent verdict of the answers that were not verified."""
+    """Return the most frequent verdict of unverified answers, with its count."""
     count = Counter(o.verdict for o in c.outcomes.values() if time_of(o) is None)
     if not count:
         return ""

@@ -1,4 +1,4 @@
-"""Pictures of performance and data profiles, for two solvers and for fifty."""
+"""Figures of performance and data profiles."""
 
 from __future__ import annotations
 
@@ -34,15 +34,15 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.profiles import Array, curve, performance_ratios
 
-ROW = 4  #: solvers that are told apart in one panel, with their bands
-ROWS = 4  #: of panels; further solvers are grey in all of them
-PAIRS = 6  #: panels of two solvers
-BANDED = 20  #: cases; with fewer, bands of more than two solvers hide each other
-_COLUMNS = 3  #: of those
+ROW = 4  #: solvers in colour in one panel
+ROWS = 4  #: rows of panels; further solvers are grey in all of them
+PAIRS = 6  #: largest number of pairwise panels
+BANDED = 20  #: least number of cases for bands of three or more solvers, which overlap
+_COLUMNS = 3  #: columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
-_COARSE = 60  #: points of a grey curve, of which there may be hundreds
+_COARSE = 60  #: points of a grey curve; a figure may have hundreds of them
 
-#: up to which ratio to use which ticks; beyond, powers of ten
+#: largest ratio on an axis → its ticks; beyond, powers of ten
 _FACTORS = {
     3.5: (1, 1.5, 2, 3),
     15.0: (1, 2, 5, 10),
@@ -53,13 +53,13 @@ _SHARES = Axis(
     low=0, high=1.03, ticks=((0, "0.0"), (0.5, "0.5"), (1, "1.0")), shared="shares"
 )
 
-Ends = tuple[float, float]  #: of an axis
+Ends = tuple[float, float]  #: ends of an axis
 
 
 def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
-    """Share the solvers out among rows, best means first, no colour twice in a row.
+    """Distribute solvers over rows by rank, with distinct colours in each row.
 
-    solvers : of the whole report, which their looks go by
+    solvers : all solvers of the report, whose order determines colours and markers
     """
     rows: list[dict[str, int]] = []
     for i in map(int, ranking.order[: ROW * ROWS]):
@@ -79,22 +79,22 @@ def rivals(ranking: Ranking) -> list[int]:
 
 
 def banded(ranking: Ranking) -> bool:
-    """Return whether `profile_figure` has bands; `pairwise_figure` always has."""
+    """Return whether `profile_figure` has bands; `pairwise_figure` always has them."""
     group = ranking.group
     return len(group.solvers) <= 2 or len(group.cases) >= BANDED
 
 
 def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
-    """Draw both profiles of every solver, a few in colour in each row of panels."""
+    """Plot both profiles of every solver; each row of panels colours some of them."""
     group = ranking.group
     ratios = performance_ratios(group.times)
-    known = group.times[group.solved]
-    span = (float(known.min()) / 1.3, 1.3 * float(known.max()))
+    solved = group.times[group.solved]
+    span = (float(solved.min()) / 1.3, 1.3 * float(solved.max()))
     factors, times = (1.0, _end(ratios)), span
-    found = rows_of(ranking, solvers)
+    coloured = rows_of(ranking, solvers)
     rows = []
-    for mine in found:
-        last = mine is found[-1]
+    for mine in coloured:
+        last = mine is coloured[-1]
         names = [group.solvers[i] for i in mine]
         others = sorted(set(range(len(group.solvers))) - set(mine))
         left, right = list[Mark](), list[Mark]()
@@ -104,11 +104,11 @@ def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
                 style, band = look(solvers.index(name)), banded(ranking)
                 marks += _profile(values[:, i], ends, style, name, band=band)
         panels = (
-            _panel(_factors("time / best time of the case" * last, factors), left),
+            _panel(_factors("time / best time for the case" * last, factors), left),
             _panel(_log("time in s" * last, times), right, first=False),
         )
         keys = solver_keys(names, solvers)
-        # the last row has the labels of the axes, too
+        # the last row also has the labels of the axes
         height = 1.9 + LEGEND_LINE * (2 if last else 1)
         rows.append(Row(panels=panels, height=height, legend=below(keys, ROW)))
     return Figure(
@@ -119,7 +119,7 @@ def profile_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
 
 
 def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
-    """Draw performance profiles of two: the leader, in black, and each next rival."""
+    """Plot pairwise performance profiles of the leader, in black, and each rival."""
     group, leader = ranking.group, ranking.leader
     against = rivals(ranking)
     names = [group.solvers[i] for i in (leader, *against)]
@@ -143,7 +143,7 @@ def pairwise_figure(ranking: Ranking, solvers: Sequence[str]) -> Figure:
 
 
 def _title(ranking: Ranking) -> str:
-    """Name form, accuracy and cases, families by the first part of their names."""
+    """Return form, accuracy and number of cases, and the family if it is unique."""
     group = ranking.group
     families = Counter(case.partition("/")[0] for case in group.cases)
     of = f" of {next(iter(families))}" if len(families) == 1 else ""
@@ -151,12 +151,12 @@ def _title(ranking: Ranking) -> str:
 
 
 def _end(ratios: Array) -> float:
-    """Choose where an axis of ratios ends: a little after the largest finite one."""
+    """Return the end of an axis of ratios, slightly beyond the largest finite one."""
     return float(max(2.0, 1.1 * ratios[np.isfinite(ratios)].max()))
 
 
 def _grey(values: Array, ends: Ends, solver: str) -> Series:
-    """Make the profile of a solver that is told apart in another row."""
+    """Return the grey profile of a solver that is in colour in another row."""
     at, share = curve(values, *ends, points=_COARSE)
     return Series(
         x=numbers(at), y=numbers(share.value), look=_GREY, step=True, solver=solver
@@ -166,7 +166,7 @@ def _grey(values: Array, ends: Ends, solver: str) -> Series:
 def _profile(
     values: Array, ends: Ends, style: Look, solver: str, *, band: bool = True
 ) -> list[Mark]:
-    """Make a step function with few markers, and its band."""
+    """Return a step function with few markers, and its band."""
     at, share = curve(values, *ends)
     x = numbers(at)
     line = Series(
@@ -193,7 +193,7 @@ def _log(label: str, ends: Ends) -> Axis:
 
 
 def _factors(label: str, ends: Ends) -> Axis:
-    """Label an axis of ratios, which begins at 1, as one says them."""
+    """Return a logarithmic axis of ratios from 1, with round ticks."""
     for last, ticks in _FACTORS.items():
         if ends[1] <= last:
             return replace(_log(label, ends), ticks=tuple((t, f"{t:g}") for t in ticks))

@@ -1,4 +1,4 @@
-"""One solve on several ranks: speed-up, its model, parts of the time, weak scaling."""
+"""Solves on several ranks: speed-up, its model, parts of the time, weak scaling."""
 
 from __future__ import annotations
 
@@ -43,23 +43,24 @@ from mortarbench.reports.figures.style import (
 from mortarbench.reports.statistics.intervals import Interval
 
 _BAND = 0.18  #: opacity
-_PALE = "#a9cde6"  #: a band in the first colour, in a legend
-_LONG = 72  #: letters of a name in a legend of one column
+_PALE = "#a9cde6"  #: key of a band in the first colour
+_LONG = 72  #: characters of a name in a legend of one column
 _BAR = 9.0  #: width of a bar, points
-_BEYOND = 1.5  #: times the values that an axis goes on for intervals
-_REST = "#9aa2ad"  #: time that is in none of the parts
-_ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up of one rank
+_BEYOND = 1.5  #: largest extension of an axis for intervals, factor of the values
+_REST = "#9aa2ad"  #: time outside the listed parts
+_ONE = Interval(1.0, 1.0, 1.0, 1.0, 1)  #: speed-up on one rank
 _MODEL = Look(colour=COLOURS[0], dash=DASHED, width=1.4)
-_EDGE = Look(colour=INK, width=0.8, dash=DOTTED)  #: between measured and model
+#: boundary of measured and modelled speed-ups
+_EDGE = Look(colour=INK, width=0.8, dash=DOTTED)
 
 
-def strong_figure(found: Sequence[StrongSeries]) -> Figure:
-    """Draw speed-up against ranks, a panel for each phase, beside what copies reach."""
-    shown = sorted({n for s in found for n in s.answers})
+def strong_figure(series: Sequence[StrongSeries]) -> Figure:
+    """Plot speed-up against ranks for each phase, with that of simultaneous copies."""
+    shown = sorted({n for s in series for n in s.answers})
     panels, keys = [], []
     for phase in PHASES:
         marks: list[Mark] = [_ideal(shown)]
-        for i, s in enumerate(found):
+        for i, s in enumerate(series):
             marks += _speed_ups(s, phase, look(i))
         panels.append(
             Panel(
@@ -67,14 +68,14 @@ def strong_figure(found: Sequence[StrongSeries]) -> Figure:
                 title=phase, marks=tuple(marks),
             )
         )  # fmt: skip
-    for i, s in enumerate(found):
+    for i, s in enumerate(series):
         label = legible(s.title, _LONG)
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
-    if any(s.copies for s in found):
-        keys.append(Key(label="as many copies at once", look=_copies_look(INK)))
-    if any(s.crowded(n) for s in found for n in s.several):
+    if any(s.copies for s in series):
+        keys.append(Key(label="as many simultaneous copies", look=_copies_look(INK)))
+    if any(s.crowded(n) for s in series for n in s.several):
         crowded = replace(look(0), dash=None, fill="none")
-        keys.append(Key(label="more ranks than CPUs: they took turns", look=crowded))
+        keys.append(Key(label="more ranks than CPUs (time-shared)", look=crowded))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
     return _figure(panels, keys, 1)
 
@@ -95,26 +96,26 @@ def _speed_ups(s: StrongSeries, phase: str, style: Look) -> list[Series]:
     ]
 
 
-def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
-    """Draw the speed-up that the model says beyond the measured ranks, never within.
+def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
+    """Plot the speed-up predicted beyond the measured ranks.
 
-    found : series with a model, each with the ranks that it is asked about
+    predicted : series with a model, each with the ranks of the prediction
     """
     panels = []
-    for i, (s, asked) in enumerate(found):
+    for i, (s, asked) in enumerate(predicted):
         assert s.model is not None
         last = s.model.measured[-1]
         beyond = {float(n): s.model.speed_up(n) for n in (last, *asked)}
-        ranks, said = tuple(beyond), beyond.values()
+        ranks, modelled = tuple(beyond), beyond.values()
         colour = look(i).colour
         measured = [(n, s.speed_up(n, "solve"), s.answers[n])
                     for n in s.model.measured[1:]]  # fmt: skip
         marks: list[Mark] = [
             _ideal([1, *asked]),
-            Area(x=ranks, low=tuple(v.low for v in said),
-                 high=tuple(v.high for v in said), colour=colour, opacity=_BAND,
+            Area(x=ranks, low=tuple(v.low for v in modelled),
+                 high=tuple(v.high for v in modelled), colour=colour, opacity=_BAND,
                  solver=s.solver),
-            Series(x=ranks, y=tuple(v.value for v in said), solver=s.solver,
+            Series(x=ranks, y=tuple(v.value for v in modelled), solver=s.solver,
                    look=replace(_MODEL, colour=colour)),
             *curve([(1, _ONE, s.answers[1]), *measured], _line(look(i)), s.solver),
         ]  # fmt: skip
@@ -139,13 +140,13 @@ def model_figure(found: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Figure:
     return _figure(panels, keys, 4)
 
 
-def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
-    """Draw a bar for each solve on several ranks, of its parts; means of the ranks."""
-    parts = [rank_parts(s.answers[n]) for s, n in found]
+def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
+    """Draw the parts of each solve on several ranks as a bar; means over the ranks."""
+    parts = [rank_parts(s.answers[n]) for s, n in series]
     named = list(dict.fromkeys(name for of in parts for name in of))
     colours = {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(named)}
     marks = []
-    for i, ((s, n), of) in enumerate(zip(found, parts, strict=True)):
+    for i, ((s, n), of) in enumerate(zip(series, parts, strict=True)):
         o, start = s.answers[n], 0.0
         whole = t.value if (t := o.seconds("solve")) is not None else 0.0
         means = {name: part.mean for name, part in of.items()}
@@ -161,22 +162,22 @@ def parts_figure(found: Sequence[tuple[StrongSeries, int]]) -> Figure:
                 start += taken
     keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
     keys.append(Key(label="rest", look=_bar(_REST)))
-    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in found]
+    names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in series]
     panel = Panel(
-        x=Axis(label="seconds of the solve", low=0.0), y=categories(names),
+        x=Axis(label="solve time in s", low=0.0), y=categories(names),
         marks=tuple(marks), grid="x",
     )  # fmt: skip
     figure = with_legend((Row(panels=(panel,)),), keys, 6, 0.0)
-    return replace(figure, height=0.9 + LEGEND_LINE + 0.26 * len(found))
+    return replace(figure, height=0.9 + LEGEND_LINE + 0.26 * len(series))
 
 
-def weak_figure(found: Sequence[WeakSeries]) -> Figure:
-    """Draw the time against ranks that have equally much, a panel for each phase."""
-    shown = sorted({m.ranks for s in found for m in s.members})
+def weak_figure(series: Sequence[WeakSeries]) -> Figure:
+    """Plot time against ranks at a constant size per rank, a panel for each phase."""
+    shown = sorted({m.ranks for s in series for m in s.members})
     panels = []
     for phase in PHASES:
         marks: list[Mark] = []
-        for i, s in enumerate(found):
+        for i, s in enumerate(series):
             answers = {m.ranks: m.answer for m in s.members}
             copied = {1: answers[1]} | {
                 n: s.copies[n] for n in answers if n in s.copies
@@ -193,12 +194,17 @@ def weak_figure(found: Sequence[WeakSeries]) -> Figure:
             )
         )  # fmt: skip
     keys = [
-        Key(label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs of a rank",
+        Key(label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs per rank",
             look=_line(look(i)), solver=s.solver)
-        for i, s in enumerate(found)
+        for i, s in enumerate(series)
     ]  # fmt: skip
-    if any(s.copies for s in found):
-        keys.append(Key(label="copies of the first at once", look=_copies_look(INK)))
+    if any(s.copies for s in series):
+        keys.append(
+            Key(
+                label="simultaneous copies of the smallest problem",
+                look=_copies_look(INK),
+            )
+        )
     return _figure(panels, keys, 1)
 
 
@@ -216,9 +222,9 @@ def _ranks_axis(ranks: Sequence[int]) -> Axis:
 
 
 def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
-    """Make a logarithmic axis whose ticks are powers of two.
+    """Return a logarithmic axis with powers of two as ticks.
 
-    Intervals may leave it where they are wide: values are what it is to show.
+    Wide intervals are clipped; all values are shown.
     """
     curves = [m for m in marks if isinstance(m, Series)]
     shown = [v for m in curves for v in m.y]

@@ -1,4 +1,4 @@
-"""Time, iterations and counts of each kind against size and H/h; and κ."""
+"""Time, iterations, operation counts and condition numbers against size and H/h."""
 
 from __future__ import annotations
 
@@ -43,21 +43,21 @@ from mortarbench.reports.figures.style import (
 )
 from mortarbench.reports.statistics.intervals import PowerLaw
 
-MOST_SERIES = 6  #: that are drawn; all are tabulated
+MOST_SERIES = 6  #: largest number of plotted series; all are tabulated
 _SIZE = "degrees of freedom $n$"
-SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: of guides, the steepest last
-#: panels of counts, whose names are those of SMALBE; others are in the tables
+SLOPES = ((1.0, "$n$"), (1.5, "$n^{3/2}$"))  #: slopes of guide lines, the steepest last
+#: panels of counts, named as by SMALBE; other counts are in the tables only
 PANELS = (
     ("products", ("P_products", "preconditioner_applies")),
     ("steps", ("cg", "expansion", "proportioning")),
 )
-KAPPA = "kappa"  #: condition numbers among the quantities begin so
-_FITTED = 24  #: points of a curve of a fit
-_FOOT = 0.04  #: part of the axis below the guides, and above them at least
+KAPPA = "kappa"  #: prefix of the names of condition numbers
+_FITTED = 24  #: points of a fitted curve
+_FOOT = 0.04  #: least share of the axis below and above the guides
 
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
-    """Draw total time and iterations against n on logarithmic axes."""
+    """Plot total time and iterations against n on logarithmic axes."""
     times, counts, keys = list[Series](), list[Series](), []
     for solver in series.solvers:
         style, answers = look(solvers.index(solver)), series.curve(solver)
@@ -73,7 +73,7 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
         Panel(x=log(_SIZE), y=log("total time in s"), marks=tuple(times))
     )
     right = Panel(x=log(_SIZE), y=log("iterations"), marks=tuple(counts))
-    lines = -(-len(series.solvers) // 2)  # of the legend
+    lines = -(-len(series.solvers) // 2)  # lines of the legend
     return Figure(
         rows=(Row(panels=(left, right)),),
         height=2.4 + TITLE + LEGEND_LINE * max(lines, 3),
@@ -82,11 +82,11 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
     )
 
 
-def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None:
-    """Draw the iterations of one solver in every series; None without any."""
+def iterations_figure(plotted: Sequence[SizeSeries], solver: str) -> Figure | None:
+    """Plot the iterations of one solver in every series; return None without any."""
     curves = list[Series]()
     keys = list[Key]()
-    for series in found[:MOST_SERIES]:
+    for series in plotted[:MOST_SERIES]:
         style = look(len(keys))
         if counted := _counts(series, solver, style):
             keys.append(Key(label=legible(series.title, 64), look=style))
@@ -104,15 +104,15 @@ def iterations_figure(found: Sequence[SizeSeries], solver: str) -> Figure | None
 
 
 def _counts(series: SizeSeries, solver: str, style: Look) -> list[Series]:
-    """Draw the iterations over the size, the middle of both ends."""
+    """Plot iterations against size, as midpoints of their ranges."""
     answers = ((n, o.iterations, o) for n, o in series.curve(solver))
     return curve([(n, i and sum(i) / 2, o) for n, i, o in answers], style, solver)
 
 
 def with_slopes(panel: Panel) -> Panel:
-    """Add guides of slopes 1 and 3/2 through the lower right.
+    """Add guide lines of slopes 1 and 3/2 at the lower right.
 
-    Where y differs less than the guides rise, its axis goes on at both ends.
+    The y axis is extended at both ends if it is shorter than the rise of the guides.
     """
     (x0, x1), (y0, y1) = limits([panel], "x"), limits([panel], "y")
     start, stop = along((x0, x1), 0.62), along((x0, x1), 0.9)
@@ -133,13 +133,13 @@ def with_slopes(panel: Panel) -> Panel:
 
 
 def along(ends: Limits, part: float) -> float:
-    """Find the value at a part of a logarithmic axis."""
+    """Return the value at a fraction of a logarithmic axis."""
     low, high = ends
     return float(low * (high / low) ** part)
 
 
 def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
-    """Draw the counts of one solver against dofs with fits c·nᵖ; None without any."""
+    """Plot the counts of one solver against dofs with fits c·nᵖ; None without any."""
     points = [(float(n), o) for n, o in series.curve(solver)]
     laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
     title = f"{solver}, {series.title}"
@@ -147,7 +147,7 @@ def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
 
 
 def torn_figure(sweep: Sweep) -> Figure | None:
-    """Draw the counts of one solver against H/h; None where none is known."""
+    """Plot the counts of one solver against H/h; return None without any."""
     points = [(float(value), o) for value, o in sweep.answers]
     shown = tuple((x, f"{x:g}") for x, _ in points)
     low, high = points[0][0] / 1.15, points[-1][0] * 1.15
@@ -198,7 +198,7 @@ def _counted(
     if not panels:
         return None
     rows = in_rows(panels, 2)
-    if len(panels) == 3:  # κ below, as wide as both
+    if len(panels) == 3:  # κ in the second row, over both columns
         rows = (rows[0], Row(panels=(replace(panels[2], span=2),)))
     return with_legend(rows, keys, 2, 0.2 + 2.3 * len(rows), title)
 
@@ -206,17 +206,17 @@ def _counted(
 def condition_numbers(
     points: Sequence[tuple[float, Outcome]],
 ) -> dict[str, tuple[float, ...]]:
-    """Return each κ that every answer has, without error bounds, by its name."""
+    """Return condition numbers present in all answers, without error bounds."""
     names = [
         name
         for name in (points[0][1].quantities if points else ())
         if (name == KAPPA or name.startswith(f"{KAPPA}_"))
         and not name.endswith("_error")
     ]
-    found: dict[str, tuple[float, ...]] = {}
+    kappas: dict[str, tuple[float, ...]] = {}
     for name in names:
         values = [o.quantities.get(name) for _, o in points]
-        known = tuple(float(v) for v in values if isinstance(v, int | float))
-        if len(known) == len(points):
-            found[" ".join(["κ", *name.removeprefix(KAPPA).split("_")[1:]])] = known
-    return found
+        numeric = tuple(float(v) for v in values if isinstance(v, int | float))
+        if len(numeric) == len(points):
+            kappas[" ".join(["κ", *name.removeprefix(KAPPA).split("_")[1:]])] = numeric
+    return kappas

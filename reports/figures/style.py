@@ -1,4 +1,4 @@
-"""One style for all figures: colours, marks, logarithmic axes, legible labels."""
+"""Style of all figures: colours, markers, logarithmic axes, legible labels."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.document.formatting import clean
 
 #: One hue for each solver, at least 28° apart up to the eighth and 6° up to the last.
-#: The first four are Okabe and Ito's; each further one is the colour of OKLCH that is
-#: farthest from those before it, as seen with normal sight, deuteranopia and protanopia
-#: (Machado et al. 2009), with a contrast of 2.4 at least on a light and a dark page.
+#: The first four are Okabe and Ito's. Each further one is the OKLCH colour farthest
+#: from its predecessors under normal vision, deuteranopia and protanopia (Machado et
+#: al. 2009), with a contrast of at least 2.4 on light and dark pages.
 COLOURS = (
     "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#8b6bf7", "#b0a93b", "#e17ffe",
     "#c9212e", "#216e45", "#4851d5", "#b02e9a", "#b775fe", "#698e2f", "#31a3b0",
@@ -35,30 +35,31 @@ COLOURS = (
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
 DASHED, DOTTED = (3.7, 1.6), (1.0, 1.65)
 DASHES = ((), DASHED, (6.4, 1.6, 1.0, 1.6), (4, 1, 1, 1, 1, 1), (1, 1))
-GUIDE = Look(colour=INK, width=0.6)  #: lines to compare with
+GUIDE = Look(colour=INK, width=0.6)  #: reference lines
 LEGEND_LINE = 0.21  #: height of a line of a legend, inches
 TITLE = 0.24  #: height of the title of a figure, inches
 
 
 def legible(label: str, limit: int = 32) -> str:
-    """Sanitise a name for a figure: replace missing characters, prevent formulas.
+    """Replace characters missing in the font and escape mathematics in a user's name.
 
     matplotlib reads $…$ as a formula and hides labels that begin with an underscore.
     """
-    known = "".join(
+    printable = "".join(
         c if c.isascii() or "\u00a0" < c <= "\u00ff" or c == "…" else "?"
         for c in clean(label, limit)
     )
-    escaped = known.replace("$", r"\$")
+    escaped = printable.replace("$", r"\$")
     return f" {escaped}" if escaped.startswith("_") else escaped
 
 
 def look(index: int) -> Look:
-    """Colour, marker and dashes of the index-th solver; distinct in grey print too.
+    """Return colour, marker and dashes of a solver, also distinct in greyscale.
 
-    Beyond as many solvers as there are colours hues recur, with other markers.
+    Colours recur with other markers beyond the length of `COLOURS`.
     """
-    rounds = index // lcm(len(COLOURS), len(MARKERS))  # of all pairs that come in turn
+    # complete cycles of (colour, marker)
+    rounds = index // lcm(len(COLOURS), len(MARKERS))
     return Look(
         colour=COLOURS[index % len(COLOURS)],
         marker=MARKERS[(index + rounds) % len(MARKERS)],
@@ -67,14 +68,14 @@ def look(index: int) -> Look:
 
 
 def log(label: str) -> Axis:
-    """Make a logarithmic axis."""
+    """Return a logarithmic axis."""
     return Axis(label=label, log=True)
 
 
 def solver_keys(names: Iterable[str], solvers: Sequence[str]) -> tuple[Key, ...]:
-    """Make the keys of some solvers.
+    """Return the legend keys of the solvers `names`.
 
-    solvers : of the whole report, which their looks go by
+    solvers : all solvers of the report, whose order determines colours and markers
     """
     return tuple(
         Key(label=legible(s), look=look(solvers.index(s)), solver=s) for s in names
@@ -82,12 +83,12 @@ def solver_keys(names: Iterable[str], solvers: Sequence[str]) -> tuple[Key, ...]
 
 
 def below(keys: Sequence[Key], columns: int, title: str = "") -> Legend:
-    """Put keys below a figure or a row."""
+    """Return a legend below a figure or a row."""
     return Legend(keys=tuple(keys), columns=columns, title=title)
 
 
 def run_ids(records: Iterable[Record]) -> tuple[str, ...]:
-    """Name the measurements behind a point."""
+    """Return the run ids of the measurements behind a point."""
     return tuple(r.run_id for r in records)
 
 
@@ -98,17 +99,17 @@ def curve(
     bars: Mapping[str, float] | None = None,
     **how: Any,
 ) -> list[Series]:
-    """Draw points as one series; return an empty list where no point is complete.
+    """Return points as one series; an empty list if no point is complete.
 
-    points : (x, y), or (x, y, answer or its run_ids); an estimate with an interval
-        (`Interval`, `Ratio`) gets an error bar, and a point without x or y is left out
+    points : (x, y), or (x, y, answer or its run_ids); estimates with an interval
+        (`Interval`, `Ratio`) have error bars; points without x or y are omitted
     bars : cap, width and opacity of the error bars
     how : further attributes of the series
     """
-    known = [p for p in points if p[0] is not None and p[1] is not None]
-    if not known:
+    complete = [p for p in points if p[0] is not None and p[1] is not None]
+    if not complete:
         return []
-    x, y, *answers = zip(*known, strict=True)
+    x, y, *answers = zip(*complete, strict=True)
     for along, values in (("x", x), ("y", y)):
         if any(isinstance(v, tuple) for v in values):
             low, high = (
@@ -128,9 +129,9 @@ def with_legend(
     height: float,
     title: str = "",
 ) -> Figure:
-    """Put a legend below rows of panels and a title above them.
+    """Return a figure of rows of panels with a title above and a legend below.
 
-    height : of the rows, inches
+    height : height of the rows, inches
     """
     return Figure(
         rows=tuple(rows),

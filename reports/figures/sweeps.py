@@ -1,4 +1,4 @@
-"""Errors that were reached against the time that it took, and sweeps of tolerances."""
+"""Error against time, and sweeps of tolerances."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ from mortarbench.reports.figures.style import (
     with_legend,
 )
 
-SHARE = 0.1  #: of the discretisation error that a solver may add
-CROWDED = 1000  #: marks; more of them are drawn smaller and let others through
-_COLUMNS = 4  #: of the legend
-_LEAST = 1e-17  #: residuals below, zero among them, are drawn there
-_LEAST_RATIO = 1e-10  #: the same of residuals over the tolerance
+SHARE = 0.1  #: largest solver error, relative to the discretisation error
+CROWDED = 1000  #: markers; more than these are drawn smaller and more transparent
+_COLUMNS = 4  #: columns of the legend
+_LEAST = 1e-17  #: smaller residuals, including zero, are drawn at this value
+_LEAST_RATIO = 1e-10  #: the same for the ratio of residual to tolerance
 _MESH = Look(colour=INK, width=0.8, dash=DASHED)
 _TENTH = Look(colour=INK, width=0.8, dash=DOTTED)
 _BARS = {"cap": 1.5, "width": 0.6, "opacity": 0.55}
 
-Sweep = Mapping[str, Sequence[Outcome]]  #: solver → its answers, by tolerance
+Sweep = Mapping[str, Sequence[Outcome]]  #: solver → its answers in order of tolerance
 
 
 def accuracy_figure(evidence: Evidence) -> Figure | None:
-    """Draw the accuracy reached against the time spent, verified answers filled."""
+    """Plot residuals against time; markers of verified answers are filled."""
     shown = [o for o in evidence.flat if o.worst is not None and o.seconds("total")]
     if not shown:
         return None
@@ -87,9 +87,9 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
 
 
 def sweep_figure(swept: Sequence[tuple[str, Sweep]], solvers: Sequence[str]) -> Figure:
-    """Draw the largest residual against the time, a panel for each (case, sweep).
+    """Plot the largest residual against time, a panel for each (case, sweep).
 
-    solvers : of the whole report, which their looks go by
+    solvers : all solvers of the report, whose order determines colours and markers
     """
     panels = []
     for case, row in swept:
@@ -115,7 +115,7 @@ def _panel(
 
 
 def _residuals(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the answers of one solver; hollow where they are not verified."""
+    """Join the answers of one solver; markers of unverified ones are hollow."""
     points = [
         (t.value, max(o.worst, _LEAST), o)
         for o in outcomes
@@ -134,10 +134,10 @@ def certified_figure(
     solvers: Sequence[str],
     meshes: Mapping[str, float],
 ) -> Figure:
-    """Draw the certified error against the time, a panel for each (case, sweep).
+    """Plot the certified error against time, a panel for each (case, sweep).
 
-    solvers : of the whole report, which their looks go by
-    meshes : physical case → its discretisation error, where one is known
+    solvers : all solvers of the report, whose order determines colours and markers
+    meshes : physical case → its discretisation error, if available
     """
     panels, lines = [], []
     for case, row in swept:
@@ -146,7 +146,10 @@ def certified_figure(
             marks += _certified(row[solver], look(solvers.index(solver)))
         error = meshes.get(next(iter(row.values()))[0].physical)
         if error is not None:
-            lines = [("discretisation error", _MESH), ("a tenth of it", _TENTH)]
+            lines = [
+                ("discretisation error", _MESH),
+                ("a tenth of the discretisation error", _TENTH),
+            ]
             rules = [Rule(axis="y", at=error, look=_MESH),
                      Rule(axis="y", at=SHARE * error, look=_TENTH)]  # fmt: skip
         panels.append(_panel(case, "certified relative error", marks, rules))
@@ -154,7 +157,7 @@ def certified_figure(
 
 
 def _certified(outcomes: Sequence[Outcome], style: Look) -> list[Series]:
-    """Join the points that count; mark the others hollow, on their own."""
+    """Join the points that count; show the others as separate hollow markers."""
     points = [
         (o.seconds("total"), max(e, SMALLEST), o)
         for o in outcomes
@@ -175,7 +178,7 @@ def _figure(
     solvers: Sequence[str],
     lines: Sequence[tuple[str, Look]] = (),
 ) -> Figure:
-    """Put the panels side by side above a legend of solvers and further lines."""
+    """Arrange panels in two columns above a legend of solvers and reference lines."""
     present = [s for s in solvers if any(s in row for _, row in swept)]
     keys = [*solver_keys(present, solvers), *(Key(label=s, look=l) for s, l in lines)]
     rows = in_rows(panels, min(len(panels), 2))

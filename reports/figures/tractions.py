@@ -1,4 +1,4 @@
-"""Pressure and shear traction along contact sides, beside the exact ones."""
+"""Pressure and shear traction along contact sides, with exact solutions."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.figures.deformed import FRICTION, length_unit, prefixed
 from mortarbench.reports.figures.style import below, curve, legible
 
-SHOWN = 1e-6  #: tractions below this times the largest pressure are not looked for
-BESIDE = 0.15  #: of the loaded part, shown on either side of it
+SHOWN = 1e-6  #: of the largest pressure: nodes with smaller tractions are not loaded
+BESIDE = 0.15  #: margin on either side, relative to the length of the loaded part
 _EXACT = Look(colour=INK, width=0.9)
 _NODE = Look(colour="#6b7480", marker="o", dash=None, size=3.2)
-#: of nodes by what friction does; of pairs without it all are as open ones
+#: markers of nodes by friction state; frictionless pairs use that of open nodes
 LOOKS = {"open": _NODE} | {
     state: replace(_NODE, colour=colour, marker=marker)
     for (state, (colour, _)), marker in zip(FRICTION.items(), "so^", strict=True)
@@ -31,11 +31,10 @@ LOOKS = {"open": _NODE} | {
 
 
 def traction_figure(fields: Fields) -> Figure | None:
-    """Draw a row of panels per loaded contact; return None if no contact is loaded.
+    """Plot tractions of each contact under load in one row; None without load.
 
-    Sides of bodies in space have no length to draw them along.
-
-    Places are distances along the undeformed slave side from its middle.
+    Only plane bodies are supported. Positions are distances from the middle of the
+    undeformed slave side.
     """
     rows, states, exact = list[Row](), set[str](), False
     for side in fields.contacts if fields.dim == 2 else ():
@@ -59,7 +58,7 @@ def traction_figure(fields: Fields) -> Figure | None:
 
 
 def places(fields: Fields, side: ContactSide) -> Vector:
-    """Measure each node (s,) along the undeformed side from its middle, m."""
+    """Return the distance (s,) of nodes from the middle of the undeformed side, m."""
     steps = np.linalg.norm(np.diff(fields.points[side.nodes], axis=0), axis=1)
     along = np.append(0.0, np.cumsum(steps))
     return np.asarray(along - along[-1] / 2)
@@ -72,7 +71,7 @@ def _states(side: ContactSide) -> Vector:
 
 
 def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
-    """Draw the pressure and, with friction, the shear over the part that is loaded."""
+    """Plot the pressure and, with friction, the shear traction on the loaded part."""
     along = places(fields, side)
     tractions = {"pressure": side.pressure}
     if side.shear is not None:
@@ -84,7 +83,7 @@ def _panels(fields: Fields, side: ContactSide) -> tuple[Panel, ...]:
     low, high = low - beyond, high + beyond
     size, unit = length_unit(high - low)
     axis = Axis(
-        label=f"along the side in {unit}",
+        label=f"position along the side in {unit}",
         low=float(low / size),
         high=float(high / size),
     )

@@ -1,1 +1,1 @@
-"""The paper's figures and tables from measured data: no measuring happens here."""
+"""Figures and tables of the paper from stored measurements."""

@@ -1,4 +1,4 @@
-"""Figures 1, 2 and 7, and the contact enlarged: the bodies, drawn to scale."""
+"""Figures 1, 2 and 7 and the enlarged contact, drawn to scale."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ from mortarbench.reports.figures.deformed import (
 )
 from mortarbench.reports.figures.style import COLOURS
 
-ACTIVE = 1e-6  #: a node is in contact if its force exceeds this times the largest
+ACTIVE = 1e-6  #: of the largest force: nodes with larger forces are in contact
 STRESSES = {
     "sxx": r"normal stress $\sigma_x$",
     "syy": r"normal stress $\sigma_y$",
     "sxy": r"shear stress $\tau_{xy}$",
     "von_mises": r"von Mises stress $\sigma_{\mathrm{vM}}$",
 }
-#: of beam and ring: transparent, so that ink stays readable on any page
+#: colour and opacity of beam and ring, legible on light and dark pages
 FILLS = ((COLOURS[0], 0.18), (COLOURS[1], 0.22))
 _SOFT = "#5c6470"
 
@@ -48,7 +48,7 @@ Place = tuple[float, float]
 
 
 class Dimensions(NamedTuple):
-    """Those of Figure 1, m, read off the mesh."""
+    """Dimensions of Figure 1, measured on the mesh, m."""
 
     l: float
     h: float
@@ -58,7 +58,7 @@ class Dimensions(NamedTuple):
     r2: float
 
     def on_circle(self, radius: float, degrees: float) -> Place:
-        """Find the point at an angle on a circle around the ring's centre."""
+        """Return the point at an angle on a circle around the centre of the ring."""
         angle = np.radians(degrees)
         x, y = self.centre
         return float(x + radius * np.cos(angle)), float(y + radius * np.sin(angle))
@@ -77,7 +77,7 @@ def dimensions(fields: Fields) -> Dimensions:
 
 
 def geometry_figure(fields: Fields, load: float) -> FieldFigure:
-    """Show Figure 1: bodies, supports, load and dimensions."""
+    """Draw Figure 1: bodies, supports, load and dimensions."""
     d = dimensions(fields)
     angles = np.linspace(0, 180, 181)
     ring = [d.on_circle(d.r2, angle) for angle in angles]
@@ -177,7 +177,7 @@ def _names(d: Dimensions) -> list[FieldMark]:
 def _panels(
     pictures: list[tuple[str, Points, dict[str, Any]]],
 ) -> tuple[FieldPanel, ...]:
-    """Put pictures of the same extent into two columns with common axes.
+    """Return panels of the same extent in two columns with common axes.
 
     pictures : title, points of the bodies, further attributes of the panel
     """
@@ -196,7 +196,7 @@ def _panels(
 
 
 def mesh_figure(examples: dict[str, Fields]) -> FieldFigure:
-    """Show Figure 2: a row for each mesh, by title, before and after deformation."""
+    """Draw Figure 2: a row for each mesh, before and after deformation."""
     deformed = f"deformed, displacement × {SCALE:g}"
     panels = _panels([
         (name, points, {"marks": mesh(fields, points, 0.8)})
@@ -210,7 +210,7 @@ def mesh_figure(examples: dict[str, Fields]) -> FieldFigure:
 
 
 def mesh(fields: Fields, points: Points, width: float) -> tuple[FieldMark, ...]:
-    """Show the cells of every body in its colour; `width` is that of the outlines."""
+    """Draw the cells of every body in its colour, with outlines of `width` points."""
     marks: list[FieldMark] = []
     for body in np.unique(fields.bodies):
         cells = fields.cells[fields.bodies == body]
@@ -228,20 +228,20 @@ def _outlined(fields: Fields, points: Points, width: float) -> list[Path]:
 
 
 class Extent(NamedTuple):
-    """The end of the colours and the largest value, both in size, Pa."""
+    """End of the colour scale and largest absolute value, Pa."""
 
     clipped: float
     largest: float
 
 
 def extent(fields: Fields, name: str) -> Extent:
-    """Clip where all but a few nodes are within: stresses are singular at corners."""
+    """Return a percentile and the maximum of a stress, which is singular at corners."""
     size = np.abs(fields.nodal[name])
     return Extent(float(np.percentile(size, PERCENTILE)), float(size.max()))
 
 
 def stress_figure(fields: Fields) -> FieldFigure:
-    """Show the four components, one colour scale for both bodies in each."""
+    """Draw the four components, each with one colour scale for both bodies."""
     points = moved(fields)
     pictures = []
     for name, title in STRESSES.items():
@@ -263,13 +263,13 @@ def stress_figure(fields: Fields) -> FieldFigure:
 
 
 def zoom_figure(fields: Fields) -> FieldFigure:
-    """Show the bodies where they touch: mesh, pressures along their normals."""
+    """Draw the mesh near the contact and pressures along their normals."""
     assert fields.contact_nodes is not None
     assert fields.contact_forces is not None
     points = moved(fields)
     size = np.hypot(*fields.contact_forces.T)
     loaded = size > ACTIVE * size.max()
-    # length of undeformed arc that belongs to each slave node, m
+    # undeformed arc length of each slave node, m
     sides = np.diff(fields.points[fields.contact_nodes], axis=0)
     half = np.linalg.norm(sides, axis=1) / 2
     lengths = np.append(half, 0) + np.append(0, half)
@@ -283,7 +283,8 @@ def zoom_figure(fields: Fields) -> FieldFigure:
     both = np.vstack([feet, tips])
     x0, y0 = (both.min(axis=0) - 0.18 * reach).tolist()
     x1, y1 = (both.max(axis=0) + 0.1 * reach).tolist()
-    unit, colour = float(f"{largest / 2:.0e}"), COLOURS[1]  # of the scale: round
+    # round value of the scale arrow
+    unit, colour = float(f"{largest / 2:.0e}"), COLOURS[1]
     x, y, arrow = x0 + 0.05 * reach, y0 + 0.05 * reach, scale * unit
     panel = FieldPanel(
         low=(x0, y0), high=(x1, y1),

@@ -1,4 +1,4 @@
-"""SMALBE against the fleet, primal against dual, and time to certified accuracy."""
+"""SMALBE and other solvers, primal and dual forms, time to certified accuracy."""
 
 from __future__ import annotations
 
@@ -40,40 +40,41 @@ from mortarbench.reports.statistics.intervals import Interval, power_law
 
 DUALS = ("dual", "dual-bounds")
 TARGETS = (1e-2, 1e-4, 1e-6)  #: certified relative errors in the energy norm
-COLUMNS = 5  #: of a legend
+COLUMNS = 5  #: columns of a legend
 _FAILED = Look(colour=INK, marker="x", dash=None)
 
 
 class Place(NamedTuple):
-    """One answer at its size."""
+    """Answer with its problem size."""
 
     size: int
     outcome: Outcome
-    dofs: bool  #: the size is that of the primal problem, not of the dual
+    dofs: bool  #: the size is that of the primal problem instead of the dual
 
     @property
     def time(self) -> Interval | None:
-        """Median time; against dofs, that of dualising included where there is any."""
+        """Median time, including any dualisation if sizes are in dofs."""
         dualised = self.outcome.with_dualising if self.dofs else None
         return dualised or self.outcome.seconds("total")
 
     @property
     def tried(self) -> bool:
-        """True unless the solver declined."""
+        """True unless the solver declined the problem."""
         return self.outcome.verdict is not Verdict.DECLINED
 
     @property
     def failed(self) -> bool:
-        """True if it was tried and not verified: its time means nothing."""
+        """True if it was tried and not verified; its time is then not shown."""
         return self.tried and not self.outcome.verified
 
 
 def places(evidence: Evidence, form: str, *, dofs: bool) -> dict[str, list[Place]]:
-    """Solver → its answers in one form, verified or not, by n (dofs) or m.
+    """Return the answers of each solver in one form, in order of n (dofs) or m.
 
-    Any answer to a case may hold its n, or its m: the variables of the QP.
+    m is the number of variables of the QP. A size missing in one answer is taken from
+    other answers to the same case.
     """
-    found: dict[str, list[Place]] = {s: [] for s in evidence.solvers}
+    answers: dict[str, list[Place]] = {s: [] for s in evidence.solvers}
     for row in evidence.outcomes.values():
         for solver, outcome in row.items():
             if outcome.first.form == form:
@@ -82,21 +83,22 @@ def places(evidence: Evidence, form: str, *, dofs: bool) -> dict[str, list[Place
                     for o in (outcome, *row.values())
                 )
                 size = int(next(filter(None, sizes), 0))
-                found[solver].append(Place(size, outcome, dofs))
-    return {s: sorted(mine, key=lambda p: p.size) for s, mine in found.items() if mine}
+                answers[solver].append(Place(size, outcome, dofs))
+    by_size = {s: sorted(of, key=lambda p: p.size) for s, of in answers.items()}
+    return {s: of for s, of in by_size.items() if of}
 
 
 def fleet_figure(evidence: Evidence) -> Figure:
-    """Draw the solvers' times on both duals against m."""
+    """Plot the times of the solvers on both duals against m."""
     titles = {
         "dual": "dual: Dirichlet rows as equalities",
-        "dual-bounds": "dual-bounds: bounds alone",
+        "dual-bounds": "dual-bounds: bounds only",
     }
     return _figure(evidence, titles, "size of the dual $m$", dofs=False)
 
 
 def primal_dual_figure(evidence: Evidence) -> Figure:
-    """Draw primal totals and dual totals with dualisation against n."""
+    """Plot total times of primal and dual forms, with dualisation, against n."""
     titles = {"primal": "primal", "dual": "dual, dualisation included"}
     return _figure(evidence, titles, "degrees of freedom $n$", dofs=True)
 
@@ -104,7 +106,7 @@ def primal_dual_figure(evidence: Evidence) -> Figure:
 def _figure(
     evidence: Evidence, titles: dict[str, str], size: str, *, dofs: bool
 ) -> Figure:
-    """Draw a panel for each form; below, a strip of what was not verified."""
+    """Plot times in a panel for each form, above a strip of unverified answers."""
     found = {form: places(evidence, form, dofs=dofs) for form in titles}
     every = {s: [p for f in found.values() for p in f.get(s, ())]
              for s in evidence.solvers}  # fmt: skip
@@ -149,7 +151,7 @@ def _figure(
 
 
 def fleet_table(evidence: Evidence, form: str) -> Table:
-    """Tabulate the times by m, and the exponents; failures as what they are."""
+    """Tabulate times or verdicts by m, and fitted exponents."""
     found = {
         solver: mine
         for solver, mine in places(evidence, form, dofs=False).items()
@@ -173,7 +175,7 @@ def fleet_table(evidence: Evidence, form: str) -> Table:
         rows.append((Cell(text=clean(solver, 40)), *cells, power))
     return Table(
         caption=f"Form {form}: median time by the size m of the dual, and the exponent "
-        "p of t = c·mᵖ over the verified sizes.",
+        "p of t = c·mᵖ fitted to the verified sizes.",
         notes=(TIMED, *legend(rows)),
         columns=("", *(f"m = {m}" for m in sizes), "p [95 %]"),
         rows=tuple(rows),
@@ -181,7 +183,7 @@ def fleet_table(evidence: Evidence, form: str) -> Table:
 
 
 def _time(outcome: Outcome, time: Interval | None) -> Cell:
-    """Show the time of a verified answer, or else the verdict."""
+    """Return the time of a verified answer, or else its verdict."""
     if not outcome.verified:
         return verdict_cell(outcome)
     value = time.value if time else None
@@ -189,7 +191,7 @@ def _time(outcome: Outcome, time: Interval | None) -> Cell:
 
 
 def totals_table(evidence: Evidence) -> Table:
-    """Tabulate primal and dual at the largest n that both were tried at."""
+    """Tabulate primal and dual total times at the largest n common to both."""
     primal, dual = (places(evidence, form, dofs=True) for form in ("primal", "dual"))
     tried = [{p.size for m in f.values() for p in m} for f in (primal, dual)]
     n = max(set.intersection(*tried), default=0)
@@ -208,16 +210,16 @@ def totals_table(evidence: Evidence) -> Table:
         )
         rows.append((Cell(text=clean(solver, 40)), *cells))
     return Table(
-        caption=f"Totals at n = {n}, prepare and solve. Dualising one load step, "
-        "factorisation included, is measured once for all solvers, so that the "
-        "interval of the last column is that of the solver alone.",
+        caption=f"Total times at n = {n}, prepare and solve. The dualisation of one "
+        "load step, including the factorisation, is measured once for all solvers; the "
+        "intervals in the last column are therefore those of the solver alone.",
         columns=("", "primal", "dual", "dualising", "dual with dualising"),
         rows=tuple(rows),
     )
 
 
 def certified_figure(evidence: Evidence) -> Figure:
-    """Draw certified errors against times, a line through the tolerances."""
+    """Plot certified errors against times, a curve over tolerances for each solver."""
     panels = list[tuple[str, Panel]]()
     for form in (f for f in DUALS if places(evidence, f, dofs=True)):
         marks = [
@@ -239,17 +241,17 @@ def certified_figure(evidence: Evidence) -> Figure:
 def swept(
     evidence: Evidence, form: str
 ) -> dict[str, list[tuple[Outcome, Interval, float]]]:
-    """Solver → verified answers with time and certified error, loosest first."""
-    found: dict[str, list[tuple[Outcome, Interval, float]]] = {}
+    """Return verified answers, times and certified errors by solver, loosest first."""
+    answers: dict[str, list[tuple[Outcome, Interval, float]]] = {}
     for o in sorted(evidence.flat, key=lambda o: -o.tol):
         time, error = o.seconds("total"), o.largest("energy_bound")
         if o.first.form == form and o.verified and time and error:
-            found.setdefault(o.solver, []).append((o, time, error))
-    return found
+            answers.setdefault(o.solver, []).append((o, time, error))
+    return answers
 
 
 def certified_table(evidence: Evidence) -> Table:
-    """Tabulate the least time in which an error was certified, and at what tol."""
+    """Tabulate the least time to a certified error, and the tolerance of that solve."""
     rows = []
     for form in DUALS:
         for solver, answers in swept(evidence, form).items():
@@ -269,8 +271,8 @@ def certified_table(evidence: Evidence) -> Table:
                 )  # fmt: skip
             rows.append(tuple(cells))
     return Table(
-        caption="Least median time in which the relative error in the energy norm was "
-        "certified, and the tolerance asked for to get there.",
+        caption="Least median time to a certified relative error in the energy norm, "
+        "and the requested tolerance.",
         notes=(TIMED,),
         columns=("form", "solver", *(f"error ≤ {tolerance(t)}" for t in TARGETS)),
         rows=tuple(rows),

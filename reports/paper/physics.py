@@ -1,4 +1,4 @@
-"""Figures that the paper lacks: pressures, both contact methods, load steps."""
+"""Figures beyond the paper: pressures, both contact methods, load steps."""
 
 from __future__ import annotations
 
@@ -30,28 +30,28 @@ from mortarbench.reports.paper.bodies import ACTIVE
 from mortarbench.reports.paper.timings import labelled, select, titled
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
-CONTACTS = {  #: of the tables → as the figures call them
-    "nts": "node-to-segment, the paper's",
+CONTACTS = {  #: name in tables → label in figures
+    "nts": "node-to-segment (the paper's method)",
     "mortar": "mortar, dual basis",
     "mortar-standard": "mortar, standard basis",
 }
-EXACT = 1e-12  #: relative errors below are rounding, and drawn there
-QUANTITIES = {  #: of the figure → the columns that make a vector
+EXACT = 1e-12  #: smaller relative errors are rounding and are drawn at this value
+QUANTITIES = {  #: name in the figure → columns of its components
     "tip displacement": ("tip_x", "tip_y"),
     "contact force": ("force_x", "force_y"),
 }
-SINCE = 5  #: steps: with fewer, the order is not yet seen
-PAPER = 10  #: steps, one linearisation each
+SINCE = 5  #: least number of steps in fits; coarser stepping is pre-asymptotic
+PAPER = 10  #: load steps of the paper, with one linearisation each
 _PRESSURE = "contact pressure in GPa"
-#: of node-to-segment and mortar
+#: colours and markers of node-to-segment and mortar
 _LOOKS = {"nts": look(0), "mortar": replace(look(1), fill="none")}
-#: viridis without its ends: one is lost on a dark page, the other on a white one
+#: viridis without its ends, which have low contrast on dark or white pages
 _RAMP = ("3b528b", "31678e", "297b8e", "218f8d", "1fa287", "32b67a", "56c667", "86d549",
          "bddf26")  # fmt: skip
 
 
 def active(rows: Sequence[Row], contact: str) -> dict[int, list[Row]]:
-    """Step → the rows of the nodes that are in contact."""
+    """Return the rows of the nodes in contact for each load step."""
     mine = select(rows, contact=contact)
     least = ACTIVE * max(float(r["force"]) for r in mine)
     return {
@@ -61,9 +61,9 @@ def active(rows: Sequence[Row], contact: str) -> dict[int, list[Row]]:
 
 
 def pressure_figure(rows: Sequence[Row]) -> Figure:
-    """Draw pressure against arc angle, and the active set, over the load steps.
+    """Plot pressure against arc angle, and the active set against load steps.
 
-    The angles are those that are ever in contact, and two nodes more on either side.
+    Angles cover all nodes ever in contact, and two more nodes on either side.
     """
     touched = {
         contact: [
@@ -85,9 +85,9 @@ def pressure_figure(rows: Sequence[Row]) -> Figure:
         places = ((float(r["angle"]), float(r["pressure"]) / 1e9) for r in mine)
         return sorted(p for p in places if low <= p[0] <= high)
 
-    known = np.array([list(bytes.fromhex(name)) for name in _RAMP])
+    ramp = np.array([list(bytes.fromhex(name)) for name in _RAMP])
     at = np.linspace(0, len(_RAMP) - 1, last)
-    mixed = [np.interp(at, np.arange(len(_RAMP)), channel) for channel in known.T]
+    mixed = [np.interp(at, np.arange(len(_RAMP)), channel) for channel in ramp.T]
     parts = np.round(np.transpose(mixed)).astype(np.uint8)
     colours = tuple(f"#{bytes(colour).hex()}" for colour in parts)
     through, _ = labelled(
@@ -129,7 +129,7 @@ def pressure_figure(rows: Sequence[Row]) -> Figure:
 
 
 def verification_figure(rows: Sequence[Row]) -> Figure:
-    """Draw the errors against exact solutions over the mesh."""
+    """Plot errors relative to exact solutions against mesh size."""
     titles = {
         "patch": ("patch test", "elements along the block", "largest stress error"),
         "hertz": ("Hertz contact", "elements per half width", "$L^2$ pressure error"),
@@ -156,18 +156,18 @@ def verification_figure(rows: Sequence[Row]) -> Figure:
 
 
 def errors(rows: Sequence[Row], relin: int, quantity: str) -> list[tuple[int, float]]:
-    """List (steps, relative error); the last row of all is what they approach."""
+    """List (steps, relative error) with respect to the solution in the last row."""
     columns = QUANTITIES[quantity]
-    *found, truth = (np.array([float(row[c]) for c in columns]) for row in rows)
+    *vectors, truth = (np.array([float(row[c]) for c in columns]) for row in rows)
     return sorted(
         (int(row["steps"]), float(np.linalg.norm(v - truth) / np.linalg.norm(truth)))
-        for row, v in zip(rows[:-1], found, strict=True)
+        for row, v in zip(rows[:-1], vectors, strict=True)
         if row["relin"] == relin
     )
 
 
 def order(rows: Sequence[Row], relin: int, quantity: str) -> PowerLaw | None:
-    """Fit error ~ (1/steps)ᵖ from SINCE steps on; None with fewer than three."""
+    """Fit error ~ (1/steps)ᵖ from SINCE steps on; return None below three points."""
     kept = [
         (1 / n, e) for n, e in errors(rows, relin, quantity) if n >= SINCE and e > 0
     ]
@@ -175,14 +175,14 @@ def order(rows: Sequence[Row], relin: int, quantity: str) -> PowerLaw | None:
 
 
 def linearisations(rows: Sequence[Row]) -> list[int]:
-    """List the numbers of linearisations per step that were tried."""
+    """List the tested numbers of linearisations per step."""
     return sorted({int(r["relin"]) for r in rows[:-1]})
 
 
 def stepping_figure(rows: Sequence[Row]) -> Figure:
-    """Draw the errors of both quantities against the number of steps.
+    """Plot the errors of both quantities against the number of steps.
 
-    A guide of slope −1 lies above the curves.
+    A guide line of slope −1 is above the curves.
     """
     panels = []
     for quantity in QUANTITIES:
@@ -215,26 +215,26 @@ def stepping_figure(rows: Sequence[Row]) -> Figure:
 
 
 def orders(rows: Sequence[Row]) -> Table:
-    """Tabulate fitted orders, and what is left at the paper's number of steps."""
-    made = []
+    """Tabulate fitted orders, and errors at the number of steps of the paper."""
+    lines = []
     for relin in linearisations(rows):
         cells = [Cell(text=str(relin), value=relin)]
         for quantity in QUANTITIES:
             law = order(rows, relin, quantity)
-            left = dict(errors(rows, relin, quantity)).get(PAPER)
+            error = dict(errors(rows, relin, quantity)).get(PAPER)
             cells += [
                 Cell(text=exponent(law), value=law.exponent) if law else Cell(),
-                Cell(text=significant(left, 2), value=left),
+                Cell(text=significant(error, 2), value=error),
             ]
-        made.append(tuple(cells))
+        lines.append(tuple(cells))
     heads = [
         head for q in QUANTITIES
         for head in (f"{q}: order [95 %]", f"error at {PAPER} steps")
     ]  # fmt: skip
     return Table(
-        caption=f"Order in 1/steps, fitted from {SINCE} steps on, and the relative "
-        f"error that {PAPER} steps leave. The first line is the paper's scheme.",
+        caption=f"Order in 1/steps, fitted from {SINCE} steps on, and relative error "
+        f"at {PAPER} steps. The first row is the scheme of the paper.",
         columns=("linearisations per step", *heads),
-        rows=tuple(made),
+        rows=tuple(lines),
         text_columns=0,
     )

@@ -1,4 +1,4 @@
-"""Numbers printed in the paper, whose figures have no tables."""
+"""Published numbers of the paper, whose figures have no tables."""
 
 from __future__ import annotations
 
@@ -23,32 +23,33 @@ TABLE_1 = {
 }
 TOTALS = (13082, 12600, 26164)  #: nodes, elements, dofs
 DOFS = TOTALS[2]
-ROWS = 186 + 181  #: m_E + m_I there, by our count: the paper does not print them
+#: m_E + m_I of this problem, computed here; the paper does not state them
+ROWS = 186 + 181
 SEGMENTS = {"master": 240, "slave": 180}
 FIGURE_2_NODES = 313
 
 ERRATA = (
     "Figure 2: 313 nodes (n = 626) do not fit the rule of the text, 2·Nh radial layers "
     "of the ring, which gives 424 nodes (n = 848) for Nr = 4, Nh = 3; Nh layers give "
-    "313. Table 1 follows the rule of the text. Both are drawn here.",
-    "Section 3: “n is lower than m” is the wrong way round; m is much lower than n.",
+    "313. Table 1 follows the rule of the text. Both are shown here.",
+    "Section 3: “n is lower than m” is reversed; m is much lower than n.",
     "Equation (4): RᵀBᵀλ = Rᵀb must read RᵀBᵀλ = Rᵀf; R is n × r, not r × n.",
     "Section 2: m_E is not the number of nodes with non-zero displacement but of "
-    "displacement components held at zero, 2(Nr + 1) + 4(2Nh + 1).",
-    "Plane strain and the unit of the load are not stated. Taken here: plane strain, "
-    "as in the library that the paper uses, and 0.1 GN per metre of thickness.",
-    "“Mortar” is node-to-segment collocation in the paper; both are timed in Figure 4.",
+    "fixed displacement components, 2(Nr + 1) + 4(2Nh + 1).",
+    "The plane state and the unit of the load are not stated. We assume plane strain, "
+    "as in the library used by the paper, and 0.1 GN per metre of thickness.",
+    "“Mortar” is node-to-segment collocation in the paper; Figure 4 shows both.",
     "Figure 5: a Cholesky factor with fixing nodes applies a generalised inverse, not "
     "the Moore-Penrose one of pinv. On the feasible set they give the same dual "
     "problem, but the two multiplications are by different matrices.",
-    "The text calls Figure 6 “Figure 7”, and Figure 5 “Figure ??”.",
+    "The text refers to Figure 6 as “Figure 7” and to Figure 5 as “Figure ??”.",
     "Tolerances, penalty, contact rows and active rows are not stated, nor whether "
     "the 0.078 s of the Cholesky factor are for both bodies. Here each dual QP is "
-    "solved by SMALBE to 1e-8, in the paper's way with the parameters of its reference "
-    "[3].",
-    "89 % of the published 29.99 s are dualisation and 3.6 % are the QPs: what the "
-    "paper concludes on QP algorithms rests on the latter.",
-    "Rotations reach 20°, bending stresses several GPa: far outside linear elasticity. "
+    "solved by SMALBE to 1e-8; for the paper's method, with the parameters of its "
+    "reference [3].",
+    "89 % of the published 29.99 s are dualisation and 3.6 % are the QPs: the "
+    "conclusions of the paper on QP algorithms rest on the latter.",
+    "Rotations reach 20°, bending stresses several GPa: far beyond linear elasticity. "
     "Stresses at the clamped and loaded corners grow without bound as the mesh is "
-    "refined. The benchmark is a numerical one.",
+    "refined. The benchmark is purely numerical.",
 )

@@ -1,4 +1,4 @@
-"""The page: figures and tables of the paper, and further ones, from measured data."""
+"""Page of the paper's figures and tables, and further ones, from measured data."""
 
 from __future__ import annotations
 
@@ -68,18 +68,18 @@ from mortarbench.reports.render.latex import latex
 from mortarbench.reports.render.writing import write_figures, write_text
 
 REPEATED = (
-    "Medians of interleaved, randomised repeats in worker processes of their own, with "
-    "the distribution-free 95 % interval of the median (below six repeats: smallest "
-    "and largest). Every answer is judged on the QP as given, by its "
-    "residuals or for small QPs by a proven optimum; only verified answers have times."
+    "Medians of interleaved, randomised repeats in separate worker processes, with "
+    "the distribution-free 95 % interval of the median (below six repeats: minimum "
+    "and maximum). Every answer is verified on the original QP, by its residuals or, "
+    "for small QPs, by a proven optimum; only verified answers have times."
 )
 
 
 def write_paper(folder: Path) -> list[Path]:
     """Write index.html, figures/ (pdf, svg, png) and tables/ (csv, tex) from data/.
 
-    data/ is an experiment and, where measured, the result folders of the suites of
-    `BEYOND`. The same data give the same bytes.
+    data/ contains an experiment and, if measured, result folders of the suites of
+    `BEYOND`. Equal data yield identical bytes.
 
     Raises
     ------
@@ -116,9 +116,9 @@ def write_paper(folder: Path) -> list[Path]:
 def compose(
     experiment: Experiment, suites: Mapping[str, Evidence] = MappingProxyType({})
 ) -> Page:
-    """Put the page together: the paper in its order, then what it does not have.
+    """Compose the page: sections of the paper in its order, then further ones.
 
-    suites : measured ones by name; those of `BEYOND` make sections
+    suites : measured suites by name; those of `BEYOND` have sections
     """
     environment = experiment.setting["environment"]
     now = environment.get("now", {}).get("time", "")
@@ -147,14 +147,14 @@ def compose(
             ),
         ),
         footer="Every sample is in data/, the medians in tables/*.csv; the figures are "
-        "drawn from these files alone.",
+        "drawn from these files only.",
     )
 
 
 def _section(
     name: str, title: str, figure: Figure | FieldFigure, caption: str, **more: Any
 ) -> Section:
-    """Make a section of one picture of the same name, and of what else it has."""
+    """Return a section with one picture of the same name and further attributes."""
     picture = Picture(name=name, caption=caption, figure=figure)
     return Section(name=name, title=title, pictures=(picture,), **more)
 
@@ -165,17 +165,17 @@ def _summary(rows: Sequence[Row]) -> Section:
         times(rows, "n", method=m)[0].time for m in ("condensed", "per-row")
     )
     prose = (
-        f"The whole analysis at Nr = {Nr}, Nh = {Nh} (n = {n}) takes {seconds(ours)} "
-        "here with the dual condensed onto the interface and our SMALBE, "
-        f"{seconds(theirs)} the paper's way: one solve per constraint row and load "
-        "step, the textbook's SMALBE; both in one interleaved run."
+        f"The complete analysis at Nr = {Nr}, Nh = {Nh} (n = {n}) takes "
+        f"{seconds(ours)} with the dual condensed onto the interface and our SMALBE, "
+        f"and {seconds(theirs)} with the paper's method: one solve per constraint row "
+        "and load step, and textbook SMALBE. Both were measured in one interleaved run."
     )
     if of_table_1(rows):
         ratio = significant(published.TOTAL / ours.value)
         prose += (
             f" Published: {published.TOTAL:.2f} s ({published.MACHINE}), {ratio} times "
-            "as long. Of this ratio the machine and the language are a part that "
-            "cannot be told from here; compare methods within one machine."
+            "as long. This ratio includes the unknown influence of machine and "
+            "language; methods should be compared on one machine."
         )
     return Section(
         name="summary",
@@ -184,15 +184,15 @@ def _summary(rows: Sequence[Row]) -> Section:
             prose,
             "Times are medians of interleaved repeats in one process, with the "
             "distribution-free 95 % interval of the median in brackets and as bars "
-            "(below six repeats: smallest and largest, which cover less). Garbage "
-            "collection is off. Methods are ours throughout, also those marked “the "
-            "paper's way”: its own code is not public.",
+            "(below six repeats: minimum and maximum, with lower coverage). Garbage "
+            "collection is off. All methods, including those marked “the paper's "
+            "way”, are our implementations: the code of the paper is not public.",
         ),
     )
 
 
 def _bodies(experiment: Experiment) -> tuple[Section, ...]:
-    """Show geometry and mesh: Figures 1 and 2."""
+    """Return the sections on geometry and mesh, Figures 1 and 2."""
     setting, states = experiment.setting, experiment.states
     E = {k: m["E"] / 1e9 for k, m in setting["materials"].items()}
     Nr, Nh = setting["plan"]["example"]
@@ -207,21 +207,21 @@ def _bodies(experiment: Experiment) -> tuple[Section, ...]:
             geometry_figure(states["example-2Nh"], setting["load"]),
             "Geometry, supports and load, drawn from the mesh. Hatched: clamped. "
             f"E = {E['beam']:g} GPa (A) and {E['ring']:g} GPa (B), "
-            f"ν = {setting['materials']['beam']['nu']:g} in both.",
+            f"ν = {setting['materials']['beam']['nu']:g} in both bodies.",
         ),
         _section(
             "figure2", "Mesh and solution", mesh_figure(meshes),
             f"Mesh with Nr = {Nr}, Nh = {Nh} and its deformation (displacement × "
-            f"{SCALE:g}) with two numbers of radial layers. (a), (b): the picture in "
-            f"the paper, Nh layers, {one} nodes (the paper: "
-            f"{published.FIGURE_2_NODES}). (c), (d): the rule of its text and Table 1, "
-            f"2·Nh layers, {two} nodes.",
+            f"{SCALE:g}) with two numbers of radial layers. (a), (b): Nh layers as in "
+            f"the figure of the paper, {one} nodes (the paper: "
+            f"{published.FIGURE_2_NODES}). (c), (d): 2·Nh layers as in its text and "
+            f"Table 1, {two} nodes.",
         ),
     )  # fmt: skip
 
 
 def _times(experiment: Experiment) -> tuple[Section, ...]:
-    """Show the times of the parts against size: Figures 3 to 6."""
+    """Return the sections on times against size, Figures 3 to 6."""
     three, four, five, six = (experiment.tables[f"figure{i}"] for i in (3, 4, 5, 6))
     law = pinv_fit(five, "build")
     return (
@@ -229,39 +229,40 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             "figure3", "Assembly", assembly_figure(three),
             "Assembly of the rectangle's stiffness matrix against its size, "
             f"{_repeats(three)} repeats (the paper: averages of 100 runs of the "
-            "vectorised library [6]). Star: its one printed number, 0.087 s, which is "
+            "vectorised library [6]). Star: the only published value, 0.087 s, "
             f"for both bodies ({published.DOFS} dofs).",
         ),
         _section(
             "figure4", "Contact rows", contact_figure(four),
             "One linearisation of the contact at u = 0 against the slave segments "
-            "(ring), a line for each number of master segments (beam), "
+            "(ring), a curve for each number of master segments (beam), "
             f"{_repeats(four)} repeats (the paper: averages of 10 runs). Star: a tenth "
-            "of its 2.064 s for ten steps with 240 master and 180 slave segments "
-            f"({published.MACHINE}).",
+            "of the published 2.064 s for ten steps with 240 master and 180 slave "
+            f"segments ({published.MACHINE}).",
         ),
         _section(
             "figure5", "Generalised inverse", inverse_figure(five),
-            "Generalised inverse of the rectangle's stiffness: building it (a), "
-            f"multiplying it with a random vector (b), {_repeats(five)} repeats (the "
+            "Generalised inverse of the rectangle's stiffness: construction (a), "
+            f"multiplication with a random vector (b), {_repeats(five)} repeats (the "
             "paper: averages of 10 runs). The dense pseudoinverse is measured up to "
-            f"n = {law.until:g}; the dotted continuation is not: it is c·n³ (a) and "
-            f"c·n² (b), fitted to the sizes from {law.since:g} on, its band the spread "
-            "of c over them. The two inverses are different matrices (see the errata).",
+            f"n = {law.until:g}; the dotted line is the extrapolation c·n³ (a) "
+            f"and c·n² (b), fitted to the sizes from {law.since:g} on; the band is the "
+            "range of c over these sizes. The two inverses are different matrices (see "
+            "the errata).",
         ),
         _section(
             "figure6", "Scaling", scaling_figure(six),
             f"Growth with Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
-            "repeats. (c): the condensed curve contains the factorisation, in which "
-            "its work lies; the other does not. (d): everything from the mesh to u. "
+            "repeats. (c): the condensed curve includes the factorisation, which "
+            "dominates its work; the other does not. (d): complete analysis. "
             f"Star and cross: published for Nr = 30 ({published.MACHINE}).",
         ),
     )  # fmt: skip
 
 
 def _repeats(rows: Sequence[Row]) -> str:
-    """State how many repeats the medians are of: a number, or the range."""
+    """Return the number of repeats behind the medians, or its range."""
     most: dict[tuple[Any, ...], int] = {}
     for row in rows:
         key = tuple(row.get(k) for k in ("Nr", "Nh", "method"))
@@ -280,9 +281,9 @@ def _final(experiment: Experiment) -> Section:
     caption = (
         f"Patch-recovered stresses at Nr = {rows[0]['Nr']}, Nh = {rows[0]['Nh']}, "
         "plane strain, on the deformed bodies (displacement × "
-        f"{SCALE:g}); never averaged across bodies. Colours end at the "
-        f"{PERCENTILE:g} % quantile of the nodal values' size, since stresses are "
-        f"singular at corners; in GPa, the largest in brackets: {ends}."
+        f"{SCALE:g}); not averaged across bodies. Colour scales end at the "
+        f"{PERCENTILE:g} % quantile of absolute nodal values, since stresses are "
+        f"singular at corners; ends in GPa, with maxima in brackets: {ends}."
     )
     picture = Picture(name="figure7", caption=caption, figure=stress_figure(fields))
     return Section(
@@ -294,19 +295,19 @@ def _final(experiment: Experiment) -> Section:
 
 
 def _physics(experiment: Experiment) -> tuple[Section, ...]:
-    """Show the contact closely, both methods, and the accuracy of the stepping."""
+    """Return the sections on the contact, both methods and accuracy of load steps."""
     tables, plan = experiment.tables, experiment.setting["plan"]
     followed = active(tables["pressures"], "nts")
     last = max(followed)
     zoom = (
-        f"The contact at load step {last}, node-to-segment, to scale (displacement × 1)"
-        ". Orange: contact pressures on the ring's nodes (dots), each drawn along the "
-        "normal of its contact row; the arrow in the corner is their scale. Pressure: "
-        "nodal force over the undeformed arc that belongs to the node."
+        f"Contact at load step {last}, node-to-segment, to scale (displacement × 1). "
+        "Orange: contact pressures on the nodes of the ring (dots), each along the "
+        "normal of its contact row, with a scale arrow in the corner. The pressure is "
+        "the nodal force over the undeformed arc length of the node."
     )
     pressures = (
-        "Contact pressure against the angle around the ring's centre, from its right "
-        f"foot on: (a) through the {last} load steps, (b) both methods at the last. "
+        "Contact pressure against the angle around the centre of the ring, from "
+        f"its right foot: (a) all {last} load steps, (b) both methods at the last. "
         f"(c): the active set, which grows from {plural(len(followed[1]), 'node')} to "
         f"{len(followed[last])} (node-to-segment; a node is active if its force "
         "exceeds 1e-6 of the largest)."
@@ -335,21 +336,21 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
             name="methods",
             title="Beyond the paper: node-to-segment against mortar",
             prose=(
-                "What the paper calls mortar is node-to-segment collocation. On its "
-                "benchmark both give nearly the same pressures (the figure above); on "
-                "problems with exact solutions they do not.",
+                "The method called mortar in the paper is node-to-segment collocation. "
+                "On its benchmark both methods yield nearly the same pressures (see "
+                "the figure above); on problems with exact solutions they differ.",
             ),
             pictures=(
                 Picture(
                     name="verification",
                     figure=verification_figure(tables["verification"]),
-                    caption="Contact rows against exact solutions. (a): largest error "
-                    "of σy at any Gauss point of the patch test, 3 elements meeting 2 "
-                    "(errors below 1e-12 are rounding and drawn there): "
-                    f"node-to-segment keeps {100 * float(left['error']):.2g} % on the "
-                    f"finest mesh, mortar has {mortar:.0e} at most. (b): pressure "
-                    "between two cylinders against Hertz's, in L²; it cannot fall "
-                    "below the order a²/R² of the finite bodies.",
+                    caption="Contact rows compared with exact solutions. (a): largest "
+                    "error of σy at any Gauss point of the patch test, 3 elements "
+                    "meeting 2 (errors below 1e-12 are rounding, drawn at 1e-12): "
+                    f"node-to-segment {100 * float(left['error']):.2g} % on the "
+                    f"finest mesh, mortar at most {mortar:.0e}. (b): pressure "
+                    "between two cylinders compared with Hertz's, in L²; its error "
+                    "is at least of order a²/R² because the bodies are finite.",
                 ),
             ),
         ),
@@ -357,14 +358,15 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
             "stepping", "Beyond the paper: accuracy of the load steps",
             stepping_figure(tables["stepping"]),
             f"Error of the load steps at Nr = {Nr}, Nh = {Nh} (node-to-segment) "
-            f"against their number; what they approach is {settled['relin']} "
-            f"linearisations in each of {settled['steps']} steps, where contact holds "
-            "as linearised at the solution itself. The errors are those of the "
-            "stepping alone, every QP being solved to rounding.",
+            f"against their number. The reference has {settled['relin']} "
+            f"linearisations in each of {settled['steps']} steps and satisfies the "
+            "contact conditions linearised at the solution. The errors are those of "
+            "the load steps only, as every QP is solved to rounding.",
             prose=(
                 "The paper linearises the contact once per step, at the solution of "
-                "the step before, and gives no error. It is of first order in 1/steps; "
-                f"orders are fitted from {SINCE} steps on, with Student's interval.",
+                "the previous step, and does not state the error. The method is of "
+                f"first order in 1/steps; fits use {SINCE} or more steps, with "
+                "Student's interval.",
             ),
             tables=(orders(tables["stepping"]),),
         ),
@@ -372,13 +374,13 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
-    """Show how SMALBE and the others grow with m, and primal against dual."""
+    """Return the sections on times of all solvers against m, and on primal and dual."""
     return (
         _section(
-            "fleet", "Beyond the paper: SMALBE against the fleet",
+            "fleet", "Beyond the paper: SMALBE and other solvers",
             fleet_figure(evidence),
             "Time against the size m of the dual at the last load step, tolerance "
-            "1e-6, verified answers only; crosses: tried and not verified. Bars: "
+            "1e-6, verified answers only; crosses: unverified answers. Bars: "
             f"interval of the median. {TIMED}",
             prose=(REPEATED,),
             tables=tuple(fleet_table(evidence, form) for form in DUALS),
@@ -386,23 +388,23 @@ def _fleet(evidence: Evidence) -> tuple[Section, ...]:
         _section(
             "totals", "Beyond the paper: primal against dual",
             primal_dual_figure(evidence),
-            "Primal totals beside dual totals, the latter with the dualisation of one "
-            "load step, its factorisation included (over ten steps, the factorisation "
-            "is shared); verified answers only, crosses: tried and not verified. "
-            "SMALBE takes bounds and equalities, so no primal form.",
+            "Total times of the primal and dual forms, the latter with the dualisation "
+            "of one load step including the factorisation (which ten steps share); "
+            "verified answers only; crosses: unverified answers. SMALBE accepts "
+            "bounds and equalities only and hence not the primal form.",
             tables=(totals_table(evidence),),
         ),
     )  # fmt: skip
 
 
 def _certified(evidence: Evidence) -> tuple[Section, ...]:
-    """Show the time to certified accuracy."""
+    """Return the section on time to certified accuracy."""
     n = max((o.size("dofs") or 0) for o in evidence.flat)
     caption = (
         "Certified relative error of the displacement in the energy norm against the "
-        f"median time at n = {n}, a line for each solver through the tolerances asked "
-        "for. The certificate is an upper bound computed from the answer alone; it "
-        "holds whatever the solver claims."
+        f"median time at n = {n}, a curve over the requested tolerances for each "
+        "solver. The certificate is an upper bound computed from the answer alone, "
+        "independent of the claims of the solver."
     )
     return (
         _section(
@@ -413,5 +415,5 @@ def _certified(evidence: Evidence) -> tuple[Section, ...]:
     )  # fmt: skip
 
 
-#: suite → sections on it
+#: suite → function that returns its sections
 BEYOND = {"paper-fleet": _fleet, "paper-accuracy": _certified}

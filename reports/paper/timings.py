@@ -1,4 +1,4 @@
-"""Figures 3 to 6, Table 1 and the times of Section 5, beside what the paper says."""
+"""Figures 3 to 6, Table 1 and the times of Section 5, with published values."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from mortarbench.reports.paper import published
 from mortarbench.reports.statistics.intervals import Interval, median_interval
 
 DOFS = "degrees of freedom $n$"
-METHODS = {  #: of the tables → as the figures and tables of the report call them
+METHODS = {  #: name in tables → label in the report
     "triplets": "triplets, vectorised (the paper's way)",
-    "compiled": "compiled, with its pattern",
+    "compiled": "compiled, pattern included",
     "compiled-reused": "compiled, pattern reused",
     "geometric": "Cholesky, fixing nodes by geometry",
     "spectral": "Cholesky, fixing nodes by spectra (the paper's way)",
@@ -44,7 +44,7 @@ METHODS = {  #: of the tables → as the figures and tables of the report call t
     "per-row": "one solve per row (the paper's way)",
     "condensed": "condensed",
 }
-LINES = {  #: of the table of times → the parts of an analysis
+LINES = {  #: row of the table of times → parts of an analysis
     "mesh and assembly": ("assembly",),
     "Cholesky": ("factor",),
     "contact rows (the paper: mortar), all steps": ("contact",),
@@ -54,7 +54,7 @@ LINES = {  #: of the table of times → the parts of an analysis
     "recovery of u, all steps": ("recovery",),
 }
 PARTS = tuple({part: None for parts in LINES.values() for part in parts})
-KEYS = {  #: of CSV tables: the columns that a median is for
+KEYS = {  #: CSV table → columns that identify a median
     "figure3": ("Nr", "n", "method"),
     "figure4": ("Nr", "Nh", "master", "slave", "method"),
     "figure5": ("Nr", "n", "method", "part"),
@@ -63,29 +63,29 @@ KEYS = {  #: of CSV tables: the columns that a median is for
 _PUBLISHED = Look(colour=INK, marker="*", size=10, edge=0.9, dash=None, fill="white")
 _FITTED = Look(colour=COLOURS[2], dash=(1, 1.5))
 
-Labelled = tuple[str, Sequence[Any], Look]  #: label, points and look of a curve
+Labelled = tuple[str, Sequence[Any], Look]  #: label, points and style of a curve
 
 
 class Point(NamedTuple):
-    """One point of a curve: a size and a time in seconds with its interval."""
+    """Point of a curve: size and time in seconds with its interval."""
 
     x: float
     time: Interval
 
 
 class Fit(NamedTuple):
-    """t = c·xᵖ with p given; c between the extremes over the points it rests on."""
+    """Fit t = c·xᵖ with prescribed p, and the range of c over the fitted points."""
 
     power: int
     c: float
     low: float
     high: float
-    since: float  #: the smallest size it rests on
-    until: float  #: the largest
+    since: float  #: smallest fitted size
+    until: float  #: largest fitted size
 
 
 def select(rows: Iterable[Row], **where: Any) -> list[Row]:
-    """Return the rows with the values in `where`; a tuple allows any of its values."""
+    """Return the rows with the values in `where`; a tuple lists alternatives."""
     return [
         row
         for row in rows
@@ -98,9 +98,9 @@ def select(rows: Iterable[Row], **where: Any) -> list[Row]:
 def medians(
     rows: Iterable[Row], keys: Sequence[str]
 ) -> dict[tuple[Any, ...], Interval]:
-    """Group rows by the values of `keys` and take the median of their seconds.
+    """Return medians of the seconds of rows grouped by the values of `keys`.
 
-    Parts that are not among the keys are summed within each repeat.
+    Rows of one repeat are summed within each group.
     """
     sums: dict[tuple[Any, ...], dict[Any, float]] = {}
     for row in rows:
@@ -111,9 +111,9 @@ def medians(
 
 
 def times(rows: Iterable[Row], x: str, **where: Any) -> list[Point]:
-    """Medians against the column `x` of `select`ed rows, whose parts are summed."""
-    found = medians(select(rows, **where), [x])
-    return [Point(float(key), time) for (key,), time in sorted(found.items())]
+    """Return medians against column `x` of `select`ed rows, with parts summed."""
+    by_size = medians(select(rows, **where), [x])
+    return [Point(float(key), time) for (key,), time in sorted(by_size.items())]
 
 
 def fit(points: Sequence[Point], power: int) -> Fit:
@@ -125,13 +125,13 @@ def fit(points: Sequence[Point], power: int) -> Fit:
 
 
 def pinv_fit(rows: Sequence[Row], part: str) -> Fit:
-    """Fit c·n³ to building the dense pseudoinverse, c·n² to multiplying with it."""
+    """Fit c·n³ to building the dense pseudoinverse or c·n² to multiplying by it."""
     points = times(rows, "n", method="pinv", part=part)
     return fit(points, 3 if part == "build" else 2)
 
 
 def titled(*panels: tuple[str, Panel]) -> tuple[Panel, ...]:
-    """Letter the panels of a figure, and name them."""
+    """Add letters and titles to the panels of a figure."""
     return tuple(
         replace(panel, title=f"({letter}) {title}")
         for letter, (title, panel) in zip("abcdef", panels, strict=False)
@@ -139,7 +139,7 @@ def titled(*panels: tuple[str, Panel]) -> tuple[Panel, ...]:
 
 
 def labelled(curves: Iterable[Labelled]) -> tuple[tuple[Mark, ...], tuple[Key, ...]]:
-    """Draw curves, and list their keys."""
+    """Return curves and their legend keys."""
     marks, keys = list[Mark](), []
     for label, points, style in curves:
         marks += curve(points, style)
@@ -148,7 +148,7 @@ def labelled(curves: Iterable[Labelled]) -> tuple[tuple[Mark, ...], tuple[Key, .
 
 
 def assembly_figure(rows: Sequence[Row]) -> Figure:
-    """Draw Figure 3: linear and logarithmic."""
+    """Draw Figure 3 on linear and logarithmic axes."""
     curves: list[Labelled] = [
         (METHODS[method], times(rows, "n", method=method), look(i))
         for i, method in enumerate(("triplets", "compiled", "compiled-reused"))
@@ -167,7 +167,7 @@ def assembly_figure(rows: Sequence[Row]) -> Figure:
 
 
 def contact_figure(rows: Sequence[Row]) -> Figure:
-    """Draw Figure 4: node-to-segment and mortar, a line for each number of masters."""
+    """Draw Figure 4: node-to-segment and mortar, a curve for each number of masters."""
     masters = sorted({row["master"] for row in rows})
     place = published.SEGMENTS["slave"], published.SECONDS["contact"] / published.STEPS
     name = f"published\n({published.SEGMENTS['master']} master segments)"
@@ -208,7 +208,7 @@ def inverse_figure(rows: Sequence[Row]) -> Figure:
             (METHODS[method], times(rows, "n", method=method, part=part), look(i))
             for method, i in (("pinv", 2), ("geometric", 0), ("spectral", 1))
         )
-        law = pinv_fit(rows, part)  # goes on where nothing was measured
+        law = pinv_fit(rows, part)  # extrapolated beyond the measured sizes
         x = np.geomspace(law.until, until, 40)
         at, low, middle, high = (
             numbers(v)
@@ -217,7 +217,7 @@ def inverse_figure(rows: Sequence[Row]) -> Figure:
         band = Area(x=at, low=low, high=high, colour=COLOURS[2], opacity=0.2)
         marks = (*marks, band, Series(x=at, y=middle, look=_FITTED))
         panels.append((title, Panel(x=log(DOFS), y=log("time in s"), marks=marks)))
-    words = "dense pinv, not measured: fitted $c\\,n^3$ (a), $c\\,n^2$ (b)"
+    words = "dense pinv, extrapolated: $c\\,n^3$ (a), $c\\,n^2$ (b)"
     return Figure(
         rows=in_rows(titled(*panels), 2),
         height=3.6,
@@ -226,7 +226,7 @@ def inverse_figure(rows: Sequence[Row]) -> Figure:
 
 
 def scaling_figure(rows: Sequence[Row]) -> Figure:
-    """Draw Figure 6: sizes, constraints, dualisation and QPs, the whole."""
+    """Draw Figure 6: sizes, constraints, dualisation and QPs, complete analysis."""
     sizes = sorted({(r["Nr"], r["n"], r["m_E"], r["m_I"]) for r in rows})
     Nr, n, m_E, m_I = np.array(sizes, dtype=float).T
     most = float(max(m_E.max(), m_I.max()))
@@ -242,8 +242,8 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     dual, whole = list[Labelled](), list[Labelled]()
     for i, (label, method, parts) in enumerate((
         ("dualisation, one solve per row", "per-row", ("dualisation",)),
-        ("the same, condensed, with factor", "condensed", ("factor", "dualisation")),
-        ("dual QPs, the textbook's SMALBE", "per-row", ("qp",)),
+        ("dualisation, condensed, with factor", "condensed", ("factor", "dualisation")),
+        ("dual QPs, textbook SMALBE", "per-row", ("qp",)),
         ("dual QPs, our SMALBE", "condensed", ("qp",)),
     )):  # fmt: skip
         points = times(summed, "m", method=method, part=parts)
@@ -262,7 +262,7 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
         ("constraints", constraints),
         ("dualisation and QPs, all steps",
          _with_head_room("size of the dual $m$", dual, 3.8)),
-        ("the whole analysis", _with_head_room("size of the primal $n$", whole, 2.2)),
+        ("complete analysis", _with_head_room("size of the primal $n$", whole, 2.2)),
     )  # fmt: skip
     return Figure(rows=in_rows(panels, 2), height=6.3)
 
@@ -277,7 +277,7 @@ def _against_Nr(Nr: Vector, y: Axis, curves: Mapping[str, Vector]) -> Panel:
 
 
 def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Panel:
-    """Make a panel of labelled curves with room for its legend above them."""
+    """Return a panel of labelled curves with space above for the legend."""
     marks, keys = labelled(curves)
     panel = Panel(
         x=Axis(label=size, most=4),
@@ -291,24 +291,24 @@ def _with_head_room(size: str, curves: Sequence[Labelled], decades: float) -> Pa
 
 
 def here(machine: dict[str, Any]) -> str:
-    """Name the machine of the measurements."""
+    """Return a description of the machine of the measurements."""
     cpu = machine.get("cpu") or "an unknown processor"
     return f"{cpu}, {machine.get('system', 'unknown system')}, one thread, Python"
 
 
 def largest(experiment: Experiment) -> list[Row]:
-    """Keep the measurements of the analysis at its largest size."""
+    """Return the measurements of the analysis at the largest size."""
     rows = experiment.tables["figure6"]
     return select(rows, Nr=max(int(row["Nr"]) for row in rows))
 
 
 def of_table_1(rows: Sequence[Row]) -> bool:
-    """Return whether this is the size that the published times are of."""
+    """Return whether the size equals that of the published times."""
     return (rows[0]["Nr"], rows[0]["Nh"]) == (30, 15)
 
 
 def table_1(experiment: Experiment) -> Table:
-    """Make Table 1, beside the paper's counts."""
+    """Return Table 1, compared with the counts of the paper."""
     heads = ("nodes", "elements", "dofs")
     counted = experiment.tables["table1"]
     lines: list[tuple[Cell, tuple[Any, ...], tuple[Any, ...]]] = [
@@ -324,31 +324,33 @@ def table_1(experiment: Experiment) -> Table:
         columns=("", "N", *heads, "segments", "the paper"),
         rows=tuple(
             (name, *(Cell(text=str(v), value=v or None) for v in ours),
-             Cell(text="the same" if ours == theirs else "another size"))
+             Cell(text="equal" if ours == theirs else "different size"))
             for name, ours, theirs in lines
         ),
     )  # fmt: skip
 
 
 def timings(experiment: Experiment) -> Table:
-    """Put Section 5's times beside ours."""
+    """Tabulate the published times of Section 5 and ours."""
     rows = largest(experiment)
     steps = experiment.setting["plan"]["steps"]
     machine = here(experiment.setting["environment"].get("machine", {}))
     lines = []
     for name, parts in (LINES | {"total": PARTS}).items():
-        said = sum(published.SECONDS.get(part, 0.0) for part in parts)
+        published_time = sum(published.SECONDS.get(part, 0.0) for part in parts)
         way, ours = (
             times(rows, "n", method=m, part=parts)[0].time
             for m in ("per-row", "condensed")
         )
         ratio = Cell()
-        if said and of_table_1(rows):
-            text = bracketed(*(said / t for t in (ours.value, ours.high, ours.low)))
-            ratio = Cell(text=text, value=said / ours.value)
+        if published_time and of_table_1(rows):
+            ends = (ours.value, ours.high, ours.low)
+            text = bracketed(*(published_time / t for t in ends))
+            ratio = Cell(text=text, value=published_time / ours.value)
         lines.append((
             Cell(text=name, kind="total" if parts == PARTS else ""),
-            Cell(text=f"{said:.4g} s", value=said) if said else Cell(),
+            Cell(text=f"{published_time:.4g} s", value=published_time)
+            if published_time else Cell(),
             Cell(text=seconds(way), value=way.value),
             Cell(text=seconds(ours), value=ours.value),
             ratio,
@@ -356,20 +358,20 @@ def timings(experiment: Experiment) -> Table:
     return Table(
         caption=f"Section 5: times at Nr = {rows[0]['Nr']}, Nh = {rows[0]['Nh']}, "
         f"{steps} steps. Published: {published.MACHINE}; ours: {clean(machine)}. "
-        "Condensed: the factor contains the condensation onto the interface, so "
-        "compare it together with the dualisation. Ratio: published over ours "
-        "condensed, two machines apart.",
+        "Condensed: the factorisation includes the condensation onto the interface and "
+        "should be compared together with the dualisation. Ratio: published time over "
+        "our condensed time, on different machines.",
         columns=("", "published", "ours, the paper's way", "ours, condensed", "ratio"),
         rows=tuple(lines),
     )
 
 
 def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
-    """Make one table per figure, in seconds, Table 1 and the published times.
+    """Return a table for each figure, in seconds, Table 1 and the published times.
 
-    kind: measured, or fitted where nothing was measured.
+    kind: measured, or fitted beyond the measured sizes.
     """
-    made = {"table1": pd.DataFrame(list(experiment.tables["table1"]))}
+    frames = {"table1": pd.DataFrame(list(experiment.tables["table1"]))}
     for name, columns in KEYS.items():
         rows = [
             dict(zip(columns, key, strict=True))
@@ -379,16 +381,16 @@ def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
         ]  # fmt: skip
         if name == "figure5":
             rows += _fitted(experiment.tables[name])
-        made[name] = pd.DataFrame(rows)
-    made["published"] = pd.DataFrame(
+        frames[name] = pd.DataFrame(rows)
+    frames["published"] = pd.DataFrame(
         {"part": part, "seconds": s, "machine": published.MACHINE}
         for part, s in (published.SECONDS | {"total": published.TOTAL}).items()
     )
-    return made
+    return frames
 
 
 def _fitted(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Tabulate the fits at the sizes that the dense pseudoinverse was not measured."""
+    """Tabulate the fits at sizes without measurements of the dense pseudoinverse."""
     sizes = sorted({(int(r["Nr"]), int(r["n"])) for r in rows})
     return [
         {"Nr": Nr, "n": n, "method": "pinv", "part": part, "kind": "fitted"}

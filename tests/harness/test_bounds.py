@@ -1,4 +1,4 @@
-"""What a user gives has bounds: beyond them one line says what would be right."""
+"""Bounds on user input: a message of one line states the admissible values."""
 
 import json
 import os

@@ -11,7 +11,7 @@ from tests.support.toy_problem import Well
 
 
 class Bare:
-    """What a family needs and nothing else."""
+    """Family with the required attributes only."""
 
     name, defaults, forms = "bare", {"n": 1}, ("only",)
 

@@ -37,7 +37,7 @@ def suite(solvers='"exact", "lax"', depths="1, 2", **settings):
 
 @pytest.fixture(scope="module", autouse=True)
 def _found():
-    """What runs find out of this machine, in no time."""
+    """Replace the description of this machine by a constant."""
     here = {"machine": {"cpu": "one"}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Registries, "environment", lambda _: here)

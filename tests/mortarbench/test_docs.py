@@ -1,4 +1,4 @@
-"""What the documents show works."""
+"""Examples and commands of the documents."""
 
 import re
 import shlex
@@ -205,7 +205,7 @@ def test_the_workflow_for_ci_calls_commands_that_there_are():
 
 @pytest.mark.slow
 def test_the_workflow_for_ci_passes_with_a_new_solver(tmp_path, monkeypatch, capsys):
-    """Of a repository with `new solver mine` and `new suite compare`."""
+    """The repository is that of `new solver mine` and `new suite compare`."""
     monkeypatch.chdir(tmp_path)
     for kind, name in (("solver", "mine"), ("suite", "compare")):
         assert main(Registries(), ["new", kind, name]) == 0

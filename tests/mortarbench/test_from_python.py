@@ -87,7 +87,7 @@ def test_fields_of_a_solver_object_are_its_options():
 
 
 def test_an_option_that_cannot_be_written_down_is_refused(tmp_path):
-    """Where the default is None, every type is accepted until a worker is started."""
+    """A default of None accepts every type until a worker is started."""
     file = tmp_path / "free.py"
     file.write_text(
         "from dataclasses import dataclass\n"
@@ -421,7 +421,7 @@ def test_the_name_of_a_function_is_not_taken_by_a_module():
 
 
 def test_a_solver_object_goes_through_the_conformance_suite():
-    """Of a solver that knows one QP only, every check declines or shows its fault."""
+    """Every check of a solver for a single QP is declined or fails."""
     checks = ["solves a sequence"]
     found = mb.test_solver(ActiveRow(), checks=checks)
 

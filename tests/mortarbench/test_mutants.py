@@ -1,4 +1,4 @@
-"""What tools/mutants.py changes, and that its list is about this code."""
+"""Mutations by tools/mutants.py, and its list compared with the code."""
 
 import ast
 import sys

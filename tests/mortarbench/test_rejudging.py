@@ -31,7 +31,7 @@ tolerances = st.floats(-10, 0).map(lambda e: 10.0**e)
 
 
 def record(claimed, found, tol, **changes):
-    """Make a record as a journal gives it back: NaN and inf are null there."""
+    """Return a record as read from a journal, which stores NaN and inf as null."""
     status = verdict(claimed, found, changes.get("accuracy") or tol)
     made = Record(
         run_id="r", case="box/dual", family="box", params={}, form="dual", sizes={},
@@ -165,7 +165,7 @@ def test_the_journal_and_its_table_keep_the_status_as_stored(folder):
 
 
 def test_measured_statuses_come_back_from_their_residuals(tmp_path, monkeypatch):
-    """Of a real run, verified and refuted answers: no status is taken from the line."""
+    """The run has verified and refuted answers; stored statuses are not reused."""
     monkeypatch.chdir(tmp_path)
     bench = Registries(
         families=PROBLEMS, solvers=SOLVERS, reference=reference_solution,

@@ -1,4 +1,4 @@
-"""What authors of solvers do: sweeps, versions side by side, files to start from."""
+"""Tasks of solver authors: sweeps, versions side by side, file templates."""
 
 import json
 import os

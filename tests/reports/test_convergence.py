@@ -168,7 +168,7 @@ def test_rows_that_slip_are_drawn_below_the_active_set(folder):
     above, below = figure.panels
 
     assert below.marks[0].y == (0, 1, 3, 2)
-    assert (above.y.label, below.y.label) == ("active bounds", "of two bounds")
+    assert (above.y.label, below.y.label) == ("active bounds", "active, two-sided")
 
 
 def test_one_solver_that_does_not_count_products_puts_all_on_iterations(folder):

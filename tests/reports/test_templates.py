@@ -17,7 +17,7 @@ TEMPLATES = sorted(path for path in ROOT.rglob("*.j2") if path.parent.name != "a
 
 @pytest.fixture
 def sentences(tmp_path, monkeypatch):
-    """Make sentences of a template beside a module of a package of its own."""
+    """Return a factory of sentences from a template in a package of its own."""
     package = tmp_path / f"pages_{tmp_path.name}"
     package.mkdir()
     (package / "__init__.py").touch()

@@ -1,4 +1,4 @@
-"""What a report says of how times are known, and of what they leave out."""
+"""Statements of a report on the measurement of times and on their omissions."""
 
 import re
 from dataclasses import replace

@@ -160,7 +160,7 @@ def test_a_failure_leaves_nothing_to_the_next(load_steps):
 
 
 def test_a_block_that_changes_is_not_factorised_again(load_steps):
-    """As in Newton's method, where every problem has another matrix."""
+    """Every problem has another matrix, as in Newton's method."""
     scaled = [
         replace(qp, P=(1 + 0.01 * k) * qp.P)
         for k, qp in enumerate(load_steps["dual"][:4])

@@ -53,7 +53,7 @@ def record_of(text, label, tol=1e-8, **more):
 
 
 def write(folder, answers, tol=1e-8):
-    """Make a result folder of (solver, case, solution or verdict)."""
+    """Write a result folder of (solver, case, solution or verdict)."""
     cases = {}
     with Journal(folder, "here") as journal:
         for label, text, answer in answers:
@@ -336,7 +336,7 @@ def finds_nothing(qp):
 
 
 def test_a_row_is_closed_where_its_force_outweighs_its_gap(duplicate):
-    """As an interior point has them: all forces and all gaps are positive."""
+    """All forces and all gaps are positive, as at an interior point."""
     point = reference_point(duplicate.mechanics, reference_solution)
     inside = pushed((1.5, 1e-9), (0.5 - 5e-8, 1 - 1e-7))
 

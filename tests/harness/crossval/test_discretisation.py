@@ -1,4 +1,4 @@
-"""What finer meshes say of the error of a mesh, against errors known without them.
+"""Error estimates of a mesh from finer meshes, compared with exact errors.
 
 The obstacle problems have exact solutions: the true error of u_h is a quadrature over
 its elements. The patch test's solution is in every finite element space.
@@ -307,7 +307,7 @@ def test_less_time_takes_nothing_away_that_more_time_has_told(tmp_path):
 
 
 def test_what_was_told_of_other_parameters_or_meshes_does_not_stay(tmp_path):
-    """As after a default, which a case's name leaves out, has changed."""
+    """The default of a parameter that the name of the case omits has changed."""
     name = "obstacle/dim=1/n=4/primal"
     meshes(tmp_path, name)
     data = json.loads((tmp_path / FILE).read_text())
@@ -361,7 +361,7 @@ def test_the_file_is_plain_data(tmp_path):
 
 
 def test_tresca_on_flat_sides_has_an_error_and_other_friction_a_reason(tmp_path):
-    """Of two meshes that one halving apart, the coarse one's error has the change."""
+    """The squared coarse error is the sum of the squares of change and fine error."""
     name = (
         "contact-patch/lower={0}/upper={0}/ratio=0.1/friction=tresca/bound=1e5/primal"
     )

@@ -266,7 +266,7 @@ def test_the_least_pivot_is_one_of_the_sum_and_not_of_a_part():
 
 
 def test_a_rank_without_rows_takes_part_in_a_solve():
-    """Of A = diag(4, 9) on rank 0, rank 1 has nothing."""
+    """Rank 0 holds A = diag(4, 9); rank 1 holds no rows."""
 
     def work(ranks):
         k = 0 if ranks.rank else 2

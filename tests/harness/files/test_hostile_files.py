@@ -42,7 +42,7 @@ def build(path):
 
 @pytest.fixture
 def cheaply():
-    """Have the kernel refuse memory beyond `ADDRESS_SPACE` to this process."""
+    """Limit the memory that this process may add to `ADDRESS_SPACE`."""
     _, hard = before = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
         used = int(file.read().split()[0]) * resource.getpagesize()

@@ -58,7 +58,7 @@ BUILT = []
 
 
 def diagonal(arrays):
-    """Make the product with the diagonal matrix of an array."""
+    """Return the product with the diagonal matrix of an array."""
     BUILT.append(1)
     d = arrays["d"]
     return lambda x: d[:, None] * x if x.ndim == 2 else d * x
@@ -68,7 +68,7 @@ MAKERS = {"diagonal": diagonal}
 
 
 def operator_of(d):
-    """Make a QP whose P is the operator diag(d)."""
+    """Return a QP whose P is the operator diag(d)."""
     n = d.size
     P = SerialisableOperator(n, "diagonal", {"d": d}, MAKERS)
     return QP(

@@ -78,7 +78,7 @@ def test_matrices_come_back_sparse_or_dense_as_they_were(path):
 
 
 def test_a_problem_that_somebody_else_wrote_is_dense(path):
-    """As pandas writes it: no metadata of ours, matrices flattened, None for absent."""
+    """A file of pandas has flattened matrices, None for absent ones and no metadata."""
     row = {"P": P.ravel(), "q": np.ones(3), "G": None, "h": None, "name": "theirs"}
     row |= {"A": np.ones(3), "b": np.array([2.0]), "lb": None, "ub": np.ones(3)}
     pd.DataFrame({k: [v] for k, v in row.items()}).to_parquet(path, index=False)
@@ -150,7 +150,7 @@ def test_files_that_are_none_are_refused(path, tmp_path):
 
 
 def test_reading_starts_no_threads_that_could_outlive_python(path):
-    """Where arrow has threads, a process now and then aborts at its end."""
+    """Threads of arrow occasionally abort a process at its exit."""
     save_parquet(path, make_qp(), {})
     program = (
         "import os, pathlib, sys; import pyarrow.parquet; "

@@ -65,7 +65,7 @@ def test_what_supports_hold_is_shrunk_until_it_fits():
 
 
 def test_very_many_rows_are_closed_by_iterations_as_few_are_by_a_factor(monkeypatch):
-    """Of a disc that contact alone holds, each node somewhere within a millimetre."""
+    """Contact alone holds the disc; its nodes are displaced by about a millimetre."""
     mechanics = disc_between_plates().mechanics
     rng = np.random.default_rng(161803)
     u = 1e-3 * rng.standard_normal(mechanics.exact.f.size).astype(Real)

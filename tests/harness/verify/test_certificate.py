@@ -63,7 +63,7 @@ class Known:
 
     @property
     def slack(self) -> float:
-        """How far the reference itself may be off."""
+        """Bound of the error of the reference."""
         return self.exact.bound * self.exact.norm
 
 
@@ -76,7 +76,7 @@ def known(name: str) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Whether no error that the certificate speaks of exceeds what it says."""
+    """Return whether every error is within the bound stated by the certificate."""
     slack = problem.slack
     of_u, of_equilibrium = map(problem.error, (found.u, found.equilibrium))
     of_answer = problem.error(s.x.astype(Real))
@@ -166,7 +166,7 @@ def test_the_bound_of_the_solution_is_that_of_rounding(name):
 
 
 def beyond(solver: Solver, qp: QP) -> bool:
-    """Whether it is an active set with dense factors that would take many minutes."""
+    """Return whether a dense active-set solver would take many minutes."""
     return solver in (SOLVERS["highs"], SOLVERS["daqp"]) and qp.P.shape[0] > 3000
 
 

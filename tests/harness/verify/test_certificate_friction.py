@@ -90,7 +90,7 @@ def known(name: str) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Whether no error that the certificate speaks of exceeds what it says."""
+    """Return whether every error is within the bound stated by the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     of_u, of_equilibrium = map(problem.error, (found.u, found.equilibrium))
     of_answer = problem.error(s.x.astype(Real))
@@ -270,7 +270,7 @@ def test_a_body_may_be_as_far_from_its_place_as_it_slid_either_way(far, monkeypa
 
 
 def test_work_of_friction_has_its_own_part():
-    """Where a force does not oppose the slip, the work that it lacks is charged."""
+    """Missing work is charged if a force does not oppose the slip."""
     problem = known("beam-ring/Nr=3/Nh=2/steps=2/friction=tresca/bound=5e7")
     mechanics, s = problem.mechanics, problem.solution()
     slip = mechanics.friction.T @ s.x - mechanics.friction.start

@@ -132,7 +132,7 @@ KINDS = (
 
 
 def attack(name: str, count: int) -> tuple[list[str], list[float]]:
-    """Tell exceeded bounds and missing ones; give bound over true error."""
+    """Return messages on violated or missing bounds, and bounds over true errors."""
     mechanics, u, lam, length = known(name)
     rng, told, sharp = np.random.default_rng(sum(map(ord, name))), [], []
     for i in range(count):
@@ -528,7 +528,7 @@ def test_a_single_motion_that_only_contact_stops_leaves_a_seminorm():
 def test_rows_are_exchanged_where_contact_alone_holds_what_is_near(
     name, bound, count, monkeypatch
 ):
-    """Of pairs that prove a bound by work alone."""
+    """Each pair proves a bound by its work alone."""
     mechanics, u, lam, _ = known(name)
     monkeypatch.setattr(certificate, "_proved", lambda *args: pair(work=bound**2 / 2))
     split = Undivided(mechanics)

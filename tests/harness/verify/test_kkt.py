@@ -343,7 +343,7 @@ class Diagonal:
 
 
 def test_a_rank_without_bounds_takes_part_in_the_residuals():
-    """Of 9 variables on 3 ranks, those of the last have no bounds."""
+    """The last of three ranks holds 3 of 9 variables, all without bounds."""
     rng = np.random.default_rng(5)
     d, q, x, z = 1 + rng.random((4, 9))
     lb = np.where(np.arange(9) < 6, 0.5, -np.inf)

@@ -183,7 +183,7 @@ def test_repeating_a_short_sample_changes_no_time(qp, monkeypatch, sample_second
 
 
 def test_each_phase_has_a_peak_of_its_own(qp):
-    """What preparing needed and gave back is not counted where it solves."""
+    """Memory allocated and freed by `prepare` does not count towards the solve."""
     honest = PLUGIN.solvers["honest"]
 
     class Hungry(type(honest)):

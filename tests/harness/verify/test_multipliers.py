@@ -11,7 +11,7 @@ TOL = 1e-8
 
 
 def solved_qp(seed, *, definite=True):
-    """Make a QP with redundant and degenerate rows, and its exact solution x.
+    """Return a QP with redundant and degenerate rows, and its exact solution x.
 
     Every kind of constraint: equality rows of which some are combinations of others,
     active inequality rows with and without a multiplier, some written twice, bounds on
@@ -138,7 +138,7 @@ def test_units_of_rows_and_variables_change_nothing(power):
 
 
 def test_multipliers_that_are_given_stay():
-    """Of two equal rows one bears a part; the other takes the rest."""
+    """One of two equal rows keeps its multiplier; the other takes the remainder."""
     qp = QP.from_arrays([[1.0]], [-3.0], G=[[1.0]], h=[1.0], ub=[1.0])
     one = np.array([1.0])
     s = with_multipliers(qp, one, z=np.array([0.5]))

@@ -209,7 +209,7 @@ def test_multipliers_of_a_solution_over_balls_prove_it(seed):
 
 @pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny ball")])
 def test_multipliers_over_balls_are_found_whatever_rows_they_share(trap):
-    """Of rounded solutions, whose radii are met to rounding alone."""
+    """Solutions are rounded: they meet the radii up to rounding only."""
     worst = []
     for seed in range(20):
         planted = ExactProblem({trap}, seed)

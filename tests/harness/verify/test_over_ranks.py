@@ -38,7 +38,7 @@ ROUNDING = 1e-4
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request):
-    """What ranks, and one process, make of the same answers."""
+    """Return evaluations of the same answers on several ranks and in one process."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(request.param), sys.executable, "-m", "mpi4py",

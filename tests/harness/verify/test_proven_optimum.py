@@ -36,7 +36,7 @@ INF = np.inf
 
 
 def qp_of(P, q, *, A=None, b=(), G=None, h=(), lb=-INF, ub=INF):
-    """Make a QP of nested lists; a list of numbers is a diagonal P."""
+    """Return a QP from nested lists; a list of numbers is a diagonal P."""
     n, P = len(q), np.array(P, dtype=float)
     rows = [no_rows(n) if M is None else np.array(M, dtype=float) for M in (A, G)]
     lb, ub = (np.array(np.broadcast_to(v, n), dtype=float) for v in (lb, ub))
@@ -739,7 +739,7 @@ def test_a_short_search_finds_no_wrong_point_verified_and_no_right_one_refuted(w
 @pytest.mark.slow
 @pytest.mark.parametrize("way", WAYS)
 def test_a_search_of_a_hundred_thousand_points_finds_none_either(way):
-    """Of 7500 right points one is refuted, as docs/verdicts.md says: big-M."""
+    """One of 7500 right points is refuted, a big-M problem (docs/verdicts.md)."""
     wrong, refuted, verified = search(314159, 100_000 // len(WAYS), way)
 
     assert wrong == []

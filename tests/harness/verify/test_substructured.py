@@ -125,7 +125,7 @@ def known(name: str, parts: tuple[int, int] = (3, 2)) -> Known:
 
 
 def holds(problem: Known, s: Solution, found: Certificate) -> bool:
-    """Whether no error that the certificate speaks of exceeds what it says."""
+    """Return whether every error is within the bound stated by the certificate."""
     exact, slack = problem.mechanics.exact, problem.exact.bound * problem.exact.norm
     worst = max(problem.error(found.u), problem.error(s.x.astype(Real)))
     within = min(found.error, found.bound * problem.exact.norm)

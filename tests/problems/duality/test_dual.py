@@ -134,7 +134,7 @@ def test_displacements_at_constraints_are_those_of_the_whole_inverse(floating):
 
 
 def condition(mesh, nodes):
-    """Of the stiffness without the components of `nodes`."""
+    """Return the condition number of the stiffness with `nodes` held."""
     K = stiffness(mesh, D).toarray()
     free = np.setdiff1d(np.arange(mesh.dofs), dofs_of(np.asarray(nodes), 2))
     return np.linalg.cond(K[np.ix_(free, free)])

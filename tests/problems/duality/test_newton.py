@@ -279,7 +279,7 @@ def test_a_direction_uphill_may_not_raise_the_merit_function():
 @pytest.mark.parametrize("strain", [-1.0, 1.0])
 @pytest.mark.parametrize("potential", [-1.0, 1.0])
 def test_rounding_of_the_energies_does_not_shorten_a_step(strain, potential):
-    """Of 1 each: 12 eps more is rounding, a thousand are not."""
+    """At energies of 1, an increase by 12 eps is rounding, by 1000 eps it is not."""
     start = configuration(0.0, potential, 0.0, r=0.0, strain_energy=strain)
     eps = np.finfo(float).eps
     for more, length in ((12 * eps, 1.0), (1000 * eps, 0.5)):

@@ -33,7 +33,7 @@ from tests.support.threads import on_threads, without_lock
 
 
 def loads(work):
-    """Say what each rank does, if all do what `assign_factorisations` says."""
+    """Return the work of each rank under `assign_factorisations`."""
     done = np.zeros(len(work))
     for name, task in assign_factorisations(work).items():
         size = work[task.factor_rank][name]
@@ -453,7 +453,7 @@ def test_rows_are_coupled_where_the_sum_of_all_parts_is_more_than_rounding():
 
 
 def summed(decades=0):
-    """Who of three ranks touches which of 14 rows, and parts with rows as long."""
+    """Return masks of 14 rows on three ranks, row lengths and summands."""
     rng = np.random.default_rng(0)
     here = np.zeros((3, 14), dtype=bool)
     for p in range(3):
@@ -504,7 +504,7 @@ def test_equal_contact_rows_are_inverted_to_rounding():
 
 
 def test_the_sum_of_parts_on_some_rows_is_inverted_by_all_alike():
-    """What couples them with others, and equations with contact, is left out."""
+    """Couplings with other rows, and of equations with contact, are left out."""
     here, _, parts = summed()
     some, first = np.array([0, 3, 4, 5, 8, 9, 12]), 5  # three equations
     A = sum(parts)[np.ix_(some, some)]

@@ -49,7 +49,7 @@ SOLVED = 1e-10  #: what two references may leave of another point to linearise a
 
 
 def emitted(ranks, cases):
-    """What the shares of several ranks are together, by case."""
+    """Return the assembled parts of several ranks, by case."""
     done = subprocess.run(
         [
             mpi.mpiexec(), "-n", str(ranks), sys.executable, "-m", "mpi4py",
@@ -91,7 +91,7 @@ def test_ranks_settle_coulomb_s_law_of_bodies_that_contact_holds(described):
     params=[2, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 4))],
 )
 def found(request, described):
-    """What the shares of several ranks are together."""
+    """Return the assembled parts of several ranks."""
     bodies = described["first"], described["friction"]
     return emitted(request.param, [*CASES, *bodies])
 

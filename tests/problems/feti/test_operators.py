@@ -238,7 +238,7 @@ def test_contact_rows_do_not_weigh_the_equations(kind):
 
 
 def test_preconditioners_bring_the_spectrum_together():
-    """As the field has it: none, lumped, Dirichlet."""
+    """Condition numbers are ordered as in the literature: none, lumped, Dirichlet."""
     pair = on_one_process(Membranes(2, 8).in_subdomains("orthonormal")).decomposed
     F = operator_of(pair)
     _, B, R = dense(pair)
@@ -295,7 +295,7 @@ def test_equal_subdomains_share_one_stiffness_in_what_is_written():
 
 
 def test_a_kind_without_kernel_has_its_inverse():
-    """Where supports are eliminated, as in FETI-1."""
+    """Supports are eliminated, as in FETI-1."""
     (kind,) = membranes().classes
     n = kind.K.shape[0]
     K = csc_array(kind.K + eye_array(n))

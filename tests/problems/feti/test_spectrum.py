@@ -79,7 +79,7 @@ def test_the_error_bounds_hold_and_are_as_small_as_asked(crowded: str) -> None:
 
 
 def test_errors_of_ritz_values_come_from_the_last_entries_of_their_vectors() -> None:
-    """Of [[2, 2], [2, 5]]: 1 with (2, −1)/√5 and 6 with (1, 2)/√5."""
+    """The eigenpairs of [[2, 2], [2, 5]] are 1, (2, −1)/√5 and 6, (1, 2)/√5."""
     found = ritz_bounds(np.array([2.0, 5.0]), np.array([2.0]), 0.5)
     assert [found.smallest, found.largest] == pytest.approx([1.0, 6.0])
     errors = [found.smallest_error, found.largest_error]

@@ -1,4 +1,4 @@
-"""What is known of subdomains without the whole is what tearing makes of it."""
+"""Subdomains described without the whole mesh, compared with those of tearing."""
 
 import numpy as np
 import pytest

@@ -55,7 +55,7 @@ def test_compact_blocks_of_squares_are_squares() -> None:
 
 
 def test_compact_blocks_of_long_cells_are_rectangles_about_as_long_as_wide() -> None:
-    """Of cells that are 8 times as long as wide, 2 × 16 are a square."""
+    """A block of 2 × 16 cells is a square if cells are 8 times as long as wide."""
     mesh = rectangle((0.0, 0.0), (8.0, 1.0), (16, 16))
     label = label_blocks(
         compact_blocks(sides(np.full(16, 1 / 2), np.full(16, 1 / 16)), 6)
@@ -94,7 +94,7 @@ def test_a_compact_block_as_long_as_wide_is_cut_between_rows() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_rounding_of_lengths_moves_no_cut_of_compact_blocks(seed: int) -> None:
-    """Of seven equal cells, two lines are as near to the middle."""
+    """Two grid lines of seven equal cells are equally close to the middle."""
     wide, deep = np.full(7, 1.0), np.full(2, 1.0)
     rounding = 1 + 1e-15 * np.random.default_rng(seed).standard_normal((2, 7))
     found = compact_blocks(sides(wide * rounding[0], deep * rounding[1, :2]), 3)

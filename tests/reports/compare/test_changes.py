@@ -1,4 +1,4 @@
-"""What changed between two result folders: what was planted is found, no more."""
+"""Changes between two result folders: planted changes are found, and no others."""
 
 import json
 import re
@@ -44,7 +44,7 @@ def record(solver="one", case=0, repeat=0, **changes):
 
 
 def suite(seed, cases=12, repeats=5, scatter=0.05, **slower):
-    """Make a run of all solvers whose times scatter; those named take longer."""
+    """Return a run of all solvers with scattered times, some of them slower."""
     rng = np.random.default_rng(seed)
     return [
         record(
@@ -158,7 +158,7 @@ def test_what_a_change_by_half_may_hide_in_is_not_called_unchanged(low, high, wo
 
 
 def test_cells_that_resolve_nothing_are_counted_apart(changed):
-    """Of two cells without a change, one scatters by a factor of ten."""
+    """One of two unchanged cells scatters by a factor of ten."""
     times = {0: (1.0, 1.0), 1: (0.1, 10.0)}
     before = [record(case=k, repeat=i) for k in times for i in range(2)]
     after = [
@@ -584,7 +584,7 @@ def test_a_worse_verdict_fails_where_times_cannot_be_compared(folders):
 
 
 def test_a_gate_without_verified_answers_of_a_solver_names_it(folders):
-    """Of the two solvers of the suite, one is wrong everywhere in the later folder."""
+    """One of the two solvers is wrong on all cases of the later folder."""
     pair = [r for r in suite(2, cases=4, repeats=3) if r.solver in ("one", "two")]
     spoilt = [
         r.replace(verdict=Verdict.WRONG) if r.solver == "two" else r for r in pair

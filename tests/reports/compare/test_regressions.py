@@ -1,4 +1,4 @@
-"""What a CI fails on: no more than one alarm in twenty, and regressions are found."""
+"""Failures of a CI: at most one false alarm in twenty, and detected regressions."""
 
 from dataclasses import replace
 

@@ -218,7 +218,7 @@ def test_a_form_that_nobody_solves_everywhere_is_named(record, evidence):
 def test_problems_without_seconds_of_dualising_are_left_out_and_counted(
     record, evidence
 ):
-    """As in folders of older versions."""
+    """Folders of older versions lack the seconds of dualising."""
     known = four_ways(record, count=9)
     old = [r.replace(dualise_seconds=None) if r.params["n"] == 0 else r for r in known]
     page = compose(evidence(old))

@@ -1,4 +1,4 @@
-"""What figures of reports say: whose points they show, and the measurements behind."""
+"""Figures of reports: solvers and measurements behind their points."""
 
 import pickle
 import subprocess
@@ -59,7 +59,7 @@ def series(figure):
 
 
 def told(figure):
-    """Map every point (solver, x, y) that has measurements to these."""
+    """Map every point (solver, x, y) with measurements to their run ids."""
     return {
         (one.solver, x, y): runs
         for one in series(figure)
@@ -68,7 +68,7 @@ def told(figure):
 
 
 def swept():
-    """Every solver once per tolerance, with residual and certified error 2·tol."""
+    """Return records of all solvers and tolerances, with residual and error 2·tol."""
     first = {r.solver: r for r in reversed([*records(SOLVERS, 1, 1)])}
     return [
         r.replace(
@@ -128,7 +128,7 @@ def test_times_and_iterations_over_size_name_the_measurements_of_their_size(camp
 
 @pytest.mark.parametrize("spread", [1.0, 1 + 1e-9, 1.02, 1.5, 4.0, 1e6])
 def test_guides_leave_the_axes_their_room_however_little_times_differ(spread):
-    """Sizes of 1 to 100: a guide of slope 3/2 rises by seven."""
+    """A guide of slope 3/2 rises by a factor of seven over sizes of 1 to 100."""
     grown = [
         r.replace(run_id=f"{n}", solver="a", case=f"box/n={n}/dual", family="box",
               form="dual", params={"n": n}, sizes={"variables": n},
@@ -245,7 +245,7 @@ def test_what_is_drawn_of_a_solver_bears_its_name(campaign):
 
 
 def test_putting_a_report_together_loads_no_matplotlib():
-    """It takes a second, which only those who draw should pay."""
+    """Its import takes a second and is needed for drawing only."""
     code = (
         "import sys; from mortarbench.reports import folder; "
         "from mortarbench.reports.paper import report; "

@@ -1,4 +1,4 @@
-"""Figures that stand alone: hues, ends of axes, what they state about themselves."""
+"""Legibility of figures: hues, ends of axes, titles."""
 
 import colorsys
 from itertools import combinations, pairwise
@@ -42,7 +42,7 @@ def linear(colour):
 
 
 def oklab(light):
-    """Ottosson 2020."""
+    """Return OKLab coordinates (Ottosson 2020)."""
     lms = np.array([[0.4122214708, 0.5363325363, 0.0514459929],
                     [0.2119034982, 0.6806995451, 0.1073969566],
                     [0.0883024619, 0.2817188376, 0.6299787005]]) @ light  # fmt: skip
@@ -61,7 +61,7 @@ def test_no_two_solvers_of_a_figure_share_a_hue(count, degrees):
 
 @pytest.mark.parametrize("sight", SIGHTS)
 def test_the_first_eight_colours_differ_for_colour_blind_readers(sight):
-    """0.02 of OKLab is about a just noticeable difference."""
+    """A distance of 0.02 in OKLab is about a just noticeable difference."""
     seen = [oklab(np.clip(SIGHTS[sight] @ linear(c), 0, 1)) for c in COLOURS[:8]]
     assert min(np.linalg.norm(a - b) for a, b in combinations(seen, 2)) > 0.06
 

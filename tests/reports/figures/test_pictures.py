@@ -1,4 +1,4 @@
-"""Pictures of two rectangles: what is drawn is where and what the fields say."""
+"""Pictures of two rectangles, compared with their fields."""
 
 import re
 from dataclasses import replace
@@ -40,7 +40,7 @@ LOWER, UPPER = 3, 6  # columns of cells
 
 
 def rectangle(columns, width, height, bottom):
-    """One row of cells: (2·columns + 2, 2) points and (columns, 4) cells."""
+    """Return one row of cells: (2·columns + 2, 2) points and (columns, 4) cells."""
     x = np.linspace(0, width, columns + 1)
     points = [
         np.column_stack([x, np.full_like(x, y)]) for y in (bottom, bottom + height)
@@ -165,7 +165,7 @@ def test_arrows_push_on_the_loaded_nodes_in_the_direction_of_the_force(bodies):
 
 
 def side(name, nodes, forces):
-    """One contact, as loaded."""
+    """Return one contact under the given load."""
     forces = np.array(forces, dtype=float)
     ones = np.ones(len(forces))
     return ContactSide(
@@ -186,7 +186,7 @@ def test_each_contact_that_carries_load_has_a_window_with_its_own_forces(bodies)
 
     assert titles[0].startswith("(a) ")
     assert titles[1].startswith("(b) up on low: contact forces")
-    assert titles[1].endswith("the largest is 3 MN/m")
+    assert titles[1].endswith("on the slave nodes, largest 3 MN/m")
     assert titles[2].startswith("(c) low on floor: contact forces")
     assert len(figure.panels) == len(figure.heights) == 3
     assert [len(a.feet) for a in arrows] == [1, 2]
@@ -215,7 +215,7 @@ def test_forces_of_nodes_that_stick_and_slip_have_colours_of_their_own(bodies):
     ("state", "key"),
     [
         ("sliding without contact", "sliding without contact: orange (2)"),
-        ("open", "open: grey (2)"),  # their neighbours' forces; results of old say so
+        ("open", "open: grey (2)"),  # forces of neighbours, in older results
     ],
 )
 def test_nodes_with_shear_alone_neither_widen_the_window_nor_hide_contact(
@@ -244,7 +244,7 @@ def test_nodes_with_shear_alone_neither_widen_the_window_nor_hide_contact(
 def test_a_side_that_slides_without_contact_is_coloured_to_the_middle_of_its_nodes(
     bodies,
 ):
-    """Two of four nodes, in the overview and in the enlargement."""
+    """Two of four nodes slide without contact, in overview and enlargement."""
     pair = side("up on low", [4, 5, 0, 1], [[0, -3], [0, -2], [1, 0], [0, 0]])
     states = np.array(["slip", "stick"] + 2 * ["sliding without contact"])
     rough = replace(pair, shear=pair.gap, friction=states)
@@ -315,7 +315,7 @@ def test_the_scale_is_that_of_the_displacement(bodies):
 
 
 def test_contacts_are_enlarged_as_they_are_whatever_the_scale_of_the_whole(bodies):
-    """Where displacements are multiplied, bodies in contact overlap."""
+    """Bodies in contact overlap if displacements are multiplied."""
     one, four = (deformed_figure(bodies, scale).panels[1] for scale in (1.0, 4.0))
 
     assert (one.low, one.high) == (four.low, four.high)
@@ -387,7 +387,9 @@ def test_a_state_without_numbers_is_not_drawn(bodies):
 def test_bodies_without_extent_are_not_drawn(bodies):
     flat = Fields(**{**vars(bodies), "points": 0 * bodies.points})
 
-    with pytest.raises(InputError, match="no width or no height"):
+    with pytest.raises(
+        InputError, match=r"^bodies have no width or no height and cannot be drawn$"
+    ):
         deformed_figure(flat)
 
 
@@ -446,7 +448,9 @@ def test_bodies_in_space_are_not_drawn(bodies):
     space = replace(
         bodies, points=lifted(bodies.points), displacement=lifted(bodies.displacement)
     )
-    with pytest.raises(InputError, match=r"in space: expected a \.vtu"):
+    with pytest.raises(
+        InputError, match=r"^bodies in space cannot be drawn: expected a \.vtu$"
+    ):
         deformed_figure(space)
     loaded = (side("up on low", [4, 5], [[0, 0], [0, -3e6]]),)
     assert traction_figure(replace(bodies, contacts=loaded)) is not None

@@ -16,7 +16,7 @@ SIZES = (1_000, 16_000, 81_000, 256_000)  # fourth powers are whole numbers
 
 
 def records(**but):
-    """Make answers whose cg steps are n^¼, whose other counts stay, with κ."""
+    """Yield answers with CG steps of order n^¼, other counts constant, and κ."""
     for n in SIZES:
         yield Record(
             run_id=f"{n:012d}", case=f"plate/Sx={n}/dual", family="plate",

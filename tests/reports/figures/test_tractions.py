@@ -1,4 +1,4 @@
-"""Tractions along contacts: which nodes are shown where, and what is exact."""
+"""Tractions along contacts: positions of nodes and exact solutions."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from mortarbench.solvers.reference.solve import reference_solution
 
 
 def solved(family, form="dual", **given):
-    """Deformed state of the reference solution."""
+    """Return the deformed state of the reference solution."""
     family = PROBLEMS[family]
     case = family.build(form, family.complete(given), reference_solution)
     return case.fields(reference_solution(case.qp))
@@ -27,7 +27,7 @@ SHEARED = dict(n=8, m=8, load=0.1, friction="coulomb", mu=0.4, Q=0.6)
      ("hertz-plane", dict(n=6, load=0.1))],
 )  # fmt: skip
 def test_the_nodes_lie_along_the_exact_curves(family, given):
-    """Over the middle: at the edges the exact tractions have vertical tangents."""
+    """Exact tractions have vertical tangents at the edges, which are left out."""
     fields = solved(family, **given)
     (side,) = fields.contacts
     at, half = places(fields, side), side.exact[side.exact[:, 1] > 0, 0].max()

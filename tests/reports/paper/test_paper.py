@@ -1,4 +1,4 @@
-"""The paper's figures and tables, measured in little and drawn by the real code."""
+"""Figures and tables of the paper, from small measurements."""
 
 import csv
 import shutil
@@ -80,7 +80,7 @@ def experiment():
 
 @pytest.fixture(scope="module")
 def data(experiment, tmp_path_factory):
-    """A folder of what was measured, and nothing else."""
+    """Return a folder of measurements only."""
     path = tmp_path_factory.mktemp("paper") / "measured"
     save_experiment(experiment, path / "data")
     for name, records in synthetic().items():
@@ -92,7 +92,7 @@ def data(experiment, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(data, svg_only):
-    """The page and its tables; figures are SVG alone."""
+    """Return the page and its tables, with figures as SVG only."""
     path = data.with_name("page")
     shutil.copytree(data, path)
     with svg_only():
@@ -110,7 +110,7 @@ def all_formats(data):
 
 @pytest.fixture(scope="module")
 def sorts(data):
-    """A figure of each sort in all formats, drawn of what is stored."""
+    """Return a figure of each sort in all formats, drawn from stored data."""
     suites = {n: read_evidence(data / "data" / n) for n in synthetic()}
     page = compose(load_experiment(data / "data"), suites)
     pictures = {p.name: p for s in page.sections for p in s.pictures}
@@ -139,7 +139,7 @@ def record(solver, form, m, seconds, repeat, **changes):
 
 
 def synthetic():
-    """Times of 1e-6·m² s; `lazy` is wrong at the largest size, in no time at all."""
+    """Return times of 1e-6·m² s; `lazy` is wrong at the largest size, after 1 ns."""
     fleet = [
         record(solver, form, m, 1e-6 * m**2 * (1 + repeat / 100), repeat,
                **(wrong if solver == "lazy" and m == 200 else {}))
@@ -201,7 +201,7 @@ def test_the_page_shows_all_of_it_and_escapes_what_is_foreign(folder):
 
 @pytest.mark.slow
 def test_all_of_the_same_data_is_drawn_to_the_same_bytes(all_formats, data, tmp_path):
-    """From the files in data/ alone: nothing is measured again."""
+    """The page is drawn from the files in data/ without new measurements."""
     shutil.copytree(data / "data", tmp_path / "data")
     save_experiment(load_experiment(data / "data"), tmp_path / "data")
     again = write_paper(tmp_path)
@@ -213,7 +213,7 @@ def test_all_of_the_same_data_is_drawn_to_the_same_bytes(all_formats, data, tmp_
 
 
 def test_the_same_data_are_drawn_to_the_same_bytes(folder, data, sorts, tmp_path):
-    """What is stored, and a figure of each sort: those drawn before the page was."""
+    """Stored data and a figure of each sort are equal, byte by byte, in two runs."""
     save_experiment(load_experiment(data / "data"), tmp_path / "data")
     stored = [*(tmp_path / "data").glob("*.csv")]
     assert stored
@@ -225,7 +225,10 @@ def test_the_same_data_are_drawn_to_the_same_bytes(folder, data, sorts, tmp_path
 
 
 def test_table_1_counts_as_the_papers_formulas_do(experiment):
-    """(8Nr + 1)(Nr + 1) and (12Nh + 1)(2Nh + 1) nodes, 8Nr² and 24Nh² elements."""
+    """The beam has (8Nr + 1)(Nr + 1) nodes and 8Nr² elements.
+
+    The ring has (12Nh + 1)(2Nh + 1) nodes and 24Nh² elements.
+    """
     beam, ring = experiment.tables["table1"]
 
     assert list(beam.values()) == ["rectangle", 2, 17 * 3, 32, 102, 16]
@@ -234,7 +237,7 @@ def test_table_1_counts_as_the_papers_formulas_do(experiment):
 
 @pytest.mark.parametrize("Nr", [1, 2])
 def test_the_dual_has_the_sizes_of_the_papers_formulas(experiment, Nr):
-    """m_E = 2(Nr + 1) + 4(2Nh + 1) components held, m_I = 12Nh + 1 nodes of the arc."""
+    """There are m_E = 2(Nr + 1) + 4(2Nh + 1) and m_I = 12Nh + 1 rows."""
     sizes = {
         (r["n"], r["m_E"], r["m_I"])
         for r in experiment.tables["figure6"] if r["Nr"] == Nr
@@ -289,7 +292,7 @@ def test_only_the_papers_way_solves_for_all_rows_in_each_step(way, solves, monke
 
 
 def test_an_analysis_solves_the_problem_of_its_last_step():
-    """Its solution satisfies the primal's stationarity and its contact rows."""
+    """The solution satisfies primal stationarity and the contact rows."""
     a = analyse(2, 2, solve=solve, condense=True, steps=2)
     qp, s = a.primal, a.solution
     residual = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z
@@ -309,7 +312,7 @@ def test_an_unsolved_qp_is_not_timed_in_silence():
 
 
 def test_what_was_not_measured_says_so(folder):
-    """Beyond the largest dense size: c·n³ to build, c·n² to multiply, marked fitted."""
+    """Rows beyond the largest dense size are c·n³ and c·n², marked as fitted."""
     rows = [r for r in rows_of(folder / "tables" / "figure5.csv")
             if r["method"] == "pinv"]  # fmt: skip
     kinds = {(r["part"], int(r["n"])): r["kind"] for r in rows}
@@ -380,7 +383,7 @@ def test_published_times_are_compared_at_the_published_size_only(experiment):
 
 
 def with_orders(p):
-    """Plant tips and forces that are off by 0.1·steps⁻ᵖ."""
+    """Return tips and forces with errors of 0.1·steps⁻ᵖ."""
 
     def row(steps, relin, error):
         return {"steps": steps, "relin": relin, "tip_x": 3 * (1 + error), "tip_y": 4,
@@ -437,7 +440,7 @@ def evidence(name):
 
 
 def test_an_answer_that_is_not_verified_is_never_drawn_as_a_time():
-    """`lazy` took 1 ns to be wrong: below every axis, and a cross instead."""
+    """The wrong answer of `lazy` after 1 ns is a cross and does not affect the axis."""
     figure = fleet_figure(evidence("paper-fleet"))
     upper, strips = (row.panels for row in figure.rows)
 
@@ -471,7 +474,7 @@ def test_dual_totals_include_the_dualisation():
 
 
 def test_the_time_to_an_error_is_that_of_the_cheapest_certified_answer():
-    """tol 1e-2 is certified to 0.1 only, 1e-4 to 1e-3, 1e-6 to 1e-5."""
+    """Certified errors are 0.1, 1e-3 and 1e-5 at tolerances 1e-2, 1e-4 and 1e-6."""
     (row,) = certified_table(evidence("paper-accuracy")).rows
 
     assert row[2].value == pytest.approx(1e-3 * 1e-4**-0.1)

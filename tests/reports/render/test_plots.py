@@ -1,4 +1,4 @@
-"""What files and the page draw is what the figure's value says, point by point."""
+"""Points in files and on the page, compared with those of the figure's value."""
 
 import json
 import pickle

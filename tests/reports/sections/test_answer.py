@@ -132,7 +132,7 @@ def test_a_winner_over_cases_takes_both_the_interval_and_the_signs(
 def test_where_few_of_many_cases_were_solved_no_ratio_over_cases_is_told(
     record, opened
 ):
-    """As where a sequence was asked for more steps than there were."""
+    """An example is a sequence that was asked for more steps than it has."""
     records = [
         record(s, k, 0.01, **({} if k < 4 else {"verdict": Verdict.DECLINED}))
         for k in range(9) for s in "ab"

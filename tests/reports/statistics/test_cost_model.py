@@ -22,7 +22,7 @@ def sent_on(N):
 
 
 def modelled(N, work=2.0, repeated=0.1, slowdown=1.0, sent=SENT):
-    """Do the sum of the model by hand."""
+    """Evaluate the model by hand."""
     depth, neighbours = int(np.ceil(np.log2(N))), min(N - 1, 6)
     waits = 300 * 5e-6 * depth + 120 * 2e-6 * neighbours + (N > 1) * 4e6 / 2e9
     return (slowdown if N > 1 else 1.0) * (work / N + repeated) + waits

@@ -157,7 +157,7 @@ def test_the_steps_are_those_that_are_written(seed, name, kind):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_a_penalty_below_the_tail_is_left_out_as_it_is_written(seed):
-    """Of a model whose first rows are those of the penalty."""
+    """The first rows of the model are those of the penalty."""
     they_agree(random_qp(seed), replace(SOLVERS["smalbe"], max_steps=25, rho=1e-3))
 
 

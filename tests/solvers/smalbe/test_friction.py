@@ -113,7 +113,7 @@ def test_bounds_that_close_and_open_again_are_followed():
 
 
 def test_the_history_ends_with_the_rows_that_slip():
-    """Where a variable has two bounds; elsewhere it has no such column."""
+    """Histories have the column `two_sided` only if a variable has two bounds."""
     qp = emitted("greco/n=16/dual-bounds")
     solver = replace(SOLVERS["smalbe"], history=True)
     s = solver.prepare(qp, TOL)()

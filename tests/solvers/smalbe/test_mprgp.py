@@ -118,7 +118,7 @@ def minimised(
 
 
 def test_without_active_bounds_it_is_conjugate_gradients(minimise):
-    """As many steps as there are distinct eigenvalues."""
+    """The number of steps is that of the distinct eigenvalues."""
     run, products = minimise(
         np.diag(np.repeat([1.0, 3.0, 10.0, 40.0], 5)), np.arange(1.0, 21.0),
         np.full(20, -np.inf),

@@ -75,7 +75,7 @@ def whole(in_face):
 
 
 def test_dirichlet_inverts_the_dual_of_one_body(whole, gap):
-    """Where B picks components, B_D S B_Dᵀ = (BK⁻¹Bᵀ)⁻¹."""
+    """If B selects components, then B_D S B_Dᵀ = (BK⁻¹Bᵀ)⁻¹."""
     assert whole(gap, "dirichlet") @ gap.P == pytest.approx(np.eye(10), abs=1e-7)
 
 

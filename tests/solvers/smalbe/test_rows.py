@@ -211,7 +211,7 @@ def test_the_same_steps_lead_to_the_same_point(G, e, monkeypatch, preconditioner
 
 
 def test_a_right_hand_side_of_rounding_is_none(G):
-    """Of rows that should say Gx = 0, nothing is met relative to 1e-18."""
+    """A right-hand side of 1e-18 is rounding and sets no scale for residuals."""
     e = 1e-18 * (-1.0) ** np.arange(9)
     size, nu = np.linalg.norm(G.toarray()), np.full(40, 1e-9)
     nu[0] = 1e3

@@ -16,7 +16,7 @@ def test_lengths_by_hand():
 
 
 def test_a_step_does_not_stop_short_of_a_bound():
-    """As far as feasible: 0.3 − 3·0.1 is 5.6e-17, which is the bound."""
+    """A feasible step to 0.3 − 3·0.1 = 5.6e-17 ends exactly at the bound."""
     x, p = np.array([0.3, 1.0]), np.array([0.1, 0.0])
 
     new, g = kernels.moved(x, p, 3.0, p, p, np.zeros(2), np.ones(2))

@@ -25,7 +25,7 @@ def torn(Nr, **keys):
 
 @pytest.fixture(scope="module", params=[1e-6, 1e-8])
 def answers(request):
-    """Of three meshes at H/h = 8, from 500 to 30 000 degrees of freedom."""
+    """Return answers on three meshes, H/h = 8, 500 to 30 000 degrees of freedom."""
     qps = [torn(Nr).qp for Nr in (8, 16, 32)]
     return request.param, [(qp, SMALBE().prepare(qp, request.param)()) for qp in qps]
 
@@ -81,7 +81,7 @@ def test_a_sequence_is_warm():
 @pytest.mark.parametrize("basis", ["standard", "dual"])
 @pytest.mark.parametrize("parts", [4, 20])
 def test_a_disc_whose_roll_held_rows_alone_feel_is_solved(basis, parts, monkeypatch):
-    """As on ranks, with sparse rows: G_F G_Fᵀ has an eigenvalue that is rounding."""
+    """With sparse rows, as on ranks, one eigenvalue of G_F G_Fᵀ is rounding."""
     monkeypatch.setattr(rows_module, "MAX_DENSE_ENTRIES", 0)
     qp = dual_of_disc_between_plates(9, parts=parts, contact="mortar", basis=basis).qp
     assert isinstance(equality_rows(qp.A, qp.b, np.isfinite(qp.lb)), SparseRows)

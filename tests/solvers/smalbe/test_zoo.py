@@ -177,7 +177,7 @@ def test_where_the_rows_are_met_a_stall_makes_the_gradient_stricter():
 
 
 def test_a_model_that_leaves_the_chopped_gradient_gives_way():
-    """Of six Lanczos steps B knows too little: 596 products where its steps went on."""
+    """Six Lanczos steps yield a poor model B; continued steps took 596 products."""
     qp = generated_case(51).qp
     s = replace(SOLVERS["smalbe"], lanczos_steps=6).prepare(qp, 1e-6)()
 
