@@ -58,7 +58,7 @@ class SMALBE(Options):
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        solve = prepared(qp, tol, self, None, eliminate=self.eliminate == "always")
+        solve = prepared(qp, tol, self, None, in_sequence=False)
         return lambda: solve()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
@@ -74,8 +74,7 @@ class SMALBE(Options):
         carry: Carry | None = None
 
         def prepare(qp: QP, tol: float) -> Callable[[], Solution]:
-            eliminate = self.eliminate != "never"
-            solve = prepared(qp, tol, self, carry, eliminate=eliminate)
+            solve = prepared(qp, tol, self, carry, in_sequence=True)
 
             def run() -> Solution:
                 nonlocal carry

@@ -37,7 +37,7 @@ import sys
 from pathlib import Path
 from harness import InputError
 from mortarbench.harness.results.work_unit import Commands
-from mortarbench.progress import shown_on
+from mortarbench.progress import display_on
 from mortarbench.harness.registry import load_plugin, resolve
 from mortarbench.harness.running.run import run
 from mortarbench.harness.suite.suite import load_suite
@@ -47,7 +47,7 @@ start = [sys.executable, "-P", {str(PLUGIN)!r}]
 plugin = load_plugin(Path({str(PLUGIN)!r}))
 suite = load_suite(Path(sys.argv[1]), plugin.problems, plugin.solvers)
 try:
-    with shown_on(sys.stderr) as progress:
+    with display_on(sys.stderr) as progress:
         run(
             suite, out=Path(sys.argv[2]),
             commands=Commands(
