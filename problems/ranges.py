@@ -90,7 +90,7 @@ STEPS = key(10, 1, MAX_STEPS)
 #: keys of the contact method; node-to-segment contact ignores basis
 METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard"))
 PLANES = schema(plane=choice("strain", "stress"))
-#: key of the gluing rows, which join the copies of a node, see `problems.feti.gluing`
+#: key of the gluing rows, which join the copies of a node (`problems.feti.subdomains`)
 GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
 #: keys of a decomposition into subdomains: H/h (0: one piece per body), and `GLUES`
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES)

@@ -272,7 +272,7 @@ def test_subdomains_that_moved_apart_are_moved_back_together(name: str) -> None:
     assert np.abs(left).max() < 1e-9
 
 
-def test_LocalProblems_are_those_of_the_torn_bodies() -> None:
+def test_local_problems_are_those_of_the_decomposed_bodies() -> None:
     parts = known(CASES[0]).own.parts
     assert isinstance(parts, LocalProblems)
     K = block_diag([parts.torn.classes[k].K for k in parts.torn.class_of])
