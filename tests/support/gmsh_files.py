@@ -60,24 +60,30 @@ master = "table"
 """
 
 
-def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
-    """Write two squares of side 2, one above the other; return the description.
-
-    Their Poisson's ratio is zero: pressed together, each is in uniaxial stress.
+def stacked_mesh(gap=0.0, sag=0.0, **sides):
+    """Return a mesh of two squares of side 2, one above the other.
 
     sag : by which the middle of the upper one's lower side is lower than its ends
+    sides : edges of further boundaries, by their names
     """
     (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0 + gap))
     upper[1, 1] -= sag
-    sides = {
+    named = {
         "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
         "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
         "axis": [[0, 3], [3, 6], [9, 12], [12, 15]],
     }  # fmt: skip
     bodies = {"lower": cells, "upper": cells + 9}
-    curves = {name: np.array(edges) for name, edges in sides.items()}
-    mesh = msh22(np.vstack([lower, upper]), bodies, curves, {})
-    (folder / "blocks.msh").write_text(mesh)
+    curves = {name: np.array(edges) for name, edges in (named | sides).items()}
+    return msh22(np.vstack([lower, upper]), bodies, curves, {})
+
+
+def stacked_blocks(folder, gap=0.0, toml=BLOCKS, sag=0.0):
+    """Write a `stacked_mesh` and its description; return the path of the latter.
+
+    Poisson's ratio is zero: pressed together, each square is in uniaxial stress.
+    """
+    (folder / "blocks.msh").write_text(stacked_mesh(gap, sag))
     path = folder / "blocks.toml"
     path.write_text(toml)
     return path

@@ -20,7 +20,7 @@ from mortarbench.problems.models.description import read_bodies
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support import ROOT, press
-from tests.support.gmsh_files import msh22, square
+from tests.support.gmsh_files import msh22, square, stacked_mesh
 from tests.support.triangles import halved
 
 NR, NH = 2, 1
@@ -320,7 +320,7 @@ traction = [4e5, -1e6]
 boundary = "right"
 traction = [0, 4e5]
 [[loads]]
-boundary = "left"
+boundary = "axis"
 traction = [0, -4e5]
 [[contacts]]
 slave = "foot"
@@ -335,16 +335,7 @@ def sheared_blocks(described):
     Their Poisson's ratio is zero, so that their common side stays straight: every load
     step has the same contact rows. Friction alone holds the upper one sideways.
     """
-    (lower, cells), (upper, _) = square(), square(at=(0.0, 2.0))
-    sides = {
-        "base": [[0, 1], [1, 2]], "table": [[6, 7], [7, 8]],
-        "foot": [[9, 10], [10, 11]], "top": [[15, 16], [16, 17]],
-        "left": [[0, 3], [3, 6], [9, 12], [12, 15]],
-        "right": [[2, 5], [5, 8], [11, 14], [14, 17]],
-    }  # fmt: skip
-    curves = {name: np.array(edges) for name, edges in sides.items()}
-    bodies = {"lower": cells, "upper": cells + 9}
-    mesh = msh22(np.vstack([lower, upper]), bodies, curves, {})
+    mesh = stacked_mesh(right=[[2, 5], [5, 8], [11, 14], [14, 17]])
     return lambda toml=SHEARED: described(mesh, toml)
 
 
