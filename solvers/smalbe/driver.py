@@ -290,18 +290,14 @@ def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
     """Prepare the outer loop with the preconditioner of the options."""
-    if problem.factor is not None:
-        solver = compiled.SMALBE(problem, options, False, None)
-        watch = None if history is None else partial(history.watch, problem)
-        return OuterLoop(solver, problem, options, watch)
-    own, kind = (
-        options.preconditioner_for(qp),
-        resolved_preconditioner(qp, options.preconditioner),
-    )
-    M = structural_preconditioner(qp, kind) if own is None else checked(own)
-    solver = compiled.SMALBE(
-        problem, options, kind != "none", M, options.step_rule_for(qp)
-    )
+    if problem.factor is not None:  # never for a subclass with steps of its own
+        solver = compiled.SMALBE(problem, options, False)
+    else:
+        own = options.preconditioner_for(qp)
+        kind = resolved_preconditioner(qp, options.preconditioner)
+        M = structural_preconditioner(qp, kind) if own is None else checked(own)
+        rule = options.step_rule_for(qp)
+        solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
     watch = None if history is None else partial(history.watch, problem)
     return OuterLoop(solver, problem, options, watch)
 
@@ -333,10 +329,10 @@ def _solve_to_tolerance(
 def _claimed(
     task: _Task, tol: float
 ) -> tuple[tuple[Solution, Callable[[], Carry | None]], float, Iterate | None, float]:
-    """Tighten the tolerance until the original problem's KKT residuals agree.
+    """Tighten the tolerance until the KKT residuals of the original QP agree.
 
-    Returns the result, the worst residual, where to go on from (None where there is
-    nothing to gain), and the tolerance in units of `tol`.
+    Returns the result, the worst residual, the iterate to continue from (None if
+    nothing can be gained), and the tolerance in units of `tol`.
     """
     options, at = task.options, task.start
     tighter, best, waited = 1.0, np.inf, 0

@@ -79,6 +79,11 @@ class Options:
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")
+        if self.is_extended and self.preconditioner == "incomplete":
+            raise ValueError(
+                "preconditioner = 'incomplete' works in scaled variables, which the "
+                "functions of a subclass do not expect; expected another one"
+            )
         model = self.expansion == "model" or self.preconditioner in ("auto", "model")
         if self.norm == "power" and model:
             raise ValueError(

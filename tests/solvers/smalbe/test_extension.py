@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.harness.registry import options_of
@@ -209,6 +210,35 @@ def test_in_a_sequence_the_functions_meet_every_variable():
     assert all(
         kkt_residuals(qp, s).worst <= 5e-8 for qp, s in zip(qps, answers, strict=True)
     )
+
+
+@pytest.mark.parametrize("kind", [WithM, WithRule])
+def test_incomplete_factors_are_refused_rather_than_left_out(kind):
+    """They scale the variables; `auto` chooses another preconditioner instead."""
+    with pytest.raises(
+        ValueError, match="preconditioner = 'incomplete' works in scaled"
+    ):
+        kind(preconditioner="incomplete")
+
+
+def test_a_rule_meets_a_sparse_qp_in_its_own_variables():
+    """`auto` would scale them; the rule sees x and the bounds as given."""
+    n, steps = 60, []
+    P = 1e4 * csr_array(2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1))
+    qp = bounded(P, np.linspace(-3, -1, n), np.full(n, -1.0), np.full(n, 5e-3))
+
+    def rule(step):
+        steps.append(step)
+        return step.x - step.alpha_cg * step.p
+
+    s = WithRule(rule=rule).prepare(qp, 1e-8)()
+
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= 5e-8
+    assert steps
+    for step in steps:
+        assert (step.ub == qp.ub).all()
+        assert step.g == pytest.approx(P @ step.x + qp.q, abs=1e-6 * abs(step.g).max())
 
 
 def test_fields_of_a_subclass_are_options():
