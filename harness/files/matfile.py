@@ -29,6 +29,7 @@ from mortarbench.harness.files.qpfile import (
     listed_dense,
 )
 from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetric
+from mortarbench.harness.sets.discs import further_sets
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
@@ -66,6 +67,8 @@ def save_mat(
     more = {name: matrices["P"] if M is qp.P else M for name, M in more.items()}
     arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
     arrays |= {name: getattr(qp, name) for name in _VECTORS}
+    for one in qp.sets[1:]:
+        arrays |= one.arrays()
     arrays |= {name: csc_array(M) for name, M in matrices.items()}
     arrays["meta"] = json.dumps({**meta, "dense": dense})
     try:
@@ -213,7 +216,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         for name in listed_dense(meta):
             check_dense(name, matrices[name])
             matrices[name] = matrices[name].toarray()
-        qp = QP(**vectors, **matrices)
+        qp = QP(**vectors, **matrices, sets=further_sets(arrays))
         check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(shortened(" ".join(str(e).split()))) from None

@@ -58,6 +58,8 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     import pyarrow as pa  # late: slow to import, and workers need neither
     import pyarrow.parquet as pq
 
+    if other := [type(one).__name__ for one in qp.sets[1:]]:
+        raise InputError(f"{path}: Parquet holds no {other[0]}; expected .npz or .mat")
     n = qp.q.size
     rows = {"P": n, "G": qp.h.size, "A": qp.b.size}
     for name, count in rows.items():

@@ -41,6 +41,8 @@ from mortarbench.harness.qp import (
     canonical,
     check_symmetric,
 )
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.discs import Discs, further_sets
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -56,13 +58,16 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
     Raises
     ------
     InputError
-        When an operator P is too large to be assembled, or the QP has sets other than
-        bounds.
+        When an operator P is too large to be assembled, or the QP has sets that
+        files cannot hold.
 
     """
     P = qp.P
-    if other := [type(one).__name__ for one in qp.sets[1:]]:
-        raise InputError(f"no file holds sets of the kind {other[0]}; expected bounds")
+    if other := [one for one in qp.sets if not isinstance(one, Box | Discs)]:
+        raise InputError(
+            f"no file holds sets of the kind {type(other[0]).__name__}; expected bounds "
+            "and discs"
+        )
     if not qp.is_explicit:
         n = qp.q.size
         check_size(f"P, an operator, as a dense matrix of {n} rows", 8 * n**2)
@@ -137,6 +142,8 @@ def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[s
     """Return the arrays of a QP, and the names of dense matrices."""
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
+    for one in qp.sets:
+        arrays |= one.arrays()
     if structure and qp.structure is not None:
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed
@@ -193,7 +200,7 @@ def load_qp(
             matrices["P"] = SerialisableOperator(
                 n, maker, _ingredients(arrays), operators
             )
-        qp = QP(**vectors, **matrices, structure=structure)
+        qp = QP(**vectors, **matrices, structure=structure, sets=further_sets(arrays))
         if not is_trusted:
             check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:

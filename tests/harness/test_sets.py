@@ -7,8 +7,11 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from mortarbench.harness import QP, Box, InputError, Solution, Status, save_qp
+import mortarbench as mb
+from mortarbench.harness import QP, Box, Discs, InputError, Solution, Status, save_qp
 from mortarbench.harness.conformance.metamorphic import change_units, permute_unknowns
+from mortarbench.harness.files.matfile import read_mat, save_mat, to_qp
+from mortarbench.harness.files.qpfile import load_qp
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import ReasonError, reason_to_decline
@@ -24,8 +27,8 @@ BOX = Box(
     np.array([1, INF, 0, INF, 2, 5, INF, 7]),
 )
 BALLS = Balls(np.array([[1, 4], [6, 2]]), np.array([2.0, 0.5]))
-SETS = [BOX, BALLS]
-names = pytest.mark.parametrize("one", SETS, ids=["box", "balls"])
+SETS = [BOX, BALLS, Discs(BALLS.index, BALLS.radius)]
+names = pytest.mark.parametrize("one", SETS, ids=["box", "balls", "discs"])
 
 
 def points(count=200, size=4.0):
@@ -322,3 +325,30 @@ def test_files_refuse_sets_that_they_cannot_hold(tmp_path):
     with pytest.raises(InputError, match=re.escape("no file holds sets of the kind")):
         save_qp(tmp_path / "a.npz", qp_with(FREE, BALLS))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_clarabel_solves_planted_discs(seed, tmp_path):
+    qp, s = with_solution(seed)
+    balls = qp.sets[1]
+    qp = replace(qp, sets=(qp.box, Discs(balls.index, balls.radius)))
+
+    answer = mb.solve(qp, "clarabel", 1e-8)
+
+    assert answer.verdict is mb.Verdict.VERIFIED
+    best = qp.objective(s.x)
+    assert qp.objective(answer.solution.x) == pytest.approx(best, rel=1e-6)
+    assert mb.solve(qp, "osqp").verdict is mb.Verdict.DECLINED
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat"])
+def test_files_hold_discs(tmp_path, suffix):
+    def load_mat(path):
+        return to_qp(read_mat(path))
+
+    qp = qp_with(FREE, Discs(BALLS.index, BALLS.radius))
+    save, load = {".npz": (save_qp, load_qp), ".mat": (save_mat, load_mat)}[suffix]
+    save(tmp_path / f"a{suffix}", qp, *([{}] if suffix == ".npz" else [{}, {}]))
+    back = load(tmp_path / f"a{suffix}")[0].sets[1]
+    assert back.index.tolist() == BALLS.index.tolist()
+    assert back.radius.tolist() == BALLS.radius.tolist()
