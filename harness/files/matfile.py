@@ -29,7 +29,7 @@ from mortarbench.harness.files.qpfile import (
     listed_dense,
 )
 from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetric
-from mortarbench.harness.sets.discs import further_sets
+from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
@@ -67,8 +67,7 @@ def save_mat(
     more = {name: matrices["P"] if M is qp.P else M for name, M in more.items()}
     arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
     arrays |= {name: getattr(qp, name) for name in _VECTORS}
-    for one in qp.sets[1:]:
-        arrays |= one.arrays()
+    arrays |= set_arrays(qp.sets[1:])
     arrays |= {name: csc_array(M) for name, M in matrices.items()}
     arrays["meta"] = json.dumps({**meta, "dense": dense})
     try:

@@ -41,8 +41,7 @@ from mortarbench.harness.qp import (
     canonical,
     check_symmetric,
 )
-from mortarbench.harness.sets.box import Box
-from mortarbench.harness.sets.discs import Discs, further_sets
+from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -58,16 +57,10 @@ def explicit_matrices(qp: QP) -> tuple[dict[str, Matrix], list[str]]:
     Raises
     ------
     InputError
-        When an operator P is too large to be assembled, or the QP has sets that
-        files cannot hold.
+        When an operator P is too large to be assembled.
 
     """
     P = qp.P
-    if other := [one for one in qp.sets if not isinstance(one, Box | Discs)]:
-        raise InputError(
-            f"no file holds sets of the kind {type(other[0]).__name__}; expected bounds "
-            "and discs"
-        )
     if not qp.is_explicit:
         n = qp.q.size
         check_size(f"P, an operator, as a dense matrix of {n} rows", 8 * n**2)
@@ -142,8 +135,7 @@ def _arrays(qp: QP, *, structure: bool) -> tuple[dict[str, NDArray[Any]], list[s
     """Return the arrays of a QP, and the names of dense matrices."""
     matrices, dense = explicit_matrices(qp)
     arrays = {name: getattr(qp, name) for name in _VECTORS}
-    for one in qp.sets:
-        arrays |= one.arrays()
+    arrays |= set_arrays(qp.sets[1:])
     if structure and qp.structure is not None:
         matrices |= {name: getattr(qp.structure, name) for name in _STRUCTURE}
         arrays["fixed"] = qp.structure.fixed

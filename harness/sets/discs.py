@@ -1,43 +1,52 @@
-"""Discs ‖x_I‖ ≤ r, as bounds of friction have in space."""
+"""Discs ‖x_I‖ ≤ r, which bound friction in space."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.sets.convex import ConvexSet, Limits, Sum, Vector
+from mortarbench.harness.sets.blocks import Blocks, norms
+from mortarbench.harness.sets.convex import Limits, Sum, Vector
 
 
 @dataclass(frozen=True, eq=False)
-class Discs:
-    """‖x[index[i]]‖ ≤ radius[i], Euclidean, for blocks of one dimension."""
+class Discs(Blocks):
+    """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
+
+    At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
+    radius 0 it is arbitrary. A QP turns discs of one variable (d = 1) into bounds.
+
+    Parameters
+    ----------
+    index : (k, d) variables of each disc, from 0; no variable occurs twice
+    radius : (k,) finite and not negative
+
+    Raises
+    ------
+    InputError
+        When shapes disagree, an index is not an integer, or a radius is negative or not
+        finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import Discs
+    >>> discs = Discs(index=[[0, 2]], radius=[1.0])
+    >>> discs.project(np.array([3.0, 7.0, 4.0]))
+    array([0.6, 7. , 0.8])
+
+    """
 
     index: NDArray[np.int64]  #: (k, d)
-    radius: Vector  #: (k,) not negative
+    radius: Vector  #: (k,)
 
-    @property
-    def block(self) -> NDArray[np.int64]:
-        """All components of the discs."""
-        return np.sort(self.index.ravel())
-
-    def check(self, n: int) -> None:
-        """Raise ValueError for other shapes, negative radii and common variables."""
-        if self.index.ndim != 2 or self.radius.shape != self.index.shape[:1]:
-            raise ValueError(
-                f"Discs: index has shape {self.index.shape} and radius "
-                f"{self.radius.shape}; expected (k, d) and (k,)"
-            )
-        if not (np.isfinite(self.radius) & (self.radius >= 0)).all():
-            raise ValueError("Discs: a radius is negative or not finite")
-        block = self.block
-        if block.size and not (0 <= block[0] and block[-1] < n):
-            raise ValueError(f"Discs: an index is not in 0 … {n - 1}")
-        if (np.diff(block) == 0).any():
-            raise ValueError("Discs: two discs have a variable in common")
+    prefix: ClassVar[str] = "disc"
+    least: ClassVar[int] = 1
+    columns: ClassVar[str] = "d"
 
     def hull(self, n: int) -> tuple[Vector, Vector]:
         """Return −r and r on the discs."""
@@ -46,17 +55,18 @@ class Discs:
         return -size, size
 
     def project(self, x: Vector) -> Vector:
-        """Shorten the blocks that are too long."""
-        norms = self._norms(x)
-        long = norms > self.radius
+        """Shorten the blocks outside their discs."""
+        sizes = self._norms(x)
+        is_outside = sizes > self.radius
         x = x.copy()
-        x[self.index[long]] *= (self.radius[long] / norms[long])[:, None]
+        factor = self.radius[is_outside] / sizes[is_outside]
+        x[self.index[is_outside]] *= factor[:, None]
         return x
 
     def limits(self, x: Vector) -> list[Limits]:
-        """Measure r − ‖x_I‖."""
-        norms = self._norms(x)
-        return [Limits(self.radius - norms, self.radius, norms, self._norms)]
+        """Return the slack r − ‖x_I‖ of each disc."""
+        sizes = self._norms(x)
+        return [Limits(self.radius - sizes, self.radius, sizes, self._norms)]
 
     def admissible(self, z: Vector) -> Vector:
         """Return the components of z (n,) on discs."""
@@ -76,28 +86,19 @@ class Discs:
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
     def substituted(self, T: Any, a: Vector) -> Discs:
-        """Return the discs of x', where T scales a disc evenly and a leaves it."""
-        coo = T.tocoo()
-        column = np.empty(T.shape[0], dtype=np.int64)
-        factor = np.empty(T.shape[0])
-        column[coo.row], factor[coo.row] = coo.col, np.abs(coo.data)
-        factors = factor[self.index]
-        if a[self.index].any() or (factors != factors[:, :1]).any():
-            raise ValueError("Discs: moved, or scaled unevenly, they are none")
-        return Discs(column[self.index], self.radius / factors[:, 0])
+        """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
 
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return `disc_index` and `disc_radius`."""
-        return {"disc_index": self.index, "disc_radius": self.radius}
+        Raises
+        ------
+        ValueError
+            When T scales variables of a disc differently, or a moves them.
+
+        """
+        columns, entries = self.entries(T, a)
+        factors = np.abs(entries)
+        if (factors != factors[:, :1]).any():
+            raise ValueError("Discs cannot be scaled unevenly")
+        return Discs(columns, self.radius / factors[:, 0])
 
     def _norms(self, v: Vector) -> Vector:
-        norms: Vector = np.linalg.norm(v[self.index], axis=1)
-        return norms
-
-
-def further_sets(arrays: Mapping[str, NDArray[Any]]) -> tuple[ConvexSet, ...]:
-    """Read the sets other than bounds that a file holds, by the names of `arrays`."""
-    if "disc_index" not in arrays:
-        return ()
-    index = np.atleast_2d(arrays["disc_index"]).astype(np.int64)
-    return (Discs(index, np.ravel(arrays["disc_radius"]).astype(float)),)
+        return norms(v[self.index])
