@@ -25,6 +25,8 @@ from .qp import no_rows as no_rows
 from .record import Record as Record
 from .record import Verdict as Verdict
 from .sets.box import Box as Box
+from .sets.cones import Cones as Cones
+from .sets.discs import Discs as Discs
 from .solution import Solution as Solution
 from .solution import Status as Status
 from .verify.certificate import Certificate as Certificate

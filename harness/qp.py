@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
 from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.sets.box import Box
-from mortarbench.harness.sets.convex import ConvexSet
+from mortarbench.harness.sets.convex import ConvexSet, hull
 from mortarbench.harness.sets.convex import Vector as Vector
+from mortarbench.harness.sets.discs import Discs
 
 NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
@@ -60,7 +62,8 @@ class QP:
     ----------
     P, q, A, b, G, h, structure : see the attributes
     lb, ub : (n,) bounds, -inf and inf for absent ones; None for no bounds
-    sets : sets of further blocks; the first may be a `Box` in place of lb and ub
+    sets : sets of further blocks; the first may be a `Box` in place of lb and ub.
+        Discs of one variable become bounds
 
     Raises
     ------
@@ -114,9 +117,6 @@ class QP:
         if lb is not None or ub is not None:
             box = Box(box.lower if lb is None else lb, box.upper if ub is None else ub)
         arrays = {"P": P, "q": q, "A": A, "b": b, "G": G, "h": h}
-        values = {**arrays, "sets": (box, *further[has_box:]), "structure": structure}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
         n, m, p = q.size, b.size, h.size
         shapes = ((n, n), (n,), (m, n), (m,), (p, n), (p,))
         for (name, array), shape in zip(arrays.items(), shapes, strict=True):
@@ -125,8 +125,11 @@ class QP:
         for name in ("q", "b", "h"):
             if not np.isfinite(arrays[name]).all():
                 raise ValueError(f"QP.{name} holds NaN or inf, expected finite numbers")
-        _check_sets(self.sets, n)
-        set_arrays = [array for one in self.sets for array in one.arrays().values()]
+        every = _without_intervals((box, *further[has_box:]), n)
+        values = {**arrays, "sets": every, "structure": structure}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        set_arrays = [array for one in every for array in one.arrays().values()]
         for array in (*arrays.values(), *set_arrays):
             _freeze(array)
 
@@ -244,14 +247,22 @@ class QP:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Numbers of variables, equality rows, inequality rows and finite bounds."""
+        """Numbers of variables, equality rows, inequality rows and finite bounds.
+
+        Numbers of discs and cones follow if there are any.
+        """
         bounds = np.isfinite(self.lb).sum() + np.isfinite(self.ub).sum()
-        return {
+        sizes = {
             "variables": self.q.size,
             "equalities": self.b.size,
             "inequalities": self.h.size,
             "bounds": int(bounds),
         }
+        for one in self.sets[1:]:
+            if isinstance(one, Blocks):
+                kind = type(one).__name__.lower()
+                sizes[kind] = sizes.get(kind, 0) + len(one.index)
+        return sizes
 
     def with_bounds(self, lb: Vector, ub: Vector) -> QP:
         """Return the same QP with other bounds (n,)."""
@@ -270,6 +281,21 @@ class QP:
     def objective(self, x: Vector) -> float:
         """Evaluate ½ xᵀP x + qᵀx."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x)
+
+
+def _without_intervals(sets: Sequence[ConvexSet], n: int) -> tuple[ConvexSet, ...]:
+    """Check sets, and return them with discs of one variable as bounds of the box.
+
+    Sets without variables are left out. Raises ValueError as `_check_sets` does.
+    """
+    _check_sets(sets, n)
+    box, others = sets[0], list[ConvexSet]()
+    for one in sets[1:]:
+        if isinstance(one, Discs) and one.index.shape[1] == 1:
+            box = Box(*hull((box, one), n))
+        elif one.block.size:
+            others.append(one)
+    return box, *others
 
 
 def _check_sets(sets: Sequence[ConvexSet], n: int) -> None:

@@ -11,6 +11,8 @@ from .harness.plugin import Family as Family
 from .harness.qp import QP as QP
 from .harness.record import Verdict as Verdict
 from .harness.sets.box import Box as Box
+from .harness.sets.cones import Cones as Cones
+from .harness.sets.discs import Discs as Discs
 from .harness.solution import Solution as Solution
 from .harness.solution import Status as Status
 from .listing import Listing as Listing

@@ -1,7 +1,8 @@
 """One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
 
 Vectors ``q, h, b, lb, ub`` are columns, matrices ``P, G, A`` sparse, ``meta`` is a JSON
-text. Further arrays are those of the case, such as F, d, B, c, R of the paper.
+text. Indices of sets, such as ``disc_index``, start at 0. Further arrays are those of
+the case, such as F, d, B, c, R of the paper.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from mortarbench.harness.files.qpfile import (
     listed_dense,
 )
 from mortarbench.harness.qp import QP, Matrix, Vector, canonical, check_symmetric
+from mortarbench.harness.sets.arrays import further_sets, set_arrays
 
 _EXPECTED = "a .mat file"
 _WRONG = "not a .mat file; expected one saved with -v7 or older"
@@ -66,6 +68,7 @@ def save_mat(
     more = {name: matrices["P"] if M is qp.P else M for name, M in more.items()}
     arrays = {name: M.tocsc() if issparse(M) else M for name, M in more.items()}
     arrays |= {name: getattr(qp, name) for name in _VECTORS}
+    arrays |= set_arrays(qp.sets[1:])
     arrays |= {name: csc_array(M) for name, M in matrices.items()}
     arrays["meta"] = json.dumps({**meta, "dense": dense})
     try:
@@ -213,7 +216,7 @@ def to_qp(arrays: Mapping[str, Any]) -> tuple[QP, dict[str, Any]]:
         for name in listed_dense(meta):
             check_dense(name, matrices[name])
             matrices[name] = matrices[name].toarray()
-        qp = QP(**vectors, **matrices)
+        qp = QP(**vectors, **matrices, sets=further_sets(arrays))
         check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(shortened(" ".join(str(e).split()))) from None

@@ -104,10 +104,15 @@ def save_qps(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     Raises
     ------
     InputError
-        If a finite right-hand side or bound counts as infinite in the format, or the
-        file cannot be written.
+        If the QP has sets other than bounds, a finite right-hand side or bound counts
+        as infinite in the format, or the file cannot be written.
 
     """
+    if len(qp.sets) > 1:
+        raise InputError(
+            f"{path}: QPS has no sets of the kind {type(qp.sets[1]).__name__}; "
+            "expected .npz or .mat"
+        )
     for name in ("b", "h", "lb", "ub"):
         values = getattr(qp, name)
         large = np.isfinite(values) & (np.abs(values) >= MIN_INFINITE)

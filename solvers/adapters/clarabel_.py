@@ -9,15 +9,25 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
-from scipy.sparse import triu
+from scipy.sparse import triu, vstack
 
-from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness import (
+    QP,
+    About,
+    Box,
+    Discs,
+    Solution,
+    Status,
+    needs_matrices,
+)
 from mortarbench.solvers.common.conversion import (
     check_positive,
+    conic,
     csc,
+    from_conic,
     from_one_sided,
     objective_factor,
     one_sided,
@@ -52,6 +62,7 @@ class Clarabel:
 
     max_iter: int = 200
 
+    accepts: ClassVar[tuple[type, ...]] = (Box, Discs)
     about: ClassVar[About] = About(
         title="Clarabel",
         method="interior point (homogeneous embedding)",
@@ -79,8 +90,14 @@ class Clarabel:
         import clarabel
 
         m = qp.b.size
-        rows, rhs = one_sided(qp)
-        cones = [clarabel.ZeroConeT(m), clarabel.NonnegativeConeT(rhs.size - m)]
+        linear, sides = one_sided(qp)
+        discs, radii = conic(qp)
+        rows, rhs = csc(vstack([linear, discs])), np.append(sides, radii)
+        cones = [clarabel.ZeroConeT(m), clarabel.NonnegativeConeT(sides.size - m)]
+        for one in qp.sets[1:]:
+            assert isinstance(one, Discs)
+            size = 1 + one.index.shape[1]
+            cones += [clarabel.SecondOrderConeT(size)] * len(one.index)
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.max_threads = 1
@@ -91,16 +108,20 @@ class Clarabel:
         P = csc(triu(csc(qp.P))) * scale
         solver = clarabel.DefaultSolver(P, qp.q * scale, rows, rhs, cones, settings)
 
+        def split(z: Any) -> dict[str, Any]:
+            parts = from_one_sided(qp, z[: sides.size])
+            return parts | {"z_box": parts["z_box"] + from_conic(qp, z[sides.size :])}
+
         def solve() -> Solution:
             r = solver.solve()
             status = CLAIMS.get(str(r.status), Status.FAILED)
             if status is Status.INFEASIBLE:
                 is_primal = str(r.status) == PRIMAL
-                ray = from_one_sided(qp, np.array(r.z)) if is_primal else {}
+                ray = split(np.array(r.z)) if is_primal else {}
                 return Solution.without_point(qp, status, str(r.status), **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), **from_one_sided(qp, np.array(r.z) / scale),
+                x=np.array(r.x), **split(np.array(r.z) / scale),
                 iterations=r.iterations, message=str(r.status),
                 reported={
                     "linear_solver": solver.get_info().linsolver.name,
@@ -109,6 +130,8 @@ class Clarabel:
             )  # fmt: skip
 
         def update(new: QP) -> None:
-            solver.update(q=new.q * scale, b=one_sided(new)[1])
+            solver.update(
+                q=new.q * scale, b=np.append(one_sided(new)[1], conic(new)[1])
+            )
 
         return Session(solve, update)

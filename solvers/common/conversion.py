@@ -14,6 +14,7 @@ from scipy.sparse import csc_matrix, eye_array, vstack
 
 from mortarbench.harness import QP, Matrix, Solution, Vector, needs_matrices, too_large
 from mortarbench.harness.sets.convex import admissible
+from mortarbench.harness.sets.discs import Discs
 
 #: absolute tolerance for solvers whose test is ≤ absolute + relative·size, so that the
 #: relative one decides
@@ -117,6 +118,29 @@ def from_one_sided(qp: QP, v: Vector) -> dict[str, Any]:
         "z": np.array(v[m : m + p]),
         "z_box": on_present_bounds(qp, z_box),
     }
+
+
+def conic(qp: QP) -> tuple[csc_matrix, Vector]:
+    """Give Rx + s = r, s = (r_i, x_I) in a second-order cone for each disc."""
+    eye = eye_array(qp.q.size, format="csr")
+    rows, rhs = [csc(eye[:0])], [np.zeros(0)]
+    for discs in qp.sets[1:]:
+        assert isinstance(discs, Discs)
+        for block, r in zip(discs.index, discs.radius, strict=True):
+            rows += [csc(0 * eye[:1]), csc(-eye[block])]
+            rhs += [np.append(r, np.zeros(block.size))]
+    return csc(vstack(rows)), np.concatenate(rhs)
+
+
+def from_conic(qp: QP, v: Vector) -> Vector:
+    """Return z_box (n,) on discs from the duals of `conic`: (t, w) ↦ −w."""
+    z_box, at = np.zeros(qp.q.size), 0
+    for discs in qp.sets[1:]:
+        assert isinstance(discs, Discs)
+        for block in discs.index:
+            z_box[block] = -v[at + 1 : at + 1 + block.size]
+            at += 1 + block.size
+    return z_box
 
 
 def to_one_sided(qp: QP, s: Solution) -> Vector:

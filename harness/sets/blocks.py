@@ -1,0 +1,121 @@
+"""Sets of one kind on disjoint blocks of variables: what discs and cones share."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.sets.convex import Vector
+
+
+class Blocks:
+    """Base of dataclasses with a field `index` (k, d) and one number for each block.
+
+    Both are copied. Kinds of sets derive from it and add their geometry.
+    """
+
+    prefix: ClassVar[str]  #: of the names of arrays in files
+    least: ClassVar[int]  #: smallest d
+    columns: ClassVar[str]  #: meaning of the d columns, for messages
+
+    index: NDArray[np.int64]  #: (k, d)
+
+    def __post_init__(self) -> None:
+        """Copy and check both arrays.
+
+        Raises
+        ------
+        InputError
+            When shapes disagree, an index is not an integer, or a number is negative or
+            not finite.
+
+        """
+        kind, size = type(self).__name__, fields(self)[1].name  # type: ignore[arg-type]
+        index, sizes = _numbers(self, "index"), _numbers(self, size)
+        if index.ndim != 2 or index.shape[1] < self.least:
+            raise InputError(
+                f"{kind}: index has shape {index.shape}; expected (k, {self.columns}), "
+                "one row per block"
+            )
+        if sizes.shape != index.shape[:1]:
+            raise InputError(
+                f"{kind}: {size} has shape {sizes.shape}; expected {index.shape[:1]}, "
+                "one number per row of index"
+            )
+        with np.errstate(invalid="ignore"):  # NaN, or beyond the range of integers
+            whole = index.astype(np.int64)
+        if not np.array_equal(whole, index):
+            raise InputError(f"{kind}: index holds a number that is not an integer")
+        bad = np.flatnonzero(~(np.isfinite(sizes) & (sizes >= 0)))
+        if bad.size:
+            raise InputError(
+                f"{kind}: {size}[{bad[0]}] = {sizes[bad[0]]}; expected finite numbers "
+                "that are not negative"
+            )
+        object.__setattr__(self, "index", whole)
+        object.__setattr__(self, size, sizes.astype(float))
+
+    @property
+    def block(self) -> NDArray[np.int64]:
+        """All variables of the blocks, in ascending order."""
+        return np.sort(self.index.ravel())
+
+    def check(self, n: int) -> None:
+        """Raise ValueError for an index out of range, or a variable in two blocks."""
+        kind, block = type(self).__name__, self.block
+        outside = block[(block < 0) | (block >= n)]
+        if outside.size:
+            raise ValueError(
+                f"{kind}: index {outside[0]} is out of range; expected 0 … {n - 1}"
+            )
+        twice = block[1:][np.diff(block) == 0]
+        if twice.size:
+            raise ValueError(
+                f"{kind}: variable {twice[0]} is listed twice; expected disjoint blocks"
+            )
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return the fields by their names in files, such as `disc_index`."""
+        names = (field.name for field in fields(self))  # type: ignore[arg-type]
+        return {f"{self.prefix}_{name}": getattr(self, name) for name in names}
+
+    def entries(self, T: Any, a: Vector) -> tuple[NDArray[np.int64], Vector]:
+        """Return columns and entries (k, d) of T in the rows of the blocks.
+
+        Raises
+        ------
+        ValueError
+            When a (n,) moves a block.
+
+        """
+        if a[self.index].any():
+            raise ValueError(f"{type(self).__name__} cannot be shifted")
+        coo = T.tocoo()
+        column, entry = np.empty(T.shape[0], dtype=np.int64), np.empty(T.shape[0])
+        column[coo.row], entry[coo.row] = coo.col, coo.data
+        return column[self.index], entry[self.index]
+
+
+def norms(blocks: Vector) -> Vector:
+    """Return the Euclidean norm (k,) of each row of (k, d)."""
+    sizes: Vector = np.linalg.norm(blocks, axis=1)
+    return sizes
+
+
+def _numbers(one: Blocks, name: str) -> NDArray[Any]:
+    """Return a copy of a field as an array of numbers."""
+    value = getattr(one, name)
+    try:
+        array = np.array(value)
+    except ValueError:  # rows of different lengths
+        array = np.array(None)
+    if array.dtype.kind not in "iuf":
+        raise InputError(
+            f"{type(one).__name__}: {name} = {shown(value)}; expected an array of "
+            "numbers"
+        )
+    return array

@@ -1,0 +1,139 @@
+"""Second-order cones ‖x_T‖ ≤ μ x_N, which Coulomb's law of friction has in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness.sets.blocks import Blocks, norms
+from mortarbench.harness.sets.convex import Limits, Sum, Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Cones(Blocks):
+    """Cones ‖x_T‖ ≤ slope[i]·x_N and x_N ≥ 0, with N = index[i, 0], T = index[i, 1:].
+
+    Slope 0 is a contact without friction: x_T = 0 and x_N ≥ 0. The normal vector
+    `z_box` is in the polar cone, slope·‖z_T‖ ≤ −z_N, and orthogonal to x.
+
+    Parameters
+    ----------
+    index : (k, d) variables of each cone, from 0, the normal one first; d ≥ 2, and no
+        variable occurs twice
+    slope : (k,) coefficient of friction μ, finite and not negative
+
+    Raises
+    ------
+    InputError
+        When shapes disagree, an index is not an integer, or a slope is negative or not
+        finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import Cones
+    >>> cones = Cones(index=[[0, 1, 2]], slope=[1.0])
+    >>> cones.project(np.array([0.0, 3.0, 4.0]))
+    array([2.5, 1.5, 2. ])
+    >>> cones.project(np.array([-5.0, 3.0, 4.0]))  # in the polar cone
+    array([0., 0., 0.])
+
+    """
+
+    index: NDArray[np.int64]  #: (k, d)
+    slope: Vector  #: (k,)
+
+    prefix: ClassVar[str] = "cone"
+    least: ClassVar[int] = 2
+    columns: ClassVar[str] = "1 + tangents"
+
+    def hull(self, n: int) -> tuple[Vector, Vector]:
+        """Return x_N ≥ 0, and x_T = 0 for slope 0."""
+        lower, upper = np.full(n, -np.inf), np.full(n, np.inf)
+        lower[self.index[:, 0]] = 0.0
+        flat = self.index[self.slope == 0, 1:]
+        lower[flat], upper[flat] = 0.0, 0.0
+        return lower, upper
+
+    def project(self, x: Vector) -> Vector:
+        """Return the nearest points of the cones, their apex for the polar cones."""
+        nearest = x.copy()
+        normal, tangent = x[self.index[:, 0]], x[self.index[:, 1:]]
+        parts = _projection(normal, tangent, np.ones_like(self.slope), self.slope)
+        nearest[self.index[:, 0]], nearest[self.index[:, 1:]] = parts
+        return nearest
+
+    def limits(self, x: Vector) -> list[Limits]:
+        """Return the slacks μx_N − ‖x_T‖, then x_N."""
+        normal, tangents = x[self.index[:, 0]], norms(x[self.index[:, 1:]])
+        pull, zero = self.slope * normal, np.zeros_like(normal)
+        return [
+            Limits(pull - tangents, zero, np.abs(pull) + tangents, self._terms),
+            Limits(normal, zero, np.abs(normal), self._normal),
+        ]
+
+    def admissible(self, z: Vector) -> Vector:
+        """Return the projection of z (n,) on the polar cones."""
+        part = np.zeros_like(z)
+        normal, tangent = z[self.index[:, 0]], z[self.index[:, 1:]]
+        against, along = _projection(
+            -normal, tangent, self.slope, np.ones_like(self.slope)
+        )
+        part[self.index[:, 0]], part[self.index[:, 1:]] = -against, along
+        return part
+
+    def support(self, z: Vector) -> Sum:
+        """Return 0, the supremum of zᵀx for z in the polar cones."""
+        return Sum(0.0, 0.0)
+
+    def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
+        """Evaluate −zᵀx of each cone, for the admissible part of z."""
+        work = (self.admissible(z) * x)[self.index]
+        return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
+
+    def substituted(self, T: Any, a: Vector) -> Cones:
+        """Return the cones of x' for x = T x' + a, if T scales tangents evenly.
+
+        Raises
+        ------
+        ValueError
+            When T scales tangents of a cone differently or reverses its normal, or a
+            moves them.
+
+        """
+        columns, entries = self.entries(T, a)
+        normal, tangents = entries[:, 0], np.abs(entries[:, 1:])
+        if (tangents != tangents[:, :1]).any() or (normal < 0).any():
+            raise ValueError("Cones cannot be scaled unevenly, nor reversed")
+        return Cones(columns, self.slope * normal / tangents[:, 0])
+
+    def _terms(self, v: Vector) -> Vector:
+        return self.slope * v[self.index[:, 0]] + norms(v[self.index[:, 1:]])
+
+    def _normal(self, v: Vector) -> Vector:
+        part: Vector = v[self.index[:, 0]]
+        return part
+
+
+def _projection(
+    normal: Vector, tangent: Vector, a: Vector, b: Vector
+) -> tuple[Vector, Vector]:
+    """Project (k,), (k, d − 1) on cones a‖t‖ ≤ bn, n ≥ 0; their polars are b‖t‖ ≤ −an.
+
+    a, b : (k,) not negative, not both zero
+    """
+    sizes, root = norms(tangent), np.hypot(a, b)
+    is_inside = (a * sizes <= b * normal) & (normal >= 0)
+    is_polar = b * sizes <= -a * normal
+    along = np.where(is_polar, 0.0, (a / root) * normal + (b / root) * sizes)
+    factor = np.divide(
+        (b / root) * along, sizes, out=np.zeros_like(sizes), where=sizes > 0
+    )
+    return (
+        np.where(is_inside, normal, (a / root) * along),
+        np.where(is_inside[:, None], tangent, factor[:, None] * tangent),
+    )

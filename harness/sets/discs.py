@@ -1,0 +1,104 @@
+"""Discs ‖x_I‖ ≤ r, which bound friction in space."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness.sets.blocks import Blocks, norms
+from mortarbench.harness.sets.convex import Limits, Sum, Vector
+
+
+@dataclass(frozen=True, eq=False)
+class Discs(Blocks):
+    """Discs ‖x[index[i]]‖ ≤ radius[i] in the Euclidean norm, on blocks of d variables.
+
+    At an active disc, the normal vector `z_box` is a nonnegative multiple of x; for
+    radius 0 it is arbitrary. A QP turns discs of one variable (d = 1) into bounds.
+
+    Parameters
+    ----------
+    index : (k, d) variables of each disc, from 0; no variable occurs twice
+    radius : (k,) finite and not negative
+
+    Raises
+    ------
+    InputError
+        When shapes disagree, an index is not an integer, or a radius is negative or not
+        finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mortarbench import Discs
+    >>> discs = Discs(index=[[0, 2]], radius=[1.0])
+    >>> discs.project(np.array([3.0, 7.0, 4.0]))
+    array([0.6, 7. , 0.8])
+
+    """
+
+    index: NDArray[np.int64]  #: (k, d)
+    radius: Vector  #: (k,)
+
+    prefix: ClassVar[str] = "disc"
+    least: ClassVar[int] = 1
+    columns: ClassVar[str] = "d"
+
+    def hull(self, n: int) -> tuple[Vector, Vector]:
+        """Return −r and r on the discs."""
+        size = np.full(n, np.inf)
+        size[self.index] = self.radius[:, None]
+        return -size, size
+
+    def project(self, x: Vector) -> Vector:
+        """Shorten the blocks outside their discs."""
+        sizes = self._norms(x)
+        is_outside = sizes > self.radius
+        x = x.copy()
+        factor = self.radius[is_outside] / sizes[is_outside]
+        x[self.index[is_outside]] *= factor[:, None]
+        return x
+
+    def limits(self, x: Vector) -> list[Limits]:
+        """Return the slack r − ‖x_I‖ of each disc."""
+        sizes = self._norms(x)
+        return [Limits(self.radius - sizes, self.radius, sizes, self._norms)]
+
+    def admissible(self, z: Vector) -> Vector:
+        """Return the components of z (n,) on discs."""
+        part = np.zeros_like(z)
+        part[self.index] = z[self.index]
+        return part
+
+    def support(self, z: Vector) -> Sum:
+        """Evaluate Σ r‖z_I‖."""
+        value = self.radius @ self._norms(z)
+        return Sum(value, value)
+
+    def support_gaps(self, x: Vector, z: Vector, limits: Sequence[Limits]) -> list[Sum]:
+        """Evaluate r‖z_I‖ − z_Iᵀx_I of each disc."""
+        work = (z * x)[self.index]
+        value = self.radius * self._norms(z)
+        return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
+
+    def substituted(self, T: Any, a: Vector) -> Discs:
+        """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
+
+        Raises
+        ------
+        ValueError
+            When T scales variables of a disc differently, or a moves them.
+
+        """
+        columns, entries = self.entries(T, a)
+        factors = np.abs(entries)
+        if (factors != factors[:, :1]).any():
+            raise ValueError("Discs cannot be scaled unevenly")
+        return Discs(columns, self.radius / factors[:, 0])
+
+    def _norms(self, v: Vector) -> Vector:
+        return norms(v[self.index])
