@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.linalg import LinearOperator
 
+from mortarbench.harness.distributed.sparse import LinearMap
+
 Arrays = Mapping[str, NDArray[Any]]
 Product = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 #: Maps plain arrays to x ↦ Px, for vectors (n,) and matrices (n, k).
@@ -62,6 +64,15 @@ class WithDiagonal(Protocol):
 
     def diagonal(self) -> NDArray[np.float64]:
         """Return Pᵢᵢ (n,)."""
+
+
+@runtime_checkable
+class Compiled(Protocol):
+    """A product x ↦ Px whose map compiled solvers apply without calling Python."""
+
+    @property
+    def linear_map(self) -> LinearMap:
+        """The same product."""
 
 
 class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has no types
@@ -128,6 +139,12 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
 
     def _adjoint(self) -> SerialisableOperator:
         return self
+
+
+def linear_map(P: Any) -> LinearMap | None:
+    """Return the map of an operator P that is `Compiled`, or None."""
+    product = P.build() if isinstance(P, SerialisableOperator) else P
+    return product.linear_map if isinstance(product, Compiled) else None
 
 
 def assembled(P: LinearOperator) -> NDArray[np.float64]:

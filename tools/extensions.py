@@ -18,6 +18,7 @@ from setuptools import Distribution, Extension
 
 ROOT = Path(__file__).parents[1]
 SCALES = ROOT / "harness" / "verify"  #: scales.h and scales.pxd, which solvers include
+MAPS = ROOT / "harness" / "distributed"  #: sparse.pxd, which problems and solvers use
 FLAGS = ["-O3", "-fno-math-errno", "-fno-trapping-math", "-g0"]
 #: modules with their flags; without contraction to fused multiply-adds, results have
 #: the same digits on every machine
@@ -68,7 +69,7 @@ def _extension(name: str, flags: list[str]) -> Extension:
         [str(source)],
         depends=[
             str(p)
-            for folder in (source.parent, SCALES)
+            for folder in (source.parent, SCALES, MAPS)
             for p in folder.iterdir()
             if p.suffix in (".h", ".pxi", ".pxd")
         ],

@@ -25,10 +25,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, eigh, lapack, qr
+from scipy.linalg import blas, lapack
 from scipy.sparse import csc_array, csc_matrix, diags_array
 from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
 
+from mortarbench.harness.distributed.sparse import BorderedFactor, factor_above
 from mortarbench.harness.distributed.vectors import (
     DistributedVector,
     Ranks,
@@ -42,10 +43,11 @@ Dense = NDArray[np.float64]
 DEPENDENCE_TOLERANCE = 1e-13
 #: Added to a diagonal of ones: a pivot of exactly zero would end the factorisation.
 PIVOT_SHIFT = 1e-15
-#: Relative amount by which a pivot may fall below its lower bound: both are rounded.
-PIVOT_TOLERANCE = 1e-3
 #: Largest size of the dense factor of the shared rows, in entries per row of A.
 MAX_FILL = 8
+#: Largest size of a matrix that is factorised as a dense one: it takes longer to order
+#: a sparse one.
+MAX_DENSE_ROWS = 48
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +291,40 @@ def local_factor(
     return LocalFactor(at, order, second.size, factor, np.asarray(L_bb))
 
 
+def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
+    """Factorise a sparse, symmetric, positive definite A (n, n), with the border last.
+
+    Other rows are ordered for little fill. A small A is all border: a dense factor.
+
+    border : (n,) mask of the rows whose block may change
+
+    Raises
+    ------
+    CholmodNotPositiveDefiniteError
+        When A is not positive definite.
+
+    """
+    if A.shape[0] <= MAX_DENSE_ROWS:
+        border = np.ones_like(border)
+    inner, last = np.flatnonzero(~border), np.flatnonzero(border)
+    if not inner.size:
+        try:
+            L = _cholesky(A.toarray())
+        except np.linalg.LinAlgError:
+            raise CholmodNotPositiveDefiniteError from None
+        return BorderedFactor(last, csc_array((last.size, 0)), L)
+    A = csc_array(A)
+    inner = inner[analyze(with_int32(A[inner][:, inner]), use_long=False).P()]
+    order = np.concatenate([inner, last])
+    ordered = with_int32(A[order][:, order])
+    factor = analyze(ordered, ordering_method="natural", use_long=False)
+    factor.cholesky_inplace(ordered)
+    L = csc_array(factor.L())
+    L.sort_indices()
+    corner = L[inner.size :, inner.size :].toarray()
+    return BorderedFactor(order, L[:, : inner.size], corner)
+
+
 def independent_rows(gram: Matrix) -> Rows:
     """Return a maximal set of independent rows of a matrix G, from GGᵀ (r, r).
 
@@ -315,36 +351,6 @@ def independent_rows(gram: Matrix) -> Rows:
             break
         kept = np.delete(kept, factor.P()[dependent[0]])
     return kept
-
-
-def factor_above(M: Dense, share: float, L_0: Dense) -> Dense:
-    """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
-
-    M is a difference of matrices as large as L₀L₀ᵀ. If the share is below the rounding
-    of these, eigenvalues of M may have either sign. In exact arithmetic the pivots of M
-    are at least those of share·L₀L₀ᵀ. If computed ones are smaller, L₀⁻¹ML₀⁻ᵀ ≥ share·I
-    is decomposed instead, its eigenvalues λ are raised to the share, and
-
-        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   from a QR factorisation of √λ QᵀL₀ᵀ,
-
-    which involves no subtraction and keeps the lower bound in spite of cancellation.
-
-    M : (k, k) symmetric
-    L_0 : (k, k) lower triangular
-    """
-    try:
-        L = _cholesky(M)
-        if (np.diag(L) ** 2 >= (1 - PIVOT_TOLERANCE) * share * np.diag(L_0) ** 2).all():
-            return L
-    except np.linalg.LinAlgError:
-        pass
-    inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
-    size, Q = eigh((inner + inner.T) / 2)
-    root = np.sqrt(np.maximum(size, share))
-    half = blas.dtrmm(1.0, L_0, Q * root, lower=1)
-    (R,) = qr(half.T, mode="r", overwrite_a=True)
-    L = np.asfortranarray(R.T)
-    return L * np.where(np.diag(L) < 0, -1.0, 1.0)
 
 
 def _cholesky(M: Dense) -> Dense:

@@ -1,23 +1,53 @@
-# cython: language_level=3, boundscheck=False, wraparound=False
-"""Products with a sparse matrix in CSR format, fused with a linear combination.
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
+"""Linear maps whose products compiled code calls without Python.
 
-On ranks, vectors are short and products many: the overhead of a library call, and
-another pass over the vectors for the combination, would cost as much as the product.
-Compiled when the package is installed; `sparse.pyi` has the types.
+A `LinearMap` is a sparse matrix, the inverse of a factorised one, or a composition of
+other maps. Operators of decomposed bodies are such maps, and so are the rows of their
+coarse problem: on short vectors, the overhead of library calls, and another pass over
+the vectors for a linear combination, would cost more than the product. Compiled when
+the package is installed; `sparse.pyi` has the types, `sparse.pxd` those of compiled
+callers.
 """
 
+from libc.math cimport sqrt
+from libc.stdlib cimport calloc, free, realloc
+from libc.string cimport memcpy, memset
+from scipy.linalg.cython_blas cimport dsyrk, dtrsv
+from scipy.linalg.cython_lapack cimport dpotrf
+
 import numpy as np
+from scipy.linalg import blas, eigh, qr
 
 
-cdef class CompressedRows:
+cdef class LinearMap:
+    """A linear map x ↦ Ax with A (n, k), for vectors (k,) and matrices (k, w)."""
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        """y ← Ax for x (k, columns) and y (n, columns), stored by rows."""
+        raise NotImplementedError
+
+    def __call__(self, x):
+        """Return Ax."""
+        x = np.ascontiguousarray(x, dtype=np.float64)
+        self.expect(x.shape[0], self.k)
+        product = np.zeros((self.n, *x.shape[1:]))
+        cdef const double[::1] from_ = x.reshape(-1)
+        cdef double[::1] to = product.reshape(-1)
+        if to.shape[0] and from_.shape[0]:
+            self.apply(&from_[0], &to[0], to.shape[0] // self.n)
+        return product
+
+    def __matmul__(self, x):
+        return self(x)
+
+    cdef int expect(self, Py_ssize_t got, Py_ssize_t expected) except -1:
+        if got != expected:
+            raise ValueError(f"vector of {got} components; expected {expected}")
+        return 0
+
+
+cdef class CompressedRows(LinearMap):
     """A matrix M (n, k) in CSR format."""
-
-    cdef readonly tuple shape
-    cdef object matrix  # keeps the arrays alive that the pointers below refer to
-    cdef Py_ssize_t n, k
-    cdef const double *data
-    cdef const int *indices
-    cdef const int *indptr
 
     def __init__(self, M):
         cdef const double[::1] data = np.ascontiguousarray(M.data, dtype=np.float64)
@@ -26,26 +56,49 @@ cdef class CompressedRows:
         self.shape, (self.n, self.k) = M.shape, M.shape
         if M.format != "csr" or indptr.shape[0] != self.n + 1:
             raise ValueError(f"{M.format} matrix; expected one by rows")
-        self.matrix = data, indices, indptr
+        self.arrays = data, indices, indptr
         self.data = &data[0] if data.shape[0] else NULL
         self.indices = &indices[0] if indices.shape[0] else NULL
         self.indptr = &indptr[0]
 
-    def __matmul__(self, const double[::1] x):
-        """Return Mx (n,) of x (k,)."""
-        self._expect(x.shape[0], self.k)
-        product = np.empty(self.n)
-        cdef double[::1] y = product
-        if self.n and self.k:
-            _times(self.n, self.data, self.indices, self.indptr, &x[0], &y[0])
-        else:
-            y[:] = 0
-        return product
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef Py_ssize_t i, c
+        cdef const double *x_j
+        cdef int j
+        if columns == 1:
+            self.times(x, y)
+            return 0
+        memset(y, 0, self.n * columns * sizeof(double))
+        for i in range(self.n):
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                x_j = x + self.indices[j] * columns
+                for c in range(columns):
+                    y[i * columns + c] += self.data[j] * x_j[c]
+        return 0
+
+    cdef void times(self, const double *x, double *y) noexcept:
+        """y ← Mx."""
+        cdef Py_ssize_t i
+        cdef int j
+        cdef double y_i
+        for i in range(self.n):
+            y_i = 0
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                y_i += self.data[j] * x[self.indices[j]]
+            y[i] = y_i
+
+    cdef void add_transposed(self, const double *x, double *y) noexcept:
+        """y ← y + Mᵀx."""
+        cdef Py_ssize_t i
+        cdef int j
+        for i in range(self.n):
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                y[self.indices[j]] += self.data[j] * x[i]
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
         """Return sv + tMx (n,) of v (n,) and x (k,)."""
-        self._expect(v.shape[0], self.n)
-        product = self @ x
+        self.expect(v.shape[0], self.n)
+        product = self(x)
         cdef double[::1] y = product
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -56,9 +109,9 @@ cdef class CompressedRows:
         self, const double[::1] v, const double[::1] x, const double[::1] weights
     ):
         """Return diag(weights)(v − Mx) (n,) of v (n,), x (k,) and weights (n,)."""
-        self._expect(v.shape[0], self.n)
-        self._expect(weights.shape[0], self.n)
-        product = self @ x
+        self.expect(v.shape[0], self.n)
+        self.expect(weights.shape[0], self.n)
+        product = self(x)
         cdef double[::1] y = product
         cdef Py_ssize_t i
         for i in range(self.n):
@@ -67,41 +120,404 @@ cdef class CompressedRows:
 
     def transposed_times(self, const double[::1] x):
         """Return Mᵀx (k,) of x (n,)."""
-        self._expect(x.shape[0], self.n)
+        self.expect(x.shape[0], self.n)
         product = np.zeros(self.k)
         cdef double[::1] y = product
         if self.n and self.k:
-            _transposed_times(
-                self.n, self.data, self.indices, self.indptr, &x[0], &y[0]
-            )
+            self.add_transposed(&x[0], &y[0])
         return product
 
-    cdef int _expect(self, Py_ssize_t got, Py_ssize_t expected) except -1:
-        if got != expected:
-            raise ValueError(f"vector of {got} components; expected {expected}")
+    def outer_products(self, const double[::1] weights, const int[::1] place, int size):
+        """Return Σᵢ wᵢmᵢmᵢᵀ (size, size) over the rows mᵢ, for weights w (n,).
+
+        place : (k,) new numbers of the columns, below `size` where M has entries
+        """
+        self.expect(weights.shape[0], self.n)
+        self.expect(place.shape[0], self.k)
+        total = np.zeros((size, size))
+        cdef double[:, ::1] block = total
+        if size and self.n:
+            add_outer_products(self, 1.0, &weights[0], &place[0], &block[0, 0], size)
+        return total
+
+
+cdef void add_outer_products(
+    CompressedRows M, double s, const double *weights, const int *place, double *block,
+    Py_ssize_t size,
+) noexcept:
+    """block ← block + s Σᵢ wᵢmᵢmᵢᵀ, see `CompressedRows.outer_products`."""
+    cdef Py_ssize_t i
+    cdef int j, l
+    cdef double *row
+    cdef double m
+    for i in range(M.n):
+        if weights[i] == 0:
+            continue
+        for j in range(M.indptr[i], M.indptr[i + 1]):
+            row = block + place[M.indices[j]] * size
+            m = s * weights[i] * M.data[j]
+            for l in range(M.indptr[i], M.indptr[i + 1]):
+                row[place[M.indices[l]]] += m * M.data[l]
+
+
+cdef class Composition(LinearMap):
+    """The map x ↦ A₁A₂…Aᵣx of maps with fitting shapes; the last one acts first."""
+
+    cdef tuple maps
+    cdef double *between[2]
+    cdef Py_ssize_t room
+
+    def __init__(self, *maps):
+        cdef LinearMap map_
+        self.maps = maps
+        for left, right in zip(maps, maps[1:]):
+            self.expect(right.shape[0], left.shape[1])
+        self.n, self.k = maps[0].shape[0], maps[len(maps) - 1].shape[1]
+        self.shape = self.n, self.k
+
+    def __dealloc__(self):
+        free(self.between[0])
+        free(self.between[1])
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef Py_ssize_t i, last = len(self.maps) - 1, room = 0
+        cdef LinearMap map_
+        for map_ in self.maps:
+            room = max(room, map_.n * columns)
+        if room > self.room:
+            for i in range(2):
+                self.between[i] = resized(self.between[i], room)
+            self.room = room
+        for i in range(last, -1, -1):
+            map_ = self.maps[i]
+            map_.apply(x, y if i == 0 else self.between[i % 2], columns)
+            x = self.between[i % 2]
         return 0
 
 
-cdef void _times(
-    Py_ssize_t n, const double *data, const int *indices, const int *indptr,
-    const double *x, double *y,
-) noexcept nogil:
-    cdef Py_ssize_t i
-    cdef int j
-    cdef double y_i
-    for i in range(n):
-        y_i = 0
-        for j in range(indptr[i], indptr[i + 1]):
-            y_i += data[j] * x[indices[j]]
-        y[i] = y_i
+cdef class DirectSum(LinearMap):
+    """The map of consecutive parts of a vector, each by a map of its own."""
+
+    cdef tuple maps
+
+    def __init__(self, *maps):
+        self.maps = maps
+        self.n, self.k = (sum(map_.shape[i] for map_ in maps) for i in (0, 1))
+        self.shape = self.n, self.k
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef LinearMap map_
+        for map_ in self.maps:
+            map_.apply(x, y, columns)
+            x += map_.k * columns
+            y += map_.n * columns
+        return 0
 
 
-cdef void _transposed_times(
-    Py_ssize_t n, const double *data, const int *indices, const int *indptr,
-    const double *x, double *y,
-) noexcept nogil:
+cdef double *resized(double *held, Py_ssize_t size) except NULL:
+    held = <double *> realloc(held, max(size, 1) * sizeof(double))
+    if not held:
+        raise MemoryError(f"cannot allocate {size} numbers")
+    return held
+
+
+# --- factors ------------------------------------------------------------------------
+
+
+# Relative amount by which a pivot may fall below its lower bound: both are rounded.
+cdef double PIVOT_TOLERANCE = 1e-3
+
+
+def factor_above(M, double share, L_0):
+    """Return L with LLᵀ = M, where M ≥ share·L₀L₀ᵀ in exact arithmetic.
+
+    M is a difference of matrices as large as L₀L₀ᵀ. If the share is below the rounding
+    of these, eigenvalues of M may have either sign. In exact arithmetic the pivots of M
+    are at least those of share·L₀L₀ᵀ. If computed ones are smaller, L₀⁻¹ML₀⁻ᵀ ≥ share·I
+    is decomposed instead, its eigenvalues λ are raised to the share, and
+
+        LLᵀ = L₀ Q λ Qᵀ L₀ᵀ   from a QR factorisation of √λ QᵀL₀ᵀ,
+
+    which involves no subtraction and keeps the lower bound in spite of cancellation.
+
+    M : (k, k) symmetric
+    L_0 : (k, k) lower triangular
+    """
+    cdef Py_ssize_t k = len(M)
+    L = np.array(M, dtype=np.float64, order="F")
+    cdef double[::1, :] at = L
+    cdef const double[::1, :] least = np.asfortranarray(L_0, dtype=np.float64)
+    if not k or factorised_above(&at[0, 0], k, share, &least[0, 0]):
+        return L
+    inner = blas.dtrsm(1.0, L_0, blas.dtrsm(1.0, L_0, M, lower=1).T, lower=1)
+    size, Q = eigh((inner + inner.T) / 2)
+    root = np.sqrt(np.maximum(size, share))
+    half = blas.dtrmm(1.0, L_0, Q * root, lower=1)
+    (R,) = qr(half.T, mode="r", overwrite_a=True)
+    L = np.asfortranarray(R.T)
+    return L * np.where(np.diag(L) < 0, -1.0, 1.0)
+
+
+cdef bint factorised_above(
+    double *M, Py_ssize_t k, double share, const double *L_0
+) noexcept:
+    """Factorise M (k, k) in place; return False if its pivots are below their bounds."""
+    cdef int n = k, info = 0
     cdef Py_ssize_t i
-    cdef int j
-    for i in range(n):
-        for j in range(indptr[i], indptr[i + 1]):
-            y[indices[j]] += data[j] * x[i]
+    cdef double pivot, least
+    dpotrf(b"L", &n, M, &n, &info)
+    if info:
+        return False
+    for i in range(k):
+        pivot, least = M[i * k + i], L_0[i * k + i]
+        if not pivot * pivot >= (1 - PIVOT_TOLERANCE) * share * least * least:
+            return False
+    return True
+
+
+cdef class BorderedFactor(LinearMap):
+    """Cholesky factor of a sparse A (n, n) whose last rows, the *border*, are dense.
+
+    ::
+
+        A = LLᵀ,   L = ⎡L_aa     ⎤     with rows in the given order.
+                       ⎣L_ba  L_bb⎦
+
+    Changes of the border need a factor of its Schur complement L_bbL_bbᵀ only. As a map
+    this is x ↦ A⁻¹x.
+
+    order : (n,) permutation of the rows, the border last
+    columns : the first n − b columns of L (n, n − b) in CSC format, diagonal first
+    L_bb : (b, b); its upper triangle is not used
+    """
+
+    def __init__(self, order, columns, L_bb):
+        cdef const int[::1] rows = np.ascontiguousarray(order, dtype=np.int32)
+        cdef const int[::1] indptr = np.ascontiguousarray(columns.indptr, np.int32)
+        cdef const int[::1] indices = np.ascontiguousarray(columns.indices, np.int32)
+        cdef const double[::1] data = np.ascontiguousarray(columns.data, np.float64)
+        cdef const double[::1, :] corner = np.asfortranarray(L_bb, dtype=np.float64)
+        cdef Py_ssize_t i, j, b = corner.shape[0]
+        cdef int size = b
+        cdef double one = 1.0, zero = 0.0
+        inverse = np.empty(rows.shape[0], dtype=np.int32)
+        cdef int[::1] place = inverse
+        self.n = self.k = rows.shape[0]
+        self.shape, self.inner, self.scale = (self.n, self.n), self.n - b, 1.0
+        self.expect(indptr.shape[0] - 1, self.inner)
+        for i in range(self.n):
+            place[rows[i]] = <int> (i - self.inner)
+        self.arrays = rows, inverse, indptr, indices, data
+        if self.n:
+            self.order, self.place = &rows[0], &place[0]
+        self.indptr = &indptr[0]
+        self.indices = &indices[0] if indices.shape[0] else NULL
+        self.data = &data[0] if data.shape[0] else NULL
+        self.reserve(b)
+        self.complement = <double *> calloc(max(b * b, 1), sizeof(double))
+        if not self.complement:
+            raise MemoryError
+        for j in range(b):
+            for i in range(j, b):
+                self.L[j * b + i] = corner[i, j]
+        if b:  # both triangles of L_bbL_bbᵀ
+            dsyrk(b"L", b"N", &size, &size, &one, self.L, &size, &zero, self.complement,
+                  &size)
+        for j in range(b):
+            for i in range(j):
+                self.complement[j * b + i] = self.complement[i * b + j]
+
+    def __dealloc__(self):
+        free(self.L)
+        free(self.complement)
+        free(self.u)
+
+    cdef int reserve(self, Py_ssize_t border) except -1:
+        self.border = border
+        self.L = <double *> calloc(max(border * border, 1), sizeof(double))
+        self.u = <double *> calloc(max(self.n, 1), sizeof(double))
+        if not self.L or not self.u:
+            raise MemoryError
+        return 0
+
+    # the two halves of a solve
+
+    cdef void reduce(self, const double *t, double *u) noexcept:
+        """u ← (L_aa⁻¹t_a, t_b − L_baL_aa⁻¹t_a), in the order of L and without `scale`."""
+        cdef Py_ssize_t i, j
+        cdef int l
+        cdef double u_j
+        for i in range(self.n):
+            u[i] = t[self.order[i]]
+        for j in range(self.inner):
+            l = self.indptr[j]
+            u_j = u[j] = u[j] / self.data[l]
+            for l in range(l + 1, self.indptr[j + 1]):
+                u[self.indices[l]] -= self.data[l] * u_j
+
+    cdef void extend(self, double *u, double *y) noexcept:
+        """y ← the solution of L_aaᵀy_a + L_baᵀy_b = u_a with y_b = u_b; u is lost."""
+        cdef Py_ssize_t i, j
+        cdef int l
+        cdef double u_j
+        for j in range(self.inner - 1, -1, -1):
+            u_j = u[j]
+            for l in range(self.indptr[j] + 1, self.indptr[j + 1]):
+                u_j -= self.data[l] * u[self.indices[l]]
+            u[j] = u_j / self.data[self.indptr[j]]
+        for i in range(self.n):
+            y[self.order[i]] = u[i]
+
+    cdef void solve_border(self, double *r, bint transposed) noexcept:
+        """r ← L_bb⁻¹r, or L_bb⁻ᵀr."""
+        cdef int b = self.border, one = 1
+        if b:
+            dtrsv(b"L", b"T" if transposed else b"N", b"N", &b, self.L, &b, r, &one)
+
+    # with the scale
+
+    cdef void forward_to(self, const double *t, double *a) noexcept:
+        """a ← L⁻¹t."""
+        self.reduce(t, a)
+        self.scale_inner(a, 1 / sqrt(self.scale))
+        self.solve_border(a + self.inner, False)
+
+    cdef void backward_to(self, const double *a, double *y) noexcept:
+        """y ← L⁻ᵀa."""
+        memcpy(self.u, a, self.n * sizeof(double))
+        self.scale_inner(self.u, 1 / sqrt(self.scale))
+        self.solve_border(self.u + self.inner, True)
+        self.extend(self.u, y)
+
+    cdef void solve_to(self, const double *t, double *y) noexcept:
+        """y ← A⁻¹t."""
+        self.reduce(t, self.u)
+        self.scale_inner(self.u, 1 / self.scale)
+        self.solve_border(self.u + self.inner, False)
+        self.solve_border(self.u + self.inner, True)
+        self.extend(self.u, y)
+
+    cdef void scale_inner(self, double *u, double s) noexcept:
+        cdef Py_ssize_t i
+        if s != 1:
+            for i in range(self.inner):
+                u[i] *= s
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef Py_ssize_t i, c
+        if columns == 1:
+            self.solve_to(x, y)
+            return 0
+        cdef double *one = resized(NULL, self.n)
+        for c in range(columns):
+            for i in range(self.n):
+                one[i] = x[i * columns + c]
+            self.solve_to(one, one)
+            for i in range(self.n):
+                y[i * columns + c] = one[i]
+        free(one)
+        return 0
+
+    def forward(self, const double[::1] t):
+        """Return L⁻¹t, in the order of L."""
+        self.expect(t.shape[0], self.n)
+        result = np.empty(self.n)
+        cdef double[::1] a = result
+        if self.n:
+            self.forward_to(&t[0], &a[0])
+        return result
+
+    def backward(self, const double[::1] a):
+        """Return L⁻ᵀa for a in the order of L."""
+        self.expect(a.shape[0], self.n)
+        result = np.empty(self.n)
+        cdef double[::1] y = result
+        if self.n:
+            self.backward_to(&a[0], &y[0])
+        return result
+
+    @property
+    def least_pivot(self):
+        """Smallest diagonal entry of L; inf for n = 0."""
+        cdef Py_ssize_t i
+        cdef double least = float("inf")
+        for i in range(self.inner):
+            least = min(least, sqrt(self.scale) * self.data[self.indptr[i]])
+        for i in range(self.border):
+            least = min(least, self.L[i * self.border + i])
+        return least
+
+    # changes of the border
+
+    cdef BorderedFactor less(self, double shift, const double *block):
+        """Return the factor of (1 + shift)A less a block (b, b) on the border."""
+        cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
+        cdef Py_ssize_t i, b = self.border
+        new.n, new.k, new.shape = self.n, self.k, self.shape
+        new.inner, new.scale, new.arrays = self.inner, 1 + shift, self.arrays
+        new.order, new.place, new.indptr = self.order, self.place, self.indptr
+        new.indices, new.data = self.indices, self.data
+        new.whole = self
+        new.reserve(b)
+        for i in range(b * b):
+            new.L[i] = (1 + shift) * self.complement[i] - block[i]
+        if b and not factorised_above(new.L, b, shift, self.L):
+            for i in range(b * b):
+                new.L[i] = (1 + shift) * self.complement[i] - block[i]
+            new.raise_border(shift)
+        return new
+
+    cdef int raise_border(self, double shift) except -1:
+        """Factorise the complement in `L` by its eigenvalues (`factor_above`)."""
+        cdef Py_ssize_t i, j, b = self.border
+        M, L_0 = np.empty((b, b), order="F"), np.zeros((b, b), order="F")
+        cdef double[::1, :] at = M
+        cdef double[::1, :] lower = L_0
+        for j in range(b):
+            for i in range(b):
+                at[i, j] = self.L[j * b + i]
+            for i in range(j, b):
+                lower[i, j] = self.whole.L[j * b + i]
+        cdef const double[::1, :] L = np.asfortranarray(factor_above(M, shift, L_0))
+        for j in range(b):
+            for i in range(j, b):
+                self.L[j * b + i] = L[i, j]
+        return 0
+
+    cdef BorderedFactor without(
+        self, double shift, CompressedRows columns, const double *removed
+    ):
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ over the rows of `columns`.
+
+        removed : the weights wᵢ, 0 or 1
+        """
+        cdef Py_ssize_t b = self.border
+        cdef double *block = <double *> calloc(max(b * b, 1), sizeof(double))
+        if not block:
+            raise MemoryError
+        add_outer_products(columns, 1.0, removed, self.place, block, b)
+        try:
+            return self.less(shift, block)
+        finally:
+            free(block)
+
+    def shifted(self, double shift, block):
+        """Return the factor of (1 + shift)A less a symmetric block (b, b) of the border.
+
+        The difference is at least shift·A, which bounds its pivots from below even
+        where rounding does not: see `factor_above`.
+        """
+        cdef const double[:, ::1] less = np.ascontiguousarray(block, dtype=np.float64)
+        self.expect(less.shape[0], self.border)
+        return self.less(shift, &less[0, 0] if self.border else NULL)
+
+    def shifted_without(
+        self, double shift, CompressedRows columns, const double[::1] removed
+    ):
+        """Return the factor of (1 + shift)A − Σᵢ wᵢmᵢmᵢᵀ; see `shifted`.
+
+        columns : rows mᵢ (n,) with entries in the border only
+        removed : weights wᵢ, 0 or 1
+        """
+        columns.expect(removed.shape[0], columns.n)
+        return self.without(shift, columns, &removed[0] if columns.n else NULL)

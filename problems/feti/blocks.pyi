@@ -1,6 +1,9 @@
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import Any
 
-def multiply(
-    M: NDArray[np.float64], X: NDArray[np.float64], Y: NDArray[np.float64]
-) -> None: ...
+from mortarbench.harness.distributed.sparse import LinearMap
+
+class BlockDiagonal(LinearMap):
+    def __init__(
+        self, blocks: Sequence[Any], sizes: Sequence[int], members: Sequence[int]
+    ) -> None: ...

@@ -1,4 +1,4 @@
-# cython: language_level=3, boundscheck=False, wraparound=False
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True
 """Products of dense blocks with the columns of all subdomains of a class.
 
 BLAS copies (packs) the block in every product, which takes a third of the time of a
@@ -6,23 +6,89 @@ product with two dozen columns. This module is compiled when the package is inst
 `blocks.pyi` declares its types.
 """
 
+from libc.stdlib cimport calloc, free
+from scipy.linalg.cython_blas cimport dspmv
+
+from mortarbench.harness.distributed.sparse cimport LinearMap
+
+import numpy as np
+
 cdef extern from "blocks.h" nogil:
     void product(
         const double *M, Py_ssize_t n, const double *X, double *Y, Py_ssize_t columns
     )
 
+ctypedef struct block:
+    Py_ssize_t n, members
+    const double *entries  # NULL for an object of Python
+    bint is_triangle
 
-def multiply(const double[:, ::1] M, const double[:, ::1] X, double[:, ::1] Y):
-    """Store MX in Y (n, k), for a block M (n, n) and columns X (n, k).
+
+cdef class BlockDiagonal(LinearMap):
+    """The map of packed vectors by blocks M_g (n_g, n_g), each for S_g subdomains.
+
+    The part of a vector that belongs to a block is a matrix (n_g, S_g), stored by rows.
+
+    blocks : symmetric; each an array (n_g, n_g), the upper triangle of one, column by
+        column, as an array (n_g (n_g + 1)/2,) if S_g = 1, or an object with `@`
+    sizes : n_g
+    members : S_g
 
     Raises
     ------
     ValueError
-        If the shapes do not fit.
+        If the shape of a block does not fit.
 
     """
-    cdef Py_ssize_t n = M.shape[0]
-    if not n == M.shape[1] == X.shape[0] == Y.shape[0] or X.shape[1] != Y.shape[1]:
-        raise ValueError(f"({n}, {M.shape[1]}) times ({X.shape[0]}, {X.shape[1]})")
-    if n and X.shape[1]:
-        product(&M[0, 0], n, &X[0, 0], &Y[0, 0], X.shape[1])
+
+    cdef list blocks
+    cdef Py_ssize_t count
+    cdef block *at  # (count,)
+
+    def __init__(self, blocks, sizes, members):
+        cdef Py_ssize_t i
+        cdef const double[::1] entries
+        self.blocks, self.count = list(blocks), len(blocks)
+        self.at = <block *> calloc(max(self.count, 1), sizeof(block))
+        if not self.at:
+            raise MemoryError
+        for i in range(self.count):
+            n, w, M = int(sizes[i]), int(members[i]), self.blocks[i]
+            self.at[i].n, self.at[i].members = n, w
+            self.n += n * w
+            if not isinstance(M, np.ndarray):
+                continue
+            self.at[i].is_triangle = M.ndim == 1
+            fits = M.shape == ((n, n) if M.ndim == 2 else (n * (n + 1) // 2,))
+            if not fits or (M.ndim == 1 and w != 1):
+                raise ValueError(f"{M.shape} times ({n}, {w})")
+            self.blocks[i] = np.ascontiguousarray(M, dtype=np.float64)
+            entries = self.blocks[i].reshape(-1)
+            self.at[i].entries = &entries[0] if n else NULL
+        self.k, self.shape = self.n, (self.n, self.n)
+
+    def __dealloc__(self):
+        free(self.at)
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        cdef Py_ssize_t i, c, n, w
+        cdef int size, step = <int> columns
+        cdef double one = 1.0, zero = 0.0
+        for i in range(self.count):
+            n, w = self.at[i].n, self.at[i].members * columns
+            if not n * w:
+                continue
+            if not self.at[i].entries:
+                X = np.asarray(<double[:n, :w]> <double *> x)
+                Y = np.asarray(<double[:n, :w]> y)
+                Y[:] = self.blocks[i] @ X
+            elif self.at[i].is_triangle:
+                size = <int> n
+                for c in range(columns):
+                    dspmv(b"U", &size, &one, <double *> self.at[i].entries,
+                          <double *> x + c, &step, &zero, y + c, &step)
+            else:
+                product(self.at[i].entries, n, x, y, w)
+            x += n * w
+            y += n * w
+        return 0

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from scipy.sparse import csc_array, csr_array, diags_array
 from mortarbench.harness import QP, InputError, Solution, Vector, no_rows
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.factor import Touched, local_factor, touched_rows
-from mortarbench.harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed.sparse import CompressedRows, LinearMap
 from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
     DistributedVector,
@@ -320,7 +320,7 @@ class RankOperator:
 
     def __call__(self, x: Dense) -> DistributedVector:
         """Return Fx."""
-        y = self._congruence(self._rows, self.local.inverses, np.asarray(x))
+        y = self._congruence(self._rows, self.local.inverse_map, np.asarray(x))
         return distributed(y, self.halo.ranks)
 
     def __matmul__(self, x: Dense) -> DistributedVector:
@@ -334,12 +334,10 @@ class RankOperator:
     def _rows(self) -> RowsOverRanks:
         return RowsOverRanks.of(self.local.packed.B, self.halo)
 
-    def _congruence(
-        self, rows: RowsOverRanks, blocks: Sequence[Any], x: Vector
-    ) -> Vector:
+    def _congruence(self, rows: RowsOverRanks, blocks: LinearMap, x: Vector) -> Vector:
         X = rows.transposed_times(x)
         with self.halo.ranks.clocked("products"):
-            Y = self.local.packed.block_products(blocks, X)
+            Y = blocks(X)
         return rows.times(Y)
 
     def onto_rows(self) -> Product:
@@ -351,8 +349,8 @@ class RankOperator:
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
         packed, ranks = self.local.packed, self.halo.ranks
-        blocks, weights = self.local.weighted_blocks(kind, scaling)
-        BW = scaled_columns(packed.B, weights)
+        each, weights = self.local.weighted_blocks(kind, scaling)
+        blocks, BW = packed.block_diagonal(each), scaled_columns(packed.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ packed.BT))
 

@@ -39,15 +39,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import blas, lapack
-from scipy.sparse import csc_matrix, csr_array, diags_array
+from scipy.linalg import lapack
+from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
-from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Vector
+from mortarbench.harness.distributed.factor import bordered_factor
+from mortarbench.harness.distributed.sparse import (
+    Composition,
+    CompressedRows,
+    DirectSum,
+    LinearMap,
+)
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
-from mortarbench.problems.feti.blocks import multiply
+from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
     Condensed,
     Dense,
@@ -94,22 +100,14 @@ class Packed:
     B: csr_array  #: (m, M) packed columns of B
     BT: csr_array  #: (M, m) the transpose, stored by rows
 
-    def congruence(self, blocks: Sequence[Any], x: Dense) -> Dense:
-        """Multiply x (m,) or (m, k) by  B_b diag(blocks) B_bᵀ."""
-        return np.asarray(self.B @ self.block_products(blocks, self.BT @ x))
+    def congruence(self, blocks: BlockDiagonal) -> Composition:
+        """Return the map x ↦ B_b diag(blocks) B_bᵀx for x (m,) or (m, k)."""
+        return Composition(CompressedRows(self.B), blocks, CompressedRows(self.BT))
 
-    def block_products(self, blocks: Sequence[Any], X: Dense) -> Dense:
-        """Multiply the part of X (M,) or (M, k) of each group by its block."""
-        Y, end = np.empty_like(X), 0
-        for block, group in zip(blocks, self.groups, strict=True):
-            n = group.touched.size
-            begin, end = end, end + n * group.members.size
-            x, y = (v[begin:end].reshape(n, -1) for v in (X, Y))
-            if isinstance(block, np.ndarray):
-                multiply(block, x, y)
-            else:
-                y[:] = block @ x
-        return Y
+    def block_diagonal(self, blocks: Sequence[Any]) -> BlockDiagonal:
+        """Return the map of packed components (M,) by the block of each group."""
+        sizes = [group.touched.size for group in self.groups]
+        return BlockDiagonal(blocks, sizes, [g.members.size for g in self.groups])
 
     def diagonal(self, blocks: Sequence[Any]) -> Vector:
         """Return the diagonal of  B_b diag(blocks) B_bᵀ.
@@ -190,14 +188,19 @@ class DualOperator:
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
-        return self.packed.congruence(self.inverses, x)
+        return self.linear_map(x)
+
+    @cached_property
+    def linear_map(self) -> Composition:
+        """F, as compiled code applies it."""
+        return self.packed.congruence(self.inverse_map)
 
     def diagonal(self) -> Vector:
         """Return the diagonal of F, (m,)."""
         return self._diagonal
 
-    def preconditioner(self, kind: str, scaling: str) -> Product:
-        """Return the function x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
+    def preconditioner(self, kind: str, scaling: str) -> Composition:
+        """Return the map x ↦ B_D diag(D) B_Dᵀx ≈ F⁻¹x for (m,) and (m, k).
 
         Parameters
         ----------
@@ -210,15 +213,20 @@ class DualOperator:
             For other names.
 
         """
-        blocks, weights = self.weighted_blocks(kind, scaling)
-        BW = scaled_columns(self.packed.B, weights)
-        gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
-        WB, solve = csr_array(BW.T), gram_inverse(gram, self.equalities)
+        if (kind, scaling) not in self._preconditioners:
+            blocks, weights = self.weighted_blocks(kind, scaling)
+            BW = scaled_columns(self.packed.B, weights)
+            gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
+            solve = gram_inverse(gram, self.equalities)
+            self._preconditioners[kind, scaling] = Composition(
+                solve, CompressedRows(BW), self.packed.block_diagonal(blocks),
+                CompressedRows(csr_array(BW.T)), solve,
+            )  # fmt: skip
+        return self._preconditioners[kind, scaling]
 
-        def product(x: Dense) -> Dense:
-            return solve(BW @ self.packed.block_products(blocks, WB @ solve(x)))
-
-        return product
+    @cached_property
+    def _preconditioners(self) -> dict[tuple[str, str], Composition]:
+        return {}
 
     def weighted_blocks(self, kind: str, scaling: str) -> tuple[list[Any], Vector]:
         """Return the blocks D of the groups, and weights W (M,) of packed components.
@@ -238,7 +246,7 @@ class DualOperator:
         groups = self.packed.groups
         blocks = (
             [g.template.block(g.touched) for g in groups] if kind == "lumped"
-            else [schur for _, schur in self._blocks]
+            else self._blocks.schur
         )  # fmt: skip
         softness = [
             np.repeat(1 / g.template.stiffness[g.touched], g.members.size)
@@ -257,26 +265,41 @@ class DualOperator:
     @property
     def inverses(self) -> list[Any]:
         """(K⁺)_bb of each group: a dense matrix, or an object with `@`."""
-        return [inverse for inverse, _ in self._blocks]
+        return self._blocks.inverses
+
+    @property
+    def inverse_map(self) -> BlockDiagonal:
+        """The map of packed components by (K⁺)_bb of each group."""
+        return self._blocks.inverse_map
 
     @cached_property
     def _diagonal(self) -> Vector:
         return self.packed.diagonal(self.inverses)
 
     @cached_property
-    def _blocks(self) -> list[tuple[Any, Any]]:
-        """(K⁺)_bb and S_bb of each group: dense matrices, or objects with `@`."""
+    def _blocks(self) -> _Blocks:
         groups = self.packed.groups
         blocks_of = {i: _implicit(g) for i, g in enumerate(groups) if not g.explicit}
         explicit = [i for i, g in enumerate(groups) if g.explicit]
         for at, condensed in self.condense([groups[i] for i in explicit]):
             blocks_of[explicit[at]] = _explicit(groups[explicit[at]], condensed)
-        return [blocks_of[i] for i in range(len(groups))]
+        inverses, schur = (
+            [blocks_of[i][k] for i in range(len(groups))] for k in (0, 1)
+        )
+        return _Blocks(inverses, schur, self.packed.block_diagonal(inverses))
+
+
+class _Blocks(NamedTuple):
+    """Local blocks of each group: dense matrices, or objects with `@`."""
+
+    inverses: list[Any]  #: (K⁺)_bb
+    schur: list[Any]  #: S_bb
+    inverse_map: BlockDiagonal  #: diag((K⁺)_bb)
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
     if group.members.size == 1:
-        return _Triangle.of(blocks.compliance), _Triangle.of(blocks.schur)
+        return _triangle(blocks.compliance), _triangle(blocks.schur)
     return blocks
 
 
@@ -289,18 +312,9 @@ def _implicit(group: Group) -> tuple[Any, Any]:
     )
 
 
-class _Triangle(NamedTuple):
-    """A symmetric matrix, stored as its upper triangle column by column."""
-
-    n: int
-    entries: Vector
-
-    @classmethod
-    def of(cls, M: Dense) -> _Triangle:
-        return cls(len(M), lapack.dtrttp(M)[0])
-
-    def __matmul__(self, X: Dense) -> Dense:
-        return np.stack([blas.dspmv(self.n, 1.0, self.entries, x) for x in X.T], axis=1)
+def _triangle(M: Dense) -> Vector:
+    """Return the upper triangle of a symmetric matrix, column by column."""
+    return np.asarray(lapack.dtrttp(M)[0])
 
 
 class _Part(NamedTuple):
@@ -318,9 +332,9 @@ class _Part(NamedTuple):
 
 def _entries(block: Any, i: NDArray[np.int64], j: NDArray[np.int64]) -> Vector:
     """Return the entries (i, j) of a block; an implicit one is evaluated in strips."""
-    if isinstance(block, _Triangle):
+    if not isinstance(block, _Part) and block.ndim == 1:  # a triangle
         i, j = np.minimum(i, j), np.maximum(i, j)
-        return np.asarray(block.entries[j * (j + 1) // 2 + i])
+        return np.asarray(block[j * (j + 1) // 2 + i])
     if not isinstance(block, _Part):
         return np.asarray(block[i, j])
     values, n = np.empty(i.size), block.b.size
@@ -349,24 +363,15 @@ def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
     return csr_array(parts, shape=gram.shape)
 
 
-def gram_inverse(gram: csr_array, equalities: int) -> Product:
-    """Return the function x ↦ (B W Bᵀ)⁺x for a result of `decouple_contact`."""
-    m = gram.shape[0]
-    inverse = block_pseudoinverse(csr_array(gram[:equalities, :equalities]))
-    if equalities == m:
-        return lambda x: np.asarray(inverse @ x)
-    contact = csc_matrix(gram[equalities:, equalities:])
-    factor = cholesky(
-        csc_matrix(contact + diags_array(CONTACT_SHIFT * contact.diagonal()))
-    )
-
-    def solve(x: Dense) -> Dense:
-        y = np.empty_like(x)
-        y[:equalities] = inverse @ x[:equalities]
-        y[equalities:] = factor(x[equalities:])
-        return y
-
-    return solve
+def gram_inverse(gram: csr_array, equalities: int) -> LinearMap:
+    """Return the map x ↦ (B W Bᵀ)⁺x for a result of `decouple_contact`."""
+    inverse = CompressedRows(block_pseudoinverse(gram[:equalities, :equalities]))
+    if equalities == gram.shape[0]:
+        return inverse
+    contact = csc_array(gram[equalities:, equalities:])
+    contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
+    none = np.zeros(contact.shape[0], dtype=bool)
+    return DirectSum(inverse, bordered_factor(contact, none))
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:

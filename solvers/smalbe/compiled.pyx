@@ -41,11 +41,13 @@ from scipy.linalg.cython_lapack cimport (
     dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
+from mortarbench.harness.distributed.sparse cimport LinearMap
 from mortarbench.harness.verify cimport scales
 
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+from mortarbench.harness.operators import linear_map
 from mortarbench.solvers.smalbe.extension import Step
 
 cdef extern from "vectors.h" nogil:

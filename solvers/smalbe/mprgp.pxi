@@ -198,6 +198,7 @@ cdef class MPRGP:
     cdef Model B  # of H; ᾱ = 1/τ is the length of gradient projection steps
     cdef Model preconditioner  # inverted in the face; None for none
     cdef object M  # v → Mv of a structural preconditioner; None for none
+    cdef LinearMap M_map  # the same, if it is compiled; else None
     cdef double M_scale  # ‖𝒫F𝒫‖: M approximates F⁻¹, not H⁻¹
     cdef object counts  # counts of applications of M
     cdef object step_rule  # of a subclass (`solvers.smalbe.extension`); None for none
@@ -384,7 +385,10 @@ cdef class MPRGP:
         self.z_Hp = self.preconditioner.inverse(self.free, self.phi, self.Hp, self.z)
         if self.M is not None:
             self.counts["preconditioner_applies"] += 1
-            copy_result(self.M(self.over.vector(view(self.z, n))), n, Mz, "M @ v")
+            if self.M_map is not None:
+                self.M_map.apply(self.z, Mz, 1)
+            else:
+                copy_result(self.M(self.over.vector(view(self.z, n))), n, Mz, "M @ v")
             for i in range(n):
                 rest[i] = self.free[i] * (self.M_scale * Mz[i] - self.z[i])
             self.z_Hp += self.preconditioner.inverse(self.free, rest, self.Hp, Mz)

@@ -159,6 +159,7 @@ cdef class Product:
     cdef object matrix
     cdef const double *dense
     cdef sparse rows  # data is NULL unless P is sparse
+    cdef LinearMap map  # of an operator that is compiled; else None
     cdef object owners
 
     def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
@@ -171,6 +172,8 @@ cdef class Product:
         elif issparse(P) and P.nnz and P.nnz < 2**31:
             M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
             self.hold_rows(M.data, M.indptr, M.indices)
+        elif not issparse(P):
+            self.map = linear_map(P)
 
     cdef int hold_rows(self, values, starts, columns) except -1:
         """Store a sparse P by rows, or by diagonals if these take no more memory."""
@@ -211,6 +214,10 @@ cdef class Product:
                   y, &one)
         elif self.rows.data:
             sparse_product(&self.rows, s, v, y)
+        elif self.map is not None:
+            self.map.apply(v, y, 1)
+            if s != 1:
+                scale(s, y, self.n)
         else:  # of a copy: an operator may keep a reference to its argument
             copy_result(self.matrix @ self.over.vector(copied(v, self.n)), self.n, y, "P @ v")
             if s != 1:

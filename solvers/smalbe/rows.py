@@ -36,13 +36,12 @@ from mortarbench.harness.distributed.factor import (
     DependentRowsError,
     LocalFactor,
     SummedFactor,
-    factor_above,
     independent_rows,
     local_factor,
     touched_rows,
     with_int32,
 )
-from mortarbench.harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed.sparse import CompressedRows, factor_above
 from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
     Ranks,

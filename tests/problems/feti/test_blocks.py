@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import lapack
 
-from mortarbench.problems.feti.blocks import multiply
+from mortarbench.problems.feti.blocks import BlockDiagonal
 
 
 @pytest.mark.parametrize("n", [1, 3, 4, 7, 256, 257, 600])
@@ -11,20 +12,42 @@ from mortarbench.problems.feti.blocks import multiply
 def test_blocks_multiply_columns(n, columns):
     rng = np.random.default_rng(n + columns)
     M, X = rng.standard_normal((n, n)), rng.standard_normal((n, columns))
-    Y = np.full((n + 1, columns), np.nan)
+    both = BlockDiagonal([2 * np.ones((1, 1)), M], [1, n], [3, columns])
 
-    multiply(M, X, Y[:n])
+    Y = both(np.append([1.0, 2.0, 3.0], X))
 
-    assert np.abs(Y[:n] - M @ X).max(initial=0) < 1e-12
-    assert np.isnan(Y[n]).all()
+    assert np.abs(Y[3:].reshape(n, -1) - M @ X).max(initial=0) < 1e-12
+    assert Y[:3].tolist() == [2, 4, 6]  # not overwritten by the second block
+
+
+@pytest.mark.parametrize("columns", [1, 2, 5])
+def test_triangles_and_objects_multiply_matrices_like_arrays(columns):
+    rng = np.random.default_rng(columns)
+    M = rng.standard_normal((4, 4))
+    M += M.T
+
+    class Halved:
+        def __matmul__(self, X):
+            return X / 2
+
+    blocks = BlockDiagonal([lapack.dtrttp(M)[0], Halved(), M], [4, 3, 4], [1, 2, 2])
+    X = rng.standard_normal((4 + 3 * 2 + 4 * 2, columns))
+
+    first, second, third = np.split(blocks(X), [4, 10])
+    assert first == pytest.approx(M @ X[:4], abs=1e-14)
+    assert second == pytest.approx(X[4:10] / 2)
+    columns_of_both = X[10:].reshape(4, -1)
+    assert third.reshape(4, -1) == pytest.approx(M @ columns_of_both, abs=1e-14)
 
 
 def test_blocks_and_columns_that_do_not_fit_are_refused():
-    M, X = np.zeros((3, 3)), np.zeros((3, 2))
+    M = np.zeros((3, 3))
 
     with pytest.raises(ValueError, match=r"\(3, 3\) times \(4, 2\)"):
-        multiply(M, np.zeros((4, 2)), np.zeros((4, 2)))
+        BlockDiagonal([M], [4], [2])
+    with pytest.raises(ValueError, match="9 components; expected 6"):
+        BlockDiagonal([M], [3], [2])(np.zeros(9))
     with pytest.raises(ValueError, match="times"):
-        multiply(M, X, np.zeros((3, 3)))
-    with pytest.raises(ValueError, match="times"):
-        multiply(np.zeros((3, 2)), X, X.copy())
+        BlockDiagonal([np.zeros((3, 2))], [3], [2])
+    with pytest.raises(ValueError, match="times"):  # a triangle is of one subdomain
+        BlockDiagonal([np.zeros(6)], [3], [2])

@@ -1,0 +1,45 @@
+cdef class LinearMap:
+    cdef readonly tuple shape
+    cdef Py_ssize_t n, k
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1
+    cdef int expect(self, Py_ssize_t got, Py_ssize_t expected) except -1
+
+
+cdef class CompressedRows(LinearMap):
+    cdef tuple arrays
+    cdef const double *data
+    cdef const int *indices
+    cdef const int *indptr
+
+    cdef void times(self, const double *x, double *y) noexcept
+    cdef void add_transposed(self, const double *x, double *y) noexcept
+
+
+cdef class BorderedFactor(LinearMap):
+    cdef Py_ssize_t inner, border
+    cdef double scale
+    cdef BorderedFactor whole
+    cdef tuple arrays
+    cdef const int *order
+    cdef const int *place
+    cdef const int *indptr
+    cdef const int *indices
+    cdef const double *data
+    cdef double *L
+    cdef double *complement
+    cdef double *u
+
+    cdef int reserve(self, Py_ssize_t border) except -1
+    cdef void reduce(self, const double *t, double *u) noexcept
+    cdef void extend(self, double *u, double *y) noexcept
+    cdef void solve_border(self, double *r, bint transposed) noexcept
+    cdef void forward_to(self, const double *t, double *a) noexcept
+    cdef void backward_to(self, const double *a, double *y) noexcept
+    cdef void solve_to(self, const double *t, double *y) noexcept
+    cdef void scale_inner(self, double *u, double s) noexcept
+    cdef int raise_border(self, double shift) except -1
+    cdef BorderedFactor less(self, double shift, const double *block)
+    cdef BorderedFactor without(
+        self, double shift, CompressedRows columns, const double *removed
+    )
