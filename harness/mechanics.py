@@ -239,8 +239,9 @@ class CellBlock(NamedTuple):
 def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
     """Split a table of cells (E, c) by kind, those with the fewest corners first.
 
-    In a mixed table, a cell with fewer than c corners repeats its last one: a triangle
-    among quadrilaterals is (a, b, c, c).
+    In a mixed table, cells with fewer than c corners repeat some of them: a triangle
+    among quadrilaterals is (a, b, c, c), a wedge among hexahedra (a, b, c, c, d, e, f,
+    f) and a tetrahedron (a, b, c, c, d, d, d, d).
 
     dim : dimension of the cells
 
@@ -256,13 +257,11 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
     """
     differs = np.ones(table.shape, dtype=bool)
     differs[:, 1:] = table[:, 1:] != table[:, :-1]
-    corners = table.shape[1] - np.argmax(differs[:, ::-1], axis=1)
-    blocks = []
+    corners, blocks = differs.sum(axis=1), []
     for count in np.unique(corners):
         cells = np.flatnonzero(corners == count)
-        blocks.append(
-            CellBlock(KINDS[dim, int(count)], table[cells, : int(count)], cells)
-        )
+        nodes = table[cells][differs[cells]].reshape(-1, count)
+        blocks.append(CellBlock(KINDS[dim, int(count)], nodes, cells))
     return tuple(blocks)
 
 

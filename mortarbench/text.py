@@ -32,6 +32,7 @@ _CONTACT_UNITS = {
     "largest_pressure": "Pa",
     "smallest_gap": "m",
     "half_width": "m",
+    "pressed_area": "m²",
 }
 
 

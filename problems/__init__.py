@@ -17,6 +17,7 @@ PROBLEMS: Registry[Family] = Registry(
         "hertz-plane": entry("mortarbench.problems.families.hertz", "HertzPlane"),
         "hertz-cylinder": entry("mortarbench.problems.families.hertz", "HertzCylinder"),
         "half-plane": entry("mortarbench.problems.families.half_plane", "HalfPlane"),
+        "cube-wall": entry("mortarbench.problems.families.cube_wall", "CubeWall"),
         "greco": entry("mortarbench.problems.families.greco", "Greco"),
         "cantilever": entry("mortarbench.problems.families.cantilever", "Cantilever"),
         "obstacle": entry("mortarbench.problems.families.obstacle", "Obstacle"),

@@ -30,10 +30,20 @@ from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_facets, dofs_of
 
 
 class ContactPair(NamedTuple):
-    """A pair of sides that may touch."""
+    """A pair of sides that may touch: boundaries of a `Mesh`, chains or faces."""
 
-    slave: Nodes  #: chain of nodes; each may get a contact row
-    master: Nodes  #: chain of nodes, its body on the left; empty for a rigid one
+    slave: Nodes
+    master: Nodes  #: empty for a rigid one
+
+    @property
+    def slave_nodes(self) -> Nodes:
+        """Nodes that may get a contact row, in the order of the chain or ascending."""
+        return self.slave if self.slave.ndim == 1 else np.unique(self.slave)
+
+    @property
+    def nodes(self) -> Nodes:
+        """Nodes of both sides, some of them repeatedly."""
+        return np.concatenate([self.slave.ravel(), self.master.ravel()])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -45,7 +55,7 @@ class ContactSides:
     names: tuple[str, ...]  #: of all bodies
     pairs: tuple[ContactPair, ...]
     length: float  #: l, unit of length of `Bodies`, m
-    force: float  #: F₀, unit of force of `Bodies`, N/m
+    force: float  #: F₀, unit of force of `Bodies`, N/m; N in space
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,7 +63,7 @@ class UnassembledBodies:
     """Bodies without their stiffness: mesh, materials, supports, load, contact sides.
 
     Nodes are numbered body by body. f and `moduli` are non-dimensional: lengths are
-    divided by `length`, forces per thickness by `force`.
+    divided by `length`, forces (in the plane per thickness) by `force`.
 
     Raises
     ------
@@ -68,7 +78,7 @@ class UnassembledBodies:
     materials: tuple[Material, ...]
     plane: Plane | None  #: None in space
     length: float  #: l, unit of length, m
-    force: float  #: F₀, unit of force, N/m
+    force: float  #: F₀, unit of force, N/m; N in space
     f: Vector  #: (n,) full load of eq. (1)
     B_D: csr_array  #: (m_E, n) one unit entry per prescribed component, eq. (5)
     pairs: tuple[ContactPair, ...]  #: sides that may touch
@@ -87,7 +97,7 @@ class UnassembledBodies:
     @property
     def interface(self) -> Nodes:
         """Displacement components with entries in contact rows, ascending."""
-        sides = [np.zeros(0, dtype=np.int64), *(n for pair in self.pairs for n in pair)]
+        sides = [np.zeros(0, dtype=np.int64), *(pair.nodes for pair in self.pairs)]
         return np.unique(dofs_of(np.concatenate(sides), self.mesh.dim))
 
     @property
@@ -107,8 +117,10 @@ class UnassembledBodies:
 
         Without contact pairs, the mean over the whole boundary.
         """
-        mesh, slaves = self.mesh, [pair.slave for pair in self.pairs]
-        chains = slaves or boundary_facets(mesh.cells, mesh.dim)
+        mesh, chains = self.mesh, [pair.slave for pair in self.pairs]
+        if not chains or mesh.dim > 2:  # around each facet
+            chains = chains or [boundary_facets(mesh.cells, mesh.dim)]
+            chains = [facet for facets in chains for facet in facets]
         sides = [mesh.points[chain] for chain in chains]
         steps = [np.linalg.norm(np.diff(side, axis=0), axis=1) for side in sides]
         return float(np.concatenate(steps).mean() / self.length)
@@ -154,7 +166,7 @@ def assemble(
     ----------
     body : (E,) body of each cell
     names, materials : one per body
-    units : (l, F₀), the units of the non-dimensional QPs, m and N/m
+    units : (l, F₀), the units of the non-dimensional QPs, m and N/m, in space N
     fixed : displacement components that are zero
     load : (n,) nodal forces: N/m in the plane, N in space
 

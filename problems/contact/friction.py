@@ -85,7 +85,9 @@ def friction_of(
     """
     if not rows.row.size:
         return NO_FRICTION
-    owner = np.repeat(np.arange(len(laws)), [pair.slave.size for pair in bodies.pairs])
+    owner = np.repeat(
+        np.arange(len(laws)), [pair.slave_nodes.size for pair in bodies.pairs]
+    )
     place = rows.place[rows.row]
     bound, mu = (
         np.array([getattr(law, name) for law in laws])[owner[place]]

@@ -66,7 +66,7 @@ def linearisation(
             return parts[0]
         # rows and slave nodes are numbered pair by pair
         first_row = np.cumsum([0, *(part.c.size for part in parts)])
-        first_place = np.cumsum([0, *(pair.slave.size for pair in bodies.pairs)])
+        first_place = np.cumsum([0, *(pair.slave_nodes.size for pair in bodies.pairs)])
         return ContactRows(
             B=csr_array(vstack([part.B for part in parts])),
             c=np.concatenate([part.c for part in parts]),
@@ -133,5 +133,5 @@ def _split_by_pair(
     bodies: UnassembledBodies | ContactSides, values: NDArray[Any]
 ) -> list[NDArray[Any]]:
     """Split an array with one entry per slave node into one array per pair."""
-    ends = np.cumsum([pair.slave.size for pair in bodies.pairs])[:-1]
+    ends = np.cumsum([pair.slave_nodes.size for pair in bodies.pairs])[:-1]
     return np.split(values, ends)

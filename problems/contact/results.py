@@ -65,6 +65,7 @@ def results_of(
     energy: ½uᵀKu − fᵀu, J/m. contact_force: the force −ΣBᵀλ of contact and friction on
     the master's body (on the slave's if the master is rigid), N/m; absent with several
     pairs, where a sum over pairs is meaningless and `contacts` has the single forces.
+    In space energies are in J and forces in N.
     max_von_mises: largest patch-recovered stress per body, Pa. contacts: results per
     pair, see `pair_results`. With friction also the items of `friction_quantities`.
 
@@ -106,7 +107,7 @@ def _contact_force(
         return {"contact_force": [0.0] * bodies.mesh.dim}
     owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
     # contact forces act on both bodies: sum those on one of them, or they cancel
-    loaded = owner == owner[(master if master.size else slave)[0]]
+    loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
 
 
@@ -146,7 +147,8 @@ def pair_results(
 
     force: force on each of its bodies, N/m. largest_pressure: largest value at a slave
     node, Pa. smallest_gap: m; negative where bodies overlap. half_width: half the
-    length of the undeformed slave side that belongs to nodes under pressure, m.
+    length of the undeformed slave side that belongs to nodes under pressure, m; in
+    space, pressed_area is the area that belongs to these nodes, m².
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)
@@ -157,14 +159,18 @@ def pair_results(
         if pair.master.size:
             force = {master: (0.0 - total).tolist()} | force  # 0.0 − x: no −0
         largest = float(np.hypot.reduce(side.force, axis=1).max(initial=0.0))
-        pressed = side.pressed(ACTIVE_THRESHOLD * largest)
+        pressed = float(side.length[side.pressed(ACTIVE_THRESHOLD * largest)].sum())
         results[side.name] = {
             "force": force,
             "largest_pressure": float(side.pressure.max()),
             "smallest_gap": (
                 None if np.isnan(side.gap).all() else float(np.nanmin(side.gap))
             ),
-            "half_width": float(side.length[pressed].sum() / 2),
+            **(
+                {"half_width": pressed / 2}
+                if bodies.mesh.dim == 2
+                else {"pressed_area": pressed}
+            ),
         }
     return results
 
@@ -180,7 +186,7 @@ def fields(
     subdomains : (E,) subdomain of each cell, if the bodies are decomposed
     """
     u = s.x * bodies.length
-    sides = [np.zeros(0, dtype=np.int64), *(pair.slave for pair in bodies.pairs)]
+    sides = [np.zeros(0, dtype=np.int64), *(p.slave_nodes for p in bodies.pairs)]
     slaves = np.concatenate(sides)
     return Fields(
         points=bodies.mesh.points,

@@ -16,7 +16,7 @@ from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
-from mortarbench.problems.contact.surface import current_surface, surface
+from mortarbench.problems.contact.surface import current_surface
 from mortarbench.problems.fem.mesh import (
     Nodes,
     as_vectors,
@@ -38,10 +38,10 @@ def contact_sides(
 
     The nodal force is the sum of contact and friction. The pressure is the component of
     the contact force along the normal of the deformed side, divided by the undeformed
-    length ∫N_j ds that belongs to the node. The gap is the slack c − Bu of the node's
-    row; with mortar contact, this is the mean gap around the node with the weights of
-    the row. With friction, the shear is the friction force along the tangent
-    (−n_y, n_x) over the same length, and each node has one of the `states`.
+    length ∫N_j (in space, area) that belongs to the node. The gap is the slack c − Bu
+    of the node's row; with mortar contact, this is the mean gap around the node with
+    the weights of the row. With friction, the shear is the friction force along the
+    tangent (−n_y, n_x) over the same length, and each node has one of the `states`.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
@@ -52,26 +52,27 @@ def contact_sides(
         pair_names(bodies), bodies.pairs, rows_of_pairs(B, bodies), strict=True
     ):
         # 0.0 − x instead of −x: no negative zeros in reports
-        contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[pair.slave]
+        slave = pair.slave_nodes
+        contact_force = as_vectors(0.0 - (B[rows].T @ s.z[rows]) * F, dim)[slave]
         own = (friction.row >= rows.start) & (friction.row < rows.stop)
         shearing = np.zeros_like(contact_force)
         if own.any():
             force = friction.T[own].T @ tangential[own]
-            shearing -= as_vectors(force, dim)[pair.slave] * F
+            shearing -= as_vectors(force, dim)[slave] * F
         side = current_surface(points, u, pair.slave, "slave")
-        length = surface(points[pair.slave], "slave").areas
+        length = current_surface(points, np.zeros_like(u), pair.slave, "slave").areas
         normal = np.einsum("sx,sx->s", contact_force, side.node_normal)
-        gap, push = np.full((2, len(pair.slave)), np.nan)
+        gap, push = np.full((2, len(slave)), np.nan)
         # nodes without a row keep the gap NaN
-        place, direction = slave_places(B[rows], pair.slave, dim)
+        place, direction = slave_places(B[rows], slave, dim)
         gap[place] = slack[rows]
         push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
         push = np.nan_to_num(push)
-        nodal_state = np.full(len(pair.slave), "open", dtype=state.dtype)
+        nodal_state = np.full(len(slave), "open", dtype=state.dtype)
         nodal_state[place[friction.row[own] - rows.start]] = state[own]
         sides.append(
             ContactSide(
-                name=name, nodes=pair.slave, length=length,
+                name=name, nodes=slave, length=length,
                 force=contact_force + shearing, pressure=(0.0 - normal) / length,
                 gap=gap, push=push,
                 shear=np.einsum("sx,sx->s", shearing, side.tangents[:, 0]) / length
@@ -124,8 +125,8 @@ def pair_names(bodies: Bodies | ContactSides) -> list[str]:
 def bodies_of(bodies: Bodies | ContactSides, pair: ContactPair) -> tuple[str, str]:
     """Return the names of the bodies of slave and master."""
     owner = bodies.body_of_node
-    master = bodies.names[owner[pair.master[0]]] if pair.master.size else RIGID
-    return bodies.names[owner[pair.slave[0]]], master
+    master = bodies.names[owner[pair.master.flat[0]]] if pair.master.size else RIGID
+    return bodies.names[owner[pair.slave.flat[0]]], master
 
 
 def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
@@ -136,7 +137,7 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     outside = []
     for pair in bodies.pairs:
         other = np.ones(N)
-        other[np.concatenate(pair)] = 0.0
+        other[pair.nodes] = 0.0
         outside.append(touches @ other > 0)
     slices, first = [], 0
     for k in range(len(bodies.pairs)):
@@ -155,7 +156,7 @@ def slave_places(
 
     Returns
     -------
-    positions (r,) in the slave chain, and unit vectors (r, dim) along the entries there
+    positions (r,) in `slave`, and unit vectors (r, dim) along the entries there
 
     """
     components = [B[:, dofs_of(slave, dim, axis)] for axis in range(dim)]

@@ -1,6 +1,6 @@
 """Contact sides in the current configuration: facets, normals and nodal areas.
 
-In the plane, facets are the segments of a chain of nodes.
+In the plane facets are the segments of a chain of nodes, in space faces of cells.
 """
 
 from __future__ import annotations
@@ -11,7 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Vector
-from mortarbench.problems.fem.mesh import Nodes, as_vectors, nodal_lengths
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    as_vectors,
+    nodal_areas,
+    nodal_lengths,
+)
 
 Points = NDArray[np.float64]  #: (…, dim), m or dimensionless
 
@@ -22,16 +27,17 @@ MIN_RELATIVE_LENGTH = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """Facets with the body on their left; facets of zero length are left out.
+    """Facets with the body on their left; segments of zero length are left out.
 
-    A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
-    a node is the normalised sum of the normals of its segments, one at an end of the
-    chain and two elsewhere (the averaged nodal normal of Popp, Gee and Wall 2009, in
-    two dimensions and without weights).
+    A segment with the unit tangent t has the outward normal (t_y, −t_x), a face that of
+    the plane through the midpoints of its edges. The normal of a node is the normalised
+    sum of the normals of its facets, in the plane one at an end of the chain and two
+    elsewhere (the averaged nodal normal of Popp, Gee and Wall 2009, without weights).
     """
 
     x: Points  #: (v, dim) nodes, m
-    facets: Nodes  #: (f, 2) first and second node of each segment
+    #: first and second node (f, 2) of each segment, or corners (f, 4) of each face
+    facets: Nodes
     normal: Points  #: (f, dim) outward unit normals of the facets
     node_normal: Points  #: (v, dim) averaged outward unit normals of the nodes
 
@@ -52,8 +58,10 @@ class Surface:
 
     @property
     def areas(self) -> Vector:
-        """Nodal areas ∫N_j (v,); in the plane lengths, m."""
-        return nodal_lengths(self.x)
+        """Nodal areas ∫N_j (v,), m²; in the plane lengths, m."""
+        if self.x.shape[1] == 2:
+            return nodal_lengths(self.x)
+        return nodal_areas(self.x, self.facets)[1]
 
     @property
     def extent(self) -> float:
@@ -61,23 +69,27 @@ class Surface:
         return float(np.linalg.norm(np.ptp(self.x, axis=0)))
 
 
-def current_surface(points: Points, u: Vector, chain: Nodes, name: str) -> Surface:
-    """Return the surface of a chain of nodes at X + u.
+def current_surface(points: Points, u: Vector, side: Nodes, name: str) -> Surface:
+    """Return the surface of a side at X + u.
 
     Parameters
     ----------
     points : (N, dim) reference positions X, m
     u : (n,) displacement, m
-    chain : (v,) nodes, the body on their left
+    side : chain (v,) of nodes, or faces (f, 4); see `Mesh`
     name : name of the side, for messages
 
     Raises
     ------
     InputError
-        When a position is not finite or no segment has a length.
+        When a position is not finite, no segment has a length, or a face no area.
 
     """
-    return surface(current_positions(points, u, chain, name), name)
+    if side.ndim == 1:
+        return surface(current_positions(points, u, side, name), name)
+    nodes, faces = np.unique(side, return_inverse=True)
+    x = current_positions(points, u, nodes, name)
+    return faceted_surface(x, faces.reshape(side.shape), name)
 
 
 def current_positions(points: Points, u: Vector, nodes: Nodes, name: str) -> Points:
@@ -112,12 +124,42 @@ def surface(x: Points, name: str) -> Surface:
     return Surface(x, facets.T, normal, unit(mean, normal[before]))
 
 
-def tangents(normal: Points) -> Points:
-    """Return unit tangents (…, dim − 1, dim) of normals (…, dim).
+def faceted_surface(x: Points, faces: Nodes, name: str) -> Surface:
+    """Return the faces (f, 4) and normals of a side in space at positions x (v, 3)."""
+    a, b, c, d = np.moveaxis(x[faces], 1, 0)
+    area = np.cross(c - a, d - b)  # twice, also where c = d
+    size = np.linalg.norm(area, axis=1, keepdims=True)
+    flat = size[:, 0] <= MIN_RELATIVE_LENGTH * size.max(initial=0.0)
+    if flat.any():
+        raise InputError(
+            f"contact {name}: the face around {x[faces[flat.argmax()]].mean(axis=0)} "
+            "has no area, expected faces with distinct corners"
+        )
+    normal = area / size
+    mean = np.zeros_like(x)
+    np.add.at(mean, faces[:, :3], normal[:, None])
+    is_quad = faces[:, 2] != faces[:, 3]
+    np.add.at(mean, faces[is_quad, 3], normal[is_quad])
+    of_node = np.zeros_like(x)
+    of_node[faces] = normal[:, None]
+    return Surface(x, faces, normal, unit(mean, of_node))
 
-    In the plane, the normal rotated anticlockwise by a right angle, (−n_y, n_x).
+
+def tangents(normal: Points) -> Points:
+    """Return unit tangents (…, dim − 1, dim) of unit normals (…, dim).
+
+    In the plane, the normal rotated anticlockwise by a right angle, (−n_y, n_x). In
+    space two orthogonal ones, −e_x and −e_y for the normal e_z (Duff et al., Building
+    an orthonormal basis, revisited, J. Comput. Graph. Tech. 6, 2017).
     """
-    return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None, :]
+    if normal.shape[-1] == 2:
+        return np.stack([-normal[..., 1], normal[..., 0]], axis=-1)[..., None, :]
+    x, y, z = np.moveaxis(normal, -1, 0)
+    sign = np.copysign(1.0, z)
+    a = -1 / (sign + z)
+    first = -1 - sign * x * x * a, -sign * x * y * a, sign * x
+    second = -x * y * a, -sign - y * y * a, y
+    return np.stack([np.stack(first, axis=-1), np.stack(second, axis=-1)], axis=-2)
 
 
 def unit(vectors: Points, otherwise: Points) -> Points:

@@ -128,7 +128,7 @@ def decomposed_path(
         return DecomposedLinearisation(stage, previous[0], sides, reference)
 
     zero = np.zeros(elastic.shape.dim * side_nodes(elastic.pairs).size)
-    places = sum(pair.slave.size for pair in elastic.pairs)
+    places = sum(pair.slave_nodes.size for pair in elastic.pairs)
     rest = State(zero, zero, np.full(places, problem.initial_force))
     return LoadPath(problem.stages, pose, rest)
 
@@ -206,7 +206,7 @@ def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
 
 def side_nodes(pairs: Sequence[ContactPair]) -> Nodes:
     """Return the nodes of all contact sides, ascending."""
-    return np.unique(np.concatenate([side for pair in pairs for side in pair]))
+    return np.unique(np.concatenate([pair.nodes for pair in pairs]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -229,7 +229,7 @@ class LinearisedSides:
     @property
     def places(self) -> int:
         """Number of slave nodes."""
-        return sum(pair.slave.size for pair in self.bodies.pairs)
+        return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
 
     @property
     def contact(self) -> Contact:

@@ -84,7 +84,7 @@ class MonolithicLinearisation:
 
     def end_state(self, s: Solution) -> tuple[Vector, Vector]:
         """Return u (n,), valid on the contact sides, and the normal nodal forces."""
-        places = sum(pair.slave.size for pair in self.bodies.pairs)
+        places = sum(pair.slave_nodes.size for pair in self.bodies.pairs)
         forces = forces_at_nodes(self.normal_multipliers(s), self.place, places)
         return self.dual().interface_displacement(s), forces
 
@@ -213,7 +213,7 @@ def _path(
             loaded, primal, first, rows.place, dual, reference, stage.part
         )
 
-    places = sum(pair.slave.size for pair in bodies.pairs)
+    places = sum(pair.slave_nodes.size for pair in bodies.pairs)
     nothing = np.zeros(bodies.mesh.dofs)
     return MonolithicPath(
         stages, pose, State(nothing, nothing, np.full(places, initial_force))

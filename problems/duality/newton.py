@@ -271,7 +271,7 @@ class NewtonPath:
 
     @property
     def _places(self) -> int:
-        return sum(pair.slave.size for pair in self.bodies.pairs)
+        return sum(pair.slave_nodes.size for pair in self.bodies.pairs)
 
     def _at_places(self, at: Iteration) -> Vector:
         """Return multipliers (places,) of all slave nodes; zero without a row."""

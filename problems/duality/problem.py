@@ -37,6 +37,7 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
+    box,
     join,
     joined_sides,
 )
@@ -47,7 +48,7 @@ from mortarbench.problems.feti.subdivision import (
     half_discs_in_blocks,
     mesh_in_subdomains,
 )
-from mortarbench.problems.feti.tearing import compact_blocks
+from mortarbench.problems.feti.tearing import blocks, compact_blocks
 
 Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m → rows
 
@@ -69,7 +70,7 @@ class Shape(Protocol):
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Chains of nodes by name, available without the mesh."""
+        """Chains or faces by name, in the plane available without the mesh."""
 
     def layout(self, size: int) -> Subdivision:
         """Return the subdivision for a size, whose meaning depends on the shape."""
@@ -126,6 +127,37 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 
 @dataclass(frozen=True, eq=False)
+class Box:
+    """A box of equal hexahedra; subdomains are blocks of at most size³ cells."""
+
+    size: tuple[float, float, float]  #: from (0, 0, 0), m
+    divisions: tuple[int, int, int]  #: numbers of cells along x, y and z
+    dim = 3
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The mesh, m."""
+        return box((0.0, 0.0, 0.0), self.size, self.divisions)
+
+    @property
+    def body(self) -> NDArray[np.int64]:
+        """Body of each cell, (E,)."""
+        return np.zeros(len(self.mesh.cells), dtype=np.int64)
+
+    @property
+    def sides(self) -> Mapping[str, Nodes]:
+        """Faces of the sides by name, see `problems.fem.mesh.box`."""
+        return self.mesh.boundaries
+
+    def layout(self, size: int) -> Subdivision:
+        """Cut the box into blocks of at most `size` cells a side."""
+        named = np.unique(np.concatenate(list(self.sides.values())))
+        return mesh_in_subdomains(
+            self.mesh, blocks(self.divisions, size), self.body, named
+        )
+
+
+@dataclass(frozen=True, eq=False)
 class Meshed:
     """An unstructured mesh; `size` is the number of subdomains, cut by METIS."""
 
@@ -158,7 +190,7 @@ class ElasticBodies:
     materials: tuple[Material, ...]  #: one per body
     plane: Plane | None  #: None in space
     length: float  #: l, m: unit of length of the QPs
-    force: float  #: F₀, N/m: unit of force of the QPs
+    force: float  #: F₀, N/m, in space N: unit of force of the QPs
     fixed: Nodes  #: components with u = 0
     forces: Forces
     pairs: tuple[ContactPair, ...]

@@ -155,6 +155,10 @@ CLONED static void sum_stiffness(
 ) {
     if (n == 4 && dim == 2 && elem->pairs == 2)
         sum_cells(4, 2, 2, elem, points, E, cells, D, material, ptr, slot, data);
+    else if (n == 8 && dim == 3 && elem->pairs == 4)
+        sum_cells(8, 3, 4, elem, points, E, cells, D, material, ptr, slot, data);
+    else if (n == 4 && dim == 3 && elem->pairs == 1)
+        sum_cells(4, 3, 1, elem, points, E, cells, D, material, ptr, slot, data);
     else
         sum_cells(n, dim, elem->pairs, elem, points, E, cells, D, material, ptr, slot, data);
 }

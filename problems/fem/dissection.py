@@ -53,7 +53,7 @@ def dissect(K: Matrix, points: Floats, last: Nodes) -> tuple[Nodes, Fronts]:
     Parameters
     ----------
     K : (dN, dN) symmetric pattern in CSC; node i has the d components d·i, d·i + 1, …
-    points : (N, 2) positions of the nodes
+    points : (N, dim) positions of the nodes
     last : nodes to be eliminated last in their connected component
 
     Returns

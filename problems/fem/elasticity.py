@@ -1,4 +1,4 @@
-"""Linear elasticity with multilinear elements, in the plane and in space.
+"""Linear elasticity with linear and multilinear elements, in the plane and in space.
 
 In the plane this is the bilinear quadrilateral of the paper (Section 2); triangles are
 degenerate quadrilaterals with two coincident corners, see `problems.fem.mesh`.

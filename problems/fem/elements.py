@@ -1,17 +1,27 @@
-"""Finite elements as data: reference cells with shape functions and facets.
+"""Finite elements as data: products of simplices, with facets.
 
-The corners ξ_a determine a multilinear element on [−1, 1]^dim:
+A simplex with the vertices v_0 … v_d has the barycentric coordinates λ_0 … λ_d, affine
+functions with λ_i(v_j) = δ_ij. The reference cell is the product of one or more
+simplices (intervals [−1, 1], unit triangles, unit tetrahedra); a corner is a choice of
+one vertex in each, and its shape function is the product
 
-    N_a(ξ) = Π_k (1 + ξ_ak ξ_k) / 2,   a = 1 … 2^dim,
+    N_a(ξ) = Π_f λ_{a_f}(ξ_f)
 
-with 2^dim Gauss points at ξ_a/√3, all of weight 1. An isoparametric cell is the image
-of the reference cell under x(ξ) = Σ N_a(ξ) x_a.
+Quadrilaterals and hexahedra are products of intervals, wedges are a triangle times an
+interval, and tetrahedra a single simplex. An isoparametric cell is the image of the
+reference cell under x(ξ) = Σ N_a(ξ) x_a.
+
+Each simplex has d + 1 points of equal weight: centroid + (vertex − centroid)/√(d + 2),
+exact for polynomials of degree 2, on intervals 3 (Stroud, Approximate calculation of
+multiple integrals, 1971, T_n: 2-1). Stiffness of affine cells is therefore exact. On a
+single simplex gradients are constant, and the centroid suffices.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,71 +29,142 @@ from numpy.typing import NDArray
 from mortarbench.harness import Vector
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+#: vertices (d + 1, d) of the simplices
+INTERVAL = np.array([[-1], [1]])
+TRIANGLE = np.array([[0, 0], [1, 0], [0, 1]])
+TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
 
 
 @dataclass(frozen=True, eq=False)
 class Element:
-    """A multilinear element with n corners."""
+    """A product of simplices with n corners."""
 
     kind: str  #: name of its cells in meshio
-    corners: NDArray[np.int64]  #: (n, dim) corners of the reference cell, each −1 or 1
-    facets: NDArray[np.int64]  #: (f, m) corners of each facet, the cell on its left
+    simplices: tuple[Ints, ...]  #: vertices of each factor
+    vertices: Ints  #: (n, factors) vertex of each factor at each corner
+    #: (f, m) corners of each facet, the cell on its left; in space anticlockwise from
+    #: outside, and triangles repeat their last corner
+    facets: Ints
 
     @property
     def dim(self) -> int:
         """Dimension of the reference cell."""
-        return int(self.corners.shape[1])
+        return sum(simplex.shape[1] for simplex in self.simplices)
+
+    @property
+    def corners(self) -> Ints:
+        """Corners of the reference cell, (n, dim)."""
+        parts = zip(self.simplices, self.vertices.T, strict=True)
+        return np.hstack([simplex[vertex] for simplex, vertex in parts])
+
+    @property
+    def centre(self) -> Vector:
+        """Centroid of the reference cell, (dim,)."""
+        return np.concatenate([simplex.mean(axis=0) for simplex in self.simplices])
 
     @property
     def points(self) -> Floats:
-        """Gauss points of the reference cell, (q, dim)."""
-        return np.asarray(self.corners / np.sqrt(3))
+        """Quadrature points of the reference cell, (q, dim)."""
+        if len(self.simplices) == 1:
+            return self.centre[None]
+        spread = [np.full(s.shape[1], np.sqrt(s.shape[1] + 2)) for s in self.simplices]
+        offset = (self.corners - self.centre) / np.concatenate(spread)
+        return np.asarray(self.centre + offset)
 
     @property
     def weights(self) -> Vector:
-        """Weights of the Gauss points, (q,)."""
-        return np.ones(len(self.corners))
+        """Weights of the quadrature points, (q,); their sum is the volume."""
+        volume = np.prod([
+            abs(np.linalg.det(s[1:] - s[0])) / factorial(s.shape[1])
+            for s in self.simplices
+        ])  # fmt: skip
+        return np.full(len(self.points), volume / len(self.points))
+
+    def shapes(self, xi: Vector) -> Vector:
+        """Return N_a (n,) at the point ξ (dim,) of the reference cell."""
+        return np.asarray(np.prod(self._coordinates(xi)[0], axis=0))
 
     def gradients(self, xi: Vector) -> Floats:
         """Return ∂N_a/∂ξ (n, dim) at the point ξ (dim,) of the reference cell."""
-        factors = 1 + self.corners * xi
-        others = [np.delete(factors, k, axis=1).prod(axis=1) for k in range(self.dim)]
-        return np.asarray(self.corners * np.stack(others, axis=-1) / 2**self.dim)
+        values, slopes = self._coordinates(xi)
+        others = [np.delete(values, f, axis=0).prod(axis=0) for f in range(len(values))]
+        columns = zip(slopes, others, strict=True)
+        return np.hstack([slope * rest[:, None] for slope, rest in columns])
+
+    def _coordinates(self, xi: Vector) -> tuple[Floats, list[Floats]]:
+        """Return λ of each factor at each corner (factors, n), and its gradients."""
+        values, slopes, start = [], [], 0
+        for simplex, vertex in zip(self.simplices, self.vertices.T, strict=True):
+            d = simplex.shape[1]
+            # λ_i(x) = coefficients[0, i] + x·coefficients[1:, i], and λ_i(v_j) = δ_ij
+            coefficients = np.linalg.inv(np.insert(simplex, 0, 1, axis=1))
+            own = coefficients[0] + xi[start : start + d] @ coefficients[1:]
+            values.append(own[vertex])
+            slopes.append(coefficients[1:].T[vertex])
+            start += d
+        return np.array(values), slopes
 
     @cached_property
     def table(self) -> Floats:
-        """∂N_a/∂ξ_k at all Gauss points, (q, dim, n)."""
+        """∂N_a/∂ξ_k at all quadrature points, (q, dim, n)."""
         return np.stack([self.gradients(xi).T for xi in self.points]).copy()
 
     @cached_property
     def edges(self) -> NDArray[np.int32]:
-        """First and last corners (dim, n/2, 2) of the edges along each axis."""
-        edges = []
-        for k in range(self.dim):
-            first = np.flatnonzero(self.corners[:, k] < 0)
-            across = self.corners[first]
-            across[:, k] = 1
-            same = (self.corners == across[:, None]).all(axis=2)
-            edges.append(np.stack([first, same.argmax(axis=1)], axis=-1))
-        return np.array(edges, dtype=np.int32)
+        """First and last corners (dim, p, 2) of the edges along each axis.
+
+        Axis k of a simplex joins its vertices 0 and k + 1. Axes with fewer edges than
+        others end with pairs of equal corners.
+        """
+        axes = []
+        for f, simplex in enumerate(self.simplices):
+            first = np.flatnonzero(self.vertices[:, f] == 0)
+            for k in range(simplex.shape[1]):
+                across = self.vertices[first]
+                across[:, f] = k + 1
+                same = (self.vertices == across[:, None]).all(axis=2)
+                axes.append(np.stack([first, same.argmax(axis=1)], axis=-1))
+        edges = np.zeros((len(axes), max(map(len, axes)), 2), dtype=np.int32)
+        for k, pairs in enumerate(axes):
+            edges[k, : len(pairs)] = pairs
+        return edges
 
 
 QUAD = Element(
     "quad",
-    corners=np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]),
+    simplices=(INTERVAL, INTERVAL),
+    vertices=np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),
     facets=np.array([[0, 1], [1, 2], [2, 3], [3, 0]]),
 )
 HEXAHEDRON = Element(
     "hexahedron",
-    corners=np.vstack([np.insert(QUAD.corners, 2, z, axis=1) for z in (-1, 1)]),
-    facets=np.array([  # anticlockwise, seen from outside
+    simplices=(INTERVAL, INTERVAL, INTERVAL),
+    vertices=np.vstack([np.insert(QUAD.vertices, 2, z, axis=1) for z in (0, 1)]),
+    facets=np.array([
         [0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6],
         [3, 0, 4, 7],
     ]),
 )  # fmt: skip
+WEDGE = Element(
+    "wedge",
+    simplices=(TRIANGLE, INTERVAL),
+    vertices=np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]),
+    facets=np.array([
+        [0, 2, 1, 1], [3, 4, 5, 5], [0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5],
+    ]),
+)  # fmt: skip
+TETRA = Element(
+    "tetra",
+    simplices=(TETRAHEDRON,),
+    vertices=np.arange(4)[:, None],
+    facets=np.array([[0, 2, 1, 1], [0, 1, 3, 3], [1, 2, 3, 3], [2, 0, 3, 3]]),
+)
 #: elements by dimension and number of columns of a table of cells
 ELEMENTS = {
-    (element.dim, len(element.corners)): element for element in (QUAD, HEXAHEDRON)
+    (element.dim, len(element.vertices)): element
+    for element in (QUAD, HEXAHEDRON, WEDGE, TETRA)
 }
 
 

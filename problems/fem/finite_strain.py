@@ -233,7 +233,7 @@ def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
 def cauchy_stress(cells: Cells, u: Vector) -> Floats:
     """Return σ = PFᵀ/J at the cell centres, (E, 4): σ_x, σ_y, τ_xy, σ_z."""
     mesh = cells.mesh
-    gradients, _ = shape_gradients(mesh.points[mesh.cells], np.zeros(mesh.dim))
+    gradients, _ = shape_gradients(mesh.points[mesh.cells], mesh.element.centre)
     centre = _deformed(cells, u, gradients[:, None])[:, 0]
     inside = deformation_gradients(cells, u)
     stress = np.empty((len(centre), 4))

@@ -2,6 +2,7 @@
 
 K without the rows of these nodes is the better conditioned the further they are apart:
 two neighbouring corners cost three digits, the central nodes of four parts hardly any.
+In space the nodes must not be on a line either, about which the body could rotate.
 """
 
 from __future__ import annotations
@@ -18,13 +19,17 @@ from mortarbench.problems.fem.mesh import Nodes
 #: fixing nodes per body: with fewer, K is worse conditioned; with more, the factor has
 #: more fill-in
 PARTS = 4
+#: least distance of some fixing node from the line through all of them, relative to the
+#: farthest node of the body; blocks have 0.35 and more, bars of one cell may have 0
+MIN_DISTANCE = 0.25
 
 
 def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
     """Choose `parts` (a power of two) fixing nodes of one body, by geometry.
 
-    The nodes (N, 2) are bisected recursively across the longest principal axis, at most
-    down to single nodes; the node nearest to the centroid of each part is chosen.
+    The nodes (N, dim) are bisected recursively across the longest principal axis, at
+    most down to single nodes; the node nearest to the centroid of each part is chosen.
+    In space, the last one is moved to the side if all are about on a line.
     """
     groups = [np.arange(len(points))]
     while len(groups) < parts and all(group.size > 1 for group in groups):
@@ -33,7 +38,15 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
     for group in groups:
         offset = points[group] - points[group].mean(axis=0)
         chosen.append(group[np.linalg.norm(offset, axis=1).argmin()])
-    return np.array(chosen, dtype=np.int64)
+    fixing = np.array(chosen, dtype=np.int64)
+    if points.shape[1] > 2:
+        offset = points - points[fixing].mean(axis=0)
+        axis = np.linalg.svd(offset[fixing], full_matrices=False)[2][0]
+        distance = np.linalg.norm(offset - np.outer(offset @ axis, axis), axis=1)
+        farthest = groups[-1][distance[groups[-1]].argmax()]
+        if distance[fixing].max() < MIN_DISTANCE * distance[farthest]:
+            fixing[-1] = farthest
+    return fixing
 
 
 def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes:

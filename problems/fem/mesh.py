@@ -9,6 +9,10 @@ N₁, N₂, N₃ + N₄ are its barycentric coordinates,
 
 so that the bilinear element *is* the linear triangle (P1). 2×2 Gauss points integrate
 its constant BᵀDB exactly, since the Jacobian determinant is linear in ξ.
+
+Meshes in space consist of tetrahedra, wedges or hexahedra. In mixtures, all cells are
+hexahedra, degenerate in the same way: a tetrahedron is (a, b, c, c, d, d, d, d), a
+wedge (a, b, c, c, d, e, f, f). Both have the stiffness of the elements themselves.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 from mortarbench.harness.mechanics import CellBlock, cell_blocks
-from mortarbench.problems.fem.elements import ELEMENTS, Element
+from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Element
 
 Nodes = NDArray[np.int64]
 
@@ -32,7 +36,8 @@ class Mesh:
     """Nodes, cells and named boundaries; lengths in m.
 
     In the plane, a boundary is a chain of nodes with the body on its left: with the
-    unit tangent t, the outward normal is (t_y, −t_x).
+    unit tangent t, the outward normal is (t_y, −t_x). In space it is a table (k, 4) of
+    faces, their corners anticlockwise from outside; triangles repeat their last corner.
 
     >>> mesh = rectangle((0.0, 0.0), (2.0, 1.0), (2, 1))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["bottom"].tolist()
@@ -41,9 +46,9 @@ class Mesh:
 
     points: NDArray[np.float64]  #: (N, dim)
     #: (E, c) nodes of each cell, counter-clockwise in the plane; in mixed meshes, cells
-    #: with fewer corners repeat their last node
+    #: with fewer corners repeat nodes
     cells: Nodes
-    boundaries: Mapping[str, Nodes]  #: nodes by name
+    boundaries: Mapping[str, Nodes]  #: chains or faces by name
 
     @property
     def dim(self) -> int:
@@ -57,7 +62,7 @@ class Mesh:
 
     @property
     def element(self) -> Element:
-        """Element of all cells; triangles are degenerate quadrilaterals."""
+        """Element of all cells, of which those in mixed meshes may be degenerate."""
         return ELEMENTS[self.dim, self.cells.shape[1]]
 
     @property
@@ -237,6 +242,37 @@ def rectangle_grid(corner: tuple[float, float], size: tuple[float, float],
     )
 
 
+def box(corner: tuple[float, ...], size: tuple[float, ...],
+        divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
+    """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
+
+    Boundaries: left and right (x), front and back (y), bottom and top (z); m.
+
+    >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
+    >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
+    (12, 2, [[8, 9, 11, 10]])
+    """
+    counts = np.add(divisions, 1)
+    number = np.arange(counts.prod()).reshape(counts[::-1])
+    ends = (slice(None, -1), slice(1, None))
+    corners = [number[ends[z], ends[y], ends[x]] for x, y, z in HEXAHEDRON.vertices]
+    cells = np.stack([corner.ravel() for corner in corners], axis=-1)
+    axes = [
+        first + length * np.arange(n + 1) / n
+        for first, length, n in zip(corner, size, divisions, strict=True)
+    ]
+    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=-1)
+    facets = boundary_facets(cells, 3)
+    centre = points[facets].mean(axis=1)
+    names = ("left", "right", "front", "back", "bottom", "top")
+    planes = [(k, axes[k][end]) for k in range(3) for end in (0, -1)]
+    return Mesh(points, cells, {
+        name: facets[centre[:, k] == place]
+        for name, (k, place) in zip(names, planes, strict=True)
+    })  # fmt: skip
+
+
 def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
                    divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
     """Divide the upper half of a ring by equal angles × equal layers.
@@ -340,19 +376,36 @@ def boundary_facets(cells: Nodes, dim: int) -> Nodes:
     """Return the boundary facets (k, m): those of exactly one cell, body on the left.
 
     In the plane facets are edges, sorted by their lower node, then by the other one.
-    Degenerate facets between repeated corners are left out.
     """
-    element = ELEMENTS[dim, cells.shape[1]]
-    facets = cells[:, element.facets].reshape(-1, element.facets.shape[1])
-    nodes = np.sort(facets, axis=1)
-    is_facet = (nodes[:, 1:] != nodes[:, :-1]).all(axis=1)
-    facets, nodes = facets[is_facet], nodes[is_facet]
-    key, count = np.zeros(len(nodes), dtype=np.int64), nodes.max(initial=0) + 1
-    # the dim lowest nodes identify a facet
-    for k in range(dim):
-        key = key * count + nodes[:, k]
+    facets, names, _ = cell_facets(cells, dim)
+    key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
+    for lowest in names.T:
+        key = key * count + lowest
     _, first, times = np.unique(key, return_index=True, return_counts=True)
     return np.asarray(facets[first[times == 1]])
+
+
+def cell_facets(cells: Nodes, dim: int) -> tuple[Nodes, Nodes, Nodes]:
+    """Return the facets of all cells (k, m), their names (k, dim) and cells (k,).
+
+    The dim lowest nodes of a facet are its name, which neighbouring cells share.
+    Degenerate facets between repeated corners are left out; triangles in space repeat
+    their last corner.
+    """
+    facet = ELEMENTS[dim, cells.shape[1]].facets
+    facets = cells[:, facet].reshape(-1, facet.shape[1])
+    cell = np.repeat(np.arange(len(cells)), len(facet))
+    names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # distinct nodes come first
+    names = np.sort(names, axis=1)[:, :dim]
+    is_facet = names[:, -1] < last
+    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    if dim > 2:
+        repeats = facets == np.roll(facets, -1, axis=1)
+        at = np.where(repeats.any(axis=1), repeats.argmax(axis=1), 2)
+        turned = (at[:, None] + np.arange(-2, 2)) % 4
+        facets = np.take_along_axis(facets, turned, axis=1)
+    return facets, names, cell
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
@@ -364,6 +417,23 @@ def nodal_lengths(chain: NDArray[np.float64]) -> Vector:
     edge = chain[1:] - chain[:-1]
     half = np.sqrt(np.einsum("ex,ex->e", edge, edge)) / 2
     return np.asarray(np.append(half, 0) + np.append(0, half))
+
+
+def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vector]:
+    """Return the nodes of faces (k, 4) in space, ascending, and their shares ∫N_j, m².
+
+    >>> unit = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
+    >>> nodes, areas = nodal_areas(unit.points, unit.boundaries["top"])
+    >>> nodes.tolist(), areas.round(12).tolist()
+    ([4, 5, 6, 7], [0.25, 0.25, 0.25, 0.25])
+    """
+    nodes, place = np.unique(faces, return_inverse=True)
+    areas, place = np.zeros(nodes.size), place.reshape(faces.shape)
+    for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
+        tangents = np.einsum("ar,fax->rfx", QUAD.gradients(xi), points[faces])
+        measure = np.linalg.norm(np.cross(*tangents), axis=1)
+        np.add.at(areas, place, weight * measure[:, None] * QUAD.shapes(xi))
+    return nodes, areas
 
 
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:

@@ -63,7 +63,7 @@ def multifrontal(
     ----------
     K : (n, n) symmetric, CSC
     free : components f
-    points : (N, 2) positions of the nodes; node i has the n/N components from i·n/N on
+    points : (N, dim) positions of the nodes; node i has n/N components from i·n/N on
     last : components whose nodes are eliminated last; K should couple distant nodes
         only among these
 

@@ -2,10 +2,17 @@
 # cython: initializedcheck=False
 """Compiled loops of nested dissection, see `problems.fem.dissection`."""
 
-from libc.math cimport INFINITY, atan2, cos, fmax, fmin, sin
+from libc.math cimport INFINITY, atan2, cos, fabs, fmax, fmin, sin
 from libc.stdint cimport int64_t
 
 import numpy as np
+
+#: Jacobi sweeps for a 3 × 3 matrix; convergence is quadratic, and four suffice for
+#: double precision
+cdef int SWEEPS = 8
+#: off-diagonal entries, and differences of eigenvalues, that count as zero, relative
+#: to the trace
+cdef double ROUNDING = 1e-9
 
 
 def node_graph(const int[::1] indptr, const int[::1] indices, int d, int nodes):
@@ -152,22 +159,64 @@ cdef void coordinates(
     const double[:, :] points, const int[::1] part, double[::1] along
 ) noexcept:
     """Write the coordinates of nodes along their longest principal axis."""
-    cdef Py_ssize_t t, n = part.shape[0]
-    cdef double x, y, angle, mean_x = 0.0, mean_y = 0.0, xx = 0.0, xy = 0.0, yy = 0.0
+    cdef Py_ssize_t t, k, l, n = part.shape[0], dim = points.shape[1]
+    cdef double[3] mean = [0.0, 0.0, 0.0]
+    cdef double[3] axis
+    cdef double[3][3] C = [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
     for t in range(n):
-        mean_x += points[part[t], 0]
-        mean_y += points[part[t], 1]
-    mean_x /= n
-    mean_y /= n
+        for k in range(dim):
+            mean[k] += points[part[t], k]
+    for k in range(dim):
+        mean[k] /= n
     for t in range(n):
-        x, y = points[part[t], 0] - mean_x, points[part[t], 1] - mean_y
-        xx += x * x
-        xy += x * y
-        yy += y * y
-    angle = atan2(2 * xy, xx - yy) / 2
-    x, y = cos(angle), sin(angle)
+        for k in range(dim):
+            axis[k] = points[part[t], k] - mean[k]
+        for k in range(dim):
+            for l in range(k, dim):
+                C[k][l] += axis[k] * axis[l]
+    principal_axis(C, dim, axis)
     for t in range(n):
-        along[t] = (points[part[t], 0] - mean_x) * x + (points[part[t], 1] - mean_y) * y
+        along[t] = (points[part[t], 0] - mean[0]) * axis[0]
+        for k in range(1, dim):
+            along[t] += (points[part[t], k] - mean[k]) * axis[k]
+
+
+cdef void principal_axis(double[3][3] C, Py_ssize_t dim, double[3] axis) noexcept:
+    """Write the eigenvector of the largest eigenvalue of C (upper triangle).
+
+    In space by Jacobi's cyclic method; entries of the size of rounding are not rotated
+    away, so that a cube is bisected along its edges.
+    """
+    cdef Py_ssize_t k, l, j, sweep, longest = 0
+    cdef double angle, c, s, one, other, size = C[0][0] + C[1][1] + C[2][2]
+    cdef double[3][3] V = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    if dim == 2:
+        angle = atan2(2 * C[0][1], C[0][0] - C[1][1]) / 2
+        axis[0], axis[1] = cos(angle), sin(angle)
+        return
+    for k in range(1, 3):
+        for l in range(k):
+            C[k][l] = C[l][k]
+    for sweep in range(SWEEPS):
+        for k in range(2):
+            for l in range(k + 1, 3):
+                if fabs(C[k][l]) <= ROUNDING * size:
+                    continue
+                angle = atan2(2 * C[k][l], C[k][k] - C[l][l]) / 2
+                c, s = cos(angle), sin(angle)
+                for j in range(3):  # C and V times the rotation from the right …
+                    one, other = C[j][k], C[j][l]
+                    C[j][k], C[j][l] = c * one + s * other, c * other - s * one
+                    one, other = V[j][k], V[j][l]
+                    V[j][k], V[j][l] = c * one + s * other, c * other - s * one
+                for j in range(3):  # … and its transpose times C from the left
+                    one, other = C[k][j], C[l][j]
+                    C[k][j], C[l][j] = c * one + s * other, c * other - s * one
+    for k in range(1, 3):  # of axes that are equally long up to rounding, the first
+        if C[k][k] > C[longest][longest] + ROUNDING * size:
+            longest = k
+    for k in range(3):
+        axis[k] = V[k][longest]
 
 
 cdef double find(double *v, Py_ssize_t n, Py_ssize_t k) noexcept:

@@ -1,8 +1,8 @@
 """Stresses from displacements: at cell centres and Gauss points, recovered at nodes.
 
 Superconvergent patch recovery after Zienkiewicz and Zhu (1992). Stresses are
-superconvergent at the centres of bilinear quadrilaterals and most accurate at the
-centroids of linear triangles; a linear polynomial is fitted to these around each
+superconvergent at the centres of multilinear cells and most accurate at the centroids
+of linear triangles and tetrahedra; a linear polynomial is fitted to these around each
 interior node. A boundary node takes the mean of the polynomials of the interior nodes
 with which it shares a cell; if there are none (at the corner of a single triangle),
 that of its boundary neighbours. Bodies share no nodes, so that no average extends over
@@ -28,7 +28,7 @@ from mortarbench.problems.fem.mesh import Mesh, boundary_facets
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, v) at the cell centres, Pa; u in m, D (v, v) or (E, v, v)."""
-    return _stress_at(np.zeros(mesh.dim), mesh, D, u)
+    return _stress_at(mesh.element.centre, mesh, D, u)
 
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

@@ -17,8 +17,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
-from mortarbench.problems.fem.elements import ELEMENTS
-from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.mesh import Nodes, cell_facets
 
 Labels = NDArray[np.int64]
 
@@ -86,13 +85,7 @@ def neighbours(points: NDArray[np.float64], cells: Nodes) -> csr_array:
     cells have the area (volume) 1, this is the length of the edge (area of the face).
     """
     dim = points.shape[1]
-    element = ELEMENTS[dim, cells.shape[1]]
-    corners = element.facets.shape[1]
-    facets = cells[:, element.facets].reshape(-1, corners)
-    cell = np.repeat(np.arange(len(cells)), len(element.facets))
-    names = np.sort(facets, axis=1)
-    is_facet = (names[:, 1:] != names[:, :-1]).all(axis=1)
-    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    facets, names, cell = cell_facets(cells, dim)
     order = np.lexsort(names.T)
     shared = np.flatnonzero((np.diff(names[order], axis=0) == 0).all(axis=1))
     one, other = cell[order[shared]], cell[order[shared + 1]]

@@ -21,7 +21,7 @@ import numpy as np
 from mortarbench.harness import QP, Friction, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
 from mortarbench.problems.contact.friction import FrictionLaw
-from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
+from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
     ContactProblem,
@@ -36,6 +36,7 @@ SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
 TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
 FORCE = TOP * SIDE  #: F₀, N/m
+GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
 PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
 PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
 FORCE_AT = 38.75e-3  #: x of the published normal force, m
@@ -66,8 +67,9 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
-        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
-            bodies.mesh, bodies.pairs[0].slave, tangential=True
+        linearise=lambda bodies, _: lambda u: rigid_rows(
+            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND,
+            tangential=True,
         ),
         results=lambda answer: {
             **published_quantities(*answer.sides), "tresca_problems": answer.problems,

@@ -52,7 +52,7 @@ from mortarbench.problems.contact.bodies import (
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.contact.linearise import linearisation
 from mortarbench.problems.contact.results import contact_forces
-from mortarbench.problems.contact.rigid_plane import rigid_plane_rows
+from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, Stage, State, load_steps
 from mortarbench.problems.duality.case_forms import with_exact_tractions
 from mortarbench.problems.duality.newton import NewtonPath
@@ -80,6 +80,7 @@ RADIUS = 8e-3  #: R of the upper cylinder, m
 NAMES = ("upper", "lower")
 MATERIAL = Material(E=200e9, nu=0.3)
 UNIT_LOAD = 1e6  #: unit of the key `load`, N/m
+GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
 
 GROWTH = 1.15  #: ratio of the sizes of neighbouring cells away from the contact
 UNIFORM_HALF_WIDTH = 1.5  #: half width of the uniformly meshed part of the arc, in a
@@ -97,8 +98,8 @@ def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
 
     return ContactProblem(
         bodies=elastic, stages=load_steps(1, 1, elastic.forces, elastic.fixed),
-        linearise=lambda bodies, _: lambda u: rigid_plane_rows(
-            bodies.mesh, bodies.pairs[0].slave
+        linearise=lambda bodies, _: lambda u: rigid_rows(
+            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND
         ),
         results=results,
         exact=_curve(exact),
@@ -121,7 +122,9 @@ def _newton_path(
     items: tuple[tuple[str, Any], ...], reference: Reference
 ) -> NewtonPath:
     bodies = _cylinder_on_plane(dict(items))[0].assembled
-    rows = rigid_plane_rows(bodies.mesh, bodies.pairs[0].slave)
+    rows = rigid_rows(
+        bodies.mesh.points, np.zeros(bodies.mesh.dofs), bodies.pairs[0].slave, GROUND
+    )
     return newton_path(bodies, lambda u: rows, dict(items), reference)
 
 

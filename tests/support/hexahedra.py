@@ -1,9 +1,19 @@
-"""Boxes of hexahedra, for tests."""
+"""Boxes of hexahedra, and their division into other cells, for tests."""
 
 import numpy as np
 
 from mortarbench.problems.fem.elements import HEXAHEDRON
 from mortarbench.problems.fem.mesh import Mesh
+
+#: Kuhn's six tetrahedra of a hexahedron around the diagonal from corner 0 to corner 6
+TETRAHEDRA = np.array([
+    [0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6],
+])  # fmt: skip
+WEDGES = np.array([[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])
+#: corners of cells that stand for degenerate hexahedra, by number of corners
+DEGENERATE = {
+    4: [0, 1, 2, 2, 3, 3, 3, 3], 6: [0, 1, 2, 2, 3, 4, 5, 5], 8: list(range(8))
+}  # fmt: skip
 
 
 def bricks(divisions: tuple[int, ...], size: tuple[float, ...]) -> Mesh:
@@ -15,3 +25,22 @@ def bricks(divisions: tuple[int, ...], size: tuple[float, ...]) -> Mesh:
     cells = [i[ends[x], ends[y], ends[z]].ravel() for x, y, z in at]
     points = np.array(list(np.ndindex(i.shape))) * np.divide(size, divisions)
     return Mesh(points, np.stack(cells, axis=-1), {})
+
+
+def bent(mesh: Mesh, amplitude: float = 0.05) -> Mesh:
+    """Distort a unit cube smoothly; its faces stay where they are."""
+    bump = amplitude * np.prod(np.sin(np.pi * mesh.points), axis=1)
+    points = mesh.points + bump[:, None] * [1, 0.7, -0.4]
+    return Mesh(points, mesh.cells, mesh.boundaries)
+
+
+def divided(mesh: Mesh, corners: np.ndarray) -> Mesh:
+    """Divide each hexahedron into cells with the given corners (k, c)."""
+    cells = mesh.cells[:, corners].reshape(-1, corners.shape[1])
+    return Mesh(mesh.points, cells, mesh.boundaries)
+
+
+def degenerate(mesh: Mesh) -> Mesh:
+    """Write all cells as hexahedra with repeated corners."""
+    corners = DEGENERATE[mesh.cells.shape[1]]
+    return Mesh(mesh.points, mesh.cells[:, corners], mesh.boundaries)

@@ -38,6 +38,7 @@ CASES = (
     "hertz-cylinder/n=3/m=2",
     "obstacle/dim=1/n=16",
     "obstacle/n=8",
+    "cube-wall/n=2",
 )
 PERTURBATIONS = 10_000
 ROUNDED = 1 + 1e-12  #: the bound is often the error itself, but for rounding
@@ -201,6 +202,16 @@ def test_bounds_of_what_solvers_return_are_sharp():
     found = [e for case in cases for e in effectivities(*case, labels)]
     assert len(found) > 70
     assert np.median(found) <= 3
+    assert min(found) >= 1 / ROUNDED
+
+
+def test_bounds_in_space_are_sharper():
+    labels = ("smalbe", "clarabel", "piqp", "osqp")
+    found = [
+        e for case in forms_of(("cube-wall/n=3",)) for e in effectivities(*case, labels)
+    ]
+    assert len(found) > 30
+    assert np.median(found) <= 2
     assert min(found) >= 1 / ROUNDED
 
 

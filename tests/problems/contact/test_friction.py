@@ -10,6 +10,7 @@ from scipy.sparse import csr_array
 from mortarbench.harness import Friction, InputError
 from mortarbench.harness.errors import PastEndError
 from mortarbench.harness.mechanics import NO_FRICTION
+from mortarbench.problems.contact.bodies import ContactPair
 from mortarbench.problems.contact.friction import (
     FrictionLaw,
     coulomb_fixed_point,
@@ -137,7 +138,7 @@ def test_a_law_reads_only_its_own_parameter():
 
 def test_each_row_has_the_law_of_its_pair_the_share_of_its_side_and_its_nodes_force():
     """Two pairs of two and three slave nodes; rows of the nodes 1, 2 and 4."""
-    pairs = [SimpleNamespace(slave=np.arange(k)) for k in (2, 3)]
+    pairs = [ContactPair(np.arange(k), np.arange(0)) for k in (2, 3)]
     bodies = SimpleNamespace(pairs=pairs, force=10.0)
     rows = SimpleNamespace(
         row=np.array([0, 1, 2]), place=np.array([1, 2, 4]),

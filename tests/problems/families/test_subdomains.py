@@ -26,6 +26,8 @@ CASES = [
     (f"contact-patch/lower=4/upper=6/{COULOMB}", "feti=2"),
     ("hertz-plane/n=2", "feti=5"),
     ("greco/n=6", "feti=3"),
+    ("cube-wall/n=4", "feti=2"),
+    ("cube-wall/n=3", "feti=2"),
     ("obstacle/n=8", "feti=3"),
     ("obstacle/dim=1/n=12", "feti=4"),
 ]

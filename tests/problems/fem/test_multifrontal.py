@@ -7,10 +7,17 @@ from scipy.sparse import block_diag, csc_array, eye_array
 
 from mortarbench.problems.fem.dissection import dissect
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
-from mortarbench.problems.fem.mesh import dofs_of, half_disc, half_ring, join, rectangle
+from mortarbench.problems.fem.mesh import (
+    box,
+    dofs_of,
+    half_disc,
+    half_ring,
+    join,
+    rectangle,
+)
 from mortarbench.problems.fem.multifrontal import multifrontal
 
-D = elasticity_matrix(Material(E=2e3, nu=0.3), "stress")
+MATERIAL = Material(E=2e3, nu=0.3)
 MESHES = {
     "beam": rectangle((0, 0), (4, 1), (32, 8)),
     "square": rectangle((0, 0), (1, 1), (13, 13)),
@@ -22,11 +29,13 @@ MESHES = {
         half_ring((0, 0), (0.6, 1), (20, 3)),
         rectangle((3, 0), (1, 1), (1, 1)),
     ))[0],
+    "cube": box((0, 0, 0), (1, 1, 1), (5, 4, 6)),
 }  # fmt: skip
 
 
 def definite(mesh):
     """Return a stiffness matrix on an elastic foundation."""
+    D = elasticity_matrix(MATERIAL, "stress" if mesh.dim == 2 else None)
     return csc_array(stiffness(mesh, D) + 7.0 * eye_array(mesh.dofs))
 
 

@@ -27,6 +27,7 @@ CASES = (
     "hertz-plane/n=2/feti=5/dual",
     "obstacle/n=11/shape=hemisphere/feti=4/dual",
     "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e5/slave=lower/dual",
+    "cube-wall/n=4/feti=2/dual",
 )
 #: that solutions come before, by number of cells the smallest there are: contact is
 #: linearised there, or the bound of Coulomb's law is theirs

@@ -1,0 +1,138 @@
+"""Contact of nodes with rigid bodies: planes, spheres and cylinders.
+
+The gap g(x) of a point is its signed distance from the rigid body, and n the outward
+normal of the body at the closest point. To first order about the displacement u^k, with
+x = X + u^k and n fixed there,
+
+    g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
+
+which is exact for planes. Each row has the entries of one node only, so that rows are
+orthonormal. Friction acts along the tangents of n: T = −t at the node.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from mortarbench.harness import InputError, Vector
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.surface import (
+    Points,
+    current_positions,
+    current_surface,
+    tangents,
+)
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
+
+_NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
+
+
+class RigidBody(Protocol):
+    """A body that nodes cannot enter."""
+
+    def gap(self, x: Points) -> tuple[Vector, Points]:
+        """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
+
+
+@dataclass(frozen=True)
+class RigidPlane:
+    """The half space below a plane."""
+
+    point: tuple[float, ...]  #: on the plane, m
+    normal: tuple[float, ...]  #: outward unit normal
+
+    def gap(self, x: Points) -> tuple[Vector, Points]:
+        """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
+        normal = np.array(self.normal)
+        return (x - self.point) @ normal, np.broadcast_to(normal, x.shape)
+
+
+@dataclass(frozen=True)
+class RigidSphere:
+    """A ball; in the plane a disc."""
+
+    centre: tuple[float, ...]  #: m
+    radius: float  #: m
+
+    def gap(self, x: Points) -> tuple[Vector, Points]:
+        """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
+        return _gap_from_centre(x - self.centre, self.radius)
+
+
+@dataclass(frozen=True)
+class RigidCylinder:
+    """An infinite circular cylinder in space."""
+
+    point: tuple[float, ...]  #: on the axis, m
+    axis: tuple[float, ...]  #: unit vector
+    radius: float  #: m
+
+    def gap(self, x: Points) -> tuple[Vector, Points]:
+        """Return signed distances (s,) of points (s, dim), and normals (s, dim)."""
+        offset, axis = x - self.point, np.array(self.axis)
+        return _gap_from_centre(offset - np.outer(offset @ axis, axis), self.radius)
+
+
+def _gap_from_centre(offset: Points, radius: float) -> tuple[Vector, Points]:
+    distance = np.linalg.norm(offset, axis=1)
+    if not distance.all():
+        raise InputError(
+            "a contact node is at the centre of a rigid sphere or cylinder, expected "
+            "nodes near its surface"
+        )
+    return distance - radius, offset / distance[:, None]
+
+
+def rigid_rows(
+    points: Points,
+    u: Vector,
+    side: Nodes,
+    rigid: RigidBody,
+    *,
+    clamped: Nodes = _NO_NODES,
+    tangential: bool = False,
+) -> ContactRows:
+    """Return rows that keep the nodes of a side out of a rigid body, linearised at u.
+
+    Parameters
+    ----------
+    points : (N, dim) reference positions X, m
+    u : (n,) displacement u^k at which to linearise, m
+    side : boundary of a `Mesh`
+    clamped : nodes of the side without a row: all their components are prescribed
+    tangential : add tangential rows for friction
+
+    Raises
+    ------
+    InputError
+        When a position is not finite, or at the centre of a sphere or cylinder.
+
+    """
+    dim, nodes = points.shape[1], side if side.ndim == 1 else np.unique(side)
+    place = np.flatnonzero(~np.isin(nodes, clamped))
+    node = nodes[place]
+    gap, normal = rigid.gap(current_positions(points, u, node, "slave"))
+    m, components = node.size, dofs_of(node, dim).reshape(-1, dim)
+    along = -tangents(normal)[: m if tangential else 0]
+    row = np.repeat(np.arange(len(along)), dim - 1)
+    reference = current_surface(points, np.zeros_like(u), side, "slave")
+    return ContactRows(
+        B=_rows(-normal, components, points.size),
+        c=gap - np.einsum("sx,sx->s", normal, u[components]),
+        T=_rows(along.reshape(-1, dim), components[row], points.size),
+        row=row, share=reference.areas[place], place=place,
+    )  # fmt: skip
+
+
+def _rows(values: Points, components: Nodes, n: int) -> csr_array:
+    """Return rows (k, n) with values (k, dim), zeros left out, at components."""
+    k, dim = values.shape
+    start = dim * np.arange(k + 1)
+    parts = values.ravel(), components.ravel(), start
+    rows = csr_array(parts, shape=(k, n), copy=True)  # the next line works in place
+    rows.eliminate_zeros()
+    return rows

@@ -1,0 +1,1 @@
+"""Models of families of elastic bodies in space."""

@@ -1,0 +1,72 @@
+"""A cube of hexahedra beside a rigid wall: PERMON's example of contact in space.
+
+The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and pressed down by
+465 Pa on its top. It bulges, and on x = 1 the wall leaves it u_x ≤ 1 mm. Contact rows
+are simple bounds, so that nothing is linearised. The nodes that are clamped have none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from mortarbench.harness import Value, Vector
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
+from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.duality.problem import (
+    Box,
+    ContactProblem,
+    ContactSolution,
+    ElasticBodies,
+    cached_problem,
+)
+from mortarbench.problems.fem.elasticity import Material
+from mortarbench.problems.fem.mesh import dofs_of, nodal_areas
+
+MATERIAL = Material(E=2e4, nu=0.33)
+SIDE = 1.0  #: of the cube, m
+PRESSURE = 465.0  #: on the top, Pa
+GAP = 1e-3  #: between cube and wall, m
+FORCE = PRESSURE * SIDE**2  #: F₀, N
+WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
+
+
+@cached_problem
+def problem(params: Mapping[str, Value]) -> ContactProblem:
+    """Return the cube with n × n × n cells."""
+    p: Any = params
+    shape = Box((SIDE, SIDE, SIDE), (p["n"], p["n"], p["n"]))
+    top, areas = nodal_areas(shape.mesh.points, shape.sides["top"])
+    forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
+    fixed = dofs_of(np.unique(shape.sides["bottom"]), 3)
+    corner = dofs_of(np.array([len(shape.mesh.points) - 1]), 3)
+
+    def results(solution: ContactSolution) -> dict[str, Any]:
+        """Return the displacement of the corner (1, 1, 1), m."""
+        return {"corner": (solution.at(corner) * SIDE).tolist()}
+
+    return ContactProblem(
+        bodies=ElasticBodies(
+            shape=shape, names=("cube",), materials=(MATERIAL,), plane=None,
+            length=SIDE, force=FORCE, fixed=fixed, forces=forces,
+            pairs=(ContactPair(shape.sides["right"], np.zeros((0, 4), dtype=int)),),
+        ),
+        stages=load_steps(1, 1, forces, fixed),
+        linearise=lambda bodies, _: lambda u: wall_rows(bodies, np.zeros_like(u)),
+        results=results,
+    )  # fmt: skip
+
+
+def wall_rows(bodies: UnassembledBodies | ContactSides, u: Vector) -> ContactRows:
+    """Return the rows u_x ≤ GAP of the side x = 1 above the clamped nodes."""
+    points = bodies.mesh.points
+    clamped = np.flatnonzero(points[:, 2] == 0)
+    return rigid_rows(points, u, bodies.pairs[0].slave, WALL, clamped=clamped)

@@ -1,0 +1,266 @@
+"""Tetrahedra, wedges, hexahedra: exact solutions, an independent code, invariants."""
+
+import numpy as np
+import pytest
+from scipy.sparse import csc_matrix, eye_array
+from scipy.sparse.linalg import spsolve
+from scipy.spatial.transform import Rotation
+from skfem import (
+    Basis,
+    ElementHex1,
+    ElementTetP1,
+    ElementVector,
+    ElementWedge1,
+    MeshHex,
+    MeshTet,
+    MeshWedge1,
+)
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+from skfem.quadrature import get_quadrature
+from skfem.refdom import RefHex, RefLine, RefTet, RefTri
+from sksparse.cholmod import cholesky
+
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    rigid_modes,
+    stiffness,
+)
+from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, TETRA, WEDGE
+from mortarbench.problems.fem.fixing import fixing_nodes
+from mortarbench.problems.fem.inverse import floating_inverse
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    boundary_facets,
+    box,
+    dofs_of,
+    nodal_areas,
+)
+from mortarbench.problems.fem.multifrontal import multifrontal
+from mortarbench.problems.fem.stress import (
+    centre_stress,
+    gauss_stress,
+    recover,
+    von_mises,
+)
+from tests.support.hexahedra import (
+    TETRAHEDRA,
+    WEDGES,
+    bent,
+    degenerate,
+    divided,
+)
+
+STEEL = Material(E=200e9, nu=0.3)
+D = elasticity_matrix(STEEL, None)
+KINDS = ("tetra", "wedge", "hexahedron")
+#: mesh, element and corners of the reference cell of scikit-fem, by meshio's names
+PEERS = {
+    "tetra": (MeshTet, ElementTetP1, TETRA.corners),
+    "wedge": (MeshWedge1, ElementWedge1, np.add(WEDGE.corners, [0, 0, 1]) / [1, 1, 2]),
+    "hexahedron": (MeshHex, ElementHex1, (HEXAHEDRON.corners + 1) / 2),
+}
+
+
+def cube(kind, n=3, amplitude=0.05):
+    """Unit cube of one kind of cells, smoothly distorted."""
+    mesh = bent(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (n, n, n)), amplitude)
+    corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
+    return mesh if corners is None else divided(mesh, corners)
+
+
+def independent(mesh, **rule):
+    """Assemble the stiffness by scikit-fem."""
+    theirs, element, ours = PEERS[mesh.element.kind]
+    place = [int(np.abs(np.subtract(ours, x)).sum(axis=1).argmin())
+             for x in element.doflocs]  # fmt: skip
+    grid = theirs(mesh.points.T.copy(), mesh.cells[:, place].T.copy())
+    basis = Basis(grid, ElementVector(element()), **rule)
+    return linear_elasticity(*lame_parameters(STEEL.E, STEEL.nu)).assemble(basis)
+
+
+def quadrature(element):
+    """Our quadrature on scikit-fem's reference cell, where intervals are [0, 1]."""
+    points, weights = element.points.T.copy(), element.weights.copy()
+    axis = 0
+    for simplex in element.simplices:
+        if simplex.shape[1] == 1:
+            points[axis] = (points[axis] + 1) / 2
+            weights = weights / 2
+        axis += simplex.shape[1]
+    return points, weights
+
+
+def exact_rule(kind):
+    """Quadrature of degree 6 on scikit-fem's reference cell.
+
+    Its own rule for wedges (12.0.2) has weights that sum to 1/4 instead of 1/2.
+    """
+    if kind != "wedge":
+        return get_quadrature({"tetra": RefTet, "hexahedron": RefHex}[kind], 6)
+    (x, v), (z, w) = get_quadrature(RefTri, 6), get_quadrature(RefLine, 6)
+    points = np.vstack([np.repeat(x, w.size, axis=1), np.tile(z, v.size)])
+    return points, np.outer(v, w).ravel()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stiffness_of_distorted_cells_equals_an_independent_code(kind):
+    mesh = cube(kind)
+    expected = independent(mesh, quadrature=quadrature(mesh.element))
+
+    K = stiffness(mesh, D)
+
+    assert [block.kind for block in mesh.blocks] == [kind]
+    assert abs(K - expected).max() <= 1e-13 * abs(expected).max()
+    assert abs(K - K.T).max() <= 1e-14 * abs(K).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_stiffness_of_affine_cells_is_exact(kind):
+    mesh = cube(kind, 2, 0.0)
+    mesh = Mesh(mesh.points @ [[1.0, 0.2, 0.1], [0.0, 0.7, -0.3], [0, 0, 1.3]],
+                mesh.cells, {})  # fmt: skip
+    expected = independent(mesh, quadrature=exact_rule(kind))
+
+    assert abs(stiffness(mesh, D) - expected).max() <= 1e-13 * abs(expected).max()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_cells_have_their_volume_and_six_rigid_modes(kind):
+    mesh = cube(kind, 2)
+    element, volume = mesh.element, 0.0
+    for xi, weight in zip(element.points, element.weights, strict=True):
+        J = np.einsum("ar,eax->erx", element.gradients(xi), mesh.points[mesh.cells])
+        volume += weight * np.linalg.det(J).sum()
+    K, R = stiffness(mesh, D), rigid_modes(mesh.points)
+
+    assert volume == pytest.approx(1, rel=1e-3 if kind == "wedge" else 1e-13)
+    assert abs(K @ R).max() <= 1e-13 * abs(K).max()
+    sizes = np.linalg.eigvalsh(K.toarray())
+    assert (abs(sizes[:6]) <= 1e-13 * sizes[-1]).all()
+    assert sizes[6] > 1e-4 * sizes[-1]
+
+
+@pytest.mark.parametrize("element", ELEMENTS.values(), ids=lambda e: e.kind)
+def test_shape_functions_interpolate_and_their_gradients_are_derivatives(element):
+    corners = element.corners.astype(float)
+    at_corners = np.array([element.shapes(x) for x in corners])
+    np.testing.assert_allclose(at_corners, np.eye(len(corners)), atol=1e-15)
+
+    xi, step = element.centre + 0.1 * np.arange(element.dim), 1e-6
+    assert element.shapes(xi).sum() == pytest.approx(1, rel=1e-15)
+    np.testing.assert_allclose(element.shapes(xi) @ corners, xi, atol=1e-15)
+    for k, axis in enumerate(np.eye(element.dim)):
+        slope = element.shapes(xi + step * axis) - element.shapes(xi - step * axis)
+        expected = slope / (2 * step)
+        np.testing.assert_allclose(element.gradients(xi)[:, k], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_linear_displacement_has_its_constant_stress_and_solves_the_problem(kind):
+    """Patch test: K u = 0 at inner nodes, and the boundary values determine u."""
+    mesh, gradient = cube(kind), np.arange(9).reshape(3, 3) / 7 - 0.4
+    u = (mesh.points @ gradient.T).ravel()
+    e = (gradient + gradient.T) / 2
+    stress = D @ [*np.diag(e), 2 * e[1, 2], 2 * e[0, 2], 2 * e[0, 1]]
+
+    for found in (centre_stress(mesh, D, u), gauss_stress(mesh, D, u)):
+        np.testing.assert_allclose(found, np.broadcast_to(stress, found.shape), 1e-11)
+    recovered = recover(mesh, centre_stress(mesh, D, u))
+    np.testing.assert_allclose(recovered, np.tile(stress, (64, 1)), rtol=1e-10)
+    K = stiffness(mesh, D)
+    inner = dofs_of(np.flatnonzero((abs(mesh.points - 0.5) < 0.49).all(axis=1)), 3)
+    assert inner.size == 24
+    assert abs((K @ u)[inner]).max() <= 1e-13 * abs(K @ u).max()
+    solved = np.where(np.isin(np.arange(u.size), inner), 0.0, u)
+    solved[inner] = spsolve(K[inner][:, inner], -(K @ solved)[inner])
+    np.testing.assert_allclose(solved, u, atol=1e-14)
+
+
+def test_degenerate_hexahedra_have_the_stiffness_of_the_cells_themselves():
+    for corners in (TETRAHEDRA, WEDGES):
+        mesh = divided(box((0.0, 0.0, 0.0), (1.0, 0.8, 0.6), (2, 2, 2)), corners)
+        mixed = degenerate(mesh)
+        expected = stiffness(mesh, D)
+
+        assert abs(stiffness(mixed, D) - expected).max() <= 1e-13 * abs(expected).max()
+        (block,) = mixed.blocks
+        assert block.kind == mesh.element.kind
+        assert (block.nodes == mesh.cells).all()
+        facets = [boundary_facets(m.cells, 3).tolist() for m in (mesh, mixed)]
+        assert {turned(f) for f in facets[0]} == {turned(f) for f in facets[1]}
+        assert all(len(set(f[:3])) == 3 for f in facets[0] + facets[1])
+
+
+def turned(facet):
+    """Start a facet from its lowest node, with a repeated corner left out."""
+    corners = list(dict.fromkeys(facet))
+    first = corners.index(min(corners))
+    return (*corners[first:], *corners[:first])
+
+
+@pytest.mark.parametrize(("kind", "faces"), [("tetra", 108), ("wedge", 72),
+                                             ("hexahedron", 54)])  # fmt: skip
+def test_facets_enclose_the_body_anticlockwise_from_outside(kind, faces):
+    mesh = cube(kind, amplitude=0.0)
+    facets = boundary_facets(mesh.cells, 3)
+    a, b, c, d = np.moveaxis(mesh.points[facets], 1, 0)
+    area = np.cross(c - a, d - b) / 2
+    nodes, shares = nodal_areas(mesh.points, facets)
+
+    assert len(facets) == faces
+    assert np.linalg.norm(area, axis=1).sum() == pytest.approx(6)
+    assert (np.einsum("fx,fx->f", area, (a + b + c) / 3 - 0.5) > 0).all()
+    assert nodes.tolist() == np.unique(facets).tolist()
+    assert shares.sum() == pytest.approx(6)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("size", [(1, 1, 1), (1, 1, 12), (9, 2, 1)])
+def test_six_rigid_modes_are_the_kernel_of_a_floating_inverse(kind, size):
+    """Also of a bar, where central nodes alone would be on a line."""
+    mesh = box((0.0, 0.0, 0.0), tuple(map(float, size)), size)
+    corners = {"tetra": TETRAHEDRA, "wedge": WEDGES}.get(kind)
+    mesh = mesh if corners is None else divided(mesh, corners)
+    K, R = stiffness(mesh, D / STEEL.E), rigid_modes(mesh.points)
+    inverse = floating_inverse(K, [R], [dofs_of(fixing_nodes(mesh.points), 3)])
+    f = np.random.default_rng(7).standard_normal(mesh.dofs)
+    f -= R @ (R.T @ f)
+
+    np.testing.assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
+    assert abs(K @ inverse(f) - f).max() <= 1e-10 * abs(f).max()
+
+
+def test_recovered_stress_of_a_bent_bar_converges_with_second_order():
+    """Pure bending: σ_z = −E κ x, exact in space with anticlastic curvature."""
+    nu, kappa, errors = STEEL.nu, 1e-3, []
+    for n in (4, 8, 16):
+        mesh = bent(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (n, n, n)), 0.03)
+        x, y, z = mesh.points.T - 0.5
+        u = kappa / 2 * np.stack(
+            [z**2 + nu * (x**2 - y**2), 2 * nu * x * y, -2 * x * z], axis=-1
+        ).ravel()  # fmt: skip
+        sigma = recover(mesh, centre_stress(mesh, D, u))
+        exact = np.zeros_like(sigma)
+        exact[:, 2] = -STEEL.E * kappa * x
+        errors.append(abs(sigma - exact).max() / (STEEL.E * kappa))
+        stress = von_mises(exact, nu, None)
+        np.testing.assert_allclose(stress, abs(exact[:, 2]), rtol=1e-12)
+
+    rates = np.log2(np.divide(errors[:-1], errors[1:]))
+    assert rates[-1] == pytest.approx(2, abs=0.3)
+
+
+def test_the_fill_of_a_box_does_not_depend_on_its_orientation():
+    mesh = box((0.0, 0.0, 0.0), (0.8, 1.0, 1.3), (8, 10, 13))
+    K = stiffness(mesh, D / STEEL.E) + eye_array(mesh.dofs, format="csc")
+    turn = Rotation.from_rotvec([0.3, 0.9, -0.5]).as_matrix()
+    every, none = np.arange(mesh.dofs), np.zeros(0, dtype=np.int64)
+    sizes = [
+        multifrontal(K, every, points, none).rows.size
+        for points in (mesh.points, mesh.points @ turn, mesh.points[:, [2, 0, 1]])
+    ]
+    metis = cholesky(csc_matrix(K), mode="supernodal", ordering_method="nesdis")
+
+    assert max(sizes) <= 1.05 * min(sizes), sizes
+    assert max(sizes) <= 2 * metis.L().nnz
