@@ -292,7 +292,7 @@ def local_factor(
 
 
 def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
-    """Factorise a sparse, symmetric, positive definite A (n, n), with the border last.
+    """Factorise a symmetric, positive definite A (n, n), with the border last.
 
     Other rows are ordered for little fill. A small A is all border: a dense factor.
 
@@ -309,7 +309,7 @@ def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
     inner, last = np.flatnonzero(~border), np.flatnonzero(border)
     if not inner.size:
         try:
-            L = _cholesky(A.toarray())
+            L = _cholesky(A if isinstance(A, np.ndarray) else A.toarray())
         except np.linalg.LinAlgError:
             raise CholmodNotPositiveDefiniteError from None
         return BorderedFactor(last, csc_array((last.size, 0)), L)
