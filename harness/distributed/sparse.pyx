@@ -441,6 +441,71 @@ cdef class BorderedFactor(LinearMap):
             raise MemoryError
         return 0
 
+    @staticmethod
+    def of_array(A, border):
+        """Factorise an array A (n, n) with few nonzero entries.
+
+        The row with the fewest entries is eliminated first (minimum degree), those of
+        the border last.
+
+        border : (n,) mask
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            When A is not positive definite.
+
+        """
+        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, inner, count = 0
+        cdef double[:, ::1] M = np.array(A, dtype=np.float64, order="C")
+        cdef const unsigned char[::1] is_last = np.asarray(border, bool).view(np.uint8)
+        last = np.flatnonzero(border)
+        inner = n - last.size
+        order, columns = np.empty(n, dtype=np.int32), np.empty((inner, n))
+        degrees = np.count_nonzero(A, axis=1)
+        cdef int[::1] row = order
+        cdef long long[::1] degree = degrees
+        cdef int[::1] neighbour = np.empty(n, dtype=np.int32)
+        cdef unsigned char[::1] is_done = np.zeros(n, dtype=np.uint8)
+        cdef double root, share
+        indptr = np.zeros(inner + 1, dtype=np.int32)
+        indices, data = np.empty(inner * n, dtype=np.int32), np.empty(inner * n)
+        cdef int[::1] begin = indptr
+        cdef int[::1] index = indices
+        cdef double[::1] value = data
+        for step in range(inner):
+            p = -1
+            for i in range(n):
+                if not is_done[i] and not is_last[i] and (
+                    p < 0 or degree[i] < degree[p]
+                ):
+                    p = i
+            if not M[p, p] > 0:
+                raise np.linalg.LinAlgError("not positive definite")
+            row[step], is_done[p], root, m = <int> p, 1, sqrt(M[p, p]), 0
+            index[count], value[count] = <int> p, root
+            for i in range(n):
+                if not is_done[i] and M[p, i] != 0:
+                    neighbour[m] = <int> i
+                    m += 1
+                    index[count + m], value[count + m] = <int> i, M[p, i] / root
+                    degree[i] -= 1
+            for j in range(m):
+                share = value[count + 1 + j]
+                for l in range(m):
+                    i = neighbour[l]
+                    if M[neighbour[j], i] == 0:
+                        degree[i] += 1
+                    M[neighbour[j], i] -= share * value[count + 1 + l]
+            count += m + 1
+            begin[step + 1] = <int> count
+        order[inner:] = last
+        place = np.empty(n, dtype=np.int32)
+        place[order] = np.arange(n, dtype=np.int32)
+        L = csc_array((data[:count], place[indices[:count]], indptr), shape=(n, inner))
+        corner = np.asarray(M)[np.ix_(last, last)]
+        return BorderedFactor(order, L, np.linalg.cholesky(corner))
+
     # the two halves of a solve
 
     cdef void reduce(self, const double *t, double *u) noexcept:

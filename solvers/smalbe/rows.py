@@ -28,11 +28,10 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csc_array, csr_array, diags_array, issparse
-from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
 from mortarbench.harness import Matrix, Vector, too_large
 from mortarbench.harness.distributed.factor import (
-    MAX_DENSE_ROWS,
+    MAX_ARRAY_ROWS,
     DependentRowsError,
     LocalFactor,
     SummedFactor,
@@ -212,7 +211,7 @@ class WholeGram:
         while True:
             try:
                 return bordered_factor(of_free + shift * self.matrix, none)
-            except CholmodNotPositiveDefiniteError:
+            except DependentRowsError:
                 shift = min(100 * shift, 1.0)  # ends at 1, as GGᵀ has a factor
 
 
@@ -419,7 +418,7 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
     gram, has_border = _gram(unit), int(changing.sum()) <= MAX_BORDER
     try:
         factor = bordered_factor(gram, changing & has_border)
-    except CholmodNotPositiveDefiniteError:
+    except DependentRowsError:
         return None
     if factor.least_pivot**2 <= RANK:
         return None
@@ -484,7 +483,7 @@ def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:
         return G.gram(columns)
     if isinstance(G, LocalRows):
         m, n = G.shape
-        if m <= MAX_DENSE_ROWS:
+        if m <= MAX_ARRAY_ROWS:
             weights = np.ones(n) if columns is None else columns.astype(float)
             place = np.arange(m, dtype=np.int32)
             return G.transposed.outer_products(weights, place, m)
