@@ -45,9 +45,9 @@ DEPENDENCE_TOLERANCE = 1e-13
 PIVOT_SHIFT = 1e-15
 #: Largest size of the dense factor of the shared rows, in entries per row of A.
 MAX_FILL = 8
-#: Largest size of a matrix that is factorised as a dense one: it takes longer to order
-#: a sparse one.
-MAX_DENSE_ROWS = 48
+#: Largest size of a sparse matrix that is factorised in an array, which takes less time
+#: than the calls of a library for sparse ones; with 500 it takes more.
+MAX_ARRAY_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -292,34 +292,36 @@ def local_factor(
 
 
 def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
-    """Factorise a sparse, symmetric, positive definite A (n, n), with the border last.
+    """Factorise a symmetric, positive definite A (n, n), with the border last.
 
-    Other rows are ordered for little fill. A small A is all border: a dense factor.
+    Other rows are ordered for little fill.
 
     border : (n,) mask of the rows whose block may change
 
     Raises
     ------
-    CholmodNotPositiveDefiniteError
+    DependentRowsError
         When A is not positive definite.
 
     """
-    if A.shape[0] <= MAX_DENSE_ROWS:
-        border = np.ones_like(border)
-    inner, last = np.flatnonzero(~border), np.flatnonzero(border)
-    if not inner.size:
+    if A.shape[0] <= MAX_ARRAY_ROWS:
+        entries = A if isinstance(A, np.ndarray) else A.toarray()
         try:
-            L = _cholesky(A.toarray())
+            return BorderedFactor.of_array(entries, border)
         except np.linalg.LinAlgError:
-            raise CholmodNotPositiveDefiniteError from None
-        return BorderedFactor(last, csc_array((last.size, 0)), L)
+            raise DependentRowsError("the rows depend on each other") from None
+    inner, last = np.flatnonzero(~border), np.flatnonzero(border)
     A = csc_array(A)
-    inner = inner[analyze(with_int32(A[inner][:, inner]), use_long=False).P()]
+    if inner.size:
+        inner = inner[analyze(with_int32(A[inner][:, inner]), use_long=False).P()]
     order = np.concatenate([inner, last])
     ordered = with_int32(A[order][:, order])
     factor = analyze(ordered, ordering_method="natural", use_long=False)
-    factor.cholesky_inplace(ordered)
-    L = csc_array(factor.L())
+    try:
+        factor.cholesky_inplace(ordered)
+        L = csc_array(factor.L())
+    except CholmodNotPositiveDefiniteError:
+        raise DependentRowsError("the rows depend on each other") from None
     L.sort_indices()
     corner = L[inner.size :, inner.size :].toarray()
     return BorderedFactor(order, L[:, : inner.size], corner)

@@ -12,8 +12,15 @@ cdef class CompressedRows(LinearMap):
     cdef const int *indices
     cdef const int *indptr
 
+    cdef int hold(self, tuple shape, data, indices, indptr) except -1
     cdef void times(self, const double *x, double *y) noexcept
     cdef void add_transposed(self, const double *x, double *y) noexcept
+    cdef void combine(
+        self, double s, const double *v, double t, const double *x, double *y
+    ) noexcept
+    cdef void weigh_difference(
+        self, const double *v, const double *x, const double *weights, double *y
+    ) noexcept
 
 
 cdef class BorderedFactor(LinearMap):

@@ -17,6 +17,7 @@ from scipy.linalg.cython_lapack cimport dpotrf
 
 import numpy as np
 from scipy.linalg import blas, eigh, qr
+from scipy.sparse import csc_array
 
 
 cdef class LinearMap:
@@ -50,16 +51,87 @@ cdef class CompressedRows(LinearMap):
     """A matrix M (n, k) in CSR format."""
 
     def __init__(self, M):
-        cdef const double[::1] data = np.ascontiguousarray(M.data, dtype=np.float64)
-        cdef const int[::1] indices = np.ascontiguousarray(M.indices, dtype=np.int32)
-        cdef const int[::1] indptr = np.ascontiguousarray(M.indptr, dtype=np.int32)
-        self.shape, (self.n, self.k) = M.shape, M.shape
-        if M.format != "csr" or indptr.shape[0] != self.n + 1:
+        if M.format != "csr":
             raise ValueError(f"{M.format} matrix; expected one by rows")
-        self.arrays = data, indices, indptr
-        self.data = &data[0] if data.shape[0] else NULL
-        self.indices = &indices[0] if indices.shape[0] else NULL
-        self.indptr = &indptr[0]
+        self.hold(M.shape, M.data, M.indices, M.indptr)
+
+    @staticmethod
+    def of_transpose(M):
+        """Return Mᵀ (k, n) of M (n, k) in CSC format, without a copy of its arrays."""
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        if M.format != "csc":
+            raise ValueError(f"{M.format} matrix; expected one by columns")
+        new.hold((M.shape[1], M.shape[0]), M.data, M.indices, M.indptr)
+        return new
+
+    cdef int hold(self, tuple shape, data, indices, indptr) except -1:
+        cdef const double[::1] entries = np.ascontiguousarray(data, dtype=np.float64)
+        cdef const int[::1] column = np.ascontiguousarray(indices, dtype=np.int32)
+        cdef const int[::1] begin = np.ascontiguousarray(indptr, dtype=np.int32)
+        self.shape, (self.n, self.k) = shape, shape
+        self.expect(begin.shape[0], self.n + 1)
+        self.arrays = entries, column, begin
+        self.data = &entries[0] if entries.shape[0] else NULL
+        self.indices = &column[0] if column.shape[0] else NULL
+        self.indptr = &begin[0]
+        return 0
+
+    def rows(self, chosen):
+        """Return the matrix of the rows `chosen` (b,)."""
+        cdef const long long[::1] at = np.ascontiguousarray(chosen, dtype=np.int64)
+        cdef Py_ssize_t i, count = 0
+        cdef int j
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        for i in range(at.shape[0]):
+            count += self.indptr[at[i] + 1] - self.indptr[at[i]]
+        entries, columns = np.empty(count), np.empty(count, dtype=np.int32)
+        begin = np.zeros(at.shape[0] + 1, dtype=np.int32)
+        cdef double[::1] data = entries
+        cdef int[::1] indices = columns
+        cdef int[::1] indptr = begin
+        count = 0
+        for i in range(at.shape[0]):
+            for j in range(self.indptr[at[i]], self.indptr[at[i] + 1]):
+                data[count], indices[count] = self.data[j], self.indices[j]
+                count += 1
+            indptr[i + 1] = <int> count
+        new.hold((at.shape[0], self.k), entries, columns, begin)
+        return new
+
+    def unit_columns(self):
+        """Return the matrix with columns of norm 1, and their norms (k,).
+
+        Columns of norm zero are left as they are.
+        """
+        cdef Py_ssize_t j, count = self.indptr[self.n]
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        sizes, entries = np.zeros(self.k), np.empty(count)
+        cdef double[::1] size = sizes
+        cdef double[::1] data = entries
+        for j in range(count):
+            size[self.indices[j]] += self.data[j] * self.data[j]
+        for j in range(self.k):
+            size[j] = sqrt(size[j])
+        for j in range(count):
+            data[j] = 1 / (size[self.indices[j]] or 1.0) * self.data[j]
+        new.hold(self.shape, entries, self.arrays[1], self.arrays[2])
+        return new, sizes
+
+    @property
+    def touched(self):
+        """Mask (k,) of the columns with entries."""
+        cdef Py_ssize_t j
+        mask = np.zeros(self.k, dtype=bool)
+        cdef unsigned char[::1] has_entry = mask.view(np.uint8)
+        for j in range(self.indptr[self.n]):
+            has_entry[self.indices[j]] = 1
+        return mask
+
+    @property
+    def by_columns(self):
+        """Mᵀ (k, n) in CSC format, sharing the arrays."""
+        data, indices, indptr = map(np.asarray, self.arrays)
+        return csc_array((data, indices, indptr), shape=(self.k, self.n))
 
     cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
         cdef Py_ssize_t i, c
@@ -95,14 +167,43 @@ cdef class CompressedRows(LinearMap):
             for j in range(self.indptr[i], self.indptr[i + 1]):
                 y[self.indices[j]] += self.data[j] * x[i]
 
+    cdef void combine(
+        self, double s, const double *v, double t, const double *x, double *y
+    ) noexcept:
+        """y ← sv + tMx; y may be v."""
+        cdef Py_ssize_t i
+        cdef int j
+        cdef double y_i
+        for i in range(self.n):
+            y_i = 0
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                y_i += self.data[j] * x[self.indices[j]]
+            y[i] = s * v[i] + t * y_i
+
+    cdef void weigh_difference(
+        self, const double *v, const double *x, const double *weights, double *y
+    ) noexcept:
+        """y ← diag(weights)(v − Mx)."""
+        cdef Py_ssize_t i
+        cdef int j
+        cdef double y_i
+        for i in range(self.n):
+            if weights[i] == 0:
+                y[i] = 0
+                continue
+            y_i = v[i]
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                y_i -= self.data[j] * x[self.indices[j]]
+            y[i] = weights[i] * y_i
+
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
         """Return sv + tMx (n,) of v (n,) and x (k,)."""
         self.expect(v.shape[0], self.n)
-        product = self(x)
+        self.expect(x.shape[0], self.k)
+        product = np.empty(self.n)
         cdef double[::1] y = product
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            y[i] = s * v[i] + t * y[i]
+        if self.n:
+            self.combine(s, &v[0], t, &x[0] if self.k else NULL, &y[0])
         return product
 
     def weighted_difference(
@@ -110,12 +211,12 @@ cdef class CompressedRows(LinearMap):
     ):
         """Return diag(weights)(v − Mx) (n,) of v (n,), x (k,) and weights (n,)."""
         self.expect(v.shape[0], self.n)
+        self.expect(x.shape[0], self.k)
         self.expect(weights.shape[0], self.n)
-        product = self(x)
+        product = np.empty(self.n)
         cdef double[::1] y = product
-        cdef Py_ssize_t i
-        for i in range(self.n):
-            y[i] = weights[i] * (v[i] - y[i])
+        if self.n:
+            self.weigh_difference(&v[0], &x[0] if self.k else NULL, &weights[0], &y[0])
         return product
 
     def transposed_times(self, const double[::1] x):
@@ -340,6 +441,71 @@ cdef class BorderedFactor(LinearMap):
             raise MemoryError
         return 0
 
+    @staticmethod
+    def of_array(A, border):
+        """Factorise an array A (n, n) with few nonzero entries.
+
+        The row with the fewest entries is eliminated first (minimum degree), those of
+        the border last.
+
+        border : (n,) mask
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            When A is not positive definite.
+
+        """
+        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, inner, count = 0
+        cdef double[:, ::1] M = np.array(A, dtype=np.float64, order="C")
+        cdef const unsigned char[::1] is_last = np.asarray(border, bool).view(np.uint8)
+        last = np.flatnonzero(border)
+        inner = n - last.size
+        order, columns = np.empty(n, dtype=np.int32), np.empty((inner, n))
+        degrees = np.count_nonzero(A, axis=1)
+        cdef int[::1] row = order
+        cdef long long[::1] degree = degrees
+        cdef int[::1] neighbour = np.empty(n, dtype=np.int32)
+        cdef unsigned char[::1] is_done = np.zeros(n, dtype=np.uint8)
+        cdef double root, share
+        indptr = np.zeros(inner + 1, dtype=np.int32)
+        indices, data = np.empty(inner * n, dtype=np.int32), np.empty(inner * n)
+        cdef int[::1] begin = indptr
+        cdef int[::1] index = indices
+        cdef double[::1] value = data
+        for step in range(inner):
+            p = -1
+            for i in range(n):
+                if not is_done[i] and not is_last[i] and (
+                    p < 0 or degree[i] < degree[p]
+                ):
+                    p = i
+            if not M[p, p] > 0:
+                raise np.linalg.LinAlgError("not positive definite")
+            row[step], is_done[p], root, m = <int> p, 1, sqrt(M[p, p]), 0
+            index[count], value[count] = <int> p, root
+            for i in range(n):
+                if not is_done[i] and M[p, i] != 0:
+                    neighbour[m] = <int> i
+                    m += 1
+                    index[count + m], value[count + m] = <int> i, M[p, i] / root
+                    degree[i] -= 1
+            for j in range(m):
+                share = value[count + 1 + j]
+                for l in range(m):
+                    i = neighbour[l]
+                    if M[neighbour[j], i] == 0:
+                        degree[i] += 1
+                    M[neighbour[j], i] -= share * value[count + 1 + l]
+            count += m + 1
+            begin[step + 1] = <int> count
+        order[inner:] = last
+        place = np.empty(n, dtype=np.int32)
+        place[order] = np.arange(n, dtype=np.int32)
+        L = csc_array((data[:count], place[indices[:count]], indptr), shape=(n, inner))
+        corner = np.asarray(M)[np.ix_(last, last)]
+        return BorderedFactor(order, L, np.linalg.cholesky(corner))
+
     # the two halves of a solve
 
     cdef void reduce(self, const double *t, double *u) noexcept:
@@ -446,6 +612,11 @@ cdef class BorderedFactor(LinearMap):
         for i in range(self.border):
             least = min(least, self.L[i * self.border + i])
         return least
+
+    @property
+    def border_rows(self):
+        """Rows (b,) of the border."""
+        return np.asarray(self.arrays[0])[self.inner:].astype(np.int64)
 
     # changes of the border
 

@@ -7,6 +7,7 @@ explicit P they run without Python; sums over ranks, products with operators, sp
 factors and preconditioners call back into Python.
 
 * operations.pxi: sums over processes, products with F, orthonormal rows
+* coarse.pxi: sparse rows and the factor of GGᵀ
 * box.pxi: the feasible set: steps to its boundary, projections, parts of the gradient
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
@@ -41,11 +42,13 @@ from scipy.linalg.cython_lapack cimport (
     dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
 )
 
-from mortarbench.harness.distributed.sparse cimport LinearMap
+from mortarbench.harness.distributed.sparse cimport (
+    BorderedFactor, CompressedRows, LinearMap,
+)
 from mortarbench.harness.verify cimport scales
 
 import numpy as np
-from scipy.sparse import csr_array, issparse
+from scipy.sparse import csc_array, csr_array, issparse
 
 from mortarbench.harness.operators import linear_map
 from mortarbench.solvers.smalbe.extension import Step
@@ -188,6 +191,7 @@ cdef extern from "incomplete.h" nogil:
                        const double *s, double *scaled, Py_ssize_t n, double *told)
 
 include "operations.pxi"
+include "coarse.pxi"
 include "preparation.pxi"
 include "box.pxi"
 include "model.pxi"

@@ -438,22 +438,36 @@ cdef class FactoredBasis(Basis):
     only those with bounds, b, are evaluated for each y:
 
         Gs = G_b(s_b + (g_b + G_bᵀy)/τ) − (Gg + GGᵀy)/τ
-
-    source : a `solvers.smalbe.rows.SparseRows`
     """
 
     cdef Rows rows
-    cdef object source, solve
-    cdef object x_b, g_b, low_b, high_b, gradient_b, s_b, Gg, weights
+    cdef Coarse coarse
+    cdef object factor  # of the face
+    cdef Room room
+    cdef double *x_b  # (places,)
+    cdef double *g_b
+    cdef double *low_b
+    cdef double *high_b
+    cdef double *gradient_b
+    cdef double *s_b
+    cdef double *Gg  # (k,)
+    cdef double *weights  # (n,)
 
     @staticmethod
     cdef FactoredBasis of(Rows rows):
         cdef FactoredBasis new = FactoredBasis.__new__(FactoredBasis)
-        new.rows, new.source, new.n = rows, rows.source, rows.n
+        cdef Py_ssize_t p
+        new.rows, new.coarse, new.n = rows, rows.coarse, rows.n
         new.over, new.over_dual = rows.over, rows.over_rows
-        new.k, new.places = rows.source.unit.shape[0], rows.source.bounded.size
+        new.k, new.places = rows.coarse.k, rows.coarse.places
+        p = new.places
         new.make_room(new.k)
-        new.s_b = np.empty(new.places)
+        new.room = Room(6 * p + new.k + new.n)
+        new.x_b, new.g_b = new.room.at, new.room.at + p
+        new.low_b, new.high_b = new.g_b + p, new.g_b + 2 * p
+        new.gradient_b, new.s_b = new.high_b + p, new.high_b + 2 * p
+        new.Gg = new.s_b + p
+        new.weights = new.Gg + new.k
         return new
 
     cdef Model model(self, Py_ssize_t k, const double *w, double shift, double tau):
@@ -467,10 +481,12 @@ cdef class FactoredBasis(Basis):
 
     cdef int begin(self, Model B, const double *x, const double *g, Box box,
                    double *s) except -1:
-        b, n = self.source.bounded, self.n
-        self.x_b, self.g_b = view(x, n)[b], view(g, n)[b]
-        self.low_b, self.high_b = view(box.lower, n)[b], view(box.upper, n)[b]
-        self.Gg = np.asarray(self.source.unit @ view(g, n))
+        cdef Py_ssize_t i, j
+        for i in range(self.places):
+            j = self.coarse.bounded[i]
+            self.x_b[i], self.g_b[i] = x[j], g[j]
+            self.low_b[i], self.high_b[i] = box.lower[j], box.upper[j]
+        self.coarse.times(g, self.Gg)
         memset(self.y_there, 0, self.k * sizeof(double))
         self.minimise_lagrangian(B, x, g, box, s)
         self.find_slope(B, s)
@@ -480,33 +496,38 @@ cdef class FactoredBasis(Basis):
         return 0
 
     cdef int newton(self, Model B) except -1:
-        free = np.ones(self.n, dtype=bool)
-        free[self.source.bounded] = view(self.piece, self.places) == 0
-        solve = self.source.gram.in_face(free, B.tau / B.w[0])
-        copy_result(B.tau * np.asarray(solve(view(self.slope, self.k))), self.k, self.dy, "dy")
+        cdef Py_ssize_t i
+        for i in range(self.places):
+            self.coarse.active[i] = self.piece[i] != 0
+        self.coarse.solve(self.coarse.in_face(B.tau / B.w[0]), self.slope, self.dy)
+        scale(B.tau, self.dy, self.k)
         return 0
 
     cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
                   double *s) except -1:
-        y = view(self.y_there, self.k)
-        self.gradient_b = self.g_b + np.asarray(self.source.of_bounded.T @ y)
-        model_minimiser(address(self.x_b), address(self.gradient_b), B.tau, address(self.low_b),
-               address(self.high_b), address(self.s_b), self.piece_there, self.places)
+        self.coarse.combine_bounded(self.g_b, self.y_there, self.gradient_b)
+        model_minimiser(self.x_b, self.gradient_b, B.tau, self.low_b, self.high_b,
+                        self.s_b, self.piece_there, self.places)
         return 0
 
     cdef int find_slope(self, Model B, const double *s) except -1:
-        part = self.source.of_bounded @ (self.gradient_b / B.tau + self.s_b)
-        GGy = np.asarray(self.source.gram.product(view(self.y_there, self.k)))
-        shift = self.Gg / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy
-        copy_result(np.asarray(part) - shift, self.k, self.slope_there, "slope")
+        cdef Py_ssize_t i
+        cdef double *GGy = self.coarse.t
+        for i in range(self.places):
+            self.gradient_b[i] = self.gradient_b[i] / B.tau + self.s_b[i]
+        self.coarse.times_bounded(self.gradient_b, self.slope_there)
+        self.coarse.product(self.y_there, GGy)
+        for i in range(self.k):
+            self.slope_there[i] -= self.Gg[i] / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy[i]
         return 0
 
     cdef int finish(self, Model B, const double *x, const double *g, Box box,
                     double *s) except -1:
-        Gty = np.asarray(self.source.unit.T @ view(self.y_there, self.k))
-        step = -(view(g, self.n) + Gty) / B.tau
-        step[self.source.bounded] = self.s_b
-        return copy_result(step, self.n, s, "s")
+        cdef Py_ssize_t i
+        self.coarse.combine(-1 / B.tau, g, -1 / B.tau, self.y_there, s)
+        for i in range(self.places):
+            s[self.coarse.bounded[i]] = self.s_b[i]
+        return 0
 
     cdef double largest(self, Model B) except? -1:
         return B.w[0]
@@ -522,16 +543,14 @@ cdef class FactoredBasis(Basis):
         return 0
 
     cdef int enter(self, Model B, const double *free) except -1:
-        is_free = view(free, self.n) > 0
-        self.solve = self.source.gram.in_face(is_free, B.tau / B.w[0])
-        self.weights = view(free, self.n) / B.tau
+        self.coarse.enter(free)
+        self.factor = self.coarse.in_face(B.tau / B.w[0])
+        copy_scaled(1 / B.tau, free, self.weights, self.n)
         return 0
 
     cdef double inverse(self, Model B, const double *free, const double *v,
                         const double *along, double *z) except? -1:
-        y = self.solve(self.source.unit @ view(v, self.n))
-        difference = self.source.weighted_difference(
-            view(v, self.n), y, self.weights
-        )
-        copy_result(difference, self.n, z, "z")
+        self.coarse.times(v, self.coarse.t)
+        self.coarse.solve(self.factor, self.coarse.t, self.coarse.y)
+        self.coarse.weigh_difference(v, self.coarse.y, self.weights, z)
         return dot(z, along, self.n)

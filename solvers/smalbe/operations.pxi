@@ -242,6 +242,7 @@ cdef class Rows:
     cdef const double *C  # NULL for C = L⁻¹G
     cdef const double *GC
     cdef const double *x_tilde
+    cdef Coarse coarse  # for C = L⁻¹G, else None
     cdef readonly object source
     cdef list owners
     cdef Reduction over
@@ -257,9 +258,10 @@ cdef class Rows:
             self.C, self.GC = read(rows.C, self.owners), read(rows.GC, self.owners)
             self.exist = self.r > 0
         else:
-            none = rows.no_multipliers
-            self.r, self.exist = np.asarray(none).size, len(rows.C) > 0
-            if getattr(none, "ranks", None) is None:
+            is_local = over.ranks is None and rows.on_one_process
+            self.coarse = (LocalCoarse if is_local else Coarse)(rows)
+            self.r, self.exist = self.coarse.r, len(rows.C) > 0
+            if getattr(rows.no_multipliers, "ranks", None) is None:
                 self.over_rows = Reduction()  # vectors (r,) are replicated
 
     cdef int times(self, const double *v, double *Cv) except -1:
@@ -267,7 +269,8 @@ cdef class Rows:
         if self.C:
             rows_times(self.C, v, Cv, self.r, self.n)
         elif self.exist:
-            copy_result(self.source.C @ view(v, self.n), self.r, Cv, "C @ v")
+            self.coarse.times(v, self.coarse.t)
+            self.coarse.forward(self.coarse.t, Cv)
         return 0
 
     cdef int combine(
@@ -277,8 +280,8 @@ cdef class Rows:
         if self.C:
             combination(s, self.C, a, v, y, self.r, self.n)
         elif self.exist:
-            total = self.source.combined(1.0, view(v, self.n), s, view(a, self.r))
-            copy_result(total, self.n, y, "v + Cᵀa")
+            self.coarse.backward(a, self.coarse.y)
+            self.coarse.combine(1.0, v, s, self.coarse.y, y)
         elif y != v:
             memcpy(y, v, self.n * sizeof(double))
         return 0
@@ -318,8 +321,7 @@ cdef class Rows:
         if error > tol * self.x_tilde_size:
             return False
         if not self.C:
-            missed = self.source.error(view(nu, self.n))
-            return np.linalg.norm(missed) <= tol * self.e_size
+            return self.coarse.error(nu) <= tol * self.e_size
         for i in range(self.m):  # Gν = GCᵀ Cν
             part = dot(self.GC + i * self.r, Cnu, self.r)
             square += part * part
@@ -331,7 +333,34 @@ cdef class Rows:
         self.times(address(nu), Cnu.at)
         return self.are_met(address(nu), Cnu.at, tol, least)
 
+    cdef int fit(self, const double *free, double *r, double *a) except -1:
+        """a ← the least-squares multipliers of `fitted` for sparse rows.
+
+        free : 1 on the free components, else 0 (n,)
+        r : becomes zero off the free components
+        """
+        cdef Py_ssize_t i
+        for i in range(self.n):
+            r[i] *= free[i]
+        self.coarse.times(r, self.coarse.t)
+        self.coarse.enter(free)
+        self.coarse.solve(self.coarse.in_face(FREE_RANK), self.coarse.t, self.coarse.y)
+        for i in range(self.coarse.k):
+            self.coarse.y[i] = -self.coarse.y[i]
+        self.coarse.product(self.coarse.y, self.coarse.t)
+        return self.coarse.forward(self.coarse.t, a)
+
+    def fitted(self, free, r):
+        """Return a (r,) with the least ‖(r + Cᵀa)_F‖ on the free components F (n,)."""
+        rest, multipliers = np.array(r, dtype=float), np.empty(self.r)
+        is_free = np.array(free, dtype=float)
+        self.fit(address(is_free), address(rest), address(multipliers))
+        return multipliers
+
 
 # An x̃ below this size relative to ν is rounding of e = 0: some hundred times 2⁻⁵³.
 # Without it `test_a_right_hand_side_of_rounding_is_none` fails.
 cdef double SHIFT_ROUNDING = 1e-13
+# Shift of G_F G_Fᵀ, relative to GGᵀ, for multipliers fitted on a face F: motions of which
+# the free components have less count as zero.
+cdef double FREE_RANK = 1e-10

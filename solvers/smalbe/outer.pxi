@@ -409,18 +409,16 @@ cdef class SMALBE(MPRGP):
     def point(self, nu, mu, lb, ub):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
-        The computation of `solvers.smalbe.driver.recover`, with normal equations for the
-        correction of a. None if C is sparse, or so nearly dependent on the free
+        The computation of `solvers.smalbe.driver.recovered`, with normal equations for
+        the correction of a. None if a dense C is so nearly dependent on the free
         components that normal equations would lose the correction.
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
         cdef list owners = []
-        if not self.rows.C and (self.rows.exist or self.over.ranks is not None):
-            return None
         result, multipliers = np.zeros((3, n)), np.zeros(r)
-        cdef Room room = Room(r * r)
+        cdef Room room = Room(r * r if self.rows.C else 0)
         cdef double *S = room.at
         cdef const double *C = self.rows.C
         cdef const double *v = address(nu)
@@ -439,9 +437,18 @@ cdef class SMALBE(MPRGP):
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
             any_left = any_left or rest[i] != 0
-        if not any_left:  # a minimum of the cost without any constraint
-            return result[0], multipliers, result[1], result[2]
-        if r:
+        any_left = self.over.any(any_left)
+        if any_left and self.rows.coarse is not None:
+            self.rows.times(rest, da)
+            for i in range(r):
+                a[i] = self.norm * at_mu[i] - da[i]
+            self.rows.combine(1.0, a, rest, rest)
+            memcpy(t, rest, n * sizeof(double))
+            self.rows.fit(free, t, da)
+            for i in range(r):
+                a[i] += da[i]
+            self.rows.combine(1.0, da, rest, rest)
+        elif any_left and r:
             rows_times(C, rest, da, r, n)
             for i in range(r):
                 a[i] = self.norm * at_mu[i] - da[i]
@@ -459,5 +466,7 @@ cdef class SMALBE(MPRGP):
             for i in range(r):
                 a[i] -= da[i]
             add_combination(-1.0, C, da, rest, r, n)
-        bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
-        return result[0], multipliers, result[1], result[2]
+        if any_left:  # else a minimum of the cost without any constraint
+            bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
+        x_array, z_array, Fx_array = map(self.over.vector, result)
+        return x_array, self.rows.over_rows.vector(multipliers), z_array, Fx_array

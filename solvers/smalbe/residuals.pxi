@@ -15,6 +15,7 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     """
     cdef Py_ssize_t i, n = len(diagonal), m = len(s.y)
     cdef bint is_dense = isinstance(G, np.ndarray)
+    cdef CompressedRows by_components = None  # Gᵀ
     cdef list owners = []
     cdef double sums[3]
     cdef double most[2]
@@ -41,6 +42,11 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     if is_dense:
         memcpy(forces, z, n * sizeof(double))
         add_combination(1.0, read(G, owners), y, forces, m, n)
+    elif issparse(G):
+        by_components = CompressedRows.of_transpose(
+            G if G.format == "csc" else csc_array(G)
+        )
+        by_components.combine(1.0, z, 1.0, y, forces)
     else:
         copy_result(G.T @ s.y, n, forces, "Gᵀy")
         add(1.0, z, forces, n)
@@ -67,6 +73,8 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     sizes_of_variables(energy, q, d, x, Fx, size, own_size, n)
     if is_dense:
         terms_of_rows(read(G, owners), e, x, own_size, size, m, n, missed, own, known)
+    elif by_components is not None:
+        terms_of_sparse_rows(by_components, e, x, own_size, size, missed, own, known)
     else:
         copy_result(G @ s.x - qp.b, m, missed, "Gx − e")
         size_of_rows = abs(G)
@@ -80,3 +88,19 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
             missed[i], scales.row_scale(fabs(e[i]), known[i], own[i])
         ))
     return worst if isfinite(worst) else INFINITY
+
+
+cdef void terms_of_sparse_rows(
+    CompressedRows G, const double *e, const double *x, const double *own_size,
+    const double *size, double *missed, double *own, double *known
+) noexcept:
+    """`terms_of_rows` of sparse rows, from their transpose (n, m); outputs begin at 0."""
+    cdef Py_ssize_t i
+    cdef int j
+    for i in range(G.k):
+        missed[i] = -e[i]
+    for i in range(G.n):
+        for j in range(G.indptr[i], G.indptr[i + 1]):
+            missed[G.indices[j]] += G.data[j] * x[i]
+            own[G.indices[j]] += fabs(G.data[j]) * own_size[i]
+            known[G.indices[j]] += fabs(G.data[j]) * size[i]

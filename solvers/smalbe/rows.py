@@ -22,26 +22,25 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from functools import cached_property, lru_cache, partial
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve
-from scipy.sparse import csc_array, csc_matrix, csr_array, diags_array, issparse
-from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
+from scipy.sparse import csc_array, csr_array, diags_array, issparse
 
 from mortarbench.harness import Matrix, Vector, too_large
 from mortarbench.harness.distributed.factor import (
+    MAX_ARRAY_ROWS,
     DependentRowsError,
     LocalFactor,
     SummedFactor,
+    bordered_factor,
     independent_rows,
     local_factor,
     touched_rows,
-    with_int32,
 )
-from mortarbench.harness.distributed.sparse import CompressedRows, factor_above
+from mortarbench.harness.distributed.sparse import BorderedFactor, CompressedRows
 from mortarbench.harness.distributed.vectors import (
     DistributedColumns,
     Ranks,
@@ -50,7 +49,7 @@ from mortarbench.harness.distributed.vectors import (
 from mortarbench.solvers.smalbe import compiled
 
 Mask: TypeAlias = NDArray[np.bool_]
-SparseColumns: TypeAlias = Any  #: a sparse array, or `DistributedColumns`
+SparseColumns: TypeAlias = Any  #: a sparse array, `LocalRows` or `DistributedColumns`
 
 CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to x̃ and e
 RANK = 1e-13  #: smaller pivots of normalised rows count as rounding
@@ -127,18 +126,25 @@ class SparseRows(Rows):
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
         y, unit = self.gram.backward(a), self.unit
-        if isinstance(unit, _LocalRows):
+        if isinstance(unit, LocalRows):
             return unit.T.combined(s, v, t, y)
         return np.asarray(s * v + t * np.asarray(unit.T @ y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
         """Return weights times (v − Gᵀy), with the normalised rows G."""
-        if isinstance(self.unit, _LocalRows):
+        if isinstance(self.unit, LocalRows):
             return self.unit.T.weighted_difference(v, y, weights)
         return np.asarray((v - np.asarray(self.unit.T @ y)) * weights)
 
     @property
+    def on_one_process(self) -> bool:
+        """True if this process has all rows and columns."""
+        return isinstance(self.unit, LocalRows) and self.unit.ranks is None
+
+    @property
     def no_multipliers(self) -> Vector:
+        if self.on_one_process:
+            return np.zeros(len(self.C))
         return self.C @ np.zeros_like(self.x_tilde)
 
     def error(self, nu: Vector) -> Vector:
@@ -146,9 +152,7 @@ class SparseRows(Rows):
         return np.asarray(self.G @ nu)
 
     def fitted(self, free: Mask, r: Vector) -> Vector:
-        solve = self.gram.in_face(free, FREE_RANK)
-        y = -solve(self.unit @ np.where(free, r, 0.0))
-        return self.gram.forward(self.gram.product(y))
+        return compiled.Rows(self, compiled.Reduction()).fitted(free, r)
 
 
 class GramFactor(Protocol):
@@ -168,65 +172,47 @@ class GramFactor(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class _Whole:
-    """Factor of all rows, replicated on every rank."""
+class WholeGram:
+    """Factor of all rows, replicated on every rank.
 
-    unit: SparseColumns  #: G
-    matrix: csc_matrix  #: GGᵀ
-    factor: Factor
-    bordered: _Bordered | None  #: None if most rows have bounded components
+    Active bounds of a face change the block of GGᵀ of the rows with entries in bounded
+    components, the border of the factor: only its Schur complement is factorised again.
+    """
+
+    unit: LocalRows | DistributedColumns  #: G
+    matrix: Matrix  #: GGᵀ
+    factor: BorderedFactor
+    has_border: bool  #: False if most rows have bounded components
+    bounded: NDArray[np.int64]  #: (b,) components with a bound
+    of_bounded: LocalRows | DistributedColumns  #: (r, b) columns of G at these
 
     def product(self, y: Vector) -> Vector:
         return np.asarray(self.matrix @ y)
 
     def forward(self, t: Vector) -> Vector:
-        t = self.factor.apply_P(t)
-        return np.asarray(self.factor.solve_L(t, use_LDLt_decomposition=False))
+        return self.factor.forward(t)
 
     def backward(self, a: Vector) -> Vector:
-        x = self.factor.solve_Lt(a, use_LDLt_decomposition=False)
-        return np.asarray(self.factor.apply_Pt(x))
+        return self.factor.backward(a)
 
-    def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
-        if self.bordered is not None:
-            return self.bordered.solver(~free, shift)
-        of_free, factor = _gram(self.unit, free), None
-        while factor is None:
+    def in_face(self, free: Mask, shift: float) -> BorderedFactor:
+        if not self.has_border:
+            return self._factorised(free, shift)
+        active, part = ~np.asarray(free)[self.bounded], self.of_bounded
+        if isinstance(part, LocalRows):
+            removed = active.astype(float)
+            return self.factor.shifted_without(shift, part.transposed, removed)
+        changed = part[self.factor.border_rows].gram(active).toarray()
+        return self.factor.shifted(shift, changed)
+
+    def _factorised(self, free: Mask, shift: float) -> BorderedFactor:
+        none = np.zeros(self.matrix.shape[0], dtype=bool)
+        of_free = _gram(self.unit, free)
+        while True:
             try:
-                factor = self.factor.cholesky(with_int32(of_free + shift * self.matrix))
-            except CholmodNotPositiveDefiniteError:
+                return bordered_factor(of_free + shift * self.matrix, none)
+            except DependentRowsError:
                 shift = min(100 * shift, 1.0)  # ends at 1, as GGᵀ has a factor
-        return lambda t: np.asarray(factor(t))
-
-
-class OuterProducts(NamedTuple):
-    """Entries of gⱼgⱼᵀ for columns gⱼ (b,) of a sparse matrix."""
-
-    size: int  #: b
-    place: NDArray[np.int64]  #: (e,) flat index of each entry in (b, b)
-    value: Vector  #: (e,)
-    column: NDArray[np.int64]  #: (e,) column j of each entry
-
-    @classmethod
-    def of(cls, G: csr_array, columns: Mask) -> OuterProducts:
-        """List the entries for the masked columns (n,) of G (b, n)."""
-        part = csc_array(G)[:, columns]
-        entries = np.diff(part.indptr)[np.repeat(
-            np.arange(part.shape[1]), np.diff(part.indptr)
-        )]  # fmt: skip
-        left = np.repeat(np.arange(part.nnz), entries)
-        first = np.repeat(part.indptr[:-1], np.diff(part.indptr) ** 2)
-        within = np.arange(left.size) - np.repeat(np.cumsum(entries) - entries, entries)
-        right = first + within
-        number = np.repeat(np.flatnonzero(columns), np.diff(part.indptr) ** 2)
-        place = part.indices[left].astype(np.int64) * G.shape[0] + part.indices[right]
-        return cls(G.shape[0], place, part.data[left] * part.data[right], number)
-
-    def summed(self, some: Mask) -> NDArray[np.float64]:
-        """Return the sum of gⱼgⱼᵀ (b, b) over the masked columns (n,)."""
-        value = np.where(some[self.column], self.value, 0.0)
-        total = np.bincount(self.place, value, self.size**2)
-        return np.asarray(total.reshape(self.size, self.size), dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +226,8 @@ class _OverRanks:
     matrix: csc_array  #: G_p G_pᵀ of the columns of rank p
     local: LocalFactor
     factor: SummedFactor
-    bounded: OuterProducts  #: of its bounded components, restricted to border rows
+    bounded: NDArray[np.int64]  #: (b,) components of rank p with a bound
+    of_bounded: LocalRows  #: (k, b) columns of G_p at these
 
     def product(self, y: Vector) -> Vector:
         return distributed(self.matrix @ np.asarray(y), self.local.at.ranks)
@@ -253,25 +240,30 @@ class _OverRanks:
 
     def in_face(self, free: Mask, shift: float) -> Callable[[Vector], Vector]:
         with self.local.at.ranks.clocked("coarse"):
-            active = self.bounded.summed(~np.asarray(free))
-            return self.factor.shifted(shift, active)
+            active = (~np.asarray(free)[self.bounded]).astype(float)
+            less = self.of_bounded.transposed.outer_products(
+                active, self._place, self.local.border.size
+            )
+            return self.factor.shifted(shift, less)
+
+    @cached_property
+    def _place(self) -> NDArray[np.int32]:
+        """Positions (k,) of the local rows in the border; −1 for all others."""
+        place = np.full(self.local.order.size, -1, dtype=np.int32)
+        place[self.local.border] = np.arange(self.local.border.size)
+        return place
 
 
 @dataclass(frozen=True, eq=False)
-class _LocalRows:
-    """Rows with entries in the columns of this rank; products are additive over ranks.
+class LocalRows:
+    """Rows with entries in the columns of this process; products add up over ranks.
 
     Only Gᵀ is stored, by components. Both products then pass over the components in
     order and access the rows, which are few, at random: these stay in the cache.
     """
 
     transposed: CompressedRows  #: (n_p, k)
-    ranks: Ranks
-
-    @classmethod
-    def of(cls, G: csc_array, ranks: Ranks) -> _LocalRows:
-        """Store G (k, n_p)."""
-        return cls(CompressedRows(G.T), ranks)
+    ranks: Ranks | None = None  #: None for one process
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -283,77 +275,28 @@ class _LocalRows:
         return _LocalRowsTransposed(self)
 
     def __matmul__(self, v: Vector) -> Vector:
-        return distributed(self.transposed.transposed_times(v), self.ranks)
+        return self.vector(self.transposed.transposed_times(v))
+
+    def vector(self, part: Vector) -> Vector:
+        """Return an array as a vector over the ranks."""
+        return part if self.ranks is None else distributed(part, self.ranks)
 
 
 @dataclass(frozen=True, eq=False)
 class _LocalRowsTransposed:
-    rows: _LocalRows
+    rows: LocalRows
 
     def __matmul__(self, y: Vector) -> Vector:
-        return distributed(self.rows.transposed @ y, self.rows.ranks)
+        return self.rows.vector(self.rows.transposed @ y)
 
     def combined(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
         """Return sv + tGᵀy, in one pass."""
-        total = self.rows.transposed.combined(s, v, t, y)
-        return distributed(total, self.rows.ranks)
+        return self.rows.vector(self.rows.transposed.combined(s, v, t, y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
         """Return weights times (v − Gᵀy), in one pass."""
         difference = self.rows.transposed.weighted_difference(v, y, weights)
-        return distributed(difference, self.rows.ranks)
-
-
-@dataclass(frozen=True, eq=False)
-class _Bordered:
-    """Factor of S = GGᵀ = LLᵀ in which rows c with bounded components come last.
-
-    L_cc L_ccᵀ is the Schur complement of S on c, and that of (1 + κ)S − G_H G_Hᵀ for
-    active components H is (1 + κ)L_cc L_ccᵀ − (G_H G_Hᵀ)_cc.
-    """
-
-    order: NDArray[np.int64]  #: (r,) permutation of the rows, c last
-    factor: Factor  #: of S in that order
-    L_cc: NDArray[np.float64]
-    #: mask H (n,) of active components → (G_H G_Hᵀ)_cc
-    active_block: Callable[[Mask], NDArray[np.float64]]
-
-    def solver(self, active: Mask, shift: float) -> Callable[[Vector], Vector]:
-        """Return the solution operator of (1 + shift)S − G_H G_Hᵀ, H = `active`."""
-        L_cc, n = self.L_cc, self.order.size
-        inner, scale = slice(0, n - len(L_cc)), 1 + shift
-        changed = scale * (L_cc @ L_cc.T) - self.active_block(active)
-        schur = factor_above(changed, shift, L_cc), True
-
-        def solve(t: Vector) -> Vector:
-            u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
-            u[inner] /= scale
-            u[inner.stop :] = L_cc.T @ cho_solve(schur, L_cc @ u[inner.stop :])
-            s = np.empty(n)
-            s[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
-            return s
-
-        return solve
-
-
-def _bordered(unit: SparseColumns, gram: csc_matrix, bounded: Mask) -> _Bordered | None:
-    last = _gram(unit, bounded).diagonal() > 0
-    c, rest = np.flatnonzero(last), np.flatnonzero(~last)
-    if c.size > MAX_BORDER:
-        return None
-    if rest.size:
-        rest = rest[analyze(with_int32(gram[rest][:, rest]), use_long=False).P()]
-    order = np.concatenate([rest, c])
-    S = with_int32(gram[order][:, order])
-    factor = analyze(S, ordering_method="natural", use_long=False)
-    factor.cholesky_inplace(S)
-    L_cc = factor.L()[rest.size :, rest.size :].toarray()
-    touching = unit[c]
-    if isinstance(touching, DistributedColumns):
-        return _Bordered(
-            order, factor, L_cc, lambda active: touching.gram(active).toarray()
-        )
-    return _Bordered(order, factor, L_cc, OuterProducts.of(touching, bounded).summed)
+        return self.rows.vector(difference)
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,7 +344,7 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    G = G if isinstance(G, DistributedColumns) else csr_array(G)
+    G = G if isinstance(G, DistributedColumns) else csc_array(G)
     rows = _factored(G, e, bounded)
     if rows is not None:
         return rows
@@ -454,29 +397,38 @@ def _consistent(missed: Vector, x_tilde: Vector, e: Vector) -> bool:
     return bool((np.abs(missed) <= CONSISTENCY_TOL * scale).all())
 
 
-def sparse_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows | None:
+def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
     """Factorise GGᵀ of sparse G (m, n); returns None for linearly dependent rows."""
-    size = np.sqrt(_gram(G).diagonal())
+    b = np.flatnonzero(np.asarray(bounded))
+    unit: LocalRows | DistributedColumns
+    of_bounded: LocalRows | DistributedColumns
+    if isinstance(G, DistributedColumns):
+        size = np.sqrt(_gram(G).diagonal())
+        unit = G.scaled(1 / np.where(size > 0, size, 1.0))
+        of_bounded = DistributedColumns(csr_array(unit.part[:, b]), unit.ranks)
+        entries = np.diff(of_bounded.part.indptr)
+        changing = unit.ranks.total(entries.astype(float)) > 0
+    else:
+        G = csc_array(G)
+        by_components, size = CompressedRows.of_transpose(G).unit_columns()
+        unit, of_bounded = LocalRows(by_components), LocalRows(by_components.rows(b))
+        changing = of_bounded.transposed.touched
     if not (size > 0).all():
         return None
-    unit = _scaled(1 / size, G)
-    gram = with_int32(_gram(unit))
-    factor = analyze(gram, use_long=False)
+    gram, has_border = _gram(unit), int(changing.sum()) <= MAX_BORDER
     try:
-        factor.cholesky_inplace(gram)
-    except CholmodNotPositiveDefiniteError:
+        factor = bordered_factor(gram, changing & has_border)
+    except DependentRowsError:
         return None
-    least = float(factor.D().min())  # CHOLMOD accepts negative pivots
-    if least <= RANK:
+    if factor.least_pivot**2 <= RANK:
         return None
-    b = np.flatnonzero(np.asarray(bounded))
-    whole = _Whole(unit, gram, factor, _bordered(unit, gram, bounded))
+    whole = WholeGram(unit, gram, factor, has_border, b, of_bounded)
     return SparseRows(
-        G=G, C=_Factored(unit, whole, len(e)), e_size=float(np.linalg.norm(e)),
-        least_pivot=np.sqrt(least), x_tilde=unit.T @ factor(e / size), consistent=True,
-        multipliers=lambda a: whole.backward(a) / size,
-        unit=unit, gram=whole,
-        bounded=b, of_bounded=_columns(unit, b),
+        G=G, e_size=float(np.linalg.norm(e)), least_pivot=factor.least_pivot,
+        C=_Factored(unit, whole, len(e)),
+        x_tilde=unit.T @ factor(e / size), consistent=True,
+        multipliers=lambda a: factor.backward(a) / size,
+        unit=unit, gram=whole, bounded=b, of_bounded=of_bounded,
     )  # fmt: skip
 
 
@@ -495,10 +447,11 @@ def rows_over_ranks(
         at = touched_rows(np.flatnonzero(np.diff(part.indptr)), ranks)
         if not at.few_shared:
             return sparse_rows(G, e, bounded)
-        rows, here = at.rows, np.asarray(bounded)
+        rows, b = at.rows, np.flatnonzero(np.asarray(bounded))
         unit = csr_array(diags_array(1 / size[rows]) @ part[rows])
-        of_bounded = csc_array(unit)[:, here]
-        changing = np.bincount(of_bounded.indices, minlength=rows.size) > 0
+        by_components = CompressedRows.of_transpose(csc_array(unit))
+        of_bounded = by_components.rows(b)
+        changing = of_bounded.touched
         matrix = csc_array(unit @ unit.T)
         try:
             local = local_factor(matrix, at, changing & ~at.is_shared)
@@ -507,44 +460,36 @@ def rows_over_ranks(
             return None
         if factor.least_pivot <= np.sqrt(RANK):
             return None
-        of_border = OuterProducts.of(csr_array(unit[local.border]), here)
-        gram = _OverRanks(matrix, local, factor, of_border)
+        part_of_bounded = LocalRows(of_bounded, ranks)
+        gram = _OverRanks(matrix, local, factor, b, part_of_bounded)
 
     def multipliers(a: Vector) -> Vector:
         whole = np.zeros(e.size)
         whole[rows] = np.asarray(factor.backward(a)) / at.touching
         return ranks.total(whole) / size
 
-    own = _LocalRows.of(csc_array(unit), ranks)
+    own = LocalRows(by_components, ranks)
     return SparseRows(
         G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
         least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
         x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
-        bounded=np.flatnonzero(here),
-        of_bounded=_LocalRows.of(of_bounded, ranks),
+        bounded=b, of_bounded=part_of_bounded,
     )  # fmt: skip
 
 
-def _gram(G: SparseColumns, columns: Mask | None = None) -> csc_array:
-    """Return G_F G_Fᵀ for the columns F (n,), by default all."""
+def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:
+    """Return G_F G_Fᵀ for the columns F (n,), by default all; small ones as arrays."""
     if isinstance(G, DistributedColumns):
         return G.gram(columns)
+    if isinstance(G, LocalRows):
+        m, n = G.shape
+        if m <= MAX_ARRAY_ROWS:
+            weights = np.ones(n) if columns is None else columns.astype(float)
+            place = np.arange(m, dtype=np.int32)
+            return G.transposed.outer_products(weights, place, m)
+        G = G.transposed.by_columns
     part = G if columns is None else G[:, np.flatnonzero(columns)]
     return csc_array(part @ part.T)
-
-
-def _columns(G: SparseColumns, at: NDArray[np.int64]) -> SparseColumns:
-    """Return the columns `at`."""
-    if isinstance(G, DistributedColumns):
-        return DistributedColumns(csr_array(G.part[:, at]), G.ranks)
-    return csr_array(G[:, at])
-
-
-def _scaled(s: Vector, G: SparseColumns) -> SparseColumns:
-    """Multiply row i by s[i]."""
-    if isinstance(G, DistributedColumns):
-        return G.scaled(s)
-    return csr_array(diags_array(s) @ G)
 
 
 def orthonormal_rows(G: Matrix, e: Vector) -> DenseRows:
