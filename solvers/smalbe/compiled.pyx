@@ -29,9 +29,7 @@ free part is not stored. The loops over vectors are in `vectors.h`.
 """
 
 cimport cython
-from cpython.buffer cimport (
-    PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer,
-)
+cimport numpy as cnp
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.stdlib cimport calloc, free as release_memory, realloc
@@ -46,7 +44,10 @@ from mortarbench.harness.verify cimport scales
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
+from mortarbench.harness import Status
 from mortarbench.solvers.smalbe.extension import Step
+
+cnp.import_array()
 
 cdef extern from "vectors.h" nogil:
     ctypedef struct sparse:
