@@ -3,7 +3,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import QP, Matrix, Solution, Vector
+from mortarbench.harness import QP, Matrix, Solution, Status, Vector
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.solvers.smalbe import rows as orthonormal_rows
 from mortarbench.solvers.smalbe.extension import Operator, StepRule
@@ -27,6 +27,7 @@ class Product:
     def __call__(self, v: Vector) -> Vector: ...
 
 class Rows:
+    n: int
     source: orthonormal_rows.Rows
     def __init__(self, rows: orthonormal_rows.Rows, over: Reduction) -> None: ...
     def fitted(self, free: NDArray[np.bool_], r: Vector) -> Vector: ...
@@ -84,7 +85,7 @@ class SMALBE:
         float,
         float,
         list[tuple[str, float, float, float, float]],
-        str,
+        Status,
     ]: ...
     def point(
         self, nu: Vector, mu: Vector, lb: Vector, ub: Vector
@@ -108,6 +109,7 @@ def homogenised(
     q: Vector,
     lb: Vector,
     ub: Vector,
+    diagonal: Vector,
     norm: float,
-) -> tuple[Vector, tuple[Vector, Vector]]: ...
+) -> tuple[Vector, tuple[Vector, Vector], float]: ...
 def multipliers(m: int, R: Array, kept: Indices, size: Vector, a: Vector) -> Vector: ...

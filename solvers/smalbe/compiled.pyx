@@ -30,9 +30,7 @@ free part is not stored. The loops over vectors are in `vectors.h`.
 """
 
 cimport cython
-from cpython.buffer cimport (
-    PyBUF_C_CONTIGUOUS, PyBUF_FORMAT, PyBuffer_Release, PyObject_GetBuffer,
-)
+cimport numpy as cnp
 from cpython.exc cimport PyErr_CheckSignals
 from libc.math cimport INFINITY, fabs, fmax, fmin, isfinite, isinf, sqrt
 from libc.stdlib cimport calloc, free as release_memory, realloc
@@ -50,8 +48,11 @@ from mortarbench.harness.verify cimport scales
 import numpy as np
 from scipy.sparse import csc_array, csr_array, issparse
 
+from mortarbench.harness import Status
 from mortarbench.harness.operators import linear_map
 from mortarbench.solvers.smalbe.extension import Step
+
+cnp.import_array()
 
 cdef extern from "vectors.h" nogil:
     ctypedef struct sparse:

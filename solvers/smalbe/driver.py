@@ -49,6 +49,10 @@ CLAIM_FACTOR = 5.0
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
 MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
+#: for a single dense P with bounds alone, whose CG takes about ten steps: on duals of
+#: beam-ring and greco with 32 to 722 unknowns, seven or eight take the fewest products
+#: on average, five or twelve up to a half more
+BOUNDS_LANCZOS_STEPS = 7
 #: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
 #: with 1e4 two or three outer iterations suffice
 RHO = 1e4
@@ -85,7 +89,7 @@ class _Task(NamedTuple):
     rho: float  #: penalty ρ
     loop: OuterLoop
     history: History | None
-    start: Iterate
+    carry: Carry | None
 
 
 def prepared(
@@ -98,24 +102,16 @@ def prepared(
     """
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
-    eliminated = None
     kind = resolved_preconditioner(qp, options.preconditioner)
-    automatic = options.preconditioner == "auto"
-    eliminate = options.eliminate == "always" or (
+    inner, scaled, eliminated = qp, None, None
+    if options.eliminate == "always" or (
         in_sequence and options.eliminate == "sequences"
-    )
-    # the functions of a subclass expect the variables of the QP as given
-    if (
-        eliminate
-        and not options.is_extended
-        and (
-            kind in ELIMINATION_PRECONDITIONERS or (kind == "incomplete" and automatic)
-        )
     ):
-        eliminated = _eliminated(qp, carry, always=options.eliminate == "always")
-    scaled = None if eliminated is not None else _scaled(qp, options, kind)
-    inner = qp if eliminated is None else eliminated.qp
-    inner = inner if scaled is None else scaled.qp
+        eliminated = _eliminated(qp, options, kind, carry)
+    if eliminated is not None:
+        inner = eliminated.qp
+    elif (scaled := _scaled(qp, options, kind)) is not None:
+        inner = scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
     steps = _lanczos_steps(options, inner, in_sequence=in_sequence)
@@ -129,28 +125,34 @@ def prepared(
         problem.counts["factorised_columns"] += eliminated.columns
     loop = outer_loop(problem, inner, options, history)
     task = _Task(
-        qp=qp, inner=inner, eliminated=eliminated, scaled=scaled, problem=problem,
-        options=options, rho=rho, loop=loop, history=history,
-        start=_start(problem, loop, options.M, _penalty(rho, tol), carry, scaled),
-    )  # fmt: skip
+        qp, inner, eliminated, scaled, problem, options, rho, loop, history, carry
+    )
     return lambda: _solve_to_tolerance(task, tol)
 
 
 def _scaled(qp: QP, options: Options, kind: Preconditioner) -> Scaled | None:
     """Scale the variables of a sparse QP with bounds, but not for a subclass."""
-    with_factor, automatic = kind == "incomplete", options.preconditioner == "auto"
-    if options.is_extended or not (with_factor or (automatic and scalable(qp))):
+    with_factor = kind == "incomplete"
+    if not with_factor and (options.preconditioner != "auto" or not scalable(qp)):
         return None
-    return Scaled.of(qp, with_factor=with_factor)
+    return None if options.is_extended else Scaled.of(qp, with_factor=with_factor)
 
 
-def _eliminated(qp: QP, carry: Carry | None, *, always: bool) -> Eliminated | None:
+def _eliminated(
+    qp: QP, options: Options, kind: Preconditioner, carry: Carry | None
+) -> Eliminated | None:
     """Eliminate the free variables of a sequence as long as one factor serves all.
 
     If the block differs from that of the previous problem, as in Newton's method, a new
     factor for each problem would cost more than it saves.
     """
-    if always or carry is None:
+    may_follow = kind in ELIMINATION_PRECONDITIONERS or (
+        kind == "incomplete" and options.preconditioner == "auto"
+    )
+    # the functions of a subclass expect the variables of the QP as given
+    if options.is_extended or not may_follow:
+        return None
+    if options.eliminate == "always" or carry is None:
         return eliminate_free(qp, carry and carry.block)
     reduced = None if carry.block is None else eliminate_free(qp, carry.block)
     return None if reduced is None or reduced.columns else reduced
@@ -213,39 +215,34 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 
     Few steps suffice for few unknowns, where more would cost as much as the CG steps;
     and if P offers a preconditioner, since the spectrum of decomposed bodies is flat
-    and only its norm is used. With bounds alone fewer are enough: seven or eight for 73
-    to 85 unknowns save as many products as they cost, of which CG takes about ten. A
-    sequence reuses the spectrum, so that further steps pay there: with fewer, the 24
-    problems of greco/n=32/dual-bounds take 170 products instead of 152.
+    and only its norm is used. With a dense P and bounds alone, BOUNDS_LANCZOS_STEPS are
+    enough. A sequence reuses the spectrum, so that further steps pay there: with fewer,
+    the 24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
     few = qp.q.size // (6 if qp.b.size or in_sequence else 10)
-    if preconditioned_operator(qp):
+    if isinstance(qp.P, np.ndarray):
+        if not qp.b.size and not in_sequence:
+            few = min(few, BOUNDS_LANCZOS_STEPS)
+    elif preconditioned_operator(qp):
         few = MIN_LANCZOS_STEPS
     return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))
 
 
-def _start(
-    problem: Projected,
-    loop: OuterLoop,
-    M: float,
-    rho: float,
-    carry: Carry | None,
-    scaled: Scaled | None,
-) -> Iterate:
+def _start(task: _Task, tol: float) -> Iterate:
     """Start from zero, or from the solution of the previous problem.
 
     A component at a bound there starts at that bound here, even if the bound has moved:
     rows that slip continue to slip when the bound of friction changes.
     """
-    C = problem.rows.C
+    problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
     x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
-        at = carry.x if scaled is None else carry.x * scaled.root
+        at = carry.x if task.scaled is None else carry.x * task.scaled.root
         x = np.where(carry.side < 0, lower, np.where(carry.side > 0, upper, at))
         x = np.where(np.isfinite(x), x, at)
-        mu = C @ carry.force / problem.spectrum.norm
-    return loop.first(x, mu, M=M, rho=rho)
+        mu = problem.rows.C @ carry.force / problem.spectrum.norm
+    return task.loop.first(x, mu, M=task.options.M, rho=rho)
 
 
 def _penalty(rho: float, tol: float) -> float:
@@ -277,12 +274,13 @@ class OuterLoop:
             self.options, tol, at, partial(infeasible, problem.rows, problem.bounds),
             self.watch,
         )  # fmt: skip
-        outer = at.outer + tuple(map(OuterIteration._make, done))
-        return Iterate(nu, g, mu, M, rho, outer, Status(status))
+        outer = (*at.outer, *[OuterIteration(*one) for one in done])
+        return Iterate(nu, g, mu, M, rho, outer, status)
 
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         """Return x, multipliers a of Cx = Cx̃, z_box and Fx; one product."""
-        point = self.solver.point(at.nu, at.mu, qp.lb, qp.ub)
+        box = qp.box
+        point = self.solver.point(at.nu, at.mu, box.lower, box.upper)
         return point or recovered(self.problem, qp, at)
 
 
@@ -317,7 +315,7 @@ def _solve_to_tolerance(
         if worst <= tol:
             break
         at = task.loop.solve(tighter * share * tol / worst * tol, at)
-        if at.status is not Status.SOLVED or not at.nu @ at.nu < np.inf:
+        if at.status is not Status.SOLVED:
             break
         point, Fx = _point(task, at)
         residual = _worst_residual(task, point, Fx, CLAIM_FACTOR * tol)
@@ -334,7 +332,7 @@ def _claimed(
     Returns the result, the worst residual, the iterate to continue from (None if
     nothing can be gained), and the tolerance in units of `tol`.
     """
-    options, at = task.options, task.start
+    options, at = task.options, _start(task, tol)
     tighter, best, waited = 1.0, np.inf, 0
     while True:
         at = task.loop.solve(tighter * tol, at)
@@ -342,9 +340,9 @@ def _claimed(
             message = "no point within the bounds meets the equality rows"
             nowhere = Solution.without_point(task.qp, at.status, message)
             return (nowhere, _nothing), np.inf, None, tighter
-        if not at.nu @ at.nu < np.inf:
+        if at.status is Status.FAILED:
             message = "the iterates diverged"
-            nowhere = Solution.without_point(task.qp, Status.FAILED, message)
+            nowhere = Solution.without_point(task.qp, at.status, message)
             return (nowhere, _nothing), np.inf, None, tighter
         point, Fx = _point(task, at)
         worst = _worst_residual(task, point, Fx, CLAIM_FACTOR * tol)
@@ -399,14 +397,14 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
     qp, problem = task.inner, task.problem
     x, a, z_box, Fx = task.loop.recovered(qp, at)
     letters = at.steps
+    counts = {"P_products": problem.F.count, **problem.counts, "outer": len(at.outer)}
+    for letter, name in STEPS.items():
+        if letter in letters:
+            counts[name] = letters.count(letter)
     point = Solution(
         status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
-        z_box=z_box, iterations=len(letters),
-        counts={
-            "P_products": problem.F.count, **problem.counts, "outer": len(at.outer),
-            **{STEPS[x]: letters.count(x) for x in STEPS if x in letters},
-        },
-        message="converged", history=task.history.columns if task.history else {},
+        z_box=z_box, iterations=len(letters), counts=counts, message="converged",
+        history=task.history.columns if task.history else {},
     )  # fmt: skip
     if task.scaled is not None:
         return task.scaled.recovered(point), Fx * task.scaled.root

@@ -36,11 +36,13 @@ cdef class Judge:
     def __init__(self, qp, scaled, root, diagonal, double norm):
         cdef Py_ssize_t n = len(diagonal)
         self.n, self.norm, self.held = n, norm, []
-        self.q, self.lb = read(qp.q, self.held), read(qp.lb, self.held)
-        self.ub = read(qp.ub, self.held)
+        box, scaled_box = qp.box, scaled.box
+        self.q, self.lb = read(qp.q, self.held), read(box.lower, self.held)
+        self.ub = read(box.upper, self.held)
         if root is not None:
             self.root = read(root, self.held)
-        self.low, self.high = read(scaled.lb, self.held), read(scaled.ub, self.held)
+        self.low = read(scaled_box.lower, self.held)
+        self.high = read(scaled_box.upper, self.held)
         self.diagonal, self.room = read(diagonal, self.held), Room(5 * n)
         self.x = self.room.at
         self.Px, self.forces = self.x + n, self.x + 2 * n

@@ -37,6 +37,8 @@ cdef enum:
     MODEL = 3
     OWN = 4
 
+EXPANSIONS = {"std": STD, "projcg": PROJCG, "mixed": MIXED, "model": MODEL}
+
 
 cdef double change_along(const Line *line, double alpha) noexcept:
     """Return f(x − αp) − f(x)."""

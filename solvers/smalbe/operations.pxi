@@ -4,9 +4,10 @@
 
 # --- numbers ------------------------------------------------------------------------
 #
-# Creating a memoryview takes as long as a pass over a thousand numbers: small problems
-# would spend more time on memoryviews than on products. Arrays are therefore accessed by
-# address, with lengths known to the caller, who also keeps a reference to each array.
+# Creating a memoryview takes as long as a pass over a thousand numbers, and a buffer or an
+# array from Python as one over a hundred: small problems would spend more time on these
+# than on products. Arrays are therefore created and accessed by NumPy's C interface, with
+# lengths known to the caller, who also keeps a reference to each array.
 
 
 @cython.final
@@ -29,14 +30,26 @@ cdef double *address(a) except NULL:
 
     Raises ValueError for other types and for arrays that are not contiguous.
     """
-    cdef Py_buffer buffer
-    cdef bint has_doubles
-    PyObject_GetBuffer(a, &buffer, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT)
-    has_doubles = buffer.format[0] == b"d"[0]
-    PyBuffer_Release(&buffer)
-    if not has_doubles:
-        raise ValueError(f"an array of {a.dtype}; expected float64")
-    return <double *> buffer.buf
+    if cnp.PyArray_Check(a):
+        if (
+            cnp.PyArray_TYPE(a) == cnp.NPY_DOUBLE and cnp.PyArray_IS_C_CONTIGUOUS(a)
+            and cnp.PyArray_ISNOTSWAPPED(a)
+        ):
+            return <double *> cnp.PyArray_DATA(a)
+        raise ValueError(f"an array of {a.dtype}; expected float64, contiguous")
+    raise ValueError(f"a {type(a).__name__}; expected an array")
+
+
+cdef empty(Py_ssize_t n):
+    """Return a new array (n,) of doubles."""
+    cdef cnp.npy_intp size = n
+    return cnp.PyArray_EMPTY(1, &size, cnp.NPY_DOUBLE, 0)
+
+
+cdef zeros(Py_ssize_t n):
+    """Return a new array (n,) of zeros."""
+    cdef cnp.npy_intp size = n
+    return cnp.PyArray_ZEROS(1, &size, cnp.NPY_DOUBLE, 0)
 
 
 def _whole(a):
@@ -58,14 +71,15 @@ cdef const double *read(a, list owners) except NULL:
 
 cdef copied(const double *v, Py_ssize_t n):
     """Return a new array (n,) with a copy of v."""
-    array = np.empty(n)
+    array = empty(n)
     memcpy(address(array), v, n * sizeof(double))
     return array
 
 
 cdef view(const double *v, Py_ssize_t n):
     """Return an array (n,) that shares the memory of v; valid during the call only."""
-    return np.asarray(<double[:n]> <double *> v) if n else np.empty(0)
+    cdef cnp.npy_intp size = n
+    return cnp.PyArray_SimpleNewFromData(1, &size, cnp.NPY_DOUBLE, <void *> v)
 
 
 cdef int copy_result(result, Py_ssize_t n, double *y, str what) except -1:
@@ -156,6 +170,7 @@ cdef class Product:
     cdef Py_ssize_t n
     cdef public long count
     cdef readonly Reduction over
+    cdef bint is_sparse
     cdef object matrix
     cdef const double *dense
     cdef sparse rows  # data is NULL unless P is sparse
@@ -164,12 +179,14 @@ cdef class Product:
 
     def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
         self.n, self.matrix = n, P
-        self.over = over or Reduction()
+        self.over = Reduction() if over is None else over
         if isinstance(P, np.ndarray) and n:
             whole = P if P.flags.c_contiguous else P.T
             self.owners = _whole(whole)
             self.dense = address(self.owners)
-        elif issparse(P) and P.nnz and P.nnz < 2**31:
+            return
+        self.is_sparse = issparse(P)
+        if self.is_sparse and P.nnz and P.nnz < 2**31:
             M = P if P.format in ("csr", "csc") else csr_array(P)  # P is symmetric
             self.hold_rows(M.data, M.indptr, M.indices)
         elif not issparse(P):
@@ -198,7 +215,7 @@ cdef class Product:
 
     def __call__(self, v):
         """Return Pv for v (n,)."""
-        result, vector = np.empty(self.n), _whole(v)
+        result, vector = empty(self.n), _whole(v)
         self.apply(address(vector), address(result))
         return self.over.vector(result)
 
@@ -236,7 +253,8 @@ cdef class Rows:
     over : processes that share vectors (n,)
     """
 
-    cdef Py_ssize_t n, r, m
+    cdef readonly Py_ssize_t n
+    cdef Py_ssize_t r, m
     cdef bint exist  # true if any process has rows
     cdef double e_size, x_tilde_size
     cdef const double *C  # NULL for C = L⁻¹G

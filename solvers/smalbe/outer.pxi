@@ -58,17 +58,18 @@ cdef class SMALBE(MPRGP):
         self.F, self.M, self.counts = problem.F, M, problem.counts
         self.M_map = M if isinstance(M, LinearMap) else None
         self.n, self.over = self.F.n, self.F.over
-        self.norm, self.inverse_norm = spectrum.norm, 1 / spectrum.norm
-        self.M_scale = spectrum.norm
+        self.norm = self.M_scale = spectrum.norm
+        self.inverse_norm = 1 / self.norm
         self.owners, self.rows = [], problem.C
         self.b, self.q = read(problem.b, self.owners), read(problem.q, self.owners)
         lower, upper = read(bounds[0], self.owners), read(bounds[1], self.owners)
         self.set = Box.of(lower, upper, self.n, self.over)
         if len(problem.diagonal):
             self.diagonal = read(problem.diagonal, self.owners)
-        self.alpha, self.Gamma_square = options.alpha, options.Gamma**2
+        self.alpha, self.Gamma_square = options.alpha, options.Gamma
+        self.Gamma_square *= self.Gamma_square
         self.reduced = options.reduced
-        self.expansion = ("std", "projcg", "mixed", "model").index(options.expansion)
+        self.expansion = EXPANSIONS[options.expansion]
         self.step_rule = step_rule
         if step_rule is not None:
             self.expansion = OWN
@@ -76,7 +77,7 @@ cdef class SMALBE(MPRGP):
         self.plain = self.expansion != MODEL
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
-        kept = MAX_DIRECTIONS if options.recycle and not issparse(self.F.matrix) else 0
+        kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
         self.directions = Directions(self.n, kept, self.over)
         self.choose_directions(spectrum.ritz)
         self.make_room()
@@ -198,7 +199,7 @@ cdef class SMALBE(MPRGP):
         """
         cdef Py_ssize_t i, n = self.n
         cdef list owners = []
-        start, gradient = np.empty(n), np.zeros(n)
+        start, gradient = empty(n), zeros(n)
         cdef bint moved = False
         cdef double *nu = address(start)
         cdef double *g = address(gradient)
@@ -243,7 +244,7 @@ cdef class SMALBE(MPRGP):
            as a certificate of infeasibility.
 
         Returns ν, g, μ, M, ρ, the outer iterations as tuples in the order of
-        `OuterIteration`, and the status.
+        `OuterIteration`, and the status: `Status.FAILED` if the iterates diverged.
 
         at : an `Iterate`
         infeasible : ν → True if ν proves that there is no feasible point
@@ -269,7 +270,7 @@ cdef class SMALBE(MPRGP):
         self.coarse_gradient = options.eta * self.b_size
         self.next_judged = FIRST_JUDGED * self.small_gradient
         done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
-        status = "iteration_limit"
+        status = Status.ITERATION_LIMIT
         while True:
             # 1. The inner problem.
             trace, M = bytearray(), self.M_now
@@ -299,7 +300,7 @@ cdef class SMALBE(MPRGP):
                 if growth != 1:
                     self.change_penalty(growth * self.rho)
             if solved:
-                status = "solved"
+                status = Status.SOLVED
                 break
             # 4. Safeguards.
             errors = [*errors, error][len(errors) > 2:]
@@ -307,7 +308,7 @@ cdef class SMALBE(MPRGP):
             if (not stopped or stalled) and infeasible(
                 self.over.vector(copied(self.x, n))
             ):
-                status = "infeasible"
+                status = Status.INFEASIBLE
                 break
             if not stopped or left < 0:
                 break
@@ -320,6 +321,10 @@ cdef class SMALBE(MPRGP):
         if self.factor is not None:
             self.counts["factorisations"] = self.factor.factorisations
             self.counts["preconditioner_applies"] = self.factor.solves
+        if status is not Status.INFEASIBLE and not (
+            self.over.total(dot(self.x, self.x, n)) < INFINITY
+        ):
+            status = Status.FAILED
         nu, g = copied(self.x, n), copied(self.g, n)
         return (self.over.vector(nu), self.over.vector(g),
                 self.rows.over_rows.vector(multipliers), self.M_now, self.rho, done, status)
@@ -417,22 +422,22 @@ cdef class SMALBE(MPRGP):
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
         cdef list owners = []
-        result, multipliers = np.zeros((3, n)), np.zeros(r)
+        restored_x, multipliers, boxes, product = empty(n), zeros(r), zeros(n), empty(n)
         cdef Room room = Room(r * r if self.rows.C else 0)
         cdef double *S = room.at
         cdef const double *C = self.rows.C
         cdef const double *v = address(nu)
         cdef const double *at_mu = address(mu)
         cdef double *a = address(multipliers)
-        cdef double *x = address(result)
-        cdef double *z_box = x + n
-        cdef double *Fx = z_box + n
+        cdef double *x = address(restored_x)
+        cdef double *z_box = address(boxes)
+        cdef double *Fx = address(product)
         cdef double *rest = self.s
         cdef double *free = self.x2
         cdef double *t = self.t
         cdef double *da = self.Cv
-        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper, read(lb, owners),
-                 read(ub, owners), x, free, n)
+        restored(v, self.rows.x_tilde, self.set.lower, self.set.upper,
+                 read(lb, owners), read(ub, owners), x, free, n)
         self.F.apply(x, Fx)
         for i in range(n):
             rest[i] = Fx[i] + self.q[i]
@@ -468,5 +473,7 @@ cdef class SMALBE(MPRGP):
             add_combination(-1.0, C, da, rest, r, n)
         if any_left:  # else a minimum of the cost without any constraint
             bound_multipliers(v, self.set.lower, self.set.upper, rest, z_box, n)
-        x_array, z_array, Fx_array = map(self.over.vector, result)
+        x_array, z_array, Fx_array = map(
+            self.over.vector, (restored_x, boxes, product)
+        )
         return x_array, self.rows.over_rows.vector(multipliers), z_array, Fx_array

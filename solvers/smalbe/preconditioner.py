@@ -66,6 +66,8 @@ def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:
     """Resolve ``auto``: dirichlet if offered, a cheap factor, else model."""
     if kind != "auto":
         return kind
+    if isinstance(qp.P, np.ndarray):
+        return "model"
     if preconditioned_operator(qp):
         return "dirichlet"
     return "incomplete" if has_sparse_factor(qp) else "model"

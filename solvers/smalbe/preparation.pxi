@@ -175,11 +175,11 @@ def lanczos(Product F, Rows C, start, int steps):
         if kept == FLAT_STEPS and is_flat(diagonal, off):
             break
     if not kept:
-        return np.zeros(1), np.zeros(1), np.zeros((1, n)), 0.0
+        return zeros(1), zeros(1), np.zeros((1, n)), 0.0
     at_start = diagonal[0]
     beta = off[kept - 1]
     dstev(b"V", &kept, diagonal, off, S, &kept, space, &info)
-    values, residuals = np.empty(kept), np.empty(kept)
+    values, residuals = empty(kept), empty(kept)
     value, residual = address(values), address(residuals)
     for i in range(kept):  # in descending order
         k = kept - 1 - i
@@ -199,34 +199,51 @@ def lanczos(Product F, Rows C, start, int steps):
 cdef double RITZ_RESIDUAL = 1e-3
 
 
-def homogenised(Product F, Rows C, q, lb, ub, double norm):
-    """Return b (n,) and the bounds of ν = x − x̃; one product, unless x̃ = 0."""
-    cdef Py_ssize_t i, n = F.n
+# 𝒫F𝒫 counts as zero if its norm is below this times the mean eigenvalue of F: some
+# hundred times 2⁻⁵³.
+cdef double NORM_ROUNDING = 1e-13
+
+
+def homogenised(Product F, Rows C, q, lb, ub, diagonal, double norm):
+    """Return b (n,), the bounds of ν = x − x̃, and the norm; one product, unless x̃ = 0.
+
+    diagonal : of F (n,), empty if unknown
+    norm : of 𝒫F𝒫; if it is zero up to rounding, the mean eigenvalue of F replaces it
+    """
+    cdef Py_ssize_t i, n = F.n, known = len(diagonal)
     cdef list owners = []
     cdef Reduction over = F.over
     cdef Room room = Room(C.r)
-    result = np.zeros((3, n))
+    result, lower, upper = zeros(n), empty(n), empty(n)
     cdef const double *shift = C.x_tilde
     cdef const double *cost = read(q, owners)
     cdef const double *low = read(lb, owners)
     cdef const double *high = read(ub, owners)
+    cdef const double *d = read(diagonal, owners)
     cdef double *b = address(result)
-    cdef double square[2]
+    cdef double *l = address(lower)
+    cdef double *u = address(upper)
+    cdef double sums[4]  # ‖d − Fx̃‖², ‖𝒫(d − Fx̃)‖², the trace, its components
+    cdef double mean
     cdef bint moved = False
-    square[:] = [0.0, 0.0]
+    sums[0] = sums[2] = 0.0
     for i in range(n):
-        b[n + i], b[2 * n + i] = low[i] - shift[i], high[i] - shift[i]
-        moved = moved or shift[i] != 0
+        l[i], u[i] = low[i] - shift[i], high[i] - shift[i]
+        moved |= shift[i] != 0
     if over.any(moved):
         F.apply(shift, b)
     for i in range(n):
         b[i] = -cost[i] - b[i]
-        square[0] += b[i] * b[i]
+        sums[0] += b[i] * b[i]
     C.project(b, room.at)
-    square[1] = dot(b, b, n)
-    over.add(square, 2)
-    if square[1] <= 1e-28 * square[0]:
+    for i in range(known):
+        sums[2] += d[i]
+    sums[1], sums[3] = dot(b, b, n), known
+    over.add(sums, 4)
+    if sums[1] <= 1e-28 * sums[0]:
         memset(b, 0, n * sizeof(double))  # d was in the span of Cᵀ up to rounding
+    mean = sums[2] / fmax(sums[3], 1.0)
+    if not norm > NORM_ROUNDING * mean:
+        norm = mean or 1.0
     scale(1 / norm, b, n)
-    bounds = over.vector(result[1]), over.vector(result[2])
-    return over.vector(result[0]), bounds
+    return over.vector(result), (over.vector(lower), over.vector(upper)), norm

@@ -24,8 +24,6 @@ from mortarbench.solvers.smalbe.rows import (
 )
 from mortarbench.solvers.smalbe.spectrum import Ritz, power_method, random_start
 
-NORM_ROUNDING = 1e-13  #: 𝒫F𝒫 counts as zero if its norm is below this times ‖F‖
-
 
 class Spectrum(NamedTuple):
     """The norm and the upper end of the spectrum of 𝒫F𝒫."""
@@ -96,17 +94,22 @@ def projected_problem(
 
     find : estimates the spectrum of 𝒫F𝒫: `by_lanczos`, `by_power`, or a stored result
     """
-    over = Reduction()
+    over, whole = Reduction(), True
     if isinstance(qp.q, DistributedVector):
-        over = Reduction(qp.q.ranks, distributed)
+        over, whole = Reduction(qp.q.ranks, distributed), False
     F = Product(qp.P, qp.q.size, over)
-    if is_sparse(qp.A):
-        rows = equality_rows(qp.A, qp.b, has_bound(qp))
-    else:
+    rows: Rows
+    if (whole and not qp.b.size) or not is_sparse(qp.A):
         rows = orthonormal_rows(qp.A, qp.b)
+    else:
+        rows = equality_rows(qp.A, qp.b, has_bound(qp))
     C, diagonal = compiled.Rows(rows, over), _diagonal(qp)
-    spectrum = _not_vanishing(find(F, C), diagonal)
-    b, bounds = compiled.homogenised(F, C, qp.q, qp.lb, qp.ub, spectrum.norm)
+    spectrum, box = find(F, C), qp.box
+    b, bounds, norm = compiled.homogenised(
+        F, C, qp.q, box.lower, box.upper, diagonal, spectrum.norm
+    )
+    if norm != spectrum.norm:
+        spectrum = spectrum._replace(norm=norm)
     return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal)
 
 
@@ -118,18 +121,9 @@ def _diagonal(qp: QP) -> Vector:
     return np.zeros(0) if diagonal is None else np.array(diagonal)
 
 
-def _not_vanishing(spectrum: Spectrum, diagonal: Vector) -> Spectrum:
-    """Replace a norm that is zero up to rounding by the mean eigenvalue of P."""
-    mean = float(np.add.reduce(diagonal)) / max(diagonal.size, 1)
-    if spectrum.norm > NORM_ROUNDING * mean:
-        return spectrum
-    return spectrum._replace(norm=mean or 1.0)
-
-
 def by_lanczos(F: Product, C: compiled.Rows, *, steps: int) -> Spectrum:
     """Estimate the norm and the upper Ritz pairs by `steps` products."""
-    start = random_start(C.source.x_tilde.size)
-    ritz = Ritz(*compiled.lanczos(F, C, start, steps))
+    ritz = Ritz(*compiled.lanczos(F, C, random_start(C.n), steps))
     return Spectrum(ritz.norm or 1.0, ritz)
 
 

@@ -35,8 +35,9 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     cdef const double *y = read(s.y, owners)
     cdef const double *z = read(s.z_box, owners)
     cdef const double *Fx = read(Px, owners)
-    cdef const double *lb = read(qp.lb, owners)
-    cdef const double *ub = read(qp.ub, owners)
+    box = qp.box
+    cdef const double *lb = read(box.lower, owners)
+    cdef const double *ub = read(box.upper, owners)
     cdef const double *e = read(qp.b, owners)
     # 1. The forces Gᵀy + z, and the energy.
     if is_dense:

@@ -24,7 +24,7 @@ class Ritz(NamedTuple):
     @property
     def norm(self) -> float:
         """θ₁ plus its residual, an upper bound of the eigenvalue near θ₁."""
-        return float(self.values[0] + self.residuals[0])
+        return float(self.values.item(0) + self.residuals.item(0))
 
 
 @lru_cache(maxsize=8)

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 from scipy.sparse import issparse
 
-from mortarbench.harness import QP, Vector
+from mortarbench.harness import QP, Status, Vector
 from mortarbench.solvers.smalbe.driver import History, recovered
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import (
@@ -44,7 +45,10 @@ class TextbookLoop:
         return first_iterate(self.problem, x, mu, M=M, rho=rho)
 
     def solve(self, tol: float, at: Any) -> Any:
-        return smalbe(self.problem, self.constants, self.inner, tol, at)
+        at = smalbe(self.problem, self.constants, self.inner, tol, at)
+        if at.status is not Status.INFEASIBLE and not at.nu @ at.nu < np.inf:
+            return at._replace(status=Status.FAILED)
+        return at
 
     def recovered(self, qp: QP, at: Iterate) -> tuple[Vector, Vector, Vector, Vector]:
         return recovered(self.problem, qp, at)

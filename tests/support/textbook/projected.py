@@ -14,7 +14,7 @@ from mortarbench.solvers.common.conversion import has_bound
 from mortarbench.solvers.smalbe import projected
 from mortarbench.solvers.smalbe import rows as given
 from mortarbench.solvers.smalbe.compiled import Product, Reduction, Rows
-from mortarbench.solvers.smalbe.projected import Spectrum, _diagonal, _not_vanishing
+from mortarbench.solvers.smalbe.projected import Spectrum, _diagonal
 from mortarbench.solvers.smalbe.rows import equality_rows, is_sparse
 from mortarbench.solvers.smalbe.spectrum import Ritz, random_start
 from tests.support.textbook import kernels
@@ -105,7 +105,9 @@ def projected_problem(
         rows = orthonormal_rows(qp.A, qp.b)
     spectrum = find(lambda v: rows.project(F(rows.project(v))), rows)
     diagonal = _diagonal(qp)
-    spectrum = _not_vanishing(spectrum, diagonal)
+    mean = diagonal.mean() if diagonal.size else 0.0
+    if not spectrum.norm > 1e-13 * mean:
+        spectrum = spectrum._replace(norm=mean or 1.0)
     d = -qp.q - F(rows.x_tilde) if rows.x_tilde.any() else -qp.q
     bounds = (qp.lb - rows.x_tilde, qp.ub - rows.x_tilde)
     b = rows.project(d) / spectrum.norm
