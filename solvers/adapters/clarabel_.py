@@ -9,28 +9,24 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from scipy.sparse import triu, vstack
+from scipy.sparse import triu
 
 from mortarbench.harness import (
     QP,
     About,
-    Box,
-    Discs,
     Solution,
     Status,
     needs_matrices,
 )
 from mortarbench.solvers.common.conversion import (
+    CONIC_SETS,
     check_positive,
-    conic,
     csc,
-    from_conic,
-    from_one_sided,
     objective_factor,
-    one_sided,
+    to_cone,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -62,7 +58,7 @@ class Clarabel:
 
     max_iter: int = 200
 
-    accepts: ClassVar[tuple[type, ...]] = (Box, Discs)
+    accepts: ClassVar[tuple[type, ...]] = CONIC_SETS
     about: ClassVar[About] = About(
         title="Clarabel",
         method="interior point (homogeneous embedding)",
@@ -89,15 +85,12 @@ class Clarabel:
     def _begin(self, qp: QP, tol: float, *, presolve: bool) -> Session:
         import clarabel
 
-        m = qp.b.size
-        linear, sides = one_sided(qp)
-        discs, radii = conic(qp)
-        rows, rhs = csc(vstack([linear, discs])), np.append(sides, radii)
-        cones = [clarabel.ZeroConeT(m), clarabel.NonnegativeConeT(sides.size - m)]
-        for one in qp.sets[1:]:
-            assert isinstance(one, Discs)
-            size = 1 + one.index.shape[1]
-            cones += [clarabel.SecondOrderConeT(size)] * len(one.index)
+        form = to_cone(qp)
+        cones = [
+            clarabel.ZeroConeT(form.equalities),
+            clarabel.NonnegativeConeT(form.inequalities),
+            *map(clarabel.SecondOrderConeT, form.cones.tolist()),
+        ]
         settings = clarabel.DefaultSettings()
         settings.verbose = False
         settings.max_threads = 1
@@ -106,22 +99,20 @@ class Clarabel:
         settings.presolve_enable = presolve  # presolved problems cannot be updated
         scale = objective_factor(qp)
         P = csc(triu(csc(qp.P))) * scale
-        solver = clarabel.DefaultSolver(P, qp.q * scale, rows, rhs, cones, settings)
-
-        def split(z: Any) -> dict[str, Any]:
-            parts = from_one_sided(qp, z[: sides.size])
-            return parts | {"z_box": parts["z_box"] + from_conic(qp, z[sides.size :])}
+        solver = clarabel.DefaultSolver(
+            P, qp.q * scale, form.rows, form.rhs, cones, settings
+        )
 
         def solve() -> Solution:
             r = solver.solve()
             status = CLAIMS.get(str(r.status), Status.FAILED)
             if status is Status.INFEASIBLE:
                 is_primal = str(r.status) == PRIMAL
-                ray = split(np.array(r.z)) if is_primal else {}
+                ray = form.multipliers(np.array(r.z)) if is_primal else {}
                 return Solution.without_point(qp, status, str(r.status), **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), **split(np.array(r.z) / scale),
+                x=np.array(r.x), **form.multipliers(np.array(r.z) / scale),
                 iterations=r.iterations, message=str(r.status),
                 reported={
                     "linear_solver": solver.get_info().linsolver.name,
@@ -130,8 +121,6 @@ class Clarabel:
             )  # fmt: skip
 
         def update(new: QP) -> None:
-            solver.update(
-                q=new.q * scale, b=np.append(one_sided(new)[1], conic(new)[1])
-            )
+            solver.update(q=new.q * scale, b=to_cone(new).rhs)
 
         return Session(solve, update)

@@ -14,13 +14,13 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Matrix, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    CONIC_SETS,
     check_positive,
     csc,
     dense,
-    from_one_sided,
     needs_independent_rows,
     objective_factor,
-    one_sided,
+    to_cone,
 )
 
 
@@ -36,6 +36,7 @@ class CVXOPT:
 
     max_iter: int = 200
 
+    accepts: ClassVar[tuple[type, ...]] = CONIC_SETS
     about: ClassVar[About] = About(
         title="CVXOPT",
         method="interior point (path following)",
@@ -64,8 +65,9 @@ class CVXOPT:
         from cvxopt import solvers
 
         is_dense = isinstance(qp.P, np.ndarray)
-        m, scale = qp.b.size, objective_factor(qp)
-        rows, rhs = one_sided(qp)
+        form, scale = to_cone(qp), objective_factor(qp)
+        rows, rhs, m = form.rows, form.rhs, form.equalities
+        dims = dict(l=form.inequalities, q=form.cones.tolist(), s=[])
         blocks = [
             _matrix(cvxopt, M, is_dense) for M in (qp.P * scale, rows[m:], rows[:m])
         ]
@@ -78,7 +80,7 @@ class CVXOPT:
         def solve() -> Solution:
             P, G, A = blocks
             try:
-                r = solvers.qp(P, q, G, h, A, b, options=options)
+                r = solvers.coneqp(P, q, G, h, dims, A, b, options=options)
             except (ValueError, ArithmeticError) as e:  # breakdown of a factorisation
                 return Solution.without_point(qp, Status.FAILED, str(e))
             v = np.concatenate([np.ravel(r["y"]), np.ravel(r["z"])]) / scale
@@ -86,7 +88,7 @@ class CVXOPT:
             failed = Status.ITERATION_LIMIT if done else Status.FAILED
             return Solution(
                 status=Status.SOLVED if r["status"] == "optimal" else failed,
-                x=np.ravel(r["x"]), **from_one_sided(qp, v),
+                x=np.ravel(r["x"]), **form.multipliers(v),
                 iterations=r["iterations"], message=r["status"],
                 reported={"linear_solver": "lapack" if is_dense else "cholmod"},
             )  # fmt: skip

@@ -7,21 +7,24 @@ optimization, J. Mach. Learn. Res. 17(83) (2016) 1-5.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mortarbench.harness import QP, About, Solution, Status, needs_matrices
+from mortarbench.harness import QP, About, Box, Solution, Status, needs_matrices
 from mortarbench.solvers.common.backends import Call, adapter_files, reason_unavailable
 from mortarbench.solvers.common.conversion import (
+    CONIC_SETS,
     DIVERGED,
     NEGLIGIBLE,
+    ConicForm,
     csc,
     objective_factor,
-    on_present_bounds,
+    to_cone,
 )
 
 #: calls of backends; a backend that is not listed runs with cvxpy's defaults
@@ -47,6 +50,7 @@ CALLS: Mapping[str, Call] = {
     "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
 }  # fmt: skip
 
+SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends for discs and cones
 CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
 LINEAR = "takes linear programs only"
 DECLINED_BACKENDS: Mapping[str, str] = {
@@ -94,6 +98,11 @@ class CVXPY:
         ),
     )
 
+    @property
+    def accepts(self) -> tuple[type, ...]:
+        """Convex sets that the backend accepts."""
+        return CONIC_SETS if self.backend in SECOND_ORDER else (Box,)
+
     @staticmethod
     def backends() -> tuple[str, ...]:
         """Return the names of all backends of cvxpy, installed or not."""
@@ -102,16 +111,17 @@ class CVXPY:
     def declines(self, qp: QP) -> str | None:
         if reason := reason_unavailable("cvxpy", self.backend, _files()):
             return reason
-        if self.backend == "SCS" and sum(qp.sizes.values()) == qp.q.size:
+        has_rows = len(qp.sets) > 1 or sum(qp.sizes.values()) > qp.q.size
+        if self.backend == "SCS" and not has_rows:
             return "needs a row or a bound"
         return DECLINED_BACKENDS.get(self.backend) or needs_matrices(qp)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         import cvxpy
 
-        call = CALLS.get(self.backend, Call())
+        call, form = CALLS.get(self.backend, Call()), to_cone(qp)
         options, scale = call.options(tol), objective_factor(qp, call.size)
-        problem, x, constraints = _model(cvxpy, qp, scale)
+        problem, x, constraints = _model(cvxpy, qp, form, scale)
         data, chain, inverse = problem.get_problem_data(
             self.backend, solver_opts=dict(options)
         )
@@ -131,7 +141,7 @@ class CVXPY:
                 return Solution.without_point(qp, status, problem.status)
             if status is Status.SOLVED and np.abs(x.value).max() > DIVERGED:
                 return Solution.without_point(qp, Status.FAILED, "diverged")
-            return _solution(qp, status, problem, x, constraints, scale)
+            return _solution(form, status, problem, x, constraints, scale)
 
         return solve
 
@@ -143,45 +153,43 @@ def _files() -> dict[str, Path]:
     return {name.upper(): path for name, path in sorted({**conic, **quadratic}.items())}
 
 
-def _model(cvxpy: Any, qp: QP, scale: float) -> tuple[Any, Any, dict[str, Any]]:
-    """Return the cvxpy problem, its variable and its constraints by name."""
-    x = cvxpy.Variable(qp.q.size)
-    low, up = np.isfinite(qp.lb), np.isfinite(qp.ub)
-    constraints = {}
-    if qp.b.size:
-        constraints["y"] = csc(qp.A) @ x == qp.b
-    if qp.h.size:
-        constraints["z"] = csc(qp.G) @ x <= qp.h
-    if low.any():
-        constraints["low"] = x[np.flatnonzero(low)] >= qp.lb[low]
-    if up.any():
-        constraints["up"] = x[np.flatnonzero(up)] <= qp.ub[up]
+def _model(
+    cvxpy: Any, qp: QP, form: ConicForm, scale: float
+) -> tuple[Any, Any, list[tuple[NDArray[np.int64], Any]]]:
+    """Return the problem, its variable, and constraints with the rows of each."""
+    x, rows = cvxpy.Variable(qp.q.size), form.rows.tocsr()
     # assume_PSD: otherwise cvxpy computes eigenvalues of P to prove convexity
     energy = cvxpy.quad_form(x, csc(qp.P) * scale, assume_PSD=True)
     objective = cvxpy.Minimize(0.5 * energy + (qp.q * scale) @ x)
-    return cvxpy.Problem(objective, list(constraints.values())), x, constraints
+    equal, less = np.split(np.arange(form.linear), [form.equalities])
+    constraints = []
+    if equal.size:
+        constraints.append((equal, rows[equal] @ x == form.rhs[equal]))
+    if less.size:
+        constraints.append((less, rows[less] @ x <= form.rhs[less]))
+    for size in np.unique(form.cones):  # cvxpy takes many cones of one size at a time
+        heads = form.heads[form.cones == size]
+        tails = (heads[:, None] + np.arange(1, size)).ravel()
+        t, w = (form.rhs[place] - rows[place] @ x for place in (heads, tails))
+        W = cvxpy.reshape(w, (heads.size, size - 1), order="C")
+        constraints.append((np.append(heads, tails), cvxpy.SOC(t, W, axis=1)))
+    return cvxpy.Problem(objective, [one for _, one in constraints]), x, constraints
 
 
 def _solution(
-    qp: QP,
+    form: ConicForm,
     status: Status,
     problem: Any,
     x: Any,
-    constraints: Mapping[str, Any],
+    constraints: Sequence[tuple[NDArray[np.int64], Any]],
     scale: float,
 ) -> Solution:
-    sizes = {"y": qp.b.size, "z": qp.h.size, "low": 0, "up": 0}
-    y, z, low, up = (
-        np.ravel(constraints[name].dual_value) / scale
-        if name in constraints
-        else np.zeros(k)
-        for name, k in sizes.items()
-    )
-    z_box = np.zeros(qp.q.size)
-    z_box[np.isfinite(qp.ub)] += up
-    z_box[np.isfinite(qp.lb)] -= low
+    v = np.zeros(form.rhs.size)
+    for place, constraint in constraints:
+        dual = constraint.dual_value
+        parts = dual if isinstance(dual, list) else [dual]
+        v[place] = np.concatenate([np.ravel(part) for part in parts]) / scale
     return Solution(
-        status=status,
-        x=np.ravel(x.value), y=y, z=z, z_box=on_present_bounds(qp, z_box),
+        status=status, x=np.ravel(x.value), **form.multipliers(v),
         iterations=problem.solver_stats.num_iters, message=problem.status,
     )  # fmt: skip

@@ -14,13 +14,13 @@ import numpy as np
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    CONIC_SETS,
     DIVERGED,
     NEGLIGIBLE,
     check_positive,
     csc,
-    from_one_sided,
     objective_factor,
-    one_sided,
+    to_cone,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -44,6 +44,7 @@ class QOCO:
 
     max_iter: int = 200
 
+    accepts: ClassVar[tuple[type, ...]] = CONIC_SETS
     about: ClassVar[About] = About(
         title="QOCO",
         method="interior point",
@@ -74,15 +75,15 @@ class QOCO:
     def _begin(self, qp: QP, tol: float) -> Session:
         import qoco
 
-        m = qp.b.size
-        rows, rhs = one_sided(qp)
-        k, scale = rhs.size - m, objective_factor(qp)
+        form, scale = to_cone(qp), objective_factor(qp)
+        rows, rhs, m = form.rows, form.rhs, form.equalities
+        k = rhs.size - m
         solver = qoco.QOCO()
         solver.setup(
             qp.q.size, k, m, csc(qp.P) * scale, qp.q * scale,
             csc(rows[:m]) if m else None, rhs[:m] if m else None,
             csc(rows[m:]) if k else None, rhs[m:] if k else None,
-            k, 0, None,
+            form.inequalities, form.cones.size, form.cones.astype(np.int32),
             abstol=NEGLIGIBLE, reltol=tol, abstol_inacc=NEGLIGIBLE,
             reltol_inacc=tol, max_iters=self.max_iter, verbose=0,
         )  # fmt: skip
@@ -95,7 +96,7 @@ class QOCO:
                 return Solution.without_point(qp, Status.FAILED, "diverged")
             return Solution(
                 status=status,
-                x=x, **from_one_sided(qp, v),
+                x=x, **form.multipliers(v),
                 iterations=r.iters, message=r.status,
                 counts={"refinement_steps": r.ir_iters},
                 reported={
@@ -106,7 +107,7 @@ class QOCO:
             )  # fmt: skip
 
         def update(new: QP) -> None:
-            rhs = one_sided(new)[1]
+            rhs = to_cone(new).rhs
             solver.update_vector_data(
                 new.q * scale, rhs[:m] if m else None, rhs[m:] if k else None
             )

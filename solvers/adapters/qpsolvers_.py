@@ -114,9 +114,8 @@ class QPSolvers:
             "its own, which claims that a strictly convex one is unbounded "
             "(conformance, shape 'unconstrained'); they are declined.",
             "No iterations from clarabel, cvxopt, daqp, highs, quadprog and sip.",
-            "ecos reaches half of the digits (dual residuals of 1e-5 at tol 1e-9, by "
-            "the conformance suite) and pyqpmad gives wrong multipliers for fixed "
-            "variables (dual residual 0.35); neither is installed.",
+            "ecos reaches half of the digits (use our adapter `ecos`), and pyqpmad, "
+            "not installed, gives wrong multipliers for fixed variables.",
         ),
     )
 

@@ -15,11 +15,9 @@ from mortarbench.harness import QP, About, Solution, Status, Vector, needs_matri
 from mortarbench.solvers.common.conversion import (
     check_choice,
     check_positive,
-    conic_point,
     csc,
-    from_one_sided,
     objective_factor,
-    one_sided,
+    to_cone,
 )
 from mortarbench.solvers.common.sequence import Session, chain, tightening
 
@@ -90,11 +88,11 @@ class QTQP:
     def _begin(self, qp: QP, tol: float) -> Session:
         import qtqp
 
-        rows, rhs = one_sided(qp)
+        form = to_cone(qp)
         scale = objective_factor(qp)
         kind = qtqp.LinearSolver[self.linear_solver.upper()]
         solver = qtqp.QTQP(
-            a=rows, b=rhs, c=qp.q * scale, z=qp.b.size, p=csc(qp.P) * scale
+            a=form.rows, b=form.rhs, c=qp.q * scale, z=qp.b.size, p=csc(qp.P) * scale
         )
         start: tuple[Vector, Vector, Vector] | None = None
 
@@ -107,11 +105,11 @@ class QTQP:
             message = r.status.value
             status = CLAIMS.get(message, Status.FAILED)
             if status is Status.INFEASIBLE:
-                ray = from_one_sided(qp, np.array(r.y)) if message == PRIMAL else {}
+                ray = form.multipliers(np.array(r.y)) if message == PRIMAL else {}
                 return Solution.without_point(qp, status, message, **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), **from_one_sided(qp, np.array(r.y) / scale),
+                x=np.array(r.x), **form.multipliers(np.array(r.y) / scale),
                 iterations=len(r.stats) - 1, message=message,
                 counts={"accepted_starts": int(solver.warm_accepted)} if start else {},
                 reported={"linear_solver": self.linear_solver},
@@ -120,7 +118,7 @@ class QTQP:
         def start_at(s: Solution) -> None:
             nonlocal start
             # the slack of this QP, not of the last: if x is feasible, Rx + s = r
-            x, y, slack = conic_point(qp, s)
+            x, y, slack = form.point(s)
             start = x, y * scale, slack
 
         return Session(solve, start=start_at)

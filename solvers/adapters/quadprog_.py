@@ -16,11 +16,10 @@ from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from mortarbench.harness import QP, About, Solution, Status
 from mortarbench.solvers.common.conversion import (
     dense,
-    from_one_sided,
     needs_dense,
     needs_independent_rows,
     objective_factor,
-    one_sided,
+    to_cone,
 )
 
 #: smallest pivot, relative to the largest, of a Hessian that counts as definite
@@ -69,14 +68,14 @@ class Quadprog:
         if pivots.min() < MIN_PIVOT * pivots.max():
             return lambda: _declined(qp, "P is singular to working precision")
         inverse = solve_triangular(L, np.eye(len(L)), lower=True).T
-        rows, rhs = one_sided(qp)
-        C = -rows.toarray().T
+        form = to_cone(qp)
+        C, rhs = -form.rows.toarray().T, form.rhs
         a = -qp.q * scale
 
         def solve() -> Solution:
             constraints = (C, -rhs, qp.b.size) if rhs.size else (None, None, 0)
             try:
-                x, _, _, iterations, multipliers, _ = quadprog.solve_qp(
+                x, _, _, iterations, v, _ = quadprog.solve_qp(
                     inverse, a, *constraints, factorized=True
                 )
             except ValueError as e:
@@ -84,7 +83,7 @@ class Quadprog:
                 status = Status.INFEASIBLE if infeasible else Status.FAILED
                 return Solution.without_point(qp, status, str(e))
             return Solution(
-                status=Status.SOLVED, x=x, **from_one_sided(qp, multipliers / scale),
+                status=Status.SOLVED, x=x, **form.multipliers(v[: rhs.size] / scale),
                 iterations=int(iterations[0]), message="solved",
                 counts={"dropped_rows": int(iterations[1])},
                 reported={"linear_solver": "dense cholesky, updated qr"},

@@ -14,13 +14,12 @@ from scipy.sparse import triu
 
 from mortarbench.harness import QP, About, Solution, Status, needs_matrices
 from mortarbench.solvers.common.conversion import (
+    CONIC_SETS,
     NEGLIGIBLE,
     check_choice,
     check_positive,
-    conic_point,
     csc,
-    from_one_sided,
-    one_sided,
+    to_cone,
 )
 from mortarbench.solvers.common.sequence import Session, chain
 
@@ -41,12 +40,14 @@ class SCS:
     SCS stops when the max norms of the primal and dual residuals and the duality gap
     are below eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a
     negligible eps_abs. The test is evaluated every 25 iterations. Equalities go to the
-    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone.
+    zero cone; inequalities and finite bounds, one row each, to the nonnegative cone;
+    discs and cones to second-order cones.
     """
 
     linear_solver: str = "auto"  #: "auto" (MKL Pardiso on Linux), "mkl" or "qdldl"
     max_iter: int = 1_000_000
 
+    accepts: ClassVar[tuple[type, ...]] = CONIC_SETS
     about: ClassVar[About] = About(
         title="SCS",
         method="operator splitting (homogeneous embedding, Anderson acceleration)",
@@ -64,7 +65,8 @@ class SCS:
         check_choice("linear_solver", self.linear_solver, ("auto", "mkl", "qdldl"))
 
     def declines(self, qp: QP) -> str | None:
-        if not any(qp.sizes[k] for k in ("equalities", "inequalities", "bounds")):
+        rows = ("equalities", "inequalities", "bounds")
+        if len(qp.sets) == 1 and not any(qp.sizes[k] for k in rows):
             return "needs a row or a bound: its cone must not be empty"
         return needs_matrices(qp)
 
@@ -77,11 +79,10 @@ class SCS:
     def _begin(self, qp: QP, tol: float) -> Session:
         import scs
 
-        m = qp.b.size
-        rows, rhs = one_sided(qp)
+        form = to_cone(qp)
         solver = scs.SCS(
-            dict(P=csc(triu(csc(qp.P))), A=rows, b=rhs, c=qp.q.copy()),
-            dict(z=m, l=rhs.size - m),
+            dict(P=csc(triu(csc(qp.P))), A=form.rows, b=form.rhs, c=qp.q.copy()),
+            dict(z=form.equalities, l=form.inequalities, q=form.cones.tolist()),
             linear_solver=scs.LinearSolver(self.linear_solver),
             eps_abs=NEGLIGIBLE, eps_rel=tol, eps_infeas=CERTIFICATE,
             max_iters=self.max_iter, verbose=False,
@@ -90,16 +91,16 @@ class SCS:
 
         def solve() -> Solution:
             point = starts.pop() if starts else None
-            x, y, s = conic_point(qp, point) if point else (None, None, None)
+            x, y, s = form.point(point) if point else (None, None, None)
             r = solver.solve(warm_start=True, x=x, y=y, s=s)
             info = r["info"]
             status = CLAIMS.get(info["status_val"], Status.FAILED)
             if status is Status.INFEASIBLE:
                 is_primal = info["status_val"] == PRIMAL
-                ray = from_one_sided(qp, r["y"]) if is_primal else {}
+                ray = form.multipliers(r["y"]) if is_primal else {}
                 return Solution.without_point(qp, status, info["status"], **ray)
             return Solution(
-                status=status, x=r["x"], **from_one_sided(qp, r["y"]),
+                status=status, x=r["x"], **form.multipliers(r["y"]),
                 iterations=info["iter"], message=info["status"],
                 counts={
                     "scale_updates": info["scale_updates"],
@@ -113,6 +114,6 @@ class SCS:
             )  # fmt: skip
 
         def update(new: QP) -> None:
-            solver.update(b=one_sided(new)[1], c=new.q.copy())
+            solver.update(b=to_cone(new).rhs, c=new.q.copy())
 
         return Session(solve, update, starts.append)

@@ -1,24 +1,31 @@
 """Conversion between QPs and the forms of solver libraries: matrices and multipliers.
 
 Libraries take a QP in one of two forms, for which multipliers are converted back:
-`two_sided`, low ≤ Rx ≤ high, and `one_sided`, Rx = r (first rows) and Rx ≤ r.
+`two_sided`, low ≤ Rx ≤ high, and `to_cone`, Rx + s = r with s in a product of cones.
+Bounds only, the latter is Rx = r (first rows) and Rx ≤ r.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_matrix, eye_array, vstack
+from scipy.sparse import coo_array, csc_matrix, csr_array, eye_array, vstack
 
 from mortarbench.harness import QP, Matrix, Solution, Vector, needs_matrices, too_large
-from mortarbench.harness.sets.convex import admissible
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
 #: absolute tolerance for solvers whose test is ≤ absolute + relative·size, so that the
 #: relative one decides
 NEGLIGIBLE = 1e-14
+#: convex sets that have rows in second-order cones
+CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
 #: ‖x‖∞ of a claimed solution beyond which it counts as diverged: the terms of the
 #: residuals then are so large that every relative residual is small
 DIVERGED = 1e12
@@ -97,63 +104,156 @@ def to_two_sided(qp: QP, s: Solution) -> Vector:
     return np.concatenate([s.y, s.z, s.z_box[has_bound(qp)]])
 
 
-def one_sided(qp: QP) -> tuple[csc_matrix, Vector]:
-    """Return R, r of Rx = r for rows of A, Rx ≤ r for those of G, x ≤ ub, −x ≤ −lb."""
+@dataclass(frozen=True, eq=False)
+class ConicForm:
+    """Constraints of a QP as  Rx + s = r  with s in a product of cones.
+
+    The components of s are zero (rows of A, and variables that a set fixes at 0), then
+    nonnegative (rows of G, x ≤ ub, −x ≤ −lb), then blocks (t, w) with ‖w‖ ≤ t, one for
+    each disc, s = (radius, x_I), and each cone, s = (slope·x_N, x_T). The multiplier v
+    of these rows is in the dual cone, and  P x + q + Rᵀv = 0  at a solution.
+    """
+
+    qp: QP
+    rows: csc_matrix  #: R
+    rhs: Vector  #: r
+    equalities: int  #: rows with s = 0
+    inequalities: int  #: rows with s ≥ 0
+    cones: NDArray[np.int64]  #: numbers of rows of the second-order cones
+
+    @property
+    def linear(self) -> int:
+        """Number of rows outside second-order cones."""
+        return self.equalities + self.inequalities
+
+    @property
+    def heads(self) -> NDArray[np.int64]:
+        """First row of each second-order cone."""
+        heads: NDArray[np.int64] = self.linear + np.cumsum(self.cones) - self.cones
+        return heads
+
+    @property
+    def tails(self) -> NDArray[np.int64]:
+        """Rows of second-order cones other than `heads`, block by block."""
+        return np.setdiff1d(np.arange(self.linear, self.rhs.size), self.heads)
+
+    def multipliers(self, v: Vector) -> dict[str, Any]:
+        """Return y, z and z_box for multipliers of the rows."""
+        m, p, first = self.qp.b.size, self.qp.h.size, self.equalities
+        is_row_of_set = np.ones(v.size, dtype=bool)
+        is_row_of_set[:m] = is_row_of_set[first : first + p] = False
+        z_box = self.rows.T @ np.where(is_row_of_set, v, 0.0)
+        return {
+            "y": np.array(v[:m]),
+            "z": np.array(v[first : first + p]),
+            "z_box": on_present_bounds(self.qp, z_box),
+        }
+
+    def point(self, s: Solution) -> tuple[Vector, Vector, Vector]:
+        """Return x, the multipliers v of the rows, and a slack in the cones."""
+        qp, first, last = self.qp, self.equalities, self.linear
+        # rows of sets hold ±x_j and slope·x_j
+        v = self.rows @ s.z_box
+        squares = np.ravel(self.rows.multiply(self.rows).sum(axis=1))[self.heads]
+        apex = np.divide(v[self.heads], squares, where=squares > 0, out=0 * squares)
+        v[: qp.b.size] = s.y
+        v[first : first + qp.h.size] = s.z
+        v[first:last] = np.maximum(v[first:last], 0.0)
+        v[self.heads] = np.maximum(apex, self._lengths(v))
+        slack = self.rhs - self.rows @ s.x
+        slack[:last] = np.maximum(slack[:last], 0.0)
+        slack[self.heads] = np.maximum(slack[self.heads], self._lengths(slack))
+        return s.x.copy(), v, slack
+
+    def _lengths(self, v: Vector) -> Vector:
+        """Return ‖w‖ of each second-order cone."""
+        owner = np.repeat(np.arange(self.cones.size), self.cones - 1)
+        lengths: Vector = np.sqrt(
+            np.bincount(owner, v[self.tails] ** 2, self.cones.size)
+        )
+        return lengths
+
+
+def to_cone(qp: QP) -> ConicForm:
+    """Return the constraints of a QP as rows in cones.
+
+    A disc of radius 0 has equality rows, since its second-order cone has no interior,
+    and interior-point methods would fail. A cone of slope 0 has rows x_T = 0, x_N ≥ 0.
+    """
     up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
     eye = eye_array(qp.q.size, format="csr")
-    rows = vstack([csc(qp.A), csc(qp.G), eye[up], -eye[low]])
-    return csc(rows), np.concatenate([qp.b, qp.h, qp.ub[up], -qp.lb[low]])
+    blocks = [_conic_blocks(one) for one in qp.sets[1:]]
+    fixed = _joined([one.tail[one.is_flat] for one in blocks])
+    normal = _joined([one.head[one.is_flat] for one in blocks if one.has_head])
+    sizes = _joined([np.full((~b.is_flat).sum(), 1 + b.tail.shape[1]) for b in blocks])
+    cones = [one.rows(qp.q.size) for one in blocks]
+    rows = [csc(qp.A), eye[fixed], csc(qp.G), eye[up], -eye[low], -eye[normal]]
+    rhs = [qp.b, np.zeros(fixed.size), qp.h, qp.ub[up], -qp.lb[low]]
+    return ConicForm(
+        qp=qp,
+        rows=csc(vstack(rows + [R for R, _ in cones])),
+        rhs=np.concatenate([*rhs, np.zeros(normal.size), *(r for _, r in cones)]),
+        equalities=qp.b.size + fixed.size,
+        inequalities=qp.h.size + int(up.sum() + low.sum()) + normal.size,
+        cones=sizes,
+    )
 
 
-def from_one_sided(qp: QP, v: Vector) -> dict[str, Any]:
-    """Return y, z and z_box for multipliers of `one_sided` rows."""
-    m, p = qp.b.size, qp.h.size
-    up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
-    z_up, z_low = np.split(v[m + p :], [up.sum()])
-    z_box = np.zeros(qp.q.size)
-    z_box[up] += z_up
-    z_box[low] -= z_low
-    return {
-        "y": np.array(v[:m]),
-        "z": np.array(v[m : m + p]),
-        "z_box": on_present_bounds(qp, z_box),
-    }
+class _ConicBlocks(NamedTuple):
+    """Constraints  ‖x[tail[i]]‖ ≤ side[i] + slope[i]·x[head[i]]."""
+
+    tail: NDArray[np.int64]  #: (k, d)
+    side: Vector  #: (k,)
+    head: NDArray[np.int64]  #: (k,)
+    slope: Vector  #: (k,) zero without heads
+    has_head: bool  #: False for discs
+
+    @property
+    def is_flat(self) -> NDArray[np.bool_]:
+        """Mask (k,) of blocks whose right-hand side is zero at all x."""
+        flat: NDArray[np.bool_] = (self.side == 0) & (self.slope == 0)
+        return flat
+
+    def rows(self, n: int) -> tuple[csr_array, Vector]:
+        """Return R, r with r − Rx = (side + slope·x_head, x_tail) block by block."""
+        tail, side, head, slope = (part[~self.is_flat] for part in self[:4])
+        k, d = tail.shape
+        first = np.arange(k) * (d + 1)
+        place = np.concatenate([first, (first[:, None] + np.arange(1, d + 1)).ravel()])
+        column = np.concatenate([head, tail.ravel()])
+        values = np.concatenate([-slope, -np.ones(tail.size)])
+        rhs = np.zeros(k * (d + 1))
+        rhs[first] = side
+        R = coo_array((values, (place, column)), shape=(rhs.size, n)).tocsr()
+        R.eliminate_zeros()
+        return R, rhs
 
 
-def conic(qp: QP) -> tuple[csc_matrix, Vector]:
-    """Give Rx + s = r, s = (r_i, x_I) in a second-order cone for each disc."""
-    eye = eye_array(qp.q.size, format="csr")
-    rows, rhs = [csc(eye[:0])], [np.zeros(0)]
-    for discs in qp.sets[1:]:
-        assert isinstance(discs, Discs)
-        for block, r in zip(discs.index, discs.radius, strict=True):
-            rows += [csc(0 * eye[:1]), csc(-eye[block])]
-            rhs += [np.append(r, np.zeros(block.size))]
-    return csc(vstack(rows)), np.concatenate(rhs)
+def _conic_blocks(one: ConvexSet) -> _ConicBlocks:
+    if isinstance(one, Discs):
+        none = np.zeros(one.radius.size)
+        return _ConicBlocks(one.index, one.radius, one.index[:, 0], none, False)
+    if isinstance(one, Cones):
+        none, head, tail = np.zeros(one.slope.size), one.index[:, 0], one.index[:, 1:]
+        return _ConicBlocks(tail, none, head, one.slope, True)
+    raise TypeError(f"{type(one).__name__} has no conic form; expected Discs or Cones")
 
 
-def from_conic(qp: QP, v: Vector) -> Vector:
-    """Return z_box (n,) on discs from the duals of `conic`: (t, w) ↦ −w."""
-    z_box, at = np.zeros(qp.q.size), 0
-    for discs in qp.sets[1:]:
-        assert isinstance(discs, Discs)
-        for block in discs.index:
-            z_box[block] = -v[at + 1 : at + 1 + block.size]
-            at += 1 + block.size
-    return z_box
+def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[np.int64]:
+    """Concatenate integers of all parts."""
+    return np.concatenate([np.empty(0, np.int64), *(part.ravel() for part in parts)])
 
 
-def to_one_sided(qp: QP, s: Solution) -> Vector:
-    """Return the multipliers of `one_sided` rows; the inverse of `from_one_sided`."""
-    up, low = np.isfinite(qp.ub), np.isfinite(qp.lb)
-    z_up, z_low = np.maximum(s.z_box[up], 0), np.maximum(-s.z_box[low], 0)
-    return np.concatenate([s.y, s.z, z_up, z_low])
-
-
-def conic_point(qp: QP, s: Solution) -> tuple[Vector, Vector, Vector]:
-    """Return x, the multipliers and the slack max(r − Rx, 0) of `one_sided` rows."""
-    rows, rhs = one_sided(qp)
-    return s.x.copy(), to_one_sided(qp, s), np.maximum(rhs - rows @ s.x, 0.0)
+def same_cones(one: QP, other: QP) -> bool:
+    """Return True if the sets beside bounds have the same rows in conic form."""
+    if len(one.sets) == len(other.sets) == 1:
+        return True
+    R, S = to_cone(one), to_cone(other)
+    return bool(
+        (R.equalities, R.inequalities) == (S.equalities, S.inequalities)
+        and np.array_equal(R.cones, S.cones)
+        and (R.rows != S.rows).nnz == 0
+    )
 
 
 def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:

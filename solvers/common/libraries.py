@@ -4,7 +4,7 @@ from __future__ import annotations
 
 #: those that adapters call, and those behind them: backends and factorisations
 PACKAGES = (
-    "clarabel", "cvxopt", "cvxpy", "daqp", "highspy", "highspy-extras", "osqp", "piqp",
-    "proxsuite", "py-mkl-pardiso", "qoco", "qpalm", "qpsolvers", "qtqp", "quadprog",
-    "scs", "sip-qp-python",
+    "clarabel", "cvxopt", "cvxpy", "daqp", "ecos", "highspy", "highspy-extras", "osqp",
+    "piqp", "proxsuite", "py-mkl-pardiso", "qoco", "qpalm", "qpsolvers", "qtqp",
+    "quadprog", "scs", "sip-qp-python",
 )  # fmt: skip

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mortarbench.harness import QP, Matrix, Solution
+from mortarbench.solvers.common.conversion import same_cones
 
 
 class Session(NamedTuple):
@@ -76,11 +77,16 @@ def tightening(
 
 
 def only_vectors_differ(one: QP, other: QP) -> bool:
-    """Return True if two QPs have equal matrices, and bounds at the same places."""
+    """Return True if two QPs have equal matrices and bounds at the same places.
+
+    Sets may differ in right-hand sides of their conic rows only.
+    """
     matrices = ((one.P, other.P), (one.A, other.A), (one.G, other.G))
     bounds = ((one.lb, other.lb), (one.ub, other.ub))
-    return all(_equal(*pair) for pair in matrices) and all(
-        np.array_equal(np.isfinite(a), np.isfinite(b)) for a, b in bounds
+    return (
+        all(_equal(*pair) for pair in matrices)
+        and all(np.array_equal(np.isfinite(a), np.isfinite(b)) for a, b in bounds)
+        and same_cones(one, other)
     )
 
 
@@ -94,10 +100,11 @@ def _equal(M: Matrix, N: Matrix) -> bool:
 
 def _fits(earlier: QP, s: Solution, qp: QP) -> bool:
     """Return True if a point is finite and has the shape of `qp`, bounds included."""
-    # bounds at other places would shift the multipliers of `to_one_sided` rows
+    # bounds at other places would shift the multipliers of conic rows
     return (
         s.mismatch(qp) is None
         and all(np.isfinite(v).all() for v in (s.x, s.y, s.z, s.z_box))
         and np.array_equal(np.isfinite(earlier.lb), np.isfinite(qp.lb))
         and np.array_equal(np.isfinite(earlier.ub), np.isfinite(qp.ub))
+        and same_cones(earlier, qp)
     )

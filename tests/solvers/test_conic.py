@@ -1,0 +1,202 @@
+"""Conic solvers on discs and cones: planted solutions, degenerate sets, sequences."""
+
+from dataclasses import replace
+from time import process_time
+
+import numpy as np
+import pytest
+from scipy.sparse import csr_array, eye_array
+
+from mortarbench.harness import QP, Cones, Discs, Solution, Status
+from mortarbench.harness.verify.kkt import kkt_residuals
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.common.conversion import to_cone
+
+WILDCARDS = ("cvxpy:CLARABEL", "cvxpy:SCS", "cvxpy:QOCO")
+NATIVE = ("clarabel", "scs", "qoco", "cvxopt", "ecos")
+
+
+def solver_of(name):
+    library, colon, backend = name.partition(":")
+    return replace(SOLVERS[f"{library}:*"], backend=backend) if colon else SOLVERS[name]
+
+
+def unit(rng, d):
+    direction = rng.standard_normal(d)
+    return direction / np.linalg.norm(direction)
+
+
+def conic_qp(seed):
+    """A QP with rows, bounds, discs and cones, and its strictly complementary solution.
+
+    Discs are active (z = c·x), inactive, or points (radius 0, any z); x in a cone is on
+    its boundary, inside, or the apex, and one cone has slope 0.
+    """
+    rng = np.random.default_rng(seed)
+    k, d, m, p = 6, int(rng.integers(2, 4)), 2, 3
+    n = k * d + k * 3 + 6
+    order = rng.permutation(n)
+    discs = order[: k * d].reshape(k, d)
+    cones = order[k * d : k * d + 3 * k].reshape(k, 3)
+    bounded = order[k * d + 3 * k :][:4]
+    x, z = rng.standard_normal(n), np.zeros(n)
+    radius = rng.uniform(0.2, 2.0, k)
+    radius[-1] = 0.0
+    for i, block in enumerate(discs):
+        at = unit(rng, d)
+        is_active = i % 2 == 0
+        x[block] = radius[i] * at * (1.0 if is_active else 0.6)
+        z[block] = at * rng.uniform(0.5, 2.0) * (is_active or not radius[i])
+    slope = rng.uniform(0.2, 2.0, k)
+    slope[-1] = 0.0
+    for i, (normal, *tangents) in enumerate(cones):
+        at, size = unit(rng, 2), rng.uniform(0.5, 2.0)
+        if i == k - 1:  # x_T = 0, x_N > 0: z_N = 0, any z_T
+            x[normal], x[tangents], z[tangents] = size, 0.0, at
+        elif i % 3 == 0:  # on the boundary
+            x[normal], x[tangents] = size, slope[i] * size * at
+            z[normal], z[tangents] = -slope[i], at
+        elif i % 3 == 1:  # inside
+            x[normal], x[tangents] = size, 0.5 * slope[i] * size * at
+        else:  # apex, z inside the polar cone
+            x[[normal, *tangents]] = 0.0
+            z[normal], z[tangents] = -size, 0.5 * size / slope[i] * at
+    lb, ub = np.full(n, -np.inf), np.full(n, np.inf)
+    lb[bounded[0]], z[bounded[0]] = x[bounded[0]], -1.0
+    ub[bounded[1]], z[bounded[1]] = x[bounded[1]], 1.5
+    lb[bounded[2]] = x[bounded[2]] - 1.0
+    M = rng.standard_normal((n, n))
+    P, A, G = M @ M.T / n + np.eye(n), *rng.standard_normal((2, p, n))
+    A, y, v = A[:m], rng.standard_normal(m), np.array([0.7, 1.2, 0.0])
+    qp = QP(
+        P=csr_array(P), q=-(P @ x + A.T @ y + G.T @ v + z),
+        A=csr_array(A), b=A @ x, G=csr_array(G), h=G @ x + [0, 0, 1], lb=lb, ub=ub,
+        sets=(Discs(discs, radius), Cones(cones, slope)),
+    )  # fmt: skip
+    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=v, z_box=z)
+
+
+#: largest error in x at tol 1e-8: interior-point methods stop at a gap of tol, which
+#: permits an angle of √tol between x and z of a disc
+ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 3e-5}
+OTHER_ERROR = 5e-4
+RESIDUAL = {"ecos": 1e-5}  #: at tol 1e-8; more than 1e-7 for 35 of 500 QPs
+
+
+def check_solution(name, seed, tol=1e-8):
+    qp, best = conic_qp(seed)
+    s = solver_of(name).prepare(qp, tol)()
+
+    value = qp.objective(best.x)
+    assert s.status is Status.SOLVED
+    assert kkt_residuals(qp, s).worst <= RESIDUAL.get(name, 10 * tol)
+    assert qp.objective(s.x) == pytest.approx(value, rel=1e-8)
+    assert np.abs(s.x - best.x).max() <= ERROR.get(name, OTHER_ERROR)
+
+
+@pytest.mark.parametrize("name", NATIVE + WILDCARDS)
+def test_planted_solutions_of_discs_and_cones_are_reached(name):
+    for seed in range(5):
+        check_solution(name, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NATIVE + WILDCARDS)
+def test_500_planted_solutions_are_reached(name):
+    for seed in range(500):
+        check_solution(name, seed)
+
+
+@pytest.mark.parametrize("name", ["clarabel", "scs", "qoco"])
+def test_a_sequence_changes_radii_and_right_hand_sides(name):
+    """Each QP by an update of its predecessor's solver; the fourth needs a new one."""
+    qp, _ = conic_qp(1)
+    discs, cones = qp.sets[1:]
+    larger = replace(discs, radius=2 * discs.radius)
+    point = replace(discs, radius=discs.radius * (np.arange(discs.radius.size) > 0))
+    steps = [
+        qp,
+        replace(qp, sets=(qp.box, larger, cones)),
+        replace(qp, q=1.1 * qp.q, h=qp.h + 0.1),
+        replace(qp, sets=(qp.box, point, cones)),
+        replace(qp, sets=(qp.box, discs, replace(cones, slope=1.5 * cones.slope))),
+    ]
+    prepare = SOLVERS[name].chain(1e-8)
+    for one in steps:
+        s = prepare(one)()
+        assert s.status is Status.SOLVED
+        assert kkt_residuals(one, s).worst <= 1e-7
+        alone = SOLVERS[name].prepare(one, 1e-8)()
+        assert one.objective(s.x) == pytest.approx(one.objective(alone.x), rel=1e-7)
+
+
+def test_a_warm_start_is_a_point_of_the_cones():
+    """SCS starts from x, slack and multipliers: at the solution they are exact."""
+    for seed in range(10):
+        qp, best = conic_qp(seed)
+        form = to_cone(qp)
+        x, v, slack = form.point(best)
+
+        assert slack == pytest.approx(form.rhs - form.rows @ x, abs=1e-12)
+        assert qp.P @ x + qp.q + form.rows.T @ v == pytest.approx(0, abs=1e-12)
+        assert slack @ v == pytest.approx(0, abs=1e-12)
+        for vector in (v, slack):
+            heads, ends = form.heads, form.heads + form.cones
+            for first, last in zip(heads, ends, strict=True):
+                assert vector[first] >= np.linalg.norm(vector[first + 1 : last]) - 1e-12
+        back = form.multipliers(v)
+        for name in ("y", "z", "z_box"):
+            assert back[name] == pytest.approx(getattr(best, name), abs=1e-12)
+
+
+def test_a_hundred_thousand_discs_are_converted_in_seconds():
+    k, began = 100_000, process_time()
+    eye, none = eye_array(3 * k, format="csr"), csr_array((0, 3 * k))
+    sets = (Discs(np.arange(3 * k).reshape(k, 3), np.ones(k)),)
+    qp = QP(P=eye, q=np.ones(3 * k), A=none, b=np.zeros(0), G=none, h=np.zeros(0),
+            sets=sets)  # fmt: skip
+    form = to_cone(qp)
+    back = form.multipliers(np.ones(form.rhs.size))
+
+    assert process_time() - began <= 2.0
+    assert form.rows.shape == (4 * k, 3 * k)
+    assert (back["z_box"] == -1).all()
+
+
+def test_what_is_degenerate_has_linear_rows():
+    """A disc of radius 0 is a point; a cone of slope 0 is x_T = 0 and x_N ≥ 0."""
+    qp, _ = conic_qp(0)
+    form = to_cone(qp)
+    assert form.equalities == qp.b.size + qp.sets[1].index.shape[1] + 2
+    assert form.cones.size == 2 * 5
+    assert form.inequalities == qp.h.size + qp.sizes["bounds"] + 1
+
+
+def degenerate():
+    """min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁: x* = (4, 4, 0), multiplier zero."""
+    none = csr_array((0, 3))
+    return QP(
+        P=eye_array(3, format="csr"), q=np.array([-4.0, -4.0, 0.0]), A=none,
+        b=np.zeros(0), G=none, h=np.zeros(0), sets=(Cones([[0, 1, 2]], [1.0]),),
+    )  # fmt: skip
+
+
+#: error in x at tol 1e-6 and 1e-8, of the order of √tol for interior-point methods
+DEGENERATE = {
+    "clarabel": (5e-3, 5e-4),
+    "cvxpy:CLARABEL": (5e-3, 5e-4),
+    "qoco": (1e-3, 4e-4),
+    "cvxpy:QOCO": (1e-3, 4e-4),
+    "cvxopt": (1e-3, 4e-4),
+    "ecos": (2e-4, 4e-6),
+    "scs": (1e-6, 1e-8),
+    "cvxpy:SCS": (1e-6, 1e-8),
+}
+
+
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_the_degenerate_cone_costs_half_of_the_digits(name):
+    for tol, error in zip((1e-6, 1e-8), DEGENERATE[name], strict=True):
+        s = solver_of(name).prepare(degenerate(), tol)()
+        assert s.status is Status.SOLVED
+        assert np.abs(s.x - [4, 4, 0]).max() <= error
