@@ -1,6 +1,8 @@
-"""Spectral projected gradients for bounds, by products with P only.
+"""Spectral projected gradients on convex sets, by products with P only.
 
-    d = clip(x − αg, lb, ub) − x,   x ← x + td
+With the projection Π on the product of sets,
+
+    d = Π(x − αg) − x,   x ← x + td
 
 with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988), s the last step. The
 line search is nonmonotone: the objective may exceed its last value but not the largest
@@ -10,6 +12,10 @@ quadratic along d, so one product Pd per iteration suffices for line search and 
 
 Alternating with sᵀPs/‖Ps‖² (ABBmin) halves the steps for a string on an obstacle, but
 takes five to twenty times as many on the duals of contact problems.
+
+The loop ends by the natural map L(x − Π(x − g/L)), which is zero exactly at solutions;
+L is the largest curvature dᵀPd/dᵀd so far. Then x ← Π(v) with v = x − g/L, and
+L(v − Π(v)) is normal to the sets at the new x: the multipliers.
 """
 
 from __future__ import annotations
@@ -21,8 +27,22 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from mortarbench.harness import QP, About, Solution, Status, Vector, kkt_residuals
-from mortarbench.solvers.baselines.infeasibility_certificate import proves_unbounded
+from mortarbench.harness import (
+    QP,
+    About,
+    Box,
+    Cones,
+    Discs,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+)
+from mortarbench.harness.sets.convex import hull
+from mortarbench.solvers.baselines.infeasibility_certificate import (
+    ROUNDING,
+    proves_unbounded,
+)
 from mortarbench.solvers.common.conversion import check_positive
 
 SUFFICIENT_DECREASE = 1e-4  #: share of the linear decrease that a step must achieve
@@ -36,11 +56,13 @@ MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
 class ProjectedGradient:
     """In-house spectral projected gradient method.
 
-    `tol` bounds ‖g^P‖/‖q‖ with the projected gradient g^P. If the KKT residuals on the
-    QP are then not within 5·tol, this bound is lowered; no other point is claimed
-    solved. The start is the point of the box nearest to zero, the first α that of the
-    exact line search. Iterations are steps; all products with P are counted.
+    `tol` bounds the natural map, relative to ‖q‖. If the KKT residuals on the QP are
+    then not within 5·tol, this bound is lowered; no other point is claimed solved. The
+    start is the feasible point nearest to zero, the first α that of the exact line
+    search. Iterations are steps; all products with P are counted.
     """
+
+    accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
 
     memory: int = 10  #: M of the line search; 1 is monotone
     max_iter: int = 50_000
@@ -57,7 +79,9 @@ class ProjectedGradient:
         check_positive(memory=self.memory, max_iter=self.max_iter)
 
     def declines(self, qp: QP) -> str | None:
-        return "takes bounds only" if qp.b.size or qp.h.size else None
+        return (
+            "takes bounds, discs and cones, no rows" if qp.b.size or qp.h.size else None
+        )
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         return lambda: _solve(_Task(qp, self, Counter()), tol)
@@ -70,6 +94,7 @@ class _State(NamedTuple):
     g: Vector  #: Px + q
     alpha: float
     costs: tuple[float, ...]  #: objectives of the last M iterates, minus the first one
+    most: float  #: largest curvature dᵀPd/dᵀd so far; 1 if all are zero
     direction: Vector | None = None  #: last d if its curvature dᵀPd is zero, else None
 
 
@@ -83,25 +108,30 @@ class _Task:
         self.counts["P_products"] += 1
         return np.asarray(self.qp.P @ v)
 
-    def downhill(self, s: _State) -> Vector:
-        """Return −g^P: −g without the components that point out of the box."""
-        out = ((s.x <= self.qp.lb) & (s.g > 0)) | ((s.x >= self.qp.ub) & (s.g < 0))
-        return np.where(out, 0.0, -s.g)
+    def project(self, v: Vector) -> Vector:
+        for one in self.qp.sets:
+            v = one.project(v)
+        return v
+
+    def natural_map(self, s: _State) -> float:
+        return s.most * float(np.linalg.norm(s.x - self.project(s.x - s.g / s.most)))
 
 
 def _start(task: _Task) -> _State:
     qp = task.qp
-    x = np.clip(np.zeros(qp.q.size), qp.lb, qp.ub)
-    s = _State(x, task.product(x) + qp.q, 1.0, (0.0,))
-    d = task.downhill(s)
+    lower, upper = hull(qp.sets, qp.q.size)
+    x = task.project(np.zeros(qp.q.size))
+    g = task.product(x) + qp.q
+    # without the components that leave a bound at once
+    d = np.where(((x <= lower) & (g > 0)) | ((x >= upper) & (g < 0)), 0.0, -g)
     curvature = float(d @ task.product(d))
-    return s._replace(alpha=float(d @ d) / curvature if curvature > 0 else 1.0)
+    alpha = float(d @ d) / curvature if curvature > 0 else 1.0
+    return _State(x, g, alpha, (0.0,), 1 / alpha)
 
 
 def _step(task: _Task, s: _State) -> _State:
     """Return the next iterate; the objective at x + td is f + t·gᵀd + t²/2·dᵀPd."""
-    lb, ub = task.qp.lb, task.qp.ub
-    d = np.clip(s.x - s.alpha * s.g, lb, ub) - s.x
+    d = task.project(s.x - s.alpha * s.g) - s.x
     w = task.product(d)
     slope, curvature, square = float(s.g @ d), float(d @ w), float(d @ d)
     rise, t = max(s.costs) - s.costs[-1], 1.0
@@ -109,30 +139,34 @@ def _step(task: _Task, s: _State) -> _State:
         t = -slope / curvature  # the minimiser along d always decreases enough
     cost = s.costs[-1] + t * slope + t * t / 2 * curvature
     curved = curvature > 1e-15 * np.sqrt(square * float(w @ w))
+    alpha = square / curvature if curved else s.alpha
     task.counts["steps"] += 1
     task.counts["shortened"] += t < 1
     return _State(
-        np.clip(s.x + t * d, lb, ub), s.g + t * w,
-        square / curvature if curved else s.alpha,
-        (*s.costs, cost)[-task.options.memory :], None if curved else d,
+        task.project(s.x + t * d), s.g + t * w, alpha,
+        (*s.costs, cost)[-task.options.memory :], max(s.most, 1 / alpha),
+        None if curved else d,
     )  # fmt: skip
 
 
 def _solve(task: _Task, tol: float) -> Solution:
-    """Lower the bound of ‖g^P‖ until the KKT residuals are within 5·tol."""
+    """Lower the bound of the natural map until the KKT residuals are within 5·tol."""
     qp, s, tighter = task.qp, _start(task), 1.0
     size = float(np.linalg.norm(qp.q)) or float(np.linalg.norm(s.g))
     while True:
-        while float(np.linalg.norm(task.downhill(s))) > tighter * tol * size:
+        while task.natural_map(s) > tighter * tol * size:
             if task.counts["steps"] >= task.options.max_iter:
-                return _unsolved(_point(task, s), "step limit")
+                point = _point(task, s, s.x - s.g / s.most)
+                return _unsolved(point, "step limit")
             s = _step(task, s)
-            if s.direction is not None and proves_unbounded(qp, s.direction):
+            if s.direction is not None and _proves_unbounded(qp, s.direction):
                 message = "the objective is unbounded below"
                 return Solution.without_point(qp, Status.INFEASIBLE, message)
-        # g was updated by g + tPd; recompute it before it becomes the multipliers
-        s = s._replace(g=task.product(s.x) + qp.q)
-        point = _point(task, s)
+        v = s.x - s.g / s.most
+        x = task.project(v)
+        # the steps only update g
+        s = s._replace(x=x, g=task.product(x) + qp.q)
+        point = _point(task, s, v)
         worst = kkt_residuals(qp, point).worst
         if worst <= CLAIM_FACTOR * tol:
             return point
@@ -141,18 +175,24 @@ def _solve(task: _Task, tol: float) -> Solution:
             return _unsolved(point, "no further progress in rounding")
 
 
+def _proves_unbounded(qp: QP, d: Vector) -> bool:
+    """Return True if the objective falls along d for ever, which stays in all sets."""
+    size = float(np.abs(d).max(initial=0.0))
+    return all(
+        np.abs(one.project(d) - d).max() <= ROUNDING * size for one in qp.sets[1:]
+    ) and proves_unbounded(qp, d)
+
+
 def _unsolved(point: Solution, message: str) -> Solution:
     return replace(point, status=Status.ITERATION_LIMIT, message=message)
 
 
-def _point(task: _Task, s: _State) -> Solution:
-    """Return the point; the multipliers of active bounds are components of −g."""
-    lb, ub = task.qp.lb, task.qp.ub
-    z_box = np.where(s.x <= lb, -np.maximum(s.g, 0), 0.0)
-    z_box += np.where(s.x >= ub, -np.minimum(s.g, 0), 0.0)
+def _point(task: _Task, s: _State, v: Vector) -> Solution:
+    """Return the iterate; L(v − Π(v)) with v = x − g/L is normal to the sets."""
     task.counts["P_products"] += 1  # of the residuals that follow
     return Solution(
-        status=Status.SOLVED, x=s.x, y=np.zeros(0), z=np.zeros(0), z_box=z_box,
-        iterations=task.counts["steps"], message="converged",
+        status=Status.SOLVED, x=s.x, y=np.zeros(0), z=np.zeros(0),
+        z_box=s.most * (v - task.project(v)), iterations=task.counts["steps"],
         counts={k: task.counts[k] for k in ("P_products", "shortened")},
+        message="converged",
     )  # fmt: skip

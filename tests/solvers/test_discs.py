@@ -1,0 +1,124 @@
+"""In-house solvers on discs and cones: planted solutions, hard radii, products."""
+
+import numpy as np
+import pytest
+
+import mortarbench as mb
+from mortarbench.harness import QP, Box, Cones, Discs, Solution, Status
+from mortarbench.solvers import SOLVERS
+from tests.support.discs import mindlin, natural_map, qp_on_cones, qp_on_discs
+
+ON_DISCS = ["projected-gradient"]
+ON_CONES = ["projected-gradient"]
+TOL = 1e-9
+
+
+def solve(name, qp, tol=TOL, **options):
+    solver = SOLVERS[name]
+    s = (
+        type(solver)(**options).prepare(qp, tol)()
+        if options
+        else solver.prepare(qp, tol)()
+    )
+    assert isinstance(s, Solution)
+    return s
+
+
+def assert_solved(name, qp, x=None, *, digits=1e-6):
+    """Solve and verify; compare with the solution x where it is known."""
+    s = solve(name, qp)
+    assert s.status is Status.SOLVED, s.message
+    answer = mb.verify(qp, s.x, y=s.y, z_box=s.z_box, tol=TOL)
+    assert answer.verdict.value == "verified", answer.residuals
+    if x is not None:
+        size = np.abs(x).max()
+        assert s.x == pytest.approx(x, abs=digits * size)
+        error = abs(qp.objective(s.x) - qp.objective(x))
+        assert error <= 1e-8 * (abs(qp.objective(x)) + 0.5 * x @ (qp.P @ x))
+    return s
+
+
+@pytest.mark.parametrize("name", ON_DISCS)
+@pytest.mark.parametrize("seed", range(25))
+def test_planted_solutions_on_discs_are_reached(name, seed):
+    qp, x = qp_on_discs(seed, dim=2 + seed % 2)
+    assert_solved(name, qp, x)
+
+
+@pytest.mark.parametrize("name", ON_CONES)
+@pytest.mark.parametrize("seed", range(25))
+def test_planted_solutions_on_cones_are_reached(name, seed):
+    qp, x = qp_on_cones(seed, dim=2 + seed % 3)
+    assert_solved(name, qp, x)
+
+
+@pytest.mark.parametrize("name", ON_DISCS)
+@pytest.mark.parametrize("seed", range(8))
+def test_discs_that_x_touches_without_a_multiplier(name, seed):
+    """Complementarity is not strict: x has half of the digits of the residuals."""
+    qp, x = qp_on_discs(seed + 100, touching=True)
+    assert_solved(name, qp, x, digits=1e-4)
+
+
+@pytest.mark.parametrize("name", ON_DISCS)
+@pytest.mark.parametrize("seed", range(8))
+def test_radii_that_differ_by_1e8(name, seed):
+    qp, x = qp_on_discs(seed + 200, spread=8.0)
+    assert_solved(name, qp, x)
+
+
+@pytest.mark.parametrize("name", ON_DISCS)
+def test_a_disc_of_radius_zero_fixes_its_variables(name):
+    P = np.array([[2.0, 1, 1], [1, 2, 1], [1, 1, 2]])
+    qp = QP.from_arrays(P, [-3, 4, 5], sets=(Discs([[1, 2]], [0.0]),))
+    s = assert_solved(name, qp, np.array([1.5, 0, 0]))
+    assert s.z_box == pytest.approx([0, -5.5, -6.5])
+
+
+@pytest.mark.parametrize("name", ON_DISCS)
+def test_a_disc_of_one_variable_is_a_bound_with_the_same_counts(name):
+    qp, _ = qp_on_discs(7)
+    index = [[i] for i in range(qp.q.size)]
+    size = np.full(qp.q.size, 0.3)
+    discs = QP.from_arrays(qp.P, qp.q, sets=(Discs(index, size),))
+    box = QP.from_arrays(qp.P, qp.q, lb=-size, ub=size)
+    s, other = solve(name, discs), solve(name, box)
+    assert [type(one) for one in discs.sets] == [Box]
+    assert s.counts == other.counts
+    assert (s.x == other.x).all()
+
+
+@pytest.mark.parametrize("name", ON_CONES)
+def test_the_degenerate_cone_is_solved_to_half_of_the_digits(name):
+    """The multiplier is zero on the boundary of the cone, at x = (4, 4, 0)."""
+    qp = QP.from_arrays(np.eye(3), [-4, -4, 0], sets=(Cones([[0, 1, 2]], [1.0]),))
+    s = solve(name, qp)
+    assert s.status is Status.SOLVED
+    assert s.x == pytest.approx([4, 4, 0], abs=4 * np.sqrt(TOL))
+
+
+#: products of prototypes to a natural map of 1e-8, ν = 0.3, by Q/μP and discs
+PRODUCTS = {
+    "projected-gradient": {
+        0.3: {88: 31, 376: 45, 820: 62, 1468: 74},
+        0.9: {88: 24, 376: 38, 820: 47, 1468: 70},
+    },
+}
+#: products of the start and of the claimed residuals, which the prototypes do without
+OF_CLAIM = {"projected-gradient": 3}
+
+
+@pytest.mark.parametrize("name", PRODUCTS)
+@pytest.mark.parametrize("Q", [0.3, 0.9])
+@pytest.mark.parametrize(
+    "discs",
+    [88, 376, pytest.param(820, marks=pytest.mark.slow),
+     pytest.param(1468, marks=pytest.mark.slow)],
+)  # fmt: skip
+def test_products_of_mindlins_problem(name, Q, discs):
+    qp = mindlin(discs, 0.3, Q)
+    s = solve(name, qp, 1e-8)
+    assert s.status is Status.SOLVED
+    assert natural_map(qp, s) <= 1e-8
+    products = s.counts["P_products"] - OF_CLAIM[name]
+    assert products <= 1.2 * PRODUCTS[name][Q][discs]
