@@ -10,6 +10,7 @@ from scipy.integrate import quad
 from mortarbench.harness import InputError, kkt_residuals
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.names import parse
+from mortarbench.harness.operators import assembled
 from mortarbench.problems import OPERATORS, PROBLEMS
 from mortarbench.problems.families.half_space import HalfSpace
 from mortarbench.problems.models.half_space.influence import (
@@ -27,8 +28,10 @@ from mortarbench.problems.models.half_space.rough_surface import (
     rough_surface,
 )
 from mortarbench.solvers.adapters.clarabel_ import Clarabel
+from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
+from tests.support.discs import mindlin
 
 FAMILY = HalfSpace()
 TOL = 1e-9
@@ -44,8 +47,8 @@ def built(**keys):
 def result(solver=None, **keys):
     case = built(**keys)
     qp = case.qp
-    if solver is not None:
-        qp = replace(qp, P=qp.P @ np.eye(qp.q.size))
+    if isinstance(solver, Clarabel):  # takes matrices only
+        qp = replace(qp, P=assembled(qp.P))
     s = (solver or SMALBE()).prepare(qp, TOL)()
     assert kkt_residuals(case.qp, s).worst <= 10 * TOL
     return case.quantities(s)
@@ -195,6 +198,41 @@ def test_errors_of_hertz_s_contact_decrease_with_the_square_of_the_cells():
 def test_mindlin_s_problem_has_one_disc_for_each_cell_in_contact():
     counts = [built(n=n, law="mindlin").qp.q.size // 2 for n in (12, 64, 256, 512)]
     assert counts == [88, 2608, 41684, 166740]
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
+def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
+    """With forces over μP, displacements over μP/(πGa), and R = a = E = 1 there."""
+    there, here = mindlin(88, nu, 0.7), built(n=12, law="mindlin", nu=nu, Q=0.7).qp
+    unit = 0.3 * 2 / (3 * (1 - nu**2))  # μP
+    length = unit * 2 * (1 + nu) / np.pi
+
+    assert here.q == pytest.approx(there.q / length, rel=1e-12)
+    assert here.sets[1].radius == pytest.approx(there.sets[1].radius / unit, rel=1e-12)
+    P = here.P @ np.eye(here.q.size)
+    assert P == pytest.approx(there.P * (unit / length), rel=1e-11, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("n", "nu", "Q", "c_over_a", "error"),
+    [
+        (64, 0.0, 0.5, 0.0069, 2e-4),
+        (64, 0.0, 0.9, 0.0059, 2e-4),
+        *(pytest.param(256, 0.0, Q, error, 1e-4, marks=pytest.mark.slow)
+          for Q, error in ((0.1, 0.0009), (0.3, 0.0009), (0.5, 0.0016), (0.7, 0.0018),
+                           (0.9, 0.0028))),
+        pytest.param(256, 0.3, 0.5, 0.00122, 4e-4, marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
+def test_the_stick_radius_is_that_of_cattaneo_and_mindlin(n, nu, Q, c_over_a, error):
+    """Their solution is exact for ν = 0; the resultant is off by 3e-4 for ν = 0.3."""
+    got = result(ProjectedGradient(), n=n, law="mindlin", nu=nu, Q=Q)
+
+    assert abs(got["c_over_a_error"]) < c_over_a
+    assert abs(got["force_error"]) < error
+    assert abs(got["transverse_force"]) < 1e-8 * got["tangential_force"]
+    assert got["shear_l2_error"] < (0.04 if nu else 0.011)
+    assert got["stick"] + got["slip"] == got["cells"]
 
 
 def test_coulomb_s_bounds_are_mu_times_the_pressure_of_the_normal_problem():
