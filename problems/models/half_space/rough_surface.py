@@ -25,9 +25,8 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 
-#: waves in L of the longest and the shortest component. On the grid of `half-space`,
-#: the longest is half of the side, 1.1 contact radii; a grid of 64 × 64 cells has two
-#: cells in the shortest
+#: Waves in L of the longest and the shortest component. A grid of 64 × 64 cells has two
+#: cells in the shortest.
 LONGEST, SHORTEST = 2, 32
 _DIGITS = 2.0**20  #: heights are multiples of rms/_DIGITS
 

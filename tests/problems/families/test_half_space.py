@@ -231,7 +231,7 @@ def test_the_stick_radius_is_that_of_cattaneo_and_mindlin(n, nu, Q, c_over_a, er
     assert abs(got["c_over_a_error"]) < c_over_a
     assert abs(got["force_error"]) < error
     assert abs(got["transverse_force"]) < 1e-8 * got["tangential_force"]
-    assert got["shear_l2_error"] < (0.04 if nu else 0.011)
+    assert got["shear_l2_error"] < (0.04 if nu else 0.011 if Q > 0.1 else 0.03)
     assert got["stick"] + got["slip"] == got["cells"]
 
 
