@@ -1,0 +1,376 @@
+"""Face-to-face mortar contact in space, linearised at a displacement.
+
+Sources: Puso and Laursen, "A mortar segment-to-segment contact method for large
+deformation solid mechanics", Comput. Methods Appl. Mech. Engrg. 193 (2004) 601-629, for
+the auxiliary plane; Popp, Gitterle, Gee and Wall, Int. J. Numer. Meth. Engng 83 (2010)
+1428-1465, for the dual basis. In the plane see `problems.contact.mortar`.
+
+*Triangles.* A quadrilateral face is four triangles about the mean of its corners. Its
+shape functions N_k are linear on each of them, with the value ¼ at the centre. (With
+two triangles, or with the bilinear functions, whose inverse map is not polynomial, a
+distorted face fails the patch test; [docs/contact.md] has the figures.)
+
+*Auxiliary plane.* On the slave face e with centre x_e and unit normal n_e, points of
+both sides are projected along n_e onto the plane through x_e. There each slave triangle
+is clipped by each master triangle (Sutherland and Hodgman 1974). On the overlap, a
+convex polygon with at most six corners, all integrands are polynomials of degree 2.
+Their integrals follow from the moments of the polygon, without quadrature.
+
+*Rows.* With the gap g along n_e (positive: open) and the basis Φ_j of the multipliers,
+the weak condition ∫ Φ_j g ≥ 0 reads for every slave node j, linearised at u^k with
+fixed planes and overlaps,
+
+    Σ_k D_jkᵀ u_k − Σ_l M_jlᵀ u_l ≤ g̃_j + (the left-hand side at u^k),
+    D_jk = Σ_e n_e ∫_e Φ_j N_k,   M_jl = Σ_e n_e ∫_e Φ_j N^m_l,   g̃_j = Σ_e ∫_e Φ_j g.
+
+*Balance.* At each point of an overlap a row pulls the slave by Φ_j n_e and the master
+by −Φ_j n_e on the same line along n_e: the forces of a row are in equilibrium and have
+no moment.
+
+*Basis.* "standard" is Φ_j = N_j. "dual" is Φ = A N on each face with A = D_e M_e⁺,
+where M_e = ∫ N Nᵀ and D_e = diag ∫ N over the covered part of the face. Then ∫ Φ_j N_k
+is diagonal wherever M_e is regular, and Σ Φ_j = 1 always, since D_e 1 = M_e 1. M_e is
+singular where only one triangle of a quadrilateral is covered.
+
+Each row is divided by ∫ N_j over the covered part, so that B is dimensionless, g̃ a
+length, and λ a nodal force.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array, vstack
+from scipy.spatial import KDTree
+
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.faces import Faces, current_faces, face_tangents
+from mortarbench.problems.contact.mortar import Basis
+from mortarbench.problems.contact.node_to_segment import ContactRows
+from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.surface import Points, current_positions
+from mortarbench.problems.fem.mesh import Nodes
+
+#: overlaps below this share of the area of the slave face are rounding of the
+#: projection and are left out
+MIN_OVERLAP = 1e-12
+#: eigenvalues of M_e below this share of the largest count as zero
+SINGULAR = 1e-10
+#: distances from a line below this share of the size of a triangle are rounding
+ON_LINE = 1e-14
+#: pairs of triangles that are clipped together, which bounds memory to about 100 MB
+CHUNK = 2**16
+#: distance from a master face at which the search along a ray ends, in units of the
+#: radii of both faces; smaller values cost steps, larger ones candidates
+CLOSE = 1.5
+#: steps of this search, each at least half the remaining distance from a side that is
+#: inclined by at most 60° (`Reach.cosine`)
+MAX_STEPS = 64
+#: radius, in the same units, of a ball about the end of the search that contains the
+#: faces that the rays of a slave face meet: CLOSE / cos 60° ahead, and tan 60° aside
+MAX_SPREAD = 5.0
+#: corners of a triangle clipped by a triangle, at most
+MAX_CORNERS = 6
+
+
+class Overlaps(NamedTuple):
+    """Integrals over the overlaps of pairs of faces, on the auxiliary planes.
+
+    N_j are the shape functions of the slave face, N^m_l those of the master face.
+    """
+
+    slave: Nodes  #: (p,) slave face
+    master: Nodes  #: (p,) master face
+    area: NDArray[np.float64]  #: (p, c) ∫N_j, m²
+    own: NDArray[np.float64]  #: (p, c, c) ∫N_j N_k, m²
+    other: NDArray[np.float64]  #: (p, c, d) ∫N_j N^m_l, m²
+    gap: NDArray[np.float64]  #: (p, c) ∫N_j g, m³
+
+
+def face_mortar(
+    points: Points,
+    u: Vector,
+    slave: Nodes,
+    master: Nodes,
+    *,
+    basis: Basis = "dual",
+    reach: Reach = Reach(),  # noqa: B008 - frozen
+    tangential: bool = False,
+) -> ContactRows:
+    """Linearise the weak non-penetration condition at u, with a row per covered node.
+
+    Parameters
+    ----------
+    points : (N, 3) reference positions X, m
+    u : (3N,) displacement u^k at which to linearise, m
+    slave, master : (f, c) nodes of the faces of both sides, anticlockwise from outside;
+        a triangle among quadrilaterals repeats its last node
+    basis, reach, tangential : as for `problems.contact.mortar.mortar`
+
+    Returns
+    -------
+    rows of the covered slave nodes, which are numbered in ascending order
+
+    Raises
+    ------
+    InputError
+        When a position is not finite or a face has no area.
+
+    """
+    nodes, parts = [], []
+    for faces, name in ((slave, "slave"), (master, "master")):
+        own, corners = np.unique(faces, return_inverse=True)
+        x = current_positions(points, u, own, name)
+        nodes.append(own)
+        parts.append(current_faces(x, corners.reshape(faces.shape), name))
+    s, m = parts
+    at = overlaps(s, m, reach)
+    A = _dual(at) if basis == "dual" else np.eye(s.corners.shape[1])  # Φ = A N
+    j, k = s.corners[at.slave], m.corners[at.master]
+    cover = _gather(at.area, j, len(s.x))
+    gap = _gather((A @ at.gap[..., None])[..., 0], j, len(s.x))
+    active = np.flatnonzero(cover)
+    D, M = A @ at.own, A @ at.other
+    normal = np.broadcast_to(s.normal[at.slave][:, None], (*j.shape, 3))
+
+    def rows(direction: Points) -> csr_array:
+        """Return rows along directions (p, c, 3) of the slave nodes of each overlap."""
+        entries = [
+            _entries(values, direction, j, own[columns])
+            for values, columns, own in ((D, j, nodes[0]), (-M, k, nodes[1]))
+        ]
+        value, row, column = map(np.concatenate, zip(*entries, strict=True))
+        shape = (len(s.x), points.size)
+        B = csr_array(coo_array((value / cover[row], (row, column)), shape))[active]
+        B.eliminate_zeros()
+        return B
+
+    B = rows(normal)
+    T, row = csr_array((0, points.size)), np.arange(0)
+    if tangential:
+        axes = face_tangents(s.node_normals)  # (v, 2, 3)
+        stacked = [rows(axes[j, axis]) for axis in range(2)]
+        row = np.repeat(np.arange(active.size), 2)
+        order = np.arange(2 * active.size).reshape(2, -1).T.ravel()  # row by row
+        T = csr_array(csr_array(vstack(stacked))[order])
+    return ContactRows(
+        B, gap[active] / cover[active] + B @ u, T, row, cover[active], active
+    )
+
+
+def overlaps(slave: Faces, master: Faces, reach: Reach) -> Overlaps:
+    """Clip the triangles of both sides on the auxiliary planes of the slave faces."""
+    e, m = _facing(slave, master, reach)
+    step = CHUNK // (slave.most_triangles * master.most_triangles)
+    parts = [
+        _integrals(slave, master, e[k : k + step], m[k : k + step], reach)
+        for k in range(0, max(len(e), 1), step)
+    ]
+    return Overlaps(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+
+def _facing(slave: Faces, master: Faces, reach: Reach) -> tuple[Nodes, Nodes]:
+    """Return pairs of faces (k,) that rays along a slave normal may connect.
+
+    From the centre of each slave face, both ways along its normal, a ball is moved by
+    its distance from the nearest master face until it is close to one.
+    """
+    tree = KDTree(master.centre)
+    near = slave.radius + master.radius.max()
+    limit = _max_distance(slave, master, reach) + near
+    e: list[Nodes] = []
+    m: list[Nodes] = []
+    for sign in (1.0, -1.0):
+        at, t = slave.centre.copy(), np.zeros(len(near))
+        moves = np.ones(len(near), dtype=bool)
+        for _ in range(MAX_STEPS):
+            d, _ = tree.query(at[moves])
+            step = np.where(d > CLOSE * near[moves], d - near[moves], 0.0)
+            t[moves] += step
+            at[moves] += (sign * step)[:, None] * slave.normal[moves]
+            moves[moves] = (step > 0) & (t[moves] <= limit)
+            if not moves.any():
+                break
+        # where the first way ended at its start, both ways find the same faces
+        start = np.flatnonzero(~moves & (t <= limit) & ((sign > 0) | (t > 0)))
+        found = tree.query_ball_point(at[start], MAX_SPREAD * near[start])
+        e.append(np.repeat(start, [len(k) for k in found]))
+        m.extend(np.asarray(k, dtype=np.int64) for k in found)
+    pairs = np.unique(np.stack([np.concatenate(e), np.concatenate(m)]), axis=1)
+    offset = master.centre[pairs[1]] - slave.centre[pairs[0]]
+    n = slave.normal[pairs[0]]
+    across = offset - np.einsum("px,px->p", offset, n)[:, None] * n
+    size = slave.radius[pairs[0]] + master.radius[pairs[1]]
+    used = np.linalg.norm(across, axis=1) <= size
+    used &= np.einsum("px,px->p", n, master.normal[pairs[1]]) <= reach.cosine
+    return pairs[0, used], pairs[1, used]
+
+
+def _max_distance(slave: Faces, master: Faces, reach: Reach) -> float:
+    """Return the largest gap within reach, m."""
+    if reach.distance is not None:
+        return reach.distance
+    return max(slave.extent, master.extent)
+
+
+def _integrals(
+    slave: Faces, master: Faces, e: Nodes, m: Nodes, reach: Reach
+) -> Overlaps:
+    """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
+    a, b = slave.triangles[e], master.triangles[m]
+    # all triangles of one face with all of the other, pair by pair
+    each = a * b
+    pair = np.repeat(np.arange(len(e)), each)
+    place = np.arange(len(pair)) - np.repeat(np.cumsum(each) - each, each)
+    t_s = np.searchsorted(slave.face, e)[pair] + place // b[pair]
+    t_m = np.searchsorted(master.face, m)[pair] + place % b[pair]
+    # coordinates on the auxiliary plane, and the height above it
+    frame = np.concatenate(
+        [face_tangents(slave.normal[e]), slave.normal[e][:, None]], 1
+    )
+    on_s, on_m = (
+        np.einsum(
+            "pax,pvx->pva", frame[pair], side.vertices[t] - slave.centre[e[pair], None]
+        )
+        for side, t in ((slave, t_s), (master, t_m))
+    )
+    on_m = on_m[:, ::-1]  # runs clockwise on the plane of a face that it faces
+    meets = (on_s.max(axis=1) > on_m.min(axis=1))[:, :2].all(axis=1)
+    meets &= (on_m.max(axis=1) > on_s.min(axis=1))[:, :2].all(axis=1)
+    meets &= _double_area(on_m) > 0
+    pair, t_s, t_m, on_s, on_m = (v[meets] for v in (pair, t_s, t_m, on_s, on_m))
+    moment = moments(*clip(on_s[..., :2], on_m[..., :2]))
+    # functions a + b x + c y on each triangle: barycentric coordinates and heights
+    affine_s, affine_m = (np.linalg.inv(_with_ones(on)) for on in (on_s, on_m))
+    N = np.einsum("pav,pvc->pca", affine_s, slave.shape[t_s])
+    N_m = np.einsum("pav,pvc->pca", affine_m, master.shape[t_m][:, ::-1])
+    g = np.einsum("pav,pv->pa", affine_m, on_m[..., 2])
+    g -= np.einsum("pav,pv->pa", affine_s, on_s[..., 2])
+    weighted = N @ moment
+    area = moment[:, 0, 0]
+    least = MIN_OVERLAP * slave.radius[e[pair]] ** 2
+    mean_gap = np.einsum("pa,pa->p", moment[:, 0], g) / np.where(area > 0, area, 1)
+    used = (area > least) & (np.abs(mean_gap) <= _max_distance(slave, master, reach))
+    pairs, place = np.unique(pair[used], return_inverse=True)
+
+    def summed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Sum the integrals of the triangles of each pair of faces."""
+        total = np.zeros((len(pairs), *values.shape[1:]))
+        np.add.at(total, place, values[used])
+        return total
+
+    return Overlaps(
+        e[pairs], m[pairs], summed(weighted[..., 0]),
+        summed(weighted @ N.transpose(0, 2, 1)),
+        summed(weighted @ N_m.transpose(0, 2, 1)),
+        summed((weighted @ g[..., None])[..., 0]),
+    )  # fmt: skip
+
+
+def _with_ones(triangles: Points) -> NDArray[np.float64]:
+    """Return the matrices (p, 3, 3) with rows (1, x, y) of the vertices."""
+    rows = np.ones((len(triangles), 3, 3))
+    rows[..., 1:] = triangles[..., :2]
+    return rows
+
+
+def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
+    """Clip triangles by triangles (Sutherland and Hodgman 1974).
+
+    Parameters
+    ----------
+    subject, window : (p, 3, 2) vertices, anticlockwise
+
+    Returns
+    -------
+    corners (p, 6, 2) of the overlaps, anticlockwise, and their numbers (p,); 0 where
+    the triangles do not overlap
+
+    """
+    p = len(subject)
+    polygon = np.zeros((p, MAX_CORNERS + 1, 2))
+    polygon[:, :3], count = subject, np.full(p, 3)
+    slot = np.arange(MAX_CORNERS + 1)
+    for k in range(3):
+        A, B = window[:, k], window[:, (k + 1) % 3]
+        edge = B - A
+        offset = polygon - A[:, None]
+        # positive on the inner side, the left of AB
+        d = edge[:, None, 0] * offset[..., 1] - edge[:, None, 1] * offset[..., 0]
+        # corners on the line up to rounding are inside: signs of rounding would make
+        # more than two crossings of a convex polygon
+        size = (
+            np.abs(edge).max(axis=1)[:, None] * np.abs(offset).max(axis=(1, 2))[:, None]
+        )
+        d[np.abs(d) <= ON_LINE * size] = 0
+        exists = slot < count[:, None]
+        after = np.where(slot + 1 < count[:, None], slot + 1, 0)
+        end = np.take_along_axis(polygon, after[..., None], axis=1)
+        d_end = np.take_along_axis(d, after, axis=1)
+        inside = exists & (d >= 0)
+        crosses = exists & ((d >= 0) != (d_end >= 0))
+        t = d / np.where(crosses, d - d_end, 1.0)
+        crossing = polygon + t[..., None] * (end - polygon)
+        # each corner is followed by the crossing of its edge
+        emitted = np.stack([inside, crosses], axis=2).reshape(p, -1)
+        corners = np.stack([polygon, crossing], axis=2).reshape(p, -1, 2)
+        place = np.cumsum(emitted, axis=1) - 1
+        count = emitted.sum(axis=1)
+        i, j = np.nonzero(emitted)
+        polygon = np.zeros_like(polygon)
+        polygon[i, place[i, j]] = corners[i, j]
+    return polygon[:, :MAX_CORNERS], count
+
+
+def moments(polygon: Points, count: Nodes) -> NDArray[np.float64]:
+    """Return ∫ww^T (p, 3, 3) of w = (1, x, y) over polygons, anticlockwise.
+
+    Sums over the triangles between the first corner and each edge: on a triangle of
+    area A with the corners v_i and their sum s,  ∫ww^T = A (Σ v_i v_i^T + ss^T) / 12.
+
+    polygon, count : (p, k, 2) corners, the first count (p,) of which are used
+    """
+    first = polygon[:, :1]
+    total = np.zeros((len(polygon), 3, 3))
+    for i in range(1, polygon.shape[1] - 1):
+        triangle = np.concatenate([first, polygon[:, i : i + 2]], axis=1)
+        area = np.where(i + 1 < count, _double_area(triangle) / 2, 0.0)
+        w = _with_ones(triangle)
+        s = w.sum(axis=1)
+        squares = w.transpose(0, 2, 1) @ w + s[:, :, None] * s[:, None]
+        total += (area / 12)[:, None, None] * squares
+    return total
+
+
+def _double_area(triangle: Points) -> Vector:
+    """Return twice the areas (p,) of triangles (p, 3, 2), negative if clockwise."""
+    a, b = triangle[:, 1] - triangle[:, 0], triangle[:, 2] - triangle[:, 0]
+    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])
+
+
+def _dual(at: Overlaps) -> NDArray[np.float64]:
+    """Return A = D_e M_e⁺ (p, c, c) of the slave face of each overlap."""
+    faces, place = np.unique(at.slave, return_inverse=True)
+    M_e = np.zeros((len(faces), *at.own.shape[1:]))
+    D_e = np.zeros((len(faces), at.own.shape[1]))
+    np.add.at(M_e, place, at.own)
+    np.add.at(D_e, place, at.area)
+    inverse = np.linalg.pinv(M_e, rcond=SINGULAR, hermitian=True)
+    return np.asarray((D_e[..., None] * inverse)[place])
+
+
+def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
+    """Add values (p, c) at nodes (p, c) into a vector (count,)."""
+    return np.bincount(nodes.ravel(), values.ravel(), minlength=count).astype(float)
+
+
+def _entries(
+    values: NDArray[np.float64], direction: Points, rows: Nodes, nodes: Nodes
+) -> tuple[Vector, Nodes, Nodes]:
+    """Return values, rows and columns of blocks (p, c, d) along vectors (p, c, 3)."""
+    block = values[..., None] * direction[:, :, None]  # (p, c, d, 3)
+    row = np.broadcast_to(rows[:, :, None, None], block.shape)
+    column = np.broadcast_to((3 * nodes[:, None, :, None] + np.arange(3)), block.shape)
+    return block.ravel(), row.ravel(), column.ravel()

@@ -1,0 +1,142 @@
+"""Node-to-face non-penetration in space, linearised at a given displacement.
+
+As in the plane (`problems.contact.node_to_segment`), each slave node stays on the outer
+side of the master: with its closest point x_c = Σ N_a x_a on the master faces and the
+outward normal n there, B u ≤ c with B = [−n at s, +N_a n at a] and c = g + B u^k.
+
+A quadrilateral face is four triangles (`problems.contact.faces`), on which the closest
+point is that of a triangle. n is the normal of the face; at an edge or a corner where
+several faces meet, it is their averaged normal.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
+
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.faces import Faces, current_faces, face_tangents
+from mortarbench.problems.contact.node_to_segment import ContactRows, rows_along
+from mortarbench.problems.contact.surface import Points, current_positions
+from mortarbench.problems.fem.mesh import Nodes
+
+#: distance between closest points on two faces, relative to the radius of a face, at
+#: which both are the same point of a common edge
+SAME_POINT = 1e-9
+
+
+class ClosestPoints(NamedTuple):
+    """Closest points of s positions on faces."""
+
+    face: Nodes  #: (s,)
+    N: NDArray[np.float64]  #: (s, c) shape functions of the face at the closest point
+    normal: Points  #: (s, 3) outward unit normal of the master there
+
+
+def node_to_face(
+    points: Points,
+    u: Vector,
+    slave: Nodes,
+    master: Nodes,
+    *,
+    tangential: bool = False,
+) -> ContactRows:
+    """Linearise the non-penetration condition of all slave nodes at u.
+
+    Parameters
+    ----------
+    points : (N, 3) reference positions X, m
+    u : (3N,) displacement u^k at which to linearise, m
+    slave, master : (f, c) nodes of the faces of both sides, anticlockwise from outside
+    tangential : add two tangential rows per contact row
+
+    Returns
+    -------
+    one contact row per slave node, in ascending order of their numbers
+
+    Raises
+    ------
+    InputError
+        When a position is not finite or a face has no area.
+
+    """
+    own, place = np.unique(slave, return_inverse=True)
+    nodes, corners = np.unique(master, return_inverse=True)
+    x = current_positions(points, u, own, "slave")
+    side = current_faces(x, place.reshape(slave.shape), "slave")
+    other = current_faces(
+        current_positions(points, u, nodes, "master"), corners.reshape(master.shape),
+        "master",
+    )  # fmt: skip
+    closest = closest_points(x, other)
+    at = other.corners[closest.face]
+    gap = np.einsum("sx,sx->s", x, closest.normal)
+    gap -= np.einsum("sa,sax,sx->s", closest.N, other.x[at], closest.normal)
+    node = np.column_stack([own, nodes[at]])
+    weight = np.column_stack([-np.ones(own.size), closest.N])
+    B = rows_along(node, weight, closest.normal, points.size)
+    T, row = csr_array((0, points.size)), np.arange(0)
+    if tangential:
+        row = np.repeat(np.arange(own.size), 2)
+        along = face_tangents(closest.normal).reshape(-1, 3)
+        T = rows_along(node[row], weight[row], along, points.size)
+    return ContactRows(B, gap + B @ u, T, row, side.areas, np.arange(own.size))
+
+
+def closest_points(x: Points, faces: Faces) -> ClosestPoints:
+    """Return the closest points of x (s, 3) on faces, with outward normals."""
+    tree = KDTree(faces.centre)
+    # the centre of a face is one of its points, and none is farther than its radius
+    nearest, _ = tree.query(x)
+    found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
+    node = np.repeat(np.arange(len(x)), [len(k) for k in found])
+    face = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
+    count = faces.triangles[face]
+    pair = np.repeat(np.arange(len(face)), count)
+    first = np.searchsorted(faces.face, face)
+    t = first[pair] + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
+    barycentric = closest_in_triangles(x[node[pair]], faces.vertices[t])
+    at = np.einsum("pv,pvx->px", barycentric, faces.vertices[t])
+    distance = np.linalg.norm(at - x[node[pair]], axis=1)
+    order = np.lexsort([distance, node[pair]])
+    best = order[np.unique(node[pair][order], return_index=True)[1]]
+    # faces that meet at the closest point: their normals are averaged
+    same = np.linalg.norm(at - at[best][node[pair]], axis=1)
+    meets = same <= SAME_POINT * faces.radius[faces.face[t]]
+    touching = np.unique(np.stack([node[pair], faces.face[t]])[:, meets], axis=1)
+    total = np.zeros_like(x)
+    np.add.at(total, touching[0], faces.normal[touching[1]])
+    size = np.linalg.norm(total, axis=1, keepdims=True)
+    face = faces.face[t[best]]
+    normal = np.where(size > 0, total / np.where(size > 0, size, 1), faces.normal[face])
+    N = np.einsum("sv,svc->sc", barycentric[best], faces.shape[t[best]])
+    return ClosestPoints(face, N, normal)
+
+
+def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
+    """Return barycentric coordinates (p, 3) of the closest points of x (p, 3).
+
+    Either the foot of the perpendicular, if it is inside, or the closest point of the
+    nearest edge.
+
+    triangle : (p, 3, 3) vertices
+    """
+    edges = np.roll(triangle, -1, axis=1) - triangle  # edge k from vertex k to k + 1
+    offset = x[:, None] - triangle
+    normal = np.cross(edges[:, 0], edges[:, 1])
+    square = np.einsum("px,px->p", normal, normal)[:, None]
+    # the part of vertex k + 2 is the area over edge k
+    parts = np.einsum("pkx,px->pk", np.cross(edges, offset), normal) / square
+    foot = np.roll(parts, 2, axis=1)
+    length = np.einsum("pkx,pkx->pk", edges, edges)
+    along = np.clip(np.einsum("pkx,pkx->pk", offset, edges) / length, 0.0, 1.0)
+    away = offset - along[..., None] * edges
+    k = np.einsum("pkx,pkx->pk", away, away).argmin(axis=1)
+    p = np.arange(len(x))
+    on_edge = np.zeros((len(x), 3))
+    on_edge[p, k], on_edge[p, (k + 1) % 3] = 1 - along[p, k], along[p, k]
+    return np.where((foot >= 0).all(axis=1)[:, None], foot, on_edge)
