@@ -94,6 +94,11 @@ PLANES = schema(plane=choice("strain", "stress"))
 GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
 #: keys of a decomposition into subdomains: H/h (0: one piece per body), and `GLUES`
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
+DIMENSION = schema(dim=choice(2, 3))
+#: keys that families in space do not support yet, with the only value they allow
+PLANE_ONLY: Mapping[str, Value] = {
+    "friction": "none", "kinematics": "linear", "plane": "strain"
+}  # fmt: skip
 #: laws of friction, each with the key of its parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
 #: parameters of the laws of friction, with their allowed values
@@ -272,6 +277,16 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
             f"{family}: contact_stiffness=geometric with contact={params['contact']} "
             "is not built; expected contact=nts"
         )
+
+
+def check_dimension(family: str, params: Mapping[str, Value]) -> None:
+    """Raise InputError for dim=3 with keys of plane problems."""
+    for key, only in PLANE_ONLY.items():
+        if params["dim"] == 3 and params.get(key, only) != only:
+            raise InputError(
+                f"{family}: {key}={params[key]} with dim=3 is not built; expected "
+                f"{key}={only}, or dim=2"
+            )
 
 
 def refuse_friction(family: str, params: Mapping[str, Value]) -> None:

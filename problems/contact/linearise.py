@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -20,8 +20,16 @@ from mortarbench.problems.contact.node_to_segment import (
     geometric_stiffness,
     node_to_segment,
 )
+from mortarbench.problems.contact.space.face_mortar import face_mortar
+from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
 from mortarbench.problems.fem.mesh import Nodes
+
+#: methods "nts" and "mortar" by dimension
+METHODS: Mapping[int, tuple[Callable[..., ContactRows], Callable[..., ContactRows]]] = {
+    2: (node_to_segment, mortar),
+    3: (node_to_face, face_mortar),
+}
 
 
 def linearisation(
@@ -35,15 +43,16 @@ def linearisation(
 
     The map raises InputError when it yields no row at u = 0.
 
-    contact : "nts" (node to segment) or "mortar"
+    contact : "nts" (node to segment, in space node to face) or "mortar"
     basis : of the multipliers of mortar contact, "dual" or "standard"
     laws : law of friction of each pair; empty: no friction
     fixed_segments : (places,) for node-to-segment contact, the segment of each slave
         node as in `closest_segments`; −1: the closest one at each u
     """
     pairs = len(bodies.pairs)
+    nodal, integral = METHODS[bodies.mesh.dim]
     methods: list[Callable[..., ContactRows]] = [
-        node_to_segment if contact == "nts" else partial(mortar, basis=basis)
+        nodal if contact == "nts" else partial(integral, basis=basis)
     ] * pairs
     if fixed_segments is not None:
         parts = _split_by_pair(bodies, fixed_segments)

@@ -37,7 +37,6 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
-    box,
     join,
     joined_sides,
 )
@@ -127,34 +126,39 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
-    """A box of equal hexahedra; subdomains are blocks of at most size³ cells."""
+class Boxes:
+    """Boxes of hexahedra in space; subdomains are blocks of at most size³ cells."""
 
-    size: tuple[float, float, float]  #: from (0, 0, 0), m
-    divisions: tuple[int, int, int]  #: numbers of cells along x, y and z
+    parts: tuple[Mesh, ...]  #: see `problems.fem.mesh.box`, with different boundaries
+    divisions: tuple[tuple[int, int, int], ...]  #: cells of each along x, y and z
     dim = 3
 
     @cached_property
+    def _joined(self) -> tuple[Mesh, Nodes]:
+        return join(self.parts)
+
+    @property
     def mesh(self) -> Mesh:
-        """The mesh, m."""
-        return box((0.0, 0.0, 0.0), self.size, self.divisions)
+        """All bodies, m."""
+        return self._joined[0]
 
     @property
     def body(self) -> NDArray[np.int64]:
         """Body of each cell, (E,)."""
-        return np.zeros(len(self.mesh.cells), dtype=np.int64)
+        return self._joined[1]
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Faces of the sides by name, see `problems.fem.mesh.box`."""
+        """Faces of the sides by name."""
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
-        """Cut the box into blocks of at most `size` cells a side."""
+        """Cut each box into blocks of at most `size` cells a side."""
+        labels = [blocks(divisions, size) for divisions in self.divisions]
+        first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
+        label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        return mesh_in_subdomains(
-            self.mesh, blocks(self.divisions, size), self.body, named
-        )
+        return mesh_in_subdomains(self.mesh, label, self.body, named)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from mortarbench.harness import Family, InputError
 from mortarbench.problems.ranges import (
     Keys,
     check_decomposition,
+    check_dimension,
     check_friction,
     check_kinematics,
     defaults_of,
@@ -49,6 +50,7 @@ class DeclaredFamily(Family):
         "friction": check_friction,
         "feti": check_decomposition,
         "kinematics": check_kinematics,
+        "dim": check_dimension,
     }
 
     def __init_subclass__(cls) -> None:

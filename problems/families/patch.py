@@ -9,6 +9,7 @@ from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
+    DIMENSION,
     FRICTION,
     KINEMATICS,
     METHODS,
@@ -25,6 +26,8 @@ from mortarbench.problems.ranges import (
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
+
+MAX_DISTORTION = 0.35  #: cells turn inside out where nodes move by half a cell
 
 
 class ContactPatch(ContactFamily):
@@ -43,6 +46,8 @@ class ContactPatch(ContactFamily):
         **DECOMPOSITION,
         **KINEMATICS,
         stretch=key(1.0),
+        **DIMENSION,
+        distort=key(0.0),
     )
     forms = ("primal", "dual")
     problem = "patch.problem"
@@ -52,7 +57,15 @@ class ContactPatch(ContactFamily):
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless every key is in its range, and stretch below 1."""
         super().check(params)
-        check_memory(self.name, int(params["lower"]) ** 2 + int(params["upper"]) ** 2)
+        cells = (int(params["lower"]), int(params["upper"]))
+        dim = int(params["dim"])
+        check_memory(self.name, dim * sum(n**dim for n in cells) // 2)
+        distort = float(params["distort"])
+        if not 0 <= distort <= MAX_DISTORTION * (dim - 2):
+            raise InputError(
+                f"{self.name}: distort={distort:g} with dim={dim}; expected 0, or with "
+                f"dim=3 at most {MAX_DISTORTION:g} of a cell"
+            )
         stretch = float(params["stretch"])
         if stretch == self.defaults["stretch"]:
             return

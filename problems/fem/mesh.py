@@ -273,6 +273,19 @@ def box(corner: tuple[float, ...], size: tuple[float, ...],
     })  # fmt: skip
 
 
+def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
+    """Move the nodes of a `box` at random; those of a side stay in its plane.
+
+    share : largest move along an axis, relative to the mean cell size along it
+    """
+    points = mesh.points
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = (high - low) / [len(np.unique(points[:, k])) - 1 for k in range(3)]
+    move = np.random.default_rng(seed).uniform(-share, share, points.shape) * size
+    move[(points == low) | (points == high)] = 0
+    return replace(mesh, points=points + move)
+
+
 def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
                    divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
     """Divide the upper half of a ring by equal angles × equal layers.

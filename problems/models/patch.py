@@ -13,6 +13,9 @@ error in σ_y is of order one and does not vanish with the mesh size. Friction c
 nothing if the blocks are of the same material. Contact alone supports the upper block,
 so that the form ``dual-bounds`` does not exist.
 
+In space (dim=3) the blocks are 1 m × 1 m × ½ m, with rollers also on y = 0, and σ_z =
+−p. Linear fields are exact on distorted hexahedra too (`distort`).
+
 At finite strain (kinematics=finite) the pressure is a dead load, a nominal stress, and
 the exact solution is homogeneous: with the stretches λ₁ along x and λ₂ along y
 
@@ -45,6 +48,7 @@ from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
+    Boxes,
     ContactProblem,
     ContactSolution,
     ElasticBodies,
@@ -59,8 +63,12 @@ from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
     as_vectors,
+    box,
+    distorted,
     dofs_of,
+    nodal_areas,
     nodal_lengths,
+    prefixed,
     rectangle_grid,
 )
 from mortarbench.problems.fem.stress import gauss_stress
@@ -80,11 +88,12 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     D = elasticity_matrices(elastic.materials, elastic.plane)
 
     def error(answer: ContactSolution) -> dict[str, Any]:
-        """Return the largest |σ_y + p|/p over all Gauss points."""
+        """Return the largest |σ_y + p|/p, in space |σ_z + p|/p, at Gauss points."""
         largest = 0.0
         for part in answer.meshes():
             stress = gauss_stress(part.mesh, D[part.body], part.u)
-            deviation = np.abs(stress[..., 1] + PRESSURE).max() / PRESSURE
+            vertical = stress[..., part.mesh.dim - 1]
+            deviation = np.abs(vertical + PRESSURE).max() / PRESSURE
             largest = max(largest, float(deviation))
         return {"stress_error": answer.largest(largest)}
 
@@ -234,8 +243,10 @@ def _errors(path: NewtonPath, s: Solution, exact: Homogeneous) -> dict[str, Any]
 
 
 def bodies(params: Mapping[str, Value]) -> ElasticBodies:
-    """Return the stacked blocks, with `lower` and `upper` cells along x."""
+    """Return the stacked blocks, with `lower` and `upper` cells along x and y."""
     p: Any = params
+    if p["dim"] == 3:
+        return _bodies_in_space(params)
     shape = StructuredGrids(_grids(params))
     sides, force = shape.sides, PRESSURE * LENGTH
     left = np.concatenate([sides["lower_left"], sides["upper_left"]])
@@ -246,6 +257,37 @@ def bodies(params: Mapping[str, Value]) -> ElasticBodies:
         materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
         fixed=np.concatenate(rollers), pairs=(_pair(params, sides),),
         forces=Forces(dofs_of(sides["upper_top"], 2, 1), pressing / force),
+    )  # fmt: skip
+
+
+def _bodies_in_space(params: Mapping[str, Value]) -> ElasticBodies:
+    """Return blocks of 1 m × 1 m × ½ m, with rollers on x = 0, y = 0 and z = 0."""
+    p: Any = params
+    divisions = [(p[name], p[name], -(-p[name] // 2)) for name in NAMES]
+    meshes = [
+        prefixed(
+            distorted(box((0.0, 0.0, z), (LENGTH, LENGTH, HEIGHT), n), p["distort"], k),
+            f"{name}_",
+        )
+        for k, (name, z, n) in enumerate(
+            zip(NAMES, (0.0, HEIGHT), divisions, strict=True)
+        )
+    ]
+    shape = Boxes(tuple(meshes), tuple(divisions))
+    sides, force = shape.sides, PRESSURE * LENGTH**2
+    rollers = [
+        dofs_of(np.unique(sides[name]), 3, axis)
+        for name, axis in (
+            ("lower_left", 0), ("upper_left", 0), ("lower_front", 1),
+            ("upper_front", 1), ("lower_bottom", 2),
+        )
+    ]  # fmt: skip
+    top, areas = nodal_areas(shape.mesh.points, sides["upper_top"])
+    return ElasticBodies(
+        shape=shape, names=NAMES, plane=None, length=LENGTH, force=force,
+        materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
+        fixed=np.unique(np.concatenate(rollers)), pairs=(_pair(params, sides),),
+        forces=Forces(dofs_of(top, 3, 2), -PRESSURE * areas / force),
     )  # fmt: skip
 
 

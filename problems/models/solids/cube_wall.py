@@ -22,14 +22,14 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
-    Box,
+    Boxes,
     ContactProblem,
     ContactSolution,
     ElasticBodies,
     cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh import box, dofs_of, nodal_areas
 
 MATERIAL = Material(E=2e4, nu=0.33)
 SIDE = 1.0  #: of the cube, m
@@ -43,7 +43,8 @@ WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """Return the cube with n × n × n cells."""
     p: Any = params
-    shape = Box((SIDE, SIDE, SIDE), (p["n"], p["n"], p["n"]))
+    divisions = (p["n"], p["n"], p["n"])
+    shape = Boxes((box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions),), (divisions,))
     top, areas = nodal_areas(shape.mesh.points, shape.sides["top"])
     forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
     fixed = dofs_of(np.unique(shape.sides["bottom"]), 3)

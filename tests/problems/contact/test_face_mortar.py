@@ -7,14 +7,15 @@ import pytest
 from numpy.testing import assert_allclose
 
 from mortarbench.harness import InputError
-from mortarbench.problems.contact.face_mortar import (
+from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.space.face_mortar import (
     clip,
     face_mortar,
     moments,
     overlaps,
 )
-from mortarbench.problems.contact.faces import current_faces
-from mortarbench.problems.contact.segment_search import Reach
+from mortarbench.problems.contact.space.triangles import triangulated
+from mortarbench.problems.contact.surface import current_surface
 
 RNG = np.random.default_rng(11)
 
@@ -88,7 +89,7 @@ def grid(counts, z, *, kind, up, distort=0.0):
     quads = np.stack([v.ravel() for v in (a, b, c, d)], axis=-1)
     halves = np.concatenate([quads[:, [0, 1, 2, 2]], quads[:, [0, 2, 3, 3]]])
     faces = {
-        "quad": quads, "triangle": halves[:, :3],
+        "quad": quads, "triangle": halves,
         "mixed": np.concatenate([quads[::2], halves[1 : len(quads) : 2],
                                  halves[len(quads) + 1 :: 2]]),
     }[kind]  # fmt: skip
@@ -235,7 +236,7 @@ def test_the_overlaps_cover_the_common_part_exactly_once():
         grid((37, 43), 0.0, kind="triangle", up=False, distort=0.2),
     )
     parts = [
-        current_faces(points[np.unique(f)], f - f.min(), "side")
+        triangulated(current_surface(points, np.zeros(points.size), f, "side"))
         for f in (slave, master)
     ]
     at = overlaps(*parts, Reach())
@@ -247,6 +248,8 @@ def test_a_face_without_area_is_refused():
     points = np.array(
         [[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]]
     )
-    faces = np.array([[0, 1, 2]]), np.array([[3, 5, 4]])
-    with pytest.raises(InputError, match="contact slave: face 0 has no area"):
+    faces = np.array([[0, 1, 2, 2]]), np.array([[3, 5, 4, 4]])
+    with pytest.raises(
+        InputError, match="contact slave: the face around .* has no area"
+    ):
         face_mortar(points, np.zeros(18), *faces)

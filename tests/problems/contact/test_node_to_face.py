@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from mortarbench.problems.contact.faces import current_faces
-from mortarbench.problems.contact.node_to_face import (
+from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.space.node_to_face import (
     closest_in_triangles,
     closest_points,
     node_to_face,
 )
-from mortarbench.problems.contact.node_to_segment import node_to_segment
+from mortarbench.problems.contact.space.triangles import triangulated
+from mortarbench.problems.contact.surface import faceted_surface
 
 RNG = np.random.default_rng(5)
 
@@ -89,10 +90,11 @@ def test_the_closest_face_is_that_of_an_exhaustive_search():
     points = np.stack([a.ravel(), b.ravel(), height.ravel()], axis=-1)
     i = np.arange(n * n).reshape(n, n)
     corners = (i[:-1, :-1], i[:-1, 1:], i[1:, 1:], i[1:, :-1])
-    faces = current_faces(points, np.stack([c.ravel() for c in corners], -1), "master")
+    table = np.stack([c.ravel() for c in corners], axis=-1)
+    faces = triangulated(faceted_surface(points, table, "master"))
     x = RNG.uniform([-0.5, -0.5, -1], [1.5, 1.5, 2], (200, 3))
     closest = closest_points(x, faces)
-    at = np.einsum("sc,scx->sx", closest.N, points[faces.corners[closest.face]])
+    at = np.einsum("sc,scx->sx", closest.N, points[table[closest.face]])
     for one, foot in zip(x, at, strict=True):
         every = closest_in_triangles(
             np.broadcast_to(one, (len(faces.face), 3)), faces.vertices

@@ -129,3 +129,52 @@ def test_values_out_of_range_are_refused_with_the_right_ones(bad, message):
         FAMILY.check({**FAMILY.defaults, **bad})
 
     assert message in str(e.value)
+
+
+@pytest.mark.parametrize("distort", [0.0, 0.2])
+@pytest.mark.parametrize("slave", ["lower", "upper"])
+@pytest.mark.parametrize("basis", ["dual", "standard"])
+def test_face_mortar_reproduces_a_uniform_pressure(basis, slave, distort):
+    keys = dict(dim=3, basis=basis, slave=slave, distort=distort)
+    assert error(lower=5, upper=4, **keys) <= 1e-10
+    assert error(lower=4, upper=4, form="primal", **keys) <= 2e-9  # Clarabel's accuracy
+
+
+def test_node_to_face_fails_as_in_the_plane():
+    assert error(dim=3, lower=5, upper=4, contact="nts") > 0.1
+    assert error(dim=3, lower=4, upper=4, contact="nts") <= 1e-10  # matching nodes
+
+
+def test_subdomains_of_blocks_in_space_have_the_same_solution():
+    keys = dict(dim=3, lower=4, upper=3, distort=0.2, ratio=10.0)
+    whole, parts = solved(**keys)[2], solved(feti=2, **keys)[2]
+    assert parts["stress_error"] <= 1e-10
+    for name in ("energy", "multiplier_sum", "contact_force"):
+        assert parts[name] == pytest.approx(whole[name], rel=1e-10, abs=1e-6)
+
+
+@pytest.mark.parametrize("form", ["dual", "primal"])
+def test_the_displacement_in_space_is_the_exact_linear_one(form):
+    case, s, quantities = solved(form, dim=3, distort=0.2, ratio=1.0, lower=4, upper=3)
+    points = model(FAMILY.defaults | dict(dim=3, distort=0.2, lower=4, upper=3)).mesh
+    u = as_vectors(case.recover(s), 3)
+    # uniaxial stress: strains ν p/E, ν p/E, −p/E
+    exact = points.points * [0.03, 0.03, -0.1]
+    assert u == pytest.approx(exact, abs=1e-9)
+    assert quantities["energy"] == pytest.approx(-0.5 * 1e6 * 0.1, rel=1e-8)
+    assert quantities["contact_force"] == pytest.approx([0, 0, -1e6], abs=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (dict(distort=0.1), "distort=0.1 with dim=2; expected 0, or with dim=3 at"),
+        (dict(dim=3, distort=0.5), "distort=0.5 with dim=3; expected 0, or with"),
+        (dict(dim=3, plane="stress"), "plane=stress with dim=3 is not built"),
+        (dict(dim=3, friction="tresca", bound=1.0), "friction=tresca with dim=3 is"),
+        (dict(dim=3, kinematics="finite"), "kinematics=finite with dim=3 is not built"),
+    ],
+)
+def test_keys_that_space_does_not_have_are_refused(bad, message):
+    with pytest.raises(InputError, match=message):
+        FAMILY.check({**FAMILY.defaults, **bad})

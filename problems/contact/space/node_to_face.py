@@ -4,9 +4,9 @@ As in the plane (`problems.contact.node_to_segment`), each slave node stays on t
 side of the master: with its closest point x_c = Σ N_a x_a on the master faces and the
 outward normal n there, B u ≤ c with B = [−n at s, +N_a n at a] and c = g + B u^k.
 
-A quadrilateral face is four triangles (`problems.contact.faces`), on which the closest
-point is that of a triangle. n is the normal of the face; at an edge or a corner where
-several faces meet, it is their averaged normal.
+The closest point is that of the triangles of the faces
+(`problems.contact.space.triangles`). n is the normal of the face; at an edge or a
+corner where several faces meet, it is their averaged normal.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.faces import Faces, current_faces, face_tangents
 from mortarbench.problems.contact.node_to_segment import ContactRows, rows_along
-from mortarbench.problems.contact.surface import Points, current_positions
+from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
+from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
 #: distance between closest points on two faces, relative to the radius of a face, at
@@ -33,7 +33,7 @@ class ClosestPoints(NamedTuple):
     """Closest points of s positions on faces."""
 
     face: Nodes  #: (s,)
-    N: NDArray[np.float64]  #: (s, c) shape functions of the face at the closest point
+    N: NDArray[np.float64]  #: (s, 4) shape functions of the face at the closest point
     normal: Points  #: (s, 3) outward unit normal of the master there
 
 
@@ -51,7 +51,7 @@ def node_to_face(
     ----------
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
-    slave, master : (f, c) nodes of the faces of both sides, anticlockwise from outside
+    slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
     tangential : add two tangential rows per contact row
 
     Returns
@@ -64,16 +64,13 @@ def node_to_face(
         When a position is not finite or a face has no area.
 
     """
-    own, place = np.unique(slave, return_inverse=True)
-    nodes, corners = np.unique(master, return_inverse=True)
-    x = current_positions(points, u, own, "slave")
-    side = current_faces(x, place.reshape(slave.shape), "slave")
-    other = current_faces(
-        current_positions(points, u, nodes, "master"), corners.reshape(master.shape),
-        "master",
-    )  # fmt: skip
-    closest = closest_points(x, other)
-    at = other.corners[closest.face]
+    own, nodes = np.unique(slave), np.unique(master)
+    side, other = (
+        current_surface(points, u, faces, name)
+        for faces, name in ((slave, "slave"), (master, "master"))
+    )
+    x, closest = side.x, closest_points(side.x, triangulated(other))
+    at = other.facets[closest.face]
     gap = np.einsum("sx,sx->s", x, closest.normal)
     gap -= np.einsum("sa,sax,sx->s", closest.N, other.x[at], closest.normal)
     node = np.column_stack([own, nodes[at]])
@@ -82,37 +79,36 @@ def node_to_face(
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
         row = np.repeat(np.arange(own.size), 2)
-        along = face_tangents(closest.normal).reshape(-1, 3)
+        along = tangents(closest.normal).reshape(-1, 3)
         T = rows_along(node[row], weight[row], along, points.size)
     return ContactRows(B, gap + B @ u, T, row, side.areas, np.arange(own.size))
 
 
-def closest_points(x: Points, faces: Faces) -> ClosestPoints:
+def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
     """Return the closest points of x (s, 3) on faces, with outward normals."""
     tree = KDTree(faces.centre)
     # the centre of a face is one of its points, and none is farther than its radius
     nearest, _ = tree.query(x)
     found = tree.query_ball_point(x, nearest * (1 + SAME_POINT) + faces.radius.max())
-    node = np.repeat(np.arange(len(x)), [len(k) for k in found])
-    face = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
-    count = faces.triangles[face]
-    pair = np.repeat(np.arange(len(face)), count)
-    first = np.searchsorted(faces.face, face)
-    t = first[pair] + np.arange(len(pair)) - np.repeat(np.cumsum(count) - count, count)
-    barycentric = closest_in_triangles(x[node[pair]], faces.vertices[t])
+    candidate = np.concatenate([np.asarray(k, dtype=np.int64) for k in found])
+    t, pair = faces.of_faces(candidate)
+    node = np.repeat(np.arange(len(x)), [len(k) for k in found])[pair]
+    barycentric = closest_in_triangles(x[node], faces.vertices[t])
     at = np.einsum("pv,pvx->px", barycentric, faces.vertices[t])
-    distance = np.linalg.norm(at - x[node[pair]], axis=1)
-    order = np.lexsort([distance, node[pair]])
-    best = order[np.unique(node[pair][order], return_index=True)[1]]
+    distance = np.linalg.norm(at - x[node], axis=1)
+    order = np.lexsort([distance, node])
+    best = order[np.unique(node[order], return_index=True)[1]]
     # faces that meet at the closest point: their normals are averaged
-    same = np.linalg.norm(at - at[best][node[pair]], axis=1)
+    same = np.linalg.norm(at - at[best][node], axis=1)
     meets = same <= SAME_POINT * faces.radius[faces.face[t]]
-    touching = np.unique(np.stack([node[pair], faces.face[t]])[:, meets], axis=1)
+    touching = np.unique(np.stack([node, faces.face[t]])[:, meets], axis=1)
     total = np.zeros_like(x)
-    np.add.at(total, touching[0], faces.normal[touching[1]])
+    np.add.at(total, touching[0], faces.surface.normal[touching[1]])
     size = np.linalg.norm(total, axis=1, keepdims=True)
     face = faces.face[t[best]]
-    normal = np.where(size > 0, total / np.where(size > 0, size, 1), faces.normal[face])
+    normal = np.where(
+        size > 0, total / np.where(size > 0, size, 1), faces.surface.normal[face]
+    )
     N = np.einsum("sv,svc->sc", barycentric[best], faces.shape[t[best]])
     return ClosestPoints(face, N, normal)
 

@@ -8,7 +8,7 @@ the auxiliary plane; Popp, Gitterle, Gee and Wall, Int. J. Numer. Meth. Engng 83
 *Triangles.* A quadrilateral face is four triangles about the mean of its corners. Its
 shape functions N_k are linear on each of them, with the value ¼ at the centre. (With
 two triangles, or with the bilinear functions, whose inverse map is not polynomial, a
-distorted face fails the patch test; [docs/contact.md] has the figures.)
+distorted face fails the patch test.)
 
 *Auxiliary plane.* On the slave face e with centre x_e and unit normal n_e, points of
 both sides are projected along n_e onto the plane through x_e. There each slave triangle
@@ -46,11 +46,11 @@ from scipy.sparse import coo_array, csr_array, vstack
 from scipy.spatial import KDTree
 
 from mortarbench.harness import Vector
-from mortarbench.problems.contact.faces import Faces, current_faces, face_tangents
 from mortarbench.problems.contact.mortar import Basis
 from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.segment_search import Reach
-from mortarbench.problems.contact.surface import Points, current_positions
+from mortarbench.problems.contact.space.triangles import FaceTriangles, triangulated
+from mortarbench.problems.contact.surface import Points, current_surface, tangents
 from mortarbench.problems.fem.mesh import Nodes
 
 #: overlaps below this share of the area of the slave face are rounding of the
@@ -83,10 +83,10 @@ class Overlaps(NamedTuple):
 
     slave: Nodes  #: (p,) slave face
     master: Nodes  #: (p,) master face
-    area: NDArray[np.float64]  #: (p, c) ∫N_j, m²
-    own: NDArray[np.float64]  #: (p, c, c) ∫N_j N_k, m²
-    other: NDArray[np.float64]  #: (p, c, d) ∫N_j N^m_l, m²
-    gap: NDArray[np.float64]  #: (p, c) ∫N_j g, m³
+    area: NDArray[np.float64]  #: (p, 4) ∫N_j, m²
+    own: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N_k, m²
+    other: NDArray[np.float64]  #: (p, 4, 4) ∫N_j N^m_l, m²
+    gap: NDArray[np.float64]  #: (p, 4) ∫N_j g, m³
 
 
 def face_mortar(
@@ -105,8 +105,7 @@ def face_mortar(
     ----------
     points : (N, 3) reference positions X, m
     u : (3N,) displacement u^k at which to linearise, m
-    slave, master : (f, c) nodes of the faces of both sides, anticlockwise from outside;
-        a triangle among quadrilaterals repeats its last node
+    slave, master : (f, 4), (g, 4) faces of both sides, boundaries of a `Mesh`
     basis, reach, tangential : as for `problems.contact.mortar.mortar`
 
     Returns
@@ -119,16 +118,14 @@ def face_mortar(
         When a position is not finite or a face has no area.
 
     """
-    nodes, parts = [], []
-    for faces, name in ((slave, "slave"), (master, "master")):
-        own, corners = np.unique(faces, return_inverse=True)
-        x = current_positions(points, u, own, name)
-        nodes.append(own)
-        parts.append(current_faces(x, corners.reshape(faces.shape), name))
-    s, m = parts
-    at = overlaps(s, m, reach)
-    A = _dual(at) if basis == "dual" else np.eye(s.corners.shape[1])  # Φ = A N
-    j, k = s.corners[at.slave], m.corners[at.master]
+    s, m = (
+        current_surface(points, u, side, name)
+        for side, name in ((slave, "slave"), (master, "master"))
+    )
+    nodes = np.unique(slave), np.unique(master)
+    at = overlaps(triangulated(s), triangulated(m), reach)
+    A = _dual(at) if basis == "dual" else np.eye(4)  # Φ = A N
+    j, k = s.facets[at.slave], m.facets[at.master]
     cover = _gather(at.area, j, len(s.x))
     gap = _gather((A @ at.gap[..., None])[..., 0], j, len(s.x))
     active = np.flatnonzero(cover)
@@ -136,7 +133,7 @@ def face_mortar(
     normal = np.broadcast_to(s.normal[at.slave][:, None], (*j.shape, 3))
 
     def rows(direction: Points) -> csr_array:
-        """Return rows along directions (p, c, 3) of the slave nodes of each overlap."""
+        """Return rows along directions (p, 4, 3) of the slave nodes of each overlap."""
         entries = [
             _entries(values, direction, j, own[columns])
             for values, columns, own in ((D, j, nodes[0]), (-M, k, nodes[1]))
@@ -150,20 +147,20 @@ def face_mortar(
     B = rows(normal)
     T, row = csr_array((0, points.size)), np.arange(0)
     if tangential:
-        axes = face_tangents(s.node_normals)  # (v, 2, 3)
+        axes = s.tangents  # (v, 2, 3)
         stacked = [rows(axes[j, axis]) for axis in range(2)]
         row = np.repeat(np.arange(active.size), 2)
         order = np.arange(2 * active.size).reshape(2, -1).T.ravel()  # row by row
-        T = csr_array(csr_array(vstack(stacked))[order])
+        T = csr_array(vstack(stacked).tocsr()[order])
     return ContactRows(
         B, gap[active] / cover[active] + B @ u, T, row, cover[active], active
     )
 
 
-def overlaps(slave: Faces, master: Faces, reach: Reach) -> Overlaps:
+def overlaps(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> Overlaps:
     """Clip the triangles of both sides on the auxiliary planes of the slave faces."""
     e, m = _facing(slave, master, reach)
-    step = CHUNK // (slave.most_triangles * master.most_triangles)
+    step = CHUNK // (slave.number.max() * master.number.max())
     parts = [
         _integrals(slave, master, e[k : k + step], m[k : k + step], reach)
         for k in range(0, max(len(e), 1), step)
@@ -171,7 +168,9 @@ def overlaps(slave: Faces, master: Faces, reach: Reach) -> Overlaps:
     return Overlaps(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
-def _facing(slave: Faces, master: Faces, reach: Reach) -> tuple[Nodes, Nodes]:
+def _facing(
+    slave: FaceTriangles, master: FaceTriangles, reach: Reach
+) -> tuple[Nodes, Nodes]:
     """Return pairs of faces (k,) that rays along a slave normal may connect.
 
     From the centre of each slave face, both ways along its normal, a ball is moved by
@@ -189,7 +188,7 @@ def _facing(slave: Faces, master: Faces, reach: Reach) -> tuple[Nodes, Nodes]:
             d, _ = tree.query(at[moves])
             step = np.where(d > CLOSE * near[moves], d - near[moves], 0.0)
             t[moves] += step
-            at[moves] += (sign * step)[:, None] * slave.normal[moves]
+            at[moves] += (sign * step)[:, None] * slave.surface.normal[moves]
             moves[moves] = (step > 0) & (t[moves] <= limit)
             if not moves.any():
                 break
@@ -200,35 +199,32 @@ def _facing(slave: Faces, master: Faces, reach: Reach) -> tuple[Nodes, Nodes]:
         m.extend(np.asarray(k, dtype=np.int64) for k in found)
     pairs = np.unique(np.stack([np.concatenate(e), np.concatenate(m)]), axis=1)
     offset = master.centre[pairs[1]] - slave.centre[pairs[0]]
-    n = slave.normal[pairs[0]]
+    n = slave.surface.normal[pairs[0]]
     across = offset - np.einsum("px,px->p", offset, n)[:, None] * n
     size = slave.radius[pairs[0]] + master.radius[pairs[1]]
     used = np.linalg.norm(across, axis=1) <= size
-    used &= np.einsum("px,px->p", n, master.normal[pairs[1]]) <= reach.cosine
+    used &= np.einsum("px,px->p", n, master.surface.normal[pairs[1]]) <= reach.cosine
     return pairs[0, used], pairs[1, used]
 
 
-def _max_distance(slave: Faces, master: Faces, reach: Reach) -> float:
+def _max_distance(slave: FaceTriangles, master: FaceTriangles, reach: Reach) -> float:
     """Return the largest gap within reach, m."""
     if reach.distance is not None:
         return reach.distance
-    return max(slave.extent, master.extent)
+    return max(slave.surface.extent, master.surface.extent)
 
 
 def _integrals(
-    slave: Faces, master: Faces, e: Nodes, m: Nodes, reach: Reach
+    slave: FaceTriangles, master: FaceTriangles, e: Nodes, m: Nodes, reach: Reach
 ) -> Overlaps:
     """Return the integrals over the overlaps of pairs of faces e, m (k,)."""
-    a, b = slave.triangles[e], master.triangles[m]
-    # all triangles of one face with all of the other, pair by pair
-    each = a * b
-    pair = np.repeat(np.arange(len(e)), each)
-    place = np.arange(len(pair)) - np.repeat(np.cumsum(each) - each, each)
-    t_s = np.searchsorted(slave.face, e)[pair] + place // b[pair]
-    t_m = np.searchsorted(master.face, m)[pair] + place % b[pair]
+    t_s, pair = slave.of_faces(e)
+    t_m, place = master.of_faces(m[pair])
+    # all triangles of one face with all of the other
+    t_s, pair = t_s[place], pair[place]
     # coordinates on the auxiliary plane, and the height above it
     frame = np.concatenate(
-        [face_tangents(slave.normal[e]), slave.normal[e][:, None]], 1
+        [tangents(slave.surface.normal[e]), slave.surface.normal[e][:, None]], 1
     )
     on_s, on_m = (
         np.einsum(
@@ -236,7 +232,7 @@ def _integrals(
         )
         for side, t in ((slave, t_s), (master, t_m))
     )
-    on_m = on_m[:, ::-1]  # runs clockwise on the plane of a face that it faces
+    on_m = on_m[:, ::-1]  # opposite faces run clockwise on the plane
     meets = (on_s.max(axis=1) > on_m.min(axis=1))[:, :2].all(axis=1)
     meets &= (on_m.max(axis=1) > on_s.min(axis=1))[:, :2].all(axis=1)
     meets &= _double_area(on_m) > 0
@@ -351,7 +347,7 @@ def _double_area(triangle: Points) -> Vector:
 
 
 def _dual(at: Overlaps) -> NDArray[np.float64]:
-    """Return A = D_e M_e⁺ (p, c, c) of the slave face of each overlap."""
+    """Return A = D_e M_e⁺ (p, 4, 4) of the slave face of each overlap."""
     faces, place = np.unique(at.slave, return_inverse=True)
     M_e = np.zeros((len(faces), *at.own.shape[1:]))
     D_e = np.zeros((len(faces), at.own.shape[1]))
@@ -362,15 +358,15 @@ def _dual(at: Overlaps) -> NDArray[np.float64]:
 
 
 def _gather(values: NDArray[np.float64], nodes: Nodes, count: int) -> Vector:
-    """Add values (p, c) at nodes (p, c) into a vector (count,)."""
+    """Add values (p, 4) at nodes (p, 4) into a vector (count,)."""
     return np.bincount(nodes.ravel(), values.ravel(), minlength=count).astype(float)
 
 
 def _entries(
     values: NDArray[np.float64], direction: Points, rows: Nodes, nodes: Nodes
 ) -> tuple[Vector, Nodes, Nodes]:
-    """Return values, rows and columns of blocks (p, c, d) along vectors (p, c, 3)."""
-    block = values[..., None] * direction[:, :, None]  # (p, c, d, 3)
+    """Return values, rows and columns of blocks (p, 4, 4) along vectors (p, 4, 3)."""
+    block = values[..., None] * direction[:, :, None]  # (p, 4, 4, 3)
     row = np.broadcast_to(rows[:, :, None, None], block.shape)
     column = np.broadcast_to((3 * nodes[:, None, :, None] + np.arange(3)), block.shape)
     return block.ravel(), row.ravel(), column.ravel()

@@ -1,0 +1,1 @@
+"""Contact of faces with nodes and faces in space."""

@@ -1,0 +1,59 @@
+"""Faces of contact sides in space, divided into triangles.
+
+A quadrilateral face is four triangles about the mean of its corners. Its shape
+functions are linear on each of them, with the value ¼ at the centre. So the surface is
+continuous, and integrals over overlaps of two sides are exact. The integrals ∫N_j over
+plane faces are those of the bilinear functions.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness import Vector
+from mortarbench.problems.contact.surface import Points, Surface
+from mortarbench.problems.fem.mesh import Nodes
+
+_CORNERS = np.eye(4)
+#: (4, 3, 4) shape functions at the vertices of the triangles of a quadrilateral
+_QUAD = np.array(
+    [[_CORNERS[k], _CORNERS[(k + 1) % 4], np.full(4, 0.25)] for k in range(4)]
+)
+#: (3, 4) the same for a triangle, which repeats its last corner
+_TRIANGLE = _CORNERS[:3]
+
+
+class FaceTriangles(NamedTuple):
+    """The triangles of the faces of a side in space."""
+
+    surface: Surface
+    centre: Points  #: (f, 3) means of the corners of each face, m
+    radius: Vector  #: (f,) largest distance of a corner from the centre, m
+    number: Nodes  #: (f,) number of triangles of each face, 1 or 4
+    face: Nodes  #: (t,) face of each triangle, ascending
+    shape: NDArray[np.float64]  #: (t, 3, 4) shape functions of the face at its vertices
+    vertices: Points  #: (t, 3, 3) m
+
+    def of_faces(self, faces: Nodes) -> tuple[Nodes, Nodes]:
+        """Return the triangles (k,) of faces (p,), and their places (k,) in `faces`."""
+        count = self.number[faces]
+        place = np.repeat(np.arange(len(faces)), count)
+        offset = np.arange(len(place)) - np.repeat(np.cumsum(count) - count, count)
+        return np.searchsorted(self.face, faces)[place] + offset, place
+
+
+def triangulated(surface: Surface) -> FaceTriangles:
+    """Divide the faces of a surface into triangles."""
+    is_quad = surface.facets[:, 3] != surface.facets[:, 2]
+    at = surface.x[surface.facets]
+    number = np.where(is_quad, 4, 1)
+    face = np.repeat(np.arange(len(number)), number)
+    edge = np.arange(len(face)) - np.repeat(np.cumsum(number) - number, number)
+    shape = np.where(is_quad[face, None, None], _QUAD[edge], _TRIANGLE)
+    centre = np.where(is_quad[:, None], at.mean(axis=1), at[:, :3].mean(axis=1))
+    radius = np.linalg.norm(at - centre[:, None], axis=2).max(axis=1)
+    vertices = np.einsum("tvc,tcx->tvx", shape, at[face])
+    return FaceTriangles(surface, centre, radius, number, face, shape, vertices)
