@@ -250,6 +250,6 @@ def test_a_face_without_area_is_refused():
     )
     faces = np.array([[0, 1, 2, 2]]), np.array([[3, 5, 4, 4]])
     with pytest.raises(
-        InputError, match="contact slave: the face around .* has no area"
+        InputError, match=r"contact slave: the face around .*has no area"
     ):
         face_mortar(points, np.zeros(18), *faces)
