@@ -17,11 +17,10 @@ from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
 from mortarbench.harness.files.datafile import check_size, opened, parsing
-from mortarbench.harness.mechanics import KINDS
+from mortarbench.harness.mechanics import KINDS, boundary_facets
 from mortarbench.problems.fem.elements import cross
 from mortarbench.problems.fem.mesh import (
     Nodes,
-    boundary_facets,
     is_triangle,
 )
 
