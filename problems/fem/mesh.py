@@ -30,6 +30,9 @@ from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Elemen
 
 Nodes = NDArray[np.int64]
 
+#: corners of a degenerate hexahedron, by kind, see the module's docstring
+REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]}
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
