@@ -228,6 +228,21 @@ KINDS = {
 }
 
 
+#: Corners of the facets of each kind, the cell on their left: in space anticlockwise
+#: from outside, and triangles repeat their last corner.
+FACETS = {
+    "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
+    "tetra": ((0, 2, 1, 1), (0, 1, 3, 3), (1, 2, 3, 3), (2, 0, 3, 3)),
+    "wedge": (
+        (0, 2, 1, 1), (3, 4, 5, 5), (0, 1, 4, 3), (1, 2, 5, 4), (2, 0, 3, 5),
+    ),
+    "hexahedron": (
+        (0, 3, 2, 1), (4, 5, 6, 7), (0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6),
+        (3, 0, 4, 7),
+    ),
+}  # fmt: skip
+
+
 class CellBlock(NamedTuple):
     """Cells of one kind."""
 
@@ -263,6 +278,42 @@ def cell_blocks(table: NDArray[np.int64], dim: int) -> tuple[CellBlock, ...]:
         nodes = table[cells][differs[cells]].reshape(-1, count)
         blocks.append(CellBlock(KINDS[dim, int(count)], nodes, cells))
     return tuple(blocks)
+
+
+def boundary_facets(cells: NDArray[np.int64], dim: int) -> NDArray[np.int64]:
+    """Return the boundary facets (k, m): those of exactly one cell, body on the left.
+
+    In the plane facets are edges, sorted by their lower node, then by the other one.
+    """
+    facets, names, _ = cell_facets(cells, dim)
+    key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
+    for lowest in names.T:
+        key = key * count + lowest
+    _, first, times = np.unique(key, return_index=True, return_counts=True)
+    return np.asarray(facets[first[times == 1]])
+
+
+def cell_facets(cells: NDArray[np.int64], dim: int) -> tuple[NDArray[np.int64], ...]:
+    """Return the facets of all cells (k, m), their names (k, dim) and cells (k,).
+
+    The dim lowest nodes of a facet are its name, which neighbouring cells share.
+    Degenerate facets between repeated corners are left out; triangles in space repeat
+    their last corner.
+    """
+    facet = np.array(FACETS[KINDS[dim, cells.shape[1]]])
+    facets = cells[:, facet].reshape(-1, facet.shape[1])
+    cell = np.repeat(np.arange(len(cells)), len(facet))
+    names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
+    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # distinct nodes come first
+    names = np.sort(names, axis=1)[:, :dim]
+    is_facet = names[:, -1] < last
+    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
+    if dim > 2:
+        repeats = facets == np.roll(facets, -1, axis=1)
+        at = np.where(repeats.any(axis=1), repeats.argmax(axis=1), 2)
+        turned = (at[:, None] + np.arange(-2, 2)) % 4
+        facets = np.take_along_axis(facets, turned, axis=1)
+    return facets, names, cell
 
 
 class Grid(NamedTuple):

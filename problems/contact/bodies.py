@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import InputError, Vector
+from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
@@ -26,7 +27,7 @@ from mortarbench.problems.fem.inverse import (
     regular_inverse,
     supported_inverse,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, boundary_facets, dofs_of
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
 
 
 class ContactPair(NamedTuple):

@@ -25,6 +25,7 @@ from mortarbench.harness import (
     no_rows,
 )
 from mortarbench.harness.distributed.vectors import DistributedQP, Ranks
+from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.contact.bodies import (
     ContactPair,
     ContactSides,
@@ -46,7 +47,6 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     as_vectors,
-    boundary_facets,
     dofs_of,
 )
 from mortarbench.problems.fem.stress import centre_stress, recover, von_mises

@@ -1,4 +1,4 @@
-"""Finite elements as data: products of simplices, with facets.
+"""Finite elements as data: products of simplices.
 
 A simplex with the vertices v_0 … v_d has the barycentric coordinates λ_0 … λ_d, affine
 functions with λ_i(v_j) = δ_ij. The reference cell is the product of one or more
@@ -44,9 +44,6 @@ class Element:
     kind: str  #: name of its cells in meshio
     simplices: tuple[Ints, ...]  #: vertices of each factor
     vertices: Ints  #: (n, factors) vertex of each factor at each corner
-    #: (f, m) corners of each facet, the cell on its left; in space anticlockwise from
-    #: outside, and triangles repeat their last corner
-    facets: Ints
 
     @property
     def dim(self) -> int:
@@ -136,30 +133,21 @@ QUAD = Element(
     "quad",
     simplices=(INTERVAL, INTERVAL),
     vertices=np.array([[0, 0], [1, 0], [1, 1], [0, 1]]),
-    facets=np.array([[0, 1], [1, 2], [2, 3], [3, 0]]),
 )
 HEXAHEDRON = Element(
     "hexahedron",
     simplices=(INTERVAL, INTERVAL, INTERVAL),
     vertices=np.vstack([np.insert(QUAD.vertices, 2, z, axis=1) for z in (0, 1)]),
-    facets=np.array([
-        [0, 3, 2, 1], [4, 5, 6, 7], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6],
-        [3, 0, 4, 7],
-    ]),
 )  # fmt: skip
 WEDGE = Element(
     "wedge",
     simplices=(TRIANGLE, INTERVAL),
     vertices=np.array([[0, 0], [1, 0], [2, 0], [0, 1], [1, 1], [2, 1]]),
-    facets=np.array([
-        [0, 2, 1, 1], [3, 4, 5, 5], [0, 1, 4, 3], [1, 2, 5, 4], [2, 0, 3, 5],
-    ]),
 )  # fmt: skip
 TETRA = Element(
     "tetra",
     simplices=(TETRAHEDRON,),
     vertices=np.arange(4)[:, None],
-    facets=np.array([[0, 2, 1, 1], [0, 1, 3, 3], [1, 2, 3, 3], [2, 0, 3, 3]]),
 )
 #: elements by dimension and number of columns of a table of cells
 ELEMENTS = {

@@ -1,4 +1,4 @@
-"""Reader of plane bodies from gmsh's .msh files with physical names."""
+"""Reader of bodies from gmsh's .msh files with physical names."""
 
 from __future__ import annotations
 
@@ -17,55 +17,57 @@ from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
 from mortarbench.harness.files.datafile import check_size, opened, parsing
-from mortarbench.harness.mechanics import KINDS
-from mortarbench.problems.fem.elements import cross
-from mortarbench.problems.fem.mesh import (
-    Nodes,
-    boundary_facets,
-    is_triangle,
-)
+from mortarbench.harness.mechanics import KINDS, boundary_facets, cell_blocks
+from mortarbench.problems.fem.elements import ELEMENTS, cross
+from mortarbench.problems.fem.mesh import REPEATED, Nodes, is_triangle
 
 #: memory of meshio's parser, as a multiple of the size of the file
 _PARSER_FACTOR = 32
 #: largest deviation from a plane z = const, relative to the extent
 FLATNESS_TOLERANCE = 1e-9
 #: dimension of each supported kind of cell
-DIMENSION = {kind: dim for (dim, _), kind in KINDS.items() if dim < 3}
+DIMENSION = {kind: dim for (dim, _), kind in KINDS.items()}
 #: larger coordinates are refused: products of them overflow
 MAX_COORDINATE = 1e100
 CORNERS = {kind: corners for (_, corners), kind in KINDS.items() if kind in DIMENSION}
-#: prefixes of meshio's names of cells of higher order, and of solid cells
-_CURVED = ("line", "triangle", "quad")
-_SOLID = ("tetra", "hexahedron", "wedge", "pyramid")
-_SPACE = "three dimensions are not supported yet"
-_FIRST_ORDER = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -2 -order 1"
-_NAMED = 'Physical Surface("NAME") in the .geo file'
+#: corners in the order of the mirrored cell, by kind
+_MIRRORED = {
+    "tetra": [1, 0, 2, 3], "wedge": [3, 4, 5, 0, 1, 2],
+    "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],
+}  # fmt: skip
+#: name of bodies by dimension, and of their boundaries
+_BODY, _BOUNDARY = {2: "surface", 3: "volume"}, {2: "curve", 3: "surface"}
 _SAVED = "only physical groups: Mesh.SaveAll = 0"
 
 
 class NamedMesh(NamedTuple):
-    """A plane mesh of triangles and quadrilaterals with named parts."""
+    """A mesh with named parts, in the plane or in space."""
 
-    points: NDArray[np.float64]  #: (N, 2)
-    cells: Nodes  #: (E, 4) counter-clockwise; a triangle repeats its last node
-    surfaces: Mapping[str, Nodes]  #: cell numbers of each body
-    curves: Mapping[str, Nodes]  #: (k, 2) edges with the body on their left
-    spots: Mapping[str, Nodes]  #: nodes of each physical point
+    points: NDArray[np.float64]  #: (N, dim)
+    cells: Nodes  #: (E, c) as of a `problems.fem.mesh.Mesh`
+    surfaces: Mapping[str, Nodes]  #: cell numbers of each body, in space a volume
+    #: of each physical curve, edges (k, 2) with the body on their left; in space of
+    #: each physical surface, faces (k, 4), anticlockwise from outside
+    curves: Mapping[str, Nodes]
+    spots: Mapping[str, Nodes]  #: nodes of each physical point, in space also curve
 
 
 def read_msh(path: Path) -> NamedMesh:
-    """Read the physical surfaces, curves and points of a .msh file, format 2.2 or 4.1.
+    """Read the physical groups of a .msh file, format 2.2 or 4.1.
+
+    Bodies are physical volumes of tetrahedra, wedges or hexahedra if the file has such
+    cells, else physical surfaces.
 
     Nodes and cells are numbered body by body, on which generalised inverses rely.
-    Within a body, they keep the order of the file, where triangles and quadrilaterals
-    are in blocks. Nodes without cells (such as centres of arcs) are left out.
+    Within a body, they keep the order of the file, where kinds of cells are in blocks.
+    Nodes without cells (such as centres of arcs) are left out.
 
     Raises
     ------
     InputError
-        When the file cannot be read, is not plane, or contains cells other than
-        first-order triangles and quadrilaterals, cells without a name, bodies that
-        share nodes, or a body of several disconnected parts.
+        When the file cannot be read, has surfaces that are not plane but no volumes,
+        or contains cells that are not of first order, pyramids, cells without a name,
+        bodies that share nodes, or a body of several disconnected parts.
 
     """
     mesh = _read(path)
@@ -73,41 +75,51 @@ def read_msh(path: Path) -> NamedMesh:
         if block.type not in DIMENSION:
             raise InputError(f"{path}: cells of type {block.type}; {_remedy(block)}")
     points = np.asarray(mesh.points, dtype=float)
+    dim = _dimension(mesh)
     extent = np.ptp(points, axis=0).max(initial=0.0)
-    if points.shape[1] > 2 and np.ptp(points[:, 2]) > FLATNESS_TOLERANCE * extent:
+    is_flat = points.shape[1] < 3 or (
+        np.ptp(points[:, 2]) <= FLATNESS_TOLERANCE * extent
+    )
+    if dim == 2 and not is_flat:
         raise InputError(
-            f"{path}: not plane; {_SPACE}: expected all nodes at the same z"
+            f"{path}: not plane, and without cells in space; expected all nodes at the "
+            "same z, or volumes meshed by gmsh -3"
         )
-    parts = _named(path, mesh, 2)
+    parts = _named(path, mesh, dim)
     if not parts:
-        raise InputError(f"{path}: no named surface with cells; expected {_NAMED}")
+        raise InputError(
+            f"{path}: no named {_BODY[dim]} with cells; expected {_group(dim)}"
+        )
     used = _unique_in_order([np.unique(part) for part in parts.values()])
     renumbered = np.full(len(points), -1)
     renumbered[used] = np.arange(used.size)
-    points = points[used, :2]
+    points = points[used, :dim]
     cells = renumbered[np.concatenate(list(parts.values()))]
-    cells = _counter_clockwise(path, points, cells)
+    cells = (_counter_clockwise if dim == 2 else _right_handed)(path, points, cells)
     ends = np.cumsum([0] + [len(part) for part in parts.values()])
     surfaces = {name: np.arange(ends[i], ends[i + 1]) for i, name in enumerate(parts)}
-    _check_apart(path, len(points), cells, surfaces)
-    edges_of_boundary = boundary_facets(cells, 2).tolist()
-    directed = {(min(a, b), max(a, b)): (a, b) for a, b in edges_of_boundary}
+    _check_apart(path, len(points), cells, surfaces, dim)
+    directed = {
+        tuple(sorted(set(facet))): facet
+        for facet in boundary_facets(cells, dim).tolist()
+    }
     return NamedMesh(
         points, cells, surfaces,
         curves={
-            name: _directed(path, name, renumbered[edges], directed)
-            for name, edges in _named(path, mesh, 1).items()
+            name: _directed(path, name, renumbered[facets], directed, dim)
+            for name, facets in _named(path, mesh, dim - 1).items()
         },
         spots={
-            name: renumbered[nodes].ravel()
-            for name, nodes in _named(path, mesh, 0).items()
+            name: np.unique(renumbered[nodes]) if below else renumbered[nodes].ravel()
+            for below in range(dim - 1)
+            for name, nodes in _named(path, mesh, below).items()
             if (renumbered[nodes] >= 0).all()
         },
     )  # fmt: skip
 
 
 def refine(mesh: NamedMesh) -> NamedMesh:
-    """Refine uniformly: bisect every edge, and divide each cell into four.
+    """Refine a plane mesh: bisect every edge, and divide each cell into four.
 
     New nodes lie on the straight edges, so that bodies keep their shape. A triangle is
     divided into four similar ones, a quadrilateral about the mean of its corners. Nodes
@@ -157,13 +169,22 @@ def refine(mesh: NamedMesh) -> NamedMesh:
     )  # fmt: skip
 
 
+def _dimension(mesh: Any) -> int:
+    """Return the dimension of the bodies of a file: 3 if it has cells in space."""
+    return max([2, *(DIMENSION[block.type] for block in mesh.cells)])
+
+
 def _remedy(block: Any) -> str:
     """Return the expectation of the message about unsupported cells."""
-    if block.type.startswith(_SOLID):
-        return f"{_SPACE}: expected plane bodies, gmsh -2"
-    if block.type.startswith(_CURVED):
-        return f"expected cells of first order: {_FIRST_ORDER}"
-    return f"expected triangles or quadrilaterals: {', '.join(DIMENSION)} of meshio"
+    orders = [d for kind, d in DIMENSION.items() if block.type.startswith(kind)]
+    if dim := max(orders, default=0):
+        return (
+            "expected cells of first order: Mesh.ElementOrder = 1 in the .geo file, or "
+            f"gmsh -{max(dim, 2)} -order 1"
+        )
+    if block.type.startswith("pyramid"):
+        return "expected no pyramids: volumes of tetrahedra alone, gmsh -3"
+    return f"expected {', '.join(DIMENSION)}, as meshio calls them"
 
 
 def _read(path: Path) -> Any:
@@ -270,7 +291,12 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
 
 
 def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
-    """Return the cells of one dimension by physical names, in the file's order."""
+    """Return the cells of one dimension by physical names, in the file's order.
+
+    Triangles have four columns, as quadrilaterals; so have all cells of a mixture in
+    space eight.
+    """
+    is_mixed = len({b.type for b in mesh.cells if DIMENSION[b.type] == 3}) > 1
     names = {
         int(tag): name
         for name, (tag, dimension) in mesh.field_data.items()
@@ -287,8 +313,10 @@ def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
                 part = np.asarray(block.data, dtype=np.int64)[tag == number]
                 if block.type == "triangle":
                     part = part[:, [0, 1, 2, 2]]
+                elif is_mixed and block.type in REPEATED:
+                    part = part[:, REPEATED[block.type]]
                 cells.setdefault(names[int(number)], []).append(part)
-            elif dim == 2:
+            elif dim == _dimension(mesh):
                 nameless += tag[tag == number].tolist()
     if nameless:
         # gmsh omits entities in no physical group, unless there are no groups at all
@@ -296,9 +324,14 @@ def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
         more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
         raise InputError(
             f"{path}: {len(nameless)} cells without a name; expected each in a named "
-            f"surface: {_NAMED}{more}"
+            f"{_BODY[dim]}: {_group(dim)}{more}"
         )
     return {name: np.concatenate(parts) for name, parts in cells.items()}
+
+
+def _group(dim: int) -> str:
+    """Return the line of a .geo file that names a body."""
+    return f'Physical {_BODY[dim].capitalize()}("NAME") in the .geo file'
 
 
 def _unique_in_order(parts: list[Nodes]) -> Nodes:
@@ -331,8 +364,30 @@ def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) ->
     return cells
 
 
+def _right_handed(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
+    """Reorder mirrored cells; raise InputError for cells without volume at a point."""
+    cells = cells.copy()
+    for block in cell_blocks(cells, 3):
+        element = ELEMENTS[3, block.nodes.shape[1]]
+        slopes = np.stack([element.gradients(xi) for xi in element.points])
+        J = np.einsum("qar,eax->eqrx", slopes, points[block.nodes])
+        det = np.linalg.det(J)
+        mirrored = (det < 0).all(axis=1)
+        if (bad := ~mirrored & (det <= 0).any(axis=1)).any():
+            x, y, z = points[block.nodes[bad.argmax()]].mean(axis=0)
+            raise InputError(
+                f"{path}: the {block.kind} around ({x:.6g}, {y:.6g}, {z:.6g}) has no "
+                "volume or folds over; expected distinct corners, in gmsh's order"
+            )
+        nodes = block.nodes[mirrored][:, _MIRRORED[block.kind]]
+        if cells.shape[1] != nodes.shape[1]:
+            nodes = nodes[:, REPEATED[block.kind]]
+        cells[block.cells[mirrored]] = nodes
+    return cells
+
+
 def _check_apart(
-    path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes]
+    path: Path, nodes: int, cells: Nodes, surfaces: Mapping[str, Nodes], dim: int
 ) -> None:
     """Raise InputError for bodies that share nodes, or consist of several parts."""
     owner = np.full(nodes, -1)
@@ -346,30 +401,31 @@ def _check_apart(
                 "its own for each body"
             )
         owner[of_body] = i
-    start, end = cells.ravel(), np.roll(cells, -1, axis=1).ravel()
+    start, end = cells[:, :-1].ravel(), cells[:, 1:].ravel()
     graph = coo_array((np.ones(start.size), (start, end)), shape=(nodes, nodes))
     _, part = connected_components(graph, directed=False)
     for i, name in enumerate(names):
         if (count := np.unique(part[owner == i]).size) > 1:
             raise InputError(
                 f"{path}: body {name!r} falls into {count} parts; expected a physical "
-                "surface for each"
+                f"{_BODY[dim]} for each"
             )
 
 
 def _directed(
-    path: Path, name: str, edges: Nodes, boundary: Mapping[Any, tuple[int, int]]
+    path: Path, name: str, facets: Nodes, boundary: Mapping[Any, list[int]], dim: int
 ) -> Nodes:
-    """Return the edges of a curve, directed so that the body is on the left."""
-    if (edges < 0).any():
+    """Return the facets of a boundary, directed so that the body is on the left."""
+    where, facet = f"{_BOUNDARY[dim]} {name!r}", "an edge" if dim == 2 else "a face"
+    if (facets < 0).any():
         raise InputError(
-            f"{path}: curve {name!r} has an edge that bounds no body in the file: gmsh "
-            f"leaves out surfaces without a physical name; expected {_NAMED}"
+            f"{path}: {where} has {facet} that bounds no body in the file: gmsh leaves "
+            f"out {_BODY[dim]}s without a physical name; expected {_group(dim)}"
         )
-    sorted_ = [(min(a, b), max(a, b)) for a, b in edges.tolist()]
-    if not all(edge in boundary for edge in sorted_):
+    names = [tuple(sorted(set(facet))) for facet in facets.tolist()]
+    if not all(name in boundary for name in names):
         raise InputError(
-            f"{path}: curve {name!r} has an edge that bounds no body, or lies within "
-            "one; expected edges of cells on the boundary"
+            f"{path}: {where} has {facet} that bounds no body, or lies within one; "
+            f"expected {facet.split()[1]}s of cells on the boundary"
         )
-    return np.array([boundary[edge] for edge in sorted_], dtype=np.int64)
+    return np.array([boundary[name] for name in names], dtype=np.int64)

@@ -25,10 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
-from mortarbench.harness.mechanics import CellBlock, cell_blocks
+from mortarbench.harness.mechanics import CellBlock, boundary_facets, cell_blocks
 from mortarbench.problems.fem.elements import ELEMENTS, HEXAHEDRON, QUAD, Element
 
 Nodes = NDArray[np.int64]
+
+#: corners of a degenerate hexahedron, by kind, see the module's docstring
+REPEATED = {"tetra": [0, 1, 2, 2, 3, 3, 3, 3], "wedge": [0, 1, 2, 2, 3, 4, 5, 5]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -383,42 +386,6 @@ def prefixed(mesh: Mesh, prefix: str) -> Mesh:
 def is_triangle(cells: Nodes) -> NDArray[np.bool_]:
     """Return a mask (E,) of the triangles among cells (E, 4)."""
     return np.asarray(cells[:, 2] == cells[:, 3])
-
-
-def boundary_facets(cells: Nodes, dim: int) -> Nodes:
-    """Return the boundary facets (k, m): those of exactly one cell, body on the left.
-
-    In the plane facets are edges, sorted by their lower node, then by the other one.
-    """
-    facets, names, _ = cell_facets(cells, dim)
-    key, count = np.zeros(len(names), dtype=np.int64), cells.max(initial=0) + 1
-    for lowest in names.T:
-        key = key * count + lowest
-    _, first, times = np.unique(key, return_index=True, return_counts=True)
-    return np.asarray(facets[first[times == 1]])
-
-
-def cell_facets(cells: Nodes, dim: int) -> tuple[Nodes, Nodes, Nodes]:
-    """Return the facets of all cells (k, m), their names (k, dim) and cells (k,).
-
-    The dim lowest nodes of a facet are its name, which neighbouring cells share.
-    Degenerate facets between repeated corners are left out; triangles in space repeat
-    their last corner.
-    """
-    facet = ELEMENTS[dim, cells.shape[1]].facets
-    facets = cells[:, facet].reshape(-1, facet.shape[1])
-    cell = np.repeat(np.arange(len(cells)), len(facet))
-    names, last = np.sort(facets, axis=1), np.iinfo(facets.dtype).max
-    names[:, 1:][names[:, 1:] == names[:, :-1]] = last  # distinct nodes come first
-    names = np.sort(names, axis=1)[:, :dim]
-    is_facet = names[:, -1] < last
-    facets, names, cell = facets[is_facet], names[is_facet], cell[is_facet]
-    if dim > 2:
-        repeats = facets == np.roll(facets, -1, axis=1)
-        at = np.where(repeats.any(axis=1), repeats.argmax(axis=1), 2)
-        turned = (at[:, None] + np.arange(-2, 2)) % 4
-        facets = np.take_along_axis(facets, turned, axis=1)
-    return facets, names, cell
 
 
 def nodal_lengths(chain: NDArray[np.float64]) -> Vector:

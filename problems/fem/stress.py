@@ -17,13 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
+from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.elasticity import (
     Plane,
     cell_dofs,
     shape_gradients,
     strain_matrix,
 )
-from mortarbench.problems.fem.mesh import Mesh, boundary_facets
+from mortarbench.problems.fem.mesh import Mesh
 
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

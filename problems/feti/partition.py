@@ -17,7 +17,8 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import InputError
-from mortarbench.problems.fem.mesh import Nodes, cell_facets
+from mortarbench.harness.mechanics import cell_facets
+from mortarbench.problems.fem.mesh import Nodes
 
 Labels = NDArray[np.int64]
 

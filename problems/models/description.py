@@ -145,7 +145,13 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
 
     """
     table = read_description(path)
-    named = read_msh(path.parent / table["mesh"])
+    mesh_path = path.parent / table["mesh"]
+    named = read_msh(mesh_path)
+    if named.points.shape[1] > 2:
+        raise InputError(
+            f"{mesh_path}: volumes; bodies: in space is not built; expected plane "
+            "bodies, gmsh -2"
+        )
     check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before refining
     for _ in range(halvings):
         named = refine(named)

@@ -52,6 +52,15 @@ class Raster:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Faces:
+    """Quadrilaterals drawn one over another; those without a value are outlines."""
+
+    corners: NDArray[np.float64]  #: (k, 4, 2), back to front
+    values: Vector  #: (k,) colours; NaN: a thin white outline
+    scale: ColourScale
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Polygons:
     """Filled outlines."""
 
@@ -120,7 +129,9 @@ class Label:
     size: float = 9.5  #: points
 
 
-FieldMark = ColourField | Raster | Polygons | Strokes | Path | Vectors | Arrow | Label
+FieldMark = (
+    ColourField | Raster | Faces | Polygons | Strokes | Path | Vectors | Arrow | Label
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

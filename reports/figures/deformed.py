@@ -8,9 +8,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import Fields, InputError, Vector
+from mortarbench.harness import ContactSide, Fields, InputError, Vector
+from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.harness.plugin import SLIDING
 from mortarbench.reports.document.fields import (
+    Arrow,
     ColourField,
     ColourScale,
     FieldFigure,
@@ -24,6 +26,14 @@ from mortarbench.reports.document.fields import (
     Vectors,
 )
 from mortarbench.reports.document.figure import INK, Look
+from mortarbench.reports.figures.projection import (
+    Camera,
+    camera_seeing,
+    camera_towards,
+    crease_edges,
+    face_normals,
+    visible_faces,
+)
 
 #: of the nodal stresses, where colours end: stresses are singular at corners
 PERCENTILE = 99.5
@@ -55,6 +65,7 @@ _TORN = Look(colour="white", width=0.9)  #: borders of subdomains
 #: arrows of open nodes that carry a share of their neighbours' forces
 _OPEN = "#6b7480"
 _OUTLINE = Look(colour=INK, width=0.7)
+_CREASE = np.radians(40)  #: least angle between faces whose edge is outlined
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
@@ -100,19 +111,18 @@ def automatic_scale(fields: Fields) -> float:
 
 
 def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
-    """Show all bodies and an enlargement of each contact under load.
+    """Show all bodies, and for each contact under load an enlargement.
+
+    In space, bodies are seen by a still camera, and contacts by their pressure.
 
     scale : magnification of the displacement; None: `automatic_scale`
 
     Raises
     ------
     InputError
-        When displacement or stress is not finite, when the bodies have zero extent, or
-        in three dimensions.
+        When displacement or stress is not finite, or when the bodies have zero extent.
 
     """
-    if fields.dim != 2:
-        raise InputError("bodies in space cannot be drawn: expected a .vtu")
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError(
@@ -121,6 +131,8 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies have no width or no height and cannot be drawn")
     scale = automatic_scale(fields) if scale is None else scale
+    if fields.dim == 3:
+        return _figure_in_space(fields, scale)
     points = moved(fields, scale)
     loaded = _loaded(fields)
     both = np.vstack([fields.points, points])
@@ -182,8 +194,108 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     )
 
 
+def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
+    """Show the surface of bodies in space, and the pressure on each contact side."""
+    faces = np.concatenate([boundary_facets(block.nodes, 3) for block in fields.blocks])
+    sides = [
+        (side, faces[np.isin(faces, side.nodes).all(axis=1)])
+        for side in fields.contacts if side.pressure.max(initial=0.0) > 0
+    ]  # fmt: skip
+    sides = [(side, own) for side, own in sides if len(own)]
+    normals = [face_normals(fields.points, own).sum(axis=0) for _, own in sides]
+    normals = [normal / np.linalg.norm(normal) for normal in normals]
+    camera = camera_seeing(normals[0] if normals else np.zeros(3))
+    points = moved(fields, scale)
+    span = float(np.ptp(np.vstack([fields.points, points]), axis=0).max())
+    colours = _scale(fields)
+    stress = np.full(len(points), 0.3) if colours is None else fields.nodal["von_mises"]
+    shown = visible_faces(
+        camera, points, faces, stress, colours or _PLAIN,
+        mesh=len(faces) <= _MESH_SHOWN,
+    )  # fmt: skip
+    before = crease_edges(camera, fields.points, faces, _CREASE)
+    outlines = [Path(points=ends, look=_BEFORE) for ends in before]
+    both = np.vstack([shown.corners.reshape(-1, 2), before.reshape(-1, 2)])
+    low, high = both.min(axis=0), both.max(axis=0)
+    low, high = low - 0.12 * (high - low).max(), high + 0.02 * (high - low)
+    letters = iter("abcdefghijklmnopqrstuvwxyz")
+    panels = [
+        FieldPanel(
+            low=_pair(low), high=_pair(high), axes="none", scale=colours,
+            marks=(shown, *outlines, *_triad(camera, low, high)),
+            title=f"({next(letters)}) displacement × {scale:g}; dashed: undeformed",
+        )
+    ]  # fmt: skip
+    for (side, own), normal in zip(sides, normals, strict=True):
+        panels.append(_pressure_panel(fields, side, own, normal, next(letters), span))
+    rows = -(-len(panels) // 2)
+    return FieldFigure(
+        panels=tuple(panels), columns=min(len(panels), 2), height=3.9 * rows,
+        heights=(1.0,) * rows,
+    )  # fmt: skip
+
+
+def _pressure_panel(
+    fields: Fields, side: ContactSide, faces: NDArray[np.int64], normal: Vector,
+    letter: str, span: float,
+) -> FieldPanel:  # fmt: skip
+    """Show the pressure on the undeformed faces of a side, along its mean normal."""
+    camera = camera_towards(normal)
+    pressure = np.zeros(len(fields.points))
+    pressure[side.nodes] = side.pressure
+    largest = float(side.pressure.max())
+    factor, prefix = prefixed(largest)
+    colours = ColourScale(
+        colours="inferno", low=0, high=largest, unit=factor,
+        label=f"contact pressure in {prefix}Pa",
+    )  # fmt: skip
+    shown = visible_faces(
+        camera, fields.points, faces, pressure, colours, mesh=len(faces) <= _MESH_SHOWN
+    )
+    pressed = side.nodes[side.pressure > _ACTIVE * largest]
+    places = camera.project(fields.points[pressed])
+    low, high = places.min(axis=0), places.max(axis=0)
+    half = 0.65 * float((high - low).max()) or 0.1 * span
+    corners = shown.corners.reshape(-1, 2)
+    middle = (low + high) / 2
+    low = np.maximum(middle - half, corners.min(axis=0))
+    high = np.minimum(middle + half, corners.max(axis=0))
+    unit, name = length_unit(float((high - low).max()))
+    labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
+    return FieldPanel(
+        low=_pair(low), high=_pair(high), marks=(shown,), scale=colours, unit=unit,
+        xlabel=labels[0], ylabel=labels[1], title=f"({letter}) {side.name}",
+    )  # fmt: skip
+
+
+def _axis_name(direction: Vector, unit: str) -> str:
+    """Return the label of an axis of a picture, with its name if along x, y or z."""
+    axis = int(np.abs(direction).argmax())
+    if abs(direction[axis]) < 1 - 1e-9:
+        return f"in {unit}"
+    sign = "−" if direction[axis] < 0 else ""
+    return f"{sign}${'xyz'[axis]}$ in {unit}"
+
+
+def _triad(camera: Camera, low: Vector, high: Vector) -> list[FieldMark]:
+    """Draw the directions of x, y and z in the lower left corner."""
+    size = 0.11 * float((high - low).max())
+    tips = camera.project(size * np.eye(3))
+    origin = low + size * 0.2 - np.minimum(tips.min(axis=0), 0)
+    marks: list[FieldMark] = []
+    for tip, name in zip(tips, "xyz", strict=True):
+        marks.append(
+            Arrow(start=_pair(origin), end=_pair(origin + tip), head="-|>", size=6)
+        )
+        marks.append(
+            Label(text=f"${name}$", place=_pair(origin + 1.25 * tip),
+                  align=("center", "center"))
+        )  # fmt: skip
+    return marks
+
+
 def moved(fields: Fields, scale: float = SCALE) -> Points:
-    """Return the nodes displaced by `scale` times the displacement, (n, 2)."""
+    """Return the nodes displaced by `scale` times the displacement, (n, dim)."""
     return cast(Points, fields.points + scale * fields.displacement)
 
 

@@ -36,6 +36,7 @@ from mortarbench.reports.document.fields import (
     Arrow,
     ColourField,
     ColourScale,
+    Faces,
     FieldFigure,
     FieldMark,
     FieldPanel,
@@ -352,6 +353,9 @@ def _field_panel(axes: Axes, panel: FieldPanel) -> None:
     axes.spines[["top", "right"]].set_visible(panel.axes == "frame")
 
 
+_OUTLINE, _SEAM = 0.3, 0.2  #: widths of lines around and within faces, points
+
+
 def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
     match mark:
         case ColourField():
@@ -369,6 +373,20 @@ def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
                 norm=Normalize(mark.scale.low, mark.scale.high), zorder=height,
                 extent=(x0, x1, y0, y1), interpolation="nearest",
             )  # fmt: skip
+        case Faces():
+            outline = np.isnan(mark.values)
+            values = np.where(outline, mark.scale.low, mark.values)
+            norm = Normalize(mark.scale.low, mark.scale.high)
+            fills = _colour_map(mark.scale)(norm(values))
+            fills[outline, 3] = 0.0
+            # edges in the colour of the tile close the gaps of antialiasing
+            edges = np.where(outline[:, None], to_rgba("white", 0.35), fills)
+            faces = PolyCollection(
+                list(mark.corners), facecolors=fills, edgecolors=edges,
+                linewidths=np.where(outline, _OUTLINE, _SEAM), rasterized=True,
+                zorder=height,
+            )  # fmt: skip
+            axes.add_collection(faces)
         case Polygons():
             fill = to_rgba(mark.fill, mark.opacity) if mark.fill != "none" else "none"
             polygons = PolyCollection(

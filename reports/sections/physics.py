@@ -7,7 +7,6 @@ from collections.abc import Iterator, Sequence
 
 from mortarbench.harness import InputError
 from mortarbench.harness.files.store import load_fields
-from mortarbench.harness.record import in_space
 from mortarbench.reports.data.cells import source
 from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.data.quantities import (
@@ -134,7 +133,7 @@ def _quantities(
 
 @section(
     82, "deformed", "Deformed bodies",
-    "Deformed bodies: no verified answer has plane bodies to draw.",
+    "Deformed bodies: no verified answer has bodies to draw.",
 )  # fmt: skip
 def deformed(a: Analysis) -> Iterator[Part]:
     """Draw the largest verified case; empty where no deformed state was stored."""
@@ -180,11 +179,8 @@ def tractions(a: Analysis) -> Iterator[Part]:
 
 
 def _drawable(a: Analysis) -> list[Outcome]:
-    """Return verified answers with a stored plane state; spatial ones are not drawn."""
-    return [
-        o for o in a.evidence.flat
-        if o.verified and o.first.fields and not in_space(o.quantities)
-    ]  # fmt: skip
+    """Return verified answers with a stored state."""
+    return [o for o in a.evidence.flat if o.verified and o.first.fields]
 
 
 def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:

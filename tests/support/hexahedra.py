@@ -3,17 +3,13 @@
 import numpy as np
 
 from mortarbench.problems.fem.elements import HEXAHEDRON
-from mortarbench.problems.fem.mesh import Mesh
+from mortarbench.problems.fem.mesh import REPEATED, Mesh
 
 #: Kuhn's six tetrahedra of a hexahedron around the diagonal from corner 0 to corner 6
 TETRAHEDRA = np.array([
     [0, 1, 2, 6], [0, 2, 3, 6], [0, 3, 7, 6], [0, 7, 4, 6], [0, 4, 5, 6], [0, 5, 1, 6],
 ])  # fmt: skip
 WEDGES = np.array([[0, 1, 2, 4, 5, 6], [0, 2, 3, 4, 6, 7]])
-#: corners of cells that stand for degenerate hexahedra, by number of corners
-DEGENERATE = {
-    4: [0, 1, 2, 2, 3, 3, 3, 3], 6: [0, 1, 2, 2, 3, 4, 5, 5], 8: list(range(8))
-}  # fmt: skip
 
 
 def bricks(divisions: tuple[int, ...], size: tuple[float, ...]) -> Mesh:
@@ -42,5 +38,5 @@ def divided(mesh: Mesh, corners: np.ndarray) -> Mesh:
 
 def degenerate(mesh: Mesh) -> Mesh:
     """Write all cells as hexahedra with repeated corners."""
-    corners = DEGENERATE[mesh.cells.shape[1]]
+    corners = REPEATED[mesh.element.kind]
     return Mesh(mesh.points, mesh.cells[:, corners], mesh.boundaries)

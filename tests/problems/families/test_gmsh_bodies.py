@@ -629,8 +629,11 @@ def bent(points):
          " in the .geo file, or gmsh -2 -order 1"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3] * 2]}, {}, {}, 16),
          "cells of type quad8; expected cells of first order: Mesh.ElementOrder = 1"),
-        (lambda p, c: (p, {"a": c}, {}, {}, 4), "cells of type tetra; three dimensions "
-         "are not supported yet: expected plane bodies, gmsh -2"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0]]}, {}, {}, 7), "cells of type "
+         "pyramid; expected no pyramids: volumes of tetrahedra alone, gmsh -3"),
+        (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0] * 2]}, {}, {}, 11), "cells of type"
+         " tetra10; expected cells of first order: Mesh.ElementOrder = 1 in the .geo "
+         "file, or gmsh -3 -order 1"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
         (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
          ' named surface: Physical Surface("NAME") in the .geo file'),
@@ -862,13 +865,11 @@ def test_a_mesh_in_space_is_refused_with_the_dimension_that_is_missing(described
     solid = msh22(nodes, {"block": np.array([[0, 1, 2, 3]])}, {}, {}, quad_type=4)
     bent = POINTS + np.outer(POINTS[:, 0] ** 2, [0, 0, 1])
     for mesh, what in (
-        (solid, "cells of type tetra"),
-        (msh22(bent, *parts()), "plane"),
+        (solid.replace('2 1 "block"', '3 1 "block"'), "volumes; bodies: in space is"),
+        (msh22(bent, *parts()), "not plane, and without cells in space"),
     ):
         described(mesh)
-        with pytest.raises(
-            InputError, match=f"{what}; three dimensions are not supported yet"
-        ):
+        with pytest.raises(InputError, match=what):
             read_bodies(Path("a.toml"), "strain")
 
 

@@ -1,0 +1,132 @@
+"""Pictures of bodies in space: orthographic projection, hidden faces, colours."""
+
+import numpy as np
+import pytest
+
+from mortarbench.harness import ContactSide, Fields
+from mortarbench.harness.mechanics import boundary_facets
+from mortarbench.problems.fem.mesh import box, join
+from mortarbench.reports.document.fields import ColourScale, Faces, Label, Path
+from mortarbench.reports.figures.deformed import deformed_figure
+from mortarbench.reports.figures.projection import (
+    camera_seeing,
+    camera_towards,
+    crease_edges,
+    face_normals,
+    visible_faces,
+)
+from mortarbench.reports.render.drawing import draw_fields
+from tests.support.hexahedra import TETRAHEDRA, WEDGES, degenerate, divided
+
+CUBE = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (2, 2, 2))
+SCALE = ColourScale(colours="viridis", low=0, high=1)
+
+
+def state(mesh, contacts=(), bodies=None):
+    stress = mesh.points @ [1e6, 0, 2e6]
+    return Fields(
+        points=mesh.points, cells=mesh.cells, displacement=0.001 * mesh.points,
+        bodies=np.zeros(len(mesh.cells), dtype=int) if bodies is None else bodies,
+        nodal={"von_mises": stress}, contacts=contacts,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("normal", [*np.eye(3), *-np.eye(3), [1, -1, -1], [0, 0, 0]])
+def test_the_camera_sees_a_side_and_three_sides_of_a_box(normal):
+    normal = np.array(normal) / max(np.linalg.norm(normal), 1)
+    camera = camera_seeing(normal)
+
+    axes = np.array(camera)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-15)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    if normal.any():
+        assert normal @ camera.towards > 0.3
+    assert (abs(camera.towards) > 0.3).all()
+    assert camera.up[2] > 0.5
+
+
+def test_projection_keeps_lengths_across_the_view():
+    camera = camera_towards(np.array([0.0, 0.0, -2.0]))
+    x = np.random.default_rng(1).standard_normal((20, 3))
+    flat = camera.project(x)
+
+    assert np.linalg.norm(flat, axis=1) == pytest.approx(np.hypot(x[:, 0], x[:, 1]))
+
+
+def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
+    facets = boundary_facets(CUBE.cells, 3)
+    camera = camera_towards(np.array([0.6, -0.5, 0.7]))
+    faces = visible_faces(
+        camera, CUBE.points, facets, CUBE.points[:, 2], SCALE, mesh=True
+    )
+    outlines = np.isnan(faces.values)
+
+    assert outlines.sum() == 12  # of the 24 faces
+    assert (face_normals(CUBE.points, facets) @ camera.towards > 0).sum() == 12
+    tiles = (len(outlines) - 12) / 12
+    last = (np.arange(1, 13) * (tiles + 1) - 1).astype(int)
+    assert (np.flatnonzero(outlines) == last).all()
+    # the silhouette of a cube is covered once
+    x, y = np.moveaxis(faces.corners[~outlines], -1, 0)
+    area = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1) / 2
+    assert (area > 0).all()
+    assert area.sum() == pytest.approx(camera.towards @ [1, -1, 1])
+    # the values on the top are 1, and elsewhere below it
+    assert np.nanmax(faces.values) == pytest.approx(1)
+    tops = (faces.values[~outlines] > 1 - 1e-9).sum()
+    assert tops == 4 * tiles
+
+
+def test_a_body_behind_another_is_drawn_first():
+    far, near = (box((0.0, y, 0.0), (1.0, 1.0, 1.0), (1, 1, 1)) for y in (2.0, 0.0))
+    mesh, _ = join((far, near))
+    camera = camera_towards(np.array([0.1, -1.0, 0.1]))
+    values = np.repeat([0.25, 0.75], 8)
+    facets = boundary_facets(mesh.cells, 3)
+    drawn = visible_faces(camera, mesh.points, facets, values, SCALE, mesh=False).values
+
+    assert (np.diff(drawn) >= -1e-12).all()
+    assert drawn[[0, -1]] == pytest.approx([0.25, 0.75])
+
+
+def test_creases_of_a_cube_are_its_edges_towards_the_camera():
+    camera = camera_towards(np.array([0.6, -0.5, 0.7]))
+    for mesh in (CUBE, divided(CUBE, TETRAHEDRA), degenerate(divided(CUBE, WEDGES))):
+        facets = boundary_facets(mesh.cells, 3)
+        edges = crease_edges(camera, mesh.points, facets, np.radians(40))
+        assert len(edges) == 9 * 2  # three of the twelve edges are behind
+
+
+@pytest.mark.parametrize("corners", [None, TETRAHEDRA, WEDGES])
+def test_a_figure_shows_the_bodies_and_the_pressure_on_their_contact(corners):
+    mesh = CUBE if corners is None else divided(CUBE, corners)
+    nodes = np.unique(CUBE.boundaries["bottom"])
+    pressure = np.where(mesh.points[nodes, 0] == 0.5, 3e3, 0.0)
+    side = ContactSide(
+        name="cube on rigid", nodes=nodes, length=np.full(9, 1 / 9),
+        force=np.zeros((9, 3)), pressure=pressure, gap=np.zeros(9),
+    )  # fmt: skip
+    figure = deformed_figure(state(mesh, (side,)), 50.0)
+    bodies, contact = figure.panels
+
+    assert "displacement × 50" in bodies.title
+    assert "cube on rigid" in contact.title
+    assert [panel.scale.label for panel in figure.panels] == [
+        "von Mises stress in MPa", "contact pressure in kPa"
+    ]  # fmt: skip
+    (drawn,) = (mark for mark in contact.marks if isinstance(mark, Faces))
+    assert np.nanmax(drawn.values) <= 3e3
+    assert np.nanmax(drawn.values) > 2.5e3
+    names = [mark.text for mark in bodies.marks if isinstance(mark, Label)]
+    assert names == ["$x$", "$y$", "$z$"]
+    assert sum(isinstance(mark, Path) for mark in bodies.marks) == 18
+    # seen from below: the contact faces the camera
+    (surface,) = (mark for mark in bodies.marks if isinstance(mark, Faces))
+    assert np.nanmin(surface.values) < 0.1e6
+    draw_fields(figure).canvas.draw()
+
+
+def test_bodies_without_contact_have_one_panel():
+    figure = deformed_figure(state(CUBE))
+
+    assert len(figure.panels) == 1
