@@ -117,6 +117,30 @@ cdef class CompressedRows(LinearMap):
         new.hold(self.shape, entries, self.arrays[1], self.arrays[2])
         return new, sizes
 
+    def transposed(self):
+        """Return Mᵀ (k, n) by rows."""
+        cdef Py_ssize_t i, count = self.indptr[self.n]
+        cdef int j, at
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        begin = np.zeros(self.k + 1, dtype=np.int32)
+        entries, columns = np.empty(count), np.empty(count, dtype=np.int32)
+        next_place = np.empty(self.k + 1, dtype=np.int32)
+        cdef int[::1] indptr = begin
+        cdef int[::1] place = next_place
+        cdef int[::1] indices = columns
+        cdef double[::1] data = entries
+        for j in range(count):
+            indptr[self.indices[j] + 1] += 1
+        np.cumsum(begin, out=begin)
+        next_place[:] = begin
+        for i in range(self.n):
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                at = place[self.indices[j]]
+                indices[at], data[at] = <int> i, self.data[j]
+                place[self.indices[j]] += 1
+        new.hold((self.k, self.n), entries, columns, begin)
+        return new
+
     @property
     def touched(self):
         """Mask (k,) of the columns with entries."""
@@ -151,13 +175,18 @@ cdef class CompressedRows(LinearMap):
     cdef void times(self, const double *x, double *y) noexcept:
         """y ← Mx."""
         cdef Py_ssize_t i
-        cdef int j
-        cdef double y_i
+        cdef int j, last
+        cdef double y_i, z_i
         for i in range(self.n):
-            y_i = 0
-            for j in range(self.indptr[i], self.indptr[i + 1]):
+            y_i = z_i = 0  # two sums, as each addition waits for the one before
+            j, last = self.indptr[i], self.indptr[i + 1]
+            while j + 1 < last:
                 y_i += self.data[j] * x[self.indices[j]]
-            y[i] = y_i
+                z_i += self.data[j + 1] * x[self.indices[j + 1]]
+                j += 2
+            if j < last:
+                y_i += self.data[j] * x[self.indices[j]]
+            y[i] = y_i + z_i
 
     cdef void add_transposed(self, const double *x, double *y) noexcept:
         """y ← y + Mᵀx."""
@@ -293,6 +322,18 @@ cdef class Composition(LinearMap):
             map_ = self.maps[i]
             map_.apply(x, y if i == 0 else self.between[i % 2], columns)
             x = self.between[i % 2]
+        return 0
+
+
+cdef class Identity(LinearMap):
+    """The map x ↦ x of vectors (n,)."""
+
+    def __init__(self, n):
+        self.n = self.k = n
+        self.shape = n, n
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        memcpy(y, x, self.n * columns * sizeof(double))
         return 0
 
 
