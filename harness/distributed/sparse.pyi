@@ -43,6 +43,7 @@ class DirectSum(LinearMap):
 
 class BorderedFactor(LinearMap):
     least_pivot: float
+    entries: int
     border_rows: NDArray[np.int64]
 
     def __init__(self, order: Indices, columns: csc_array, L_bb: Dense) -> None: ...

@@ -698,6 +698,11 @@ cdef class BorderedFactor(LinearMap):
         return least
 
     @property
+    def entries(self):
+        """Number of entries of L."""
+        return self.indptr[self.inner] + self.border * (self.border + 1) // 2
+
+    @property
     def border_rows(self):
         """Rows (b,) of the border."""
         return np.asarray(self.arrays[0])[self.inner:].astype(np.int64)
