@@ -125,7 +125,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
     def diagonal(self) -> NDArray[np.float64] | None:
         """Return Pᵢᵢ (n,), or None if the product is not a `WithDiagonal`."""
         product = self.build()
-        return product.diagonal() if isinstance(product, WithDiagonal) else None
+        return product.diagonal() if hasattr(product, "diagonal") else None
 
     def forget(self) -> None:
         """Drop the product, so that the next solver is charged for building it."""
@@ -141,10 +141,20 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         return self
 
 
+# The next functions look for an attribute: `isinstance` with a protocol takes longer
+# than several products with a small operator.
+
+
+def preconditioned(P: Any) -> Preconditioned | None:
+    """Return an operator P, or its product, if it is `Preconditioned`; else None."""
+    product: Any = P.build() if isinstance(P, SerialisableOperator) else P
+    return product if hasattr(product, "preconditioner") else None
+
+
 def linear_map(P: Any) -> LinearMap | None:
-    """Return the map of an operator P that is `Compiled`, or None."""
+    """Return the map of an operator P that is `Compiled`; else None."""
     product = P.build() if isinstance(P, SerialisableOperator) else P
-    return product.linear_map if isinstance(product, Compiled) else None
+    return getattr(product, "linear_map", None)
 
 
 def assembled(P: LinearOperator) -> NDArray[np.float64]:

@@ -37,6 +37,7 @@ cdef class BorderedFactor(LinearMap):
     cdef double *complement
     cdef double *u
 
+    cdef int hold(self, order, indptr, indices, data, L_bb) except -1
     cdef int reserve(self, Py_ssize_t border) except -1
     cdef void reduce(self, const double *t, double *u) noexcept
     cdef void extend(self, double *u, double *y) noexcept

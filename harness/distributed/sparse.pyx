@@ -64,6 +64,25 @@ cdef class CompressedRows(LinearMap):
         new.hold((M.shape[1], M.shape[0]), M.data, M.indices, M.indptr)
         return new
 
+    @staticmethod
+    def of_array(const double[:, ::1] M):
+        """Return the nonzero entries of an array."""
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        cdef Py_ssize_t i, j, count = 0, n = M.shape[0], k = M.shape[1]
+        entries, columns = np.empty(n * k), np.empty(n * k, dtype=np.int32)
+        begin = np.zeros(n + 1, dtype=np.int32)
+        cdef double[::1] data = entries
+        cdef int[::1] indices = columns
+        cdef int[::1] indptr = begin
+        for i in range(n):
+            for j in range(k):
+                if M[i, j] != 0:
+                    data[count], indices[count] = M[i, j], <int> j
+                    count += 1
+            indptr[i + 1] = <int> count
+        new.hold((n, k), entries[:count], columns[:count], begin)
+        return new
+
     cdef int hold(self, tuple shape, data, indices, indptr) except -1:
         cdef const double[::1] entries = np.ascontiguousarray(data, dtype=np.float64)
         cdef const int[::1] column = np.ascontiguousarray(indices, dtype=np.int32)
@@ -117,6 +136,30 @@ cdef class CompressedRows(LinearMap):
         new.hold(self.shape, entries, self.arrays[1], self.arrays[2])
         return new, sizes
 
+    def transposed(self):
+        """Return Mᵀ (k, n) by rows."""
+        cdef Py_ssize_t i, count = self.indptr[self.n]
+        cdef int j, at
+        cdef CompressedRows new = CompressedRows.__new__(CompressedRows)
+        begin = np.zeros(self.k + 1, dtype=np.int32)
+        entries, columns = np.empty(count), np.empty(count, dtype=np.int32)
+        next_place = np.empty(self.k + 1, dtype=np.int32)
+        cdef int[::1] indptr = begin
+        cdef int[::1] place = next_place
+        cdef int[::1] indices = columns
+        cdef double[::1] data = entries
+        for j in range(count):
+            indptr[self.indices[j] + 1] += 1
+        np.cumsum(begin, out=begin)
+        next_place[:] = begin
+        for i in range(self.n):
+            for j in range(self.indptr[i], self.indptr[i + 1]):
+                at = place[self.indices[j]]
+                indices[at], data[at] = <int> i, self.data[j]
+                place[self.indices[j]] += 1
+        new.hold((self.k, self.n), entries, columns, begin)
+        return new
+
     @property
     def touched(self):
         """Mask (k,) of the columns with entries."""
@@ -151,13 +194,18 @@ cdef class CompressedRows(LinearMap):
     cdef void times(self, const double *x, double *y) noexcept:
         """y ← Mx."""
         cdef Py_ssize_t i
-        cdef int j
-        cdef double y_i
+        cdef int j, last
+        cdef double y_i, z_i
         for i in range(self.n):
-            y_i = 0
-            for j in range(self.indptr[i], self.indptr[i + 1]):
+            y_i = z_i = 0  # two sums, as each addition waits for the one before
+            j, last = self.indptr[i], self.indptr[i + 1]
+            while j + 1 < last:
                 y_i += self.data[j] * x[self.indices[j]]
-            y[i] = y_i
+                z_i += self.data[j + 1] * x[self.indices[j + 1]]
+                j += 2
+            if j < last:
+                y_i += self.data[j] * x[self.indices[j]]
+            y[i] = y_i + z_i
 
     cdef void add_transposed(self, const double *x, double *y) noexcept:
         """y ← y + Mᵀx."""
@@ -191,10 +239,10 @@ cdef class CompressedRows(LinearMap):
             if weights[i] == 0:
                 y[i] = 0
                 continue
-            y_i = v[i]
+            y_i = 0
             for j in range(self.indptr[i], self.indptr[i + 1]):
-                y_i -= self.data[j] * x[self.indices[j]]
-            y[i] = weights[i] * y_i
+                y_i += self.data[j] * x[self.indices[j]]
+            y[i] = weights[i] * (v[i] - y_i)
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
         """Return sv + tMx (n,) of v (n,) and x (k,)."""
@@ -296,6 +344,18 @@ cdef class Composition(LinearMap):
         return 0
 
 
+cdef class Identity(LinearMap):
+    """The map x ↦ x of vectors (n,)."""
+
+    def __init__(self, n):
+        self.n = self.k = n
+        self.shape = n, n
+
+    cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
+        memcpy(y, x, self.n * columns * sizeof(double))
+        return 0
+
+
 cdef class DirectSum(LinearMap):
     """The map of consecutive parts of a vector, each by a map of its own."""
 
@@ -393,27 +453,30 @@ cdef class BorderedFactor(LinearMap):
     """
 
     def __init__(self, order, columns, L_bb):
+        self.hold(order, columns.indptr, columns.indices, columns.data,
+                  np.asfortranarray(L_bb, dtype=np.float64))
+
+    cdef int hold(self, order, indptr, indices, data, L_bb) except -1:
         cdef const int[::1] rows = np.ascontiguousarray(order, dtype=np.int32)
-        cdef const int[::1] indptr = np.ascontiguousarray(columns.indptr, np.int32)
-        cdef const int[::1] indices = np.ascontiguousarray(columns.indices, np.int32)
-        cdef const double[::1] data = np.ascontiguousarray(columns.data, np.float64)
-        cdef const double[::1, :] corner = np.asfortranarray(L_bb, dtype=np.float64)
+        cdef const int[::1] begin = np.ascontiguousarray(indptr, dtype=np.int32)
+        cdef const int[::1] index = np.ascontiguousarray(indices, dtype=np.int32)
+        cdef const double[::1] entries = np.ascontiguousarray(data, dtype=np.float64)
+        cdef const double[::1, :] corner = L_bb
         cdef Py_ssize_t i, j, b = corner.shape[0]
         cdef int size = b
         cdef double one = 1.0, zero = 0.0
-        inverse = np.empty(rows.shape[0], dtype=np.int32)
-        cdef int[::1] place = inverse
+        cdef int[::1] place = np.empty(rows.shape[0], dtype=np.int32)
         self.n = self.k = rows.shape[0]
         self.shape, self.inner, self.scale = (self.n, self.n), self.n - b, 1.0
-        self.expect(indptr.shape[0] - 1, self.inner)
+        self.expect(begin.shape[0] - 1, self.inner)
         for i in range(self.n):
             place[rows[i]] = <int> (i - self.inner)
-        self.arrays = rows, inverse, indptr, indices, data
+        self.arrays = rows, place, begin, index, entries
         if self.n:
             self.order, self.place = &rows[0], &place[0]
-        self.indptr = &indptr[0]
-        self.indices = &indices[0] if indices.shape[0] else NULL
-        self.data = &data[0] if data.shape[0] else NULL
+        self.indptr = &begin[0]
+        self.indices = &index[0] if index.shape[0] else NULL
+        self.data = &entries[0] if entries.shape[0] else NULL
         self.reserve(b)
         self.complement = <double *> calloc(max(b * b, 1), sizeof(double))
         if not self.complement:
@@ -427,6 +490,7 @@ cdef class BorderedFactor(LinearMap):
         for j in range(b):
             for i in range(j):
                 self.complement[j * b + i] = self.complement[i * b + j]
+        return 0
 
     def __dealloc__(self):
         free(self.L)
@@ -456,23 +520,30 @@ cdef class BorderedFactor(LinearMap):
             When A is not positive definite.
 
         """
-        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, inner, count = 0
+        cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
+        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, last, inner = 0, count = 0
         cdef double[:, ::1] M = np.array(A, dtype=np.float64, order="C")
         cdef const unsigned char[::1] is_last = np.asarray(border, bool).view(np.uint8)
-        last = np.flatnonzero(border)
-        inner = n - last.size
-        order, columns = np.empty(n, dtype=np.int32), np.empty((inner, n))
-        degrees = np.count_nonzero(A, axis=1)
-        cdef int[::1] row = order
-        cdef long long[::1] degree = degrees
-        cdef int[::1] neighbour = np.empty(n, dtype=np.int32)
-        cdef unsigned char[::1] is_done = np.zeros(n, dtype=np.uint8)
         cdef double root, share
-        indptr = np.zeros(inner + 1, dtype=np.int32)
+        cdef int size, info = 0
+        for i in range(n):
+            inner += not is_last[i]
+        order, begin = np.empty(n, dtype=np.int32), np.zeros(inner + 1, dtype=np.int32)
         indices, data = np.empty(inner * n, dtype=np.int32), np.empty(inner * n)
-        cdef int[::1] begin = indptr
+        corner = np.empty((n - inner, n - inner), order="F")
+        cdef int[:, ::1] work = np.zeros((4, n), dtype=np.int32)
+        cdef int[::1] degree = work[0]
+        cdef int[::1] neighbour = work[1]
+        cdef int[::1] is_done = work[2]
+        cdef int[::1] place = work[3]
+        cdef int[::1] row = order
+        cdef int[::1] indptr = begin
         cdef int[::1] index = indices
         cdef double[::1] value = data
+        cdef double[::1, :] L_bb = corner
+        for i in range(n):
+            for j in range(n):
+                degree[i] += M[i, j] != 0
         for step in range(inner):
             p = -1
             for i in range(n):
@@ -498,13 +569,26 @@ cdef class BorderedFactor(LinearMap):
                         degree[i] += 1
                     M[neighbour[j], i] -= share * value[count + 1 + l]
             count += m + 1
-            begin[step + 1] = <int> count
-        order[inner:] = last
-        place = np.empty(n, dtype=np.int32)
-        place[order] = np.arange(n, dtype=np.int32)
-        L = csc_array((data[:count], place[indices[:count]], indptr), shape=(n, inner))
-        corner = np.asarray(M)[np.ix_(last, last)]
-        return BorderedFactor(order, L, np.linalg.cholesky(corner))
+            indptr[step + 1] = <int> count
+        last = inner
+        for i in range(n):
+            if is_last[i]:
+                row[last] = <int> i
+                last += 1
+        for i in range(n):
+            place[row[i]] = <int> i
+        for j in range(count):
+            index[j] = place[index[j]]
+        for j in range(n - inner):
+            for i in range(n - inner):
+                L_bb[i, j] = M[row[inner + i], row[inner + j]]
+        size = <int> (n - inner)
+        if size:
+            dpotrf(b"L", &size, &L_bb[0, 0], &size, &info)
+        if info:
+            raise np.linalg.LinAlgError("not positive definite")
+        new.hold(order, begin, indices[:count], data[:count], corner)
+        return new
 
     # the two halves of a solve
 
@@ -612,6 +696,11 @@ cdef class BorderedFactor(LinearMap):
         for i in range(self.border):
             least = min(least, self.L[i * self.border + i])
         return least
+
+    @property
+    def entries(self):
+        """Number of entries of L."""
+        return self.indptr[self.inner] + self.border * (self.border + 1) // 2
 
     @property
     def border_rows(self):

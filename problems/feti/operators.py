@@ -40,7 +40,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import Vector
@@ -49,6 +49,7 @@ from mortarbench.harness.distributed.sparse import (
     Composition,
     CompressedRows,
     DirectSum,
+    Identity,
     LinearMap,
 )
 from mortarbench.harness.operators import Product
@@ -217,10 +218,16 @@ class DualOperator:
             blocks, weights = self.weighted_blocks(kind, scaling)
             BW = scaled_columns(self.packed.B, weights)
             gram = decouple_contact(csr_array(BW @ self.packed.BT), self.equalities)
-            solve = gram_inverse(gram, self.equalities)
+            E, (inverse, contact) = (
+                self.equalities,
+                gram_inverses(gram, self.equalities),
+            )
+            # (B W Bᵀ)⁺ of equality rows is as sparse as B, that of contact rows is not
+            B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
+            solve = DirectSum(Identity(E), contact)
             self._preconditioners[kind, scaling] = Composition(
-                solve, CompressedRows(BW), self.packed.block_diagonal(blocks),
-                CompressedRows(csr_array(BW.T)), solve,
+                solve, CompressedRows(B_D), self.packed.block_diagonal(blocks),
+                CompressedRows(csr_array(B_D.T)), solve,
             )  # fmt: skip
         return self._preconditioners[kind, scaling]
 
@@ -365,13 +372,17 @@ def decouple_contact(gram: csr_array, equalities: int) -> csr_array:
 
 def gram_inverse(gram: csr_array, equalities: int) -> LinearMap:
     """Return the map x ↦ (B W Bᵀ)⁺x for a result of `decouple_contact`."""
-    inverse = CompressedRows(block_pseudoinverse(gram[:equalities, :equalities]))
-    if equalities == gram.shape[0]:
-        return inverse
+    inverse, contact = gram_inverses(gram, equalities)
+    return DirectSum(CompressedRows(inverse), contact)
+
+
+def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMap]:
+    """Return (B W Bᵀ)⁺ of equality rows as a matrix, and that of contact rows."""
+    inverse = block_pseudoinverse(gram[:equalities, :equalities])
     contact = csc_array(gram[equalities:, equalities:])
     contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
     none = np.zeros(contact.shape[0], dtype=bool)
-    return DirectSum(inverse, bordered_factor(contact, none))
+    return inverse, bordered_factor(contact, none)
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:

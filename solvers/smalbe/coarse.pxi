@@ -102,6 +102,7 @@ cdef class Coarse:
 cdef class LocalCoarse(Coarse):
     """The same for rows of one process, without Python."""
 
+    cdef CompressedRows rows  # G
     cdef CompressedRows by_components  # Gᵀ
     cdef CompressedRows of_bounded  # G_bᵀ
     cdef CompressedRows given  # the transpose of the rows as given
@@ -114,14 +115,14 @@ cdef class LocalCoarse(Coarse):
         super().__init__(source)
         gram = source.gram
         self.by_components = source.unit.transposed
+        self.rows = self.by_components.transposed()
         self.of_bounded = source.of_bounded.transposed
         self.given = CompressedRows.of_transpose(source.G)
-        self.matrix, self.factor = by_rows(gram.matrix), gram.factor
+        self.matrix, self.factor = symmetric_rows(gram.matrix), gram.factor
         self.has_border, self.missed = gram.has_border, Room(self.given.k)
 
     cdef int times(self, const double *v, double *t) except -1:
-        memset(t, 0, self.k * sizeof(double))
-        self.by_components.add_transposed(v, t)
+        self.rows.times(v, t)
         return 0
 
     cdef int combine(
@@ -175,12 +176,6 @@ cdef class LocalCoarse(Coarse):
         return sqrt(dot(self.missed.at, self.missed.at, self.given.k))
 
 
-cdef CompressedRows by_rows(M):
+cdef CompressedRows symmetric_rows(M):
     """Return a symmetric matrix, an array or one in CSC format, by its rows."""
-    if issparse(M):
-        return CompressedRows.of_transpose(M)
-    k = len(M)
-    return CompressedRows(csr_array(
-        (M.ravel(), np.tile(np.arange(k, dtype=np.int32), k),
-         np.arange(0, k * k + 1, k or 1, dtype=np.int32)), shape=(k, k),
-    ))  # fmt: skip
+    return (CompressedRows.of_transpose if issparse(M) else CompressedRows.of_array)(M)

@@ -35,7 +35,7 @@ from scipy.sparse import csc_matrix, diags_array, issparse
 
 from mortarbench.harness import QP, Structure
 from mortarbench.harness.distributed.vectors import DistributedVector
-from mortarbench.harness.operators import Preconditioned, SerialisableOperator
+from mortarbench.harness.operators import Preconditioned, preconditioned
 from mortarbench.solvers.smalbe.compiled import pairs_of_columns
 from mortarbench.solvers.smalbe.extension import Operator
 from mortarbench.solvers.smalbe.rows import Mask
@@ -58,8 +58,7 @@ def preconditioned_operator(qp: QP) -> Preconditioned | None:
     """Return the operator by which P offers preconditioners, or None."""
     if qp.is_explicit:
         return None
-    product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else qp.P
-    return product if isinstance(product, Preconditioned) else None
+    return preconditioned(qp.P)
 
 
 def resolved_preconditioner(qp: QP, kind: Preconditioner) -> Preconditioner:

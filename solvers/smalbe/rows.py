@@ -55,7 +55,7 @@ CONSISTENCY_TOL = 1e-8  #: largest error of consistent rows, relative to x̃ and
 RANK = 1e-13  #: smaller pivots of normalised rows count as rounding
 FREE_RANK = 1e-10  #: smaller singular values of C on a face count as zero
 MAX_BORDER = 2000  #: limit of rows with bounded components: their block is dense
-MAX_DENSE_ENTRIES = 50_000  #: limit of entries of C; larger sparse rows stay sparse
+MAX_DENSE_ENTRIES = 2000  #: limit of entries of C; larger sparse rows stay sparse
 
 
 class Transposed(Protocol):

@@ -1,10 +1,20 @@
-"""Products of a sparse matrix by rows, against those of a dense one."""
+"""Linear maps of compiled code, against dense matrices."""
 
 import numpy as np
 import pytest
-from scipy.sparse import csr_array, random_array
+from scipy.sparse import csc_array, csr_array, eye_array, kron, random_array
 
-from mortarbench.harness.distributed.sparse import CompressedRows
+from mortarbench.harness.distributed import factor as factor_module
+from mortarbench.harness.distributed.factor import DependentRowsError, bordered_factor
+from mortarbench.harness.distributed.sparse import (
+    BorderedFactor,
+    Composition,
+    CompressedRows,
+    DirectSum,
+    Identity,
+)
+
+SEED = 1952
 
 
 @pytest.mark.parametrize("shape", [(7, 4), (4, 9), (1, 1), (0, 3), (3, 0), (5, 5)])
@@ -38,3 +48,143 @@ def test_other_formats_and_vectors_are_refused():
     ):
         with pytest.raises(ValueError, match="2 components; expected 3"):
             product()
+
+
+@pytest.fixture
+def M():
+    """Seven rows, of which two are empty, on five columns, of which one is empty."""
+    dense = random_array((7, 5), density=0.6, rng=np.random.default_rng(SEED)).toarray()
+    dense[[2, 6]], dense[:, 3] = 0, 0
+    return dense
+
+
+def test_rows_are_transposed_chosen_and_normalised(M):
+    rows = CompressedRows(csr_array(M))
+
+    def dense(part):
+        return np.column_stack([part @ unit for unit in np.eye(part.shape[1])])
+
+    assert dense(rows) == pytest.approx(M)
+    assert dense(CompressedRows.of_array(M)) == pytest.approx(M)
+    assert dense(rows.transposed()) == pytest.approx(M.T)
+    assert dense(CompressedRows.of_transpose(csc_array(M))) == pytest.approx(M.T)
+    assert dense(rows.rows(np.array([4, 0, 4]))) == pytest.approx(M[[4, 0, 4]])
+    assert rows.by_columns.toarray() == pytest.approx(M.T)
+    assert rows.touched.tolist() == (np.abs(M).sum(axis=0) > 0).tolist()
+    unit, sizes = rows.unit_columns()
+    assert sizes == pytest.approx(np.linalg.norm(M, axis=0))
+    assert dense(unit) * sizes == pytest.approx(M)
+    with pytest.raises(ValueError, match="csr matrix; expected one by columns"):
+        CompressedRows.of_transpose(csr_array(M))
+
+
+def test_outer_products_of_chosen_rows_are_summed(M):
+    rows, weights = CompressedRows(csr_array(M)), np.array([1.0, 0, 1, 0, 0, 2, 1])
+    place = np.array([2, 0, 1, -1, 3], dtype=np.int32)  # the empty column has none
+    found = rows.outer_products(weights, place, 4)
+    order = np.array([1, 2, 0, 4])
+
+    assert found == pytest.approx((M.T @ (weights[:, None] * M))[np.ix_(order, order)])
+
+
+@pytest.mark.parametrize("columns", [None, 1, 3])
+def test_maps_are_composed_and_summed(M, columns):
+    rng = np.random.default_rng(SEED)
+    A, B = rng.standard_normal((4, 7)), rng.standard_normal((3, 3))
+    rows = [CompressedRows(csr_array(part)) for part in (A, M, B)]
+    x = rng.standard_normal(5 if columns is None else (5, columns))
+    y = rng.standard_normal(10 if columns is None else (10, columns))
+
+    product = Composition(rows[0], rows[1])
+    assert product.shape == (4, 5)
+    assert product(x) == pytest.approx(A @ M @ x)
+    assert product(x) == pytest.approx(A @ M @ x)  # with the workspace of the first
+    assert Composition(rows[2])(x[:3]) == pytest.approx(B @ x[:3])
+    both = DirectSum(Identity(2), rows[1], rows[2])
+    assert both.shape == (12, 10)
+    expected = np.concatenate([y[:2], M @ y[2:7], B @ y[7:]])
+    assert both(y) == pytest.approx(expected)
+    with pytest.raises(ValueError, match="5 components; expected 7"):
+        Composition(rows[0], CompressedRows(csr_array(M.T)))
+
+
+def grid(cells):
+    """Return a Laplacian plus the identity on a square grid."""
+    path = 2 * eye_array(cells) - eye_array(cells, k=1) - eye_array(cells, k=-1)
+    one = eye_array(cells)
+    return csc_array(kron(path, one) + kron(one, path) + eye_array(cells**2))
+
+
+@pytest.fixture(params=["array", "library"])
+def way(request, monkeypatch):
+    """Factorise small matrices in an array, or as large ones."""
+    if request.param == "library":
+        monkeypatch.setattr(factor_module, "MAX_ARRAY_ROWS", -1)
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("last", [[], [3, 11, 12, 30], range(36)])
+def test_a_factor_with_a_border_solves(last):
+    A, border = grid(6), np.isin(np.arange(36), last)
+    L, dense = bordered_factor(A, border), A.toarray()
+    t, inverse = np.random.default_rng(SEED).standard_normal(36), np.linalg.inv(dense)
+
+    assert L(t) == pytest.approx(inverse @ t)
+    assert L(np.eye(36)) == pytest.approx(inverse)
+    assert L.backward(L.forward(t)) == pytest.approx(inverse @ t)
+    assert L.forward(t) @ L.forward(t) == pytest.approx(t @ inverse @ t)
+    assert np.sort(L.border_rows).tolist() == list(last)
+    # the pivots lie between the ends of the spectrum
+    least, largest = np.linalg.eigvalsh(dense)[[0, -1]]
+    assert least <= L.least_pivot**2 <= largest
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("shift", [0.5, 1e-3, 1e-14])
+def test_changes_of_the_border_are_changes_of_the_matrix(shift):
+    """All of A on two rows of the border is removed: the shift is left there."""
+    rng = np.random.default_rng(SEED)
+    free, held = rng.standard_normal((6, 12)), np.zeros((6, 4))
+    held[[1, 4]] = rng.standard_normal((2, 4))
+    free[4] = 0  # a row that held components alone have
+    G, border = np.hstack([free, held]), np.isin(np.arange(6), [1, 4])
+    L = bordered_factor(csc_array(G @ G.T), border)
+    columns = CompressedRows(csr_array(held.T))
+    block = (held @ held.T)[np.ix_(L.border_rows, L.border_rows)]
+    expected = free @ free.T + shift * G @ G.T
+    t = free @ rng.standard_normal(12)
+
+    for changed in (
+        L.shifted(shift, block),
+        L.shifted_without(shift, columns, np.ones(4)),
+    ):
+        y = changed(t)
+        assert expected @ y == pytest.approx(t, abs=1e-10)
+        assert changed.backward(changed.forward(t)) == pytest.approx(y, abs=1e-10)
+    one = np.array([0.0, 1, 0, 0])
+    some = (1 + shift) * (G @ G.T) - np.outer(held[:, 1], held[:, 1])
+    y = L.shifted_without(shift, columns, one)(some @ t)
+    assert y == pytest.approx(t, abs=1e-9)
+    with pytest.raises(ValueError, match="3 components; expected 4"):
+        L.shifted_without(shift, columns, one[:3])
+
+
+@pytest.mark.usefixtures("way")
+@pytest.mark.parametrize("last", [[], [0], [0, 1, 2]])
+def test_dependent_rows_have_no_factor(last):
+    G = np.array([[1.0, 2, 0, 0], [0, 1, 1, 3], [2, 3, -1, -3]])  # third: 2·1st − 2nd
+    gram = G @ G.T
+    gram[2, 2] -= 1e-3
+
+    with pytest.raises(DependentRowsError):
+        bordered_factor(csc_array(gram), np.isin(np.arange(3), last))
+
+
+def test_a_row_with_many_entries_is_eliminated_late():
+    """The hub of a star is first: eliminated first, it would couple all others."""
+    A = csc_array(5 * eye_array(40)).tolil()
+    A[0, 1:], A[1:, 0] = 0.1, 0.1
+    L = BorderedFactor.of_array(A.toarray(), np.arange(40) == 20)
+
+    assert L.entries <= 3 * 40
+    assert L(np.ones(40)) == pytest.approx(np.linalg.solve(A.toarray(), np.ones(40)))

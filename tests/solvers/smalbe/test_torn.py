@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mortarbench import build
 from mortarbench.harness import Status, kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -63,6 +64,37 @@ def test_the_displacement_is_that_of_the_whole(glue):
     v = whole.recover(SMALBE().prepare(whole.qp, 1e-9)())
 
     assert abs(u - v).max() <= 1e-8 * abs(v).max()
+
+
+@pytest.mark.parametrize("tol", [1e-6, 1e-9])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "membranes/S=4/n=8",
+        "membranes/S=3/n=4/glue=redundant",
+        "beam-ring/Nr=8/Nh=4/steps=1/feti=4",
+        "plate/Sx=4/Sy=4/n=4",
+    ],
+)
+def test_calls_of_python_take_the_same_steps(name, tol, monkeypatch):
+    """Ranks fill the table of operations by calls of Python: here one process does."""
+    qp = build(f"{name}/dual").qp
+    compiled = SMALBE().prepare(qp, tol)()
+    monkeypatch.setattr(SparseRows, "on_one_process", False)
+    called = SMALBE().prepare(qp, tol)()
+
+    assert called.counts == compiled.counts
+    assert called.x == pytest.approx(compiled.x, abs=1e-7 * abs(compiled.x).max())
+    assert kkt_residuals(qp, compiled).worst <= 5 * tol
+    assert kkt_residuals(qp, called).worst <= 5 * tol
+
+
+def test_a_preconditioner_is_built_once():
+    F = build("membranes/S=2/n=4/dual").qp.P.build()
+
+    built = F.preconditioner("dirichlet", "stiffness")
+    assert F.preconditioner("dirichlet", "stiffness") is built
+    assert F.preconditioner("lumped", "stiffness") is not built
 
 
 def test_a_sequence_is_warm():
