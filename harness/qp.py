@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array, csc_array, csr_array, issparse, tril, triu
 
 from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.sets.blocks import Blocks
 from mortarbench.harness.sets.box import Box
 from mortarbench.harness.sets.convex import ConvexSet, hull
 from mortarbench.harness.sets.convex import Vector as Vector
@@ -246,14 +247,22 @@ class QP:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Numbers of variables, equality rows, inequality rows and finite bounds."""
+        """Numbers of variables, equality rows, inequality rows and finite bounds.
+
+        Numbers of discs and cones follow if there are any.
+        """
         bounds = np.isfinite(self.lb).sum() + np.isfinite(self.ub).sum()
-        return {
+        sizes = {
             "variables": self.q.size,
             "equalities": self.b.size,
             "inequalities": self.h.size,
             "bounds": int(bounds),
         }
+        for one in self.sets[1:]:
+            if isinstance(one, Blocks):
+                kind = type(one).__name__.lower()
+                sizes[kind] = sizes.get(kind, 0) + len(one.index)
+        return sizes
 
     def with_bounds(self, lb: Vector, ub: Vector) -> QP:
         """Return the same QP with other bounds (n,)."""

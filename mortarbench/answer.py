@@ -146,7 +146,8 @@ class Answer:
     ) -> Figure:
         """Draw the deformed bodies with their stresses, and each contact enlarged.
 
-        For half planes, which are unbounded, draw the tractions between them.
+        For half-planes and half-spaces, which are unbounded, draw the tractions between
+        them.
 
         Parameters
         ----------
@@ -168,6 +169,7 @@ class Answer:
 
         """
         from mortarbench.reports.figures.deformed import deformed_figure
+        from mortarbench.reports.figures.maps import traction_maps
         from mortarbench.reports.figures.tractions import traction_figure
         from mortarbench.reports.render.saving import draw, save
 
@@ -175,7 +177,7 @@ class Answer:
         drawn = None if scale is None else check_scale(scale)
         figure = (
             deformed_figure(fields, drawn)
-            if len(fields.cells) else traction_figure(fields)
+            if len(fields.cells) else traction_figure(fields) or traction_maps(fields)
         )  # fmt: skip
         if figure is None:
             raise InputError("no bodies and no tractions: there is no picture")

@@ -17,6 +17,7 @@ PROBLEMS: Registry[Family] = Registry(
         "hertz-plane": entry("mortarbench.problems.families.hertz", "HertzPlane"),
         "hertz-cylinder": entry("mortarbench.problems.families.hertz", "HertzCylinder"),
         "half-plane": entry("mortarbench.problems.families.half_plane", "HalfPlane"),
+        "half-space": entry("mortarbench.problems.families.half_space", "HalfSpace"),
         "greco": entry("mortarbench.problems.families.greco", "Greco"),
         "cantilever": entry("mortarbench.problems.families.cantilever", "Cantilever"),
         "obstacle": entry("mortarbench.problems.families.obstacle", "Obstacle"),
@@ -38,6 +39,9 @@ OPERATORS: Registry[Maker] = Registry(
     {
         "tfeti": entry(
             "mortarbench.problems.feti.operator_arrays", "dual_operator_from_arrays"
-        )
+        ),
+        "half-space": entry(
+            "mortarbench.problems.models.half_space.influence", "influence_from_arrays"
+        ),
     }
 )

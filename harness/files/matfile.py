@@ -1,7 +1,8 @@
 """One QP in one .mat file, for MATLAB and Octave; names as in `harness.files.qpfile`.
 
 Vectors ``q, h, b, lb, ub`` are columns, matrices ``P, G, A`` sparse, ``meta`` is a JSON
-text. Further arrays are those of the case, such as F, d, B, c, R of the paper.
+text. Indices of sets, such as ``disc_index``, start at 0. Further arrays are those of
+the case, such as F, d, B, c, R of the paper.
 """
 
 from __future__ import annotations

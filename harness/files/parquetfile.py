@@ -3,7 +3,8 @@
 A row is a problem, with the columns ``P, q, G, h, A, b, lb, ub`` (lists of doubles) and
 ``name``. All matrices are dense and stored row by row, with as many columns as q has
 components. Absent constraints and bounds are null. qpbenchmark's ``ParquetTestSet``
-reads exactly these columns [1]_.
+reads exactly these columns [1]_. Sets other than bounds, which it would ignore, have
+further columns, named as in `harness.sets.arrays`; an index is stored row by row.
 
 The `meta` of `harness.files.qpfile` has no column. It is stored in the metadata of the
 schema under the key ``mortarbench``, which other readers ignore.
@@ -36,6 +37,7 @@ from mortarbench.harness.files.datafile import (
 from mortarbench.harness.files.durable import replacing
 from mortarbench.harness.files.qpfile import explicit_matrices, listed_dense
 from mortarbench.harness.qp import QP, Matrix, Vector, check_symmetric, no_rows
+from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
 
 _MATRICES = ("P", "G", "A")
 _KEY = "mortarbench"
@@ -58,8 +60,6 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
     import pyarrow as pa  # late: slow to import, and workers need neither
     import pyarrow.parquet as pq
 
-    if other := [type(one).__name__ for one in qp.sets[1:]]:
-        raise InputError(f"{path}: Parquet holds no {other[0]}; expected .npz or .mat")
     n = qp.q.size
     rows = {"P": n, "G": qp.h.size, "A": qp.b.size}
     for name, count in rows.items():
@@ -78,6 +78,8 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
             flat |= {name: _flat(matrices[name]), rhs: getattr(qp, rhs)}
     numbers = pa.list_(pa.float64())
     columns = {name: pa.array([flat.get(name)], numbers) for name in _COLUMNS}
+    for name, array in set_arrays(qp.sets[1:]).items():
+        columns[name] = pa.array([array.ravel()])
     table = pa.table({**columns, "name": [str(meta.get("name", path.stem))]})
     text = json.dumps({**meta, "dense": dense})
     table = table.replace_schema_metadata({_KEY: text})
@@ -117,10 +119,13 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
         for name, absent in (("lb", -np.inf), ("ub", np.inf)):
             bound = flat[name]
             parts[name] = np.full(n, absent) if bound is None else bound
-        qp = QP(**parts)
+        sets = {name: part for name, part in flat.items() if SET_ARRAY.fullmatch(name)}
+        qp = QP(**parts, sets=further_sets(sets))
         check_symmetric(qp.P)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None
+    except InputError as e:
+        raise InputError(f"{path}: {e}") from None
     return qp, meta
 
 
@@ -135,7 +140,8 @@ def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
         When the file is not Parquet, has not one row, is too large, or lacks a column.
 
     """
-    command = [sys.executable, "-I", str(_READER), str(max_bytes()), _KEY]
+    reader = [sys.executable, "-I", str(_READER)]
+    command = [*reader, str(max_bytes()), _KEY, SET_ARRAY.pattern]
     with opened(path, "a Parquet file") as file:
         done = subprocess.run(
             [*command, *_COLUMNS], stdin=file, capture_output=True, check=False

@@ -2,19 +2,21 @@
 
 ::
 
-    python parquetreader.py MAX_BYTES KEY COLUMN... < FILE
+    python parquetreader.py MAX_BYTES KEY PATTERN COLUMN... < FILE
 
 prints a line of JSON with the number of ``rows``, the columns ``missing``, the
 ``bytes`` that the file declares, and as ``meta`` the text under KEY in the metadata of
 its schema. For a file of one row of at most MAX_BYTES, the line also has ``columns``:
-the length of each list, null for a null, and -1 for other types. The numbers of all
-columns follow as float64. No other module of this package is imported, for speed.
+the length of each list, null for a null, and -1 for other types, of COLUMN... and of
+all columns whose names match PATTERN. Their numbers follow as float64. No other module
+of this package is imported, for speed.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import resource
 import signal
 import sys
@@ -28,7 +30,7 @@ SECONDS = 600  #: the same for elapsed time: a file may block
 ROOM = 2**29  #: bytes of address space beside four times the declared size
 
 
-def main(max_bytes: int, key: str, wanted: list[str]) -> None:
+def main(max_bytes: int, key: str, pattern: str, wanted: list[str]) -> None:
     """Read the file on standard input, and print its columns."""
     # a thread of Arrow may abort Python when it ends
     resource.setrlimit(resource.RLIMIT_CPU, (CPU_SECONDS, CPU_SECONDS))
@@ -40,6 +42,7 @@ def main(max_bytes: int, key: str, wanted: list[str]) -> None:
     chunks = [g.column(i) for g in groups for i in range(g.num_columns)]
     size = sum(max(8 * c.num_values, c.total_uncompressed_size) for c in chunks)
     names = file.schema_arrow.names
+    optional = [name for name in names if re.fullmatch(pattern, name)]
     meta = (file.schema_arrow.metadata or {}).get(key.encode(), b"{}")
     head: dict[str, Any] = {
         "rows": metadata.num_rows,
@@ -51,6 +54,7 @@ def main(max_bytes: int, key: str, wanted: list[str]) -> None:
         print(json.dumps(head))
         return
     _bound(4 * size + ROOM)
+    wanted = [*wanted, *optional]
     table = file.read(columns=wanted, use_threads=False)
     table.validate(full=True)
     arrays = {name: _numbers(table.column(name)[0]) for name in wanted}
@@ -87,6 +91,6 @@ def _numbers(scalar: Any) -> Any:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), sys.argv[2], sys.argv[3:])
+    main(int(sys.argv[1]), sys.argv[2], sys.argv[3], sys.argv[4:])
     sys.stdout.flush()
     os._exit(0)  # without waiting for threads of Arrow, which may not end

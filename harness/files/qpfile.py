@@ -4,14 +4,15 @@
 
     min ½xᵀPx + qᵀx   s.t.   Gx ≤ h,  Ax = b,  lb ≤ x ≤ ub
 
-is stored as the vectors ``q, h, b, lb, ub``; each matrix M of ``P, G, A`` as the parts
-``M_data, M_indices, M_indptr, M_shape`` of its CSC format (both triangles of P); and
-``meta``, a JSON object. Absent constraints have zero rows, absent bounds are ±inf.
-``meta["dense"]`` lists the matrices that were dense. The optional structure of a dual
-is stored as matrices ``K, B`` and the vector ``fixed``.
+is stored as the vectors ``q, h, b, lb, ub``; sets other than bounds by the names of
+`harness.sets.arrays`, such as ``disc_index, disc_radius``; each matrix M of ``P, G, A``
+as the parts ``M_data, M_indices, M_indptr, M_shape`` of its CSC format (both triangles
+of P); and ``meta``, a JSON object. Absent constraints have zero rows, absent bounds are
+±inf. ``meta["dense"]`` lists the matrices that were dense. The optional structure of a
+dual is stored as matrices ``K, B`` and the vector ``fixed``.
 
 Files of ``np.savez(path, P=P, q=q, G=G, h=h)`` are accepted as well: matrices are dense
-arrays or CSC parts, and ``G, h``, ``A, b`` and bounds are optional.
+arrays or CSC parts, and ``G, h``, ``A, b``, bounds and sets are optional.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from mortarbench.harness.qp import (
     canonical,
     check_symmetric,
 )
-from mortarbench.harness.sets.arrays import further_sets, set_arrays
+from mortarbench.harness.sets.arrays import SET_ARRAY, further_sets, set_arrays
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -206,11 +207,12 @@ def _plain_qp(path: Path, arrays: Mapping[str, NDArray[Any]]) -> QP:
     """Return the QP of arrays that were saved by `np.savez`."""
     try:
         for name in arrays:
-            if name not in _PLAIN:
+            if name not in _PLAIN and not SET_ARRAY.fullmatch(name):
                 raise unknown("array", name, (*_VECTORS, *_MATRICES))
         matrices = {name: _plain_matrix(arrays, name) for name in _MATRICES}
         vectors = {name: _plain_vector(arrays, name) for name in _VECTORS}
         arguments: dict[str, Any] = {**matrices, **vectors}
+        arguments["sets"] = further_sets(arrays)
         qp = QP.from_arrays(**arguments)
     except (ValueError, TypeError, OverflowError) as e:
         raise InputError(f"{path}: {shortened(' '.join(str(e).split()))}") from None

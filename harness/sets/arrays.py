@@ -3,11 +3,12 @@
 The first set of a kind has `disc_index, disc_radius` or `cone_index, cone_slope`. A
 further one of the same kind, such as discs of another dimension, has a number after the
 kind: `disc2_index, disc2_radius`, `disc3_index`, … Discs are read before cones. Indices
-start at 0.
+start at 0. Vectors and matrices may be stored in other shapes (`further_sets`).
 """
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -22,6 +23,8 @@ from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.harness.sets.discs import Discs
 
 KINDS: tuple[type[Discs] | type[Cones], ...] = (Discs, Cones)
+#: Names of all arrays of sets.
+SET_ARRAY = re.compile(r"(disc|cone)[0-9]*_(index|radius|slope)")
 
 
 def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
@@ -51,20 +54,28 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
 def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
     """Return the sets other than bounds whose arrays are among `arrays`.
 
-    Vectors may be rows or columns, as in .mat files.
+    Vectors may be rows or columns, as in .mat files, and an index may be flat, row by
+    row, as in Parquet.
 
     Raises
     ------
     InputError
-        When an array is missing beside another, or they are not such sets.
+        When an array is missing beside another, has a name of no set, or they are not
+        such sets.
 
     """
     sets: list[ConvexSet] = []
+    names = {name for name in arrays if SET_ARRAY.fullmatch(name)}
     for kind in KINDS:
         count = 1
-        while parts := _parts(kind, _prefix(kind, count), arrays):
+        while parts := _parts(kind, _prefix(kind, count), arrays, names):
             sets.append(kind(**parts))
             count += 1
+    if names:  # to leave out a set would be another problem
+        raise InputError(
+            f"{min(names)} belongs to no set; expected disc_index and disc_radius, "
+            "cone_index and cone_slope, then disc2_index, …"
+        )
     return tuple(sets)
 
 
@@ -72,17 +83,22 @@ def _prefix(kind: type[Discs] | type[Cones], count: int) -> str:
     return kind.prefix + (str(count) if count > 1 else "")
 
 
-def _parts(kind: Any, prefix: str, arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a set, none if `arrays` has no such set."""
-    index, size = (field.name for field in fields(kind))
-    lacking = [f"{prefix}_{name}" not in arrays for name in (index, size)]
-    if all(lacking):
+def _parts(
+    kind: Any, prefix: str, arrays: Mapping[str, Any], names: set[str]
+) -> dict[str, Any]:
+    """Return the arguments of a set, none if `arrays` has no such set.
+
+    names : of arrays that belong to no set yet; those of this set are removed
+    """
+    both = {f"{prefix}_{field.name}": field.name for field in fields(kind)}
+    here = names.intersection(both)
+    if not here:
         return {}
-    if any(lacking):
-        names = [f"{prefix}_{index}", f"{prefix}_{size}"]
-        here, absent = names if lacking[1] else reversed(names)
-        raise InputError(f"{absent} is missing beside {here}")
-    sizes = np.asarray(arrays[f"{prefix}_{size}"])
-    if sizes.ndim == 2 and 1 in sizes.shape:
-        sizes = sizes.ravel()
-    return {index: arrays[f"{prefix}_{index}"], size: sizes}
+    if absent := both.keys() - here:
+        raise InputError(f"{absent.pop()} is missing beside {here.pop()}")
+    names -= here
+    index, sizes = (np.asarray(arrays[name]) for name in both)
+    sizes = sizes.ravel() if sizes.ndim == 2 and 1 in sizes.shape else sizes
+    if index.ndim == 1 and sizes.size and index.size % sizes.size == 0:
+        index = index.reshape(sizes.size, -1)
+    return dict(zip(both.values(), (index, sizes), strict=True))

@@ -172,6 +172,6 @@ class ContactFamily(DeclaredFamily):
 
 def _model(place: str) -> Callable[..., Any]:
     """Import the function "MODULE.FUNCTION" of `problems.models`."""
-    module, _, name = place.partition(".")
+    module, _, name = place.rpartition(".")
     function = getattr(import_module(f"mortarbench.problems.models.{module}"), name)
     return function  # type: ignore[no-any-return]

@@ -21,12 +21,14 @@ Points = NDArray[np.float64]  #: (n, 2)
 class ColourScale:
     """Colour map of a range of values, with the label of its bar."""
 
-    colours: str  #: a colour map of matplotlib
+    #: a colour map of matplotlib; or colours of the kinds 0, 1, … called `names`
+    colours: str | tuple[str, ...]
     low: float
     high: float
     label: str = ""
     unit: float = 1.0  #: value labelled 1 on the bar
     beyond: Literal["neither", "max", "both"] = "neither"  #: ends with clipped values
+    names: tuple[str, ...] = ()  #: of kinds, at the bar
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -36,6 +38,16 @@ class ColourField:
     points: Points
     triangles: NDArray[np.int64]  #: (t, 3)
     values: Vector  #: (n,)
+    scale: ColourScale
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Raster:
+    """Values of the square cells of a grid as colours, none where NaN."""
+
+    low: tuple[float, float]  #: lower left corner
+    high: tuple[float, float]
+    values: NDArray[np.float64]  #: (rows along x, columns along y)
     scale: ColourScale
 
 
@@ -108,7 +120,7 @@ class Label:
     size: float = 9.5  #: points
 
 
-FieldMark = ColourField | Polygons | Strokes | Path | Vectors | Arrow | Label
+FieldMark = ColourField | Raster | Polygons | Strokes | Path | Vectors | Arrow | Label
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

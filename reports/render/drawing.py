@@ -12,7 +12,13 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis as TickedAxis
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import BoundaryNorm, ListedColormap, Normalize, to_rgba
+from matplotlib.colors import (
+    BoundaryNorm,
+    Colormap,
+    ListedColormap,
+    Normalize,
+    to_rgba,
+)
 from matplotlib.figure import Figure as Canvas
 from matplotlib.figure import SubFigure
 from matplotlib.lines import Line2D
@@ -36,6 +42,7 @@ from mortarbench.reports.document.fields import (
     Label,
     Path,
     Polygons,
+    Raster,
     Strokes,
     Vectors,
 )
@@ -351,9 +358,16 @@ def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
             x, y = mark.points.T
             mesh = Triangulation(x, y, mark.triangles)
             axes.tripcolor(
-                mesh, mark.values, cmap=mark.scale.colours, shading="gouraud",
+                mesh, mark.values, cmap=_colour_map(mark.scale), shading="gouraud",
                 norm=Normalize(mark.scale.low, mark.scale.high), rasterized=True,
                 zorder=height,
+            )  # fmt: skip
+        case Raster():
+            (x0, y0), (x1, y1) = mark.low, mark.high
+            axes.imshow(
+                mark.values.T, cmap=_colour_map(mark.scale), origin="lower",
+                norm=Normalize(mark.scale.low, mark.scale.high), zorder=height,
+                extent=(x0, x1, y0, y1), interpolation="nearest",
             )  # fmt: skip
         case Polygons():
             fill = to_rgba(mark.fill, mark.opacity) if mark.fill != "none" else "none"
@@ -406,8 +420,20 @@ def _field_bar(
     canvas: Canvas, scale: ColourScale, beside: Axes | list[Axes], **how: Any
 ) -> None:
     norm = Normalize(scale.low, scale.high)
-    colours = ScalarMappable(norm=norm, cmap=colormaps[scale.colours])
+    colours = ScalarMappable(norm=norm, cmap=_colour_map(scale))
     bar = canvas.colorbar(colours, ax=beside, extend=scale.beyond, **how)
-    bar.long_axis.set_major_formatter(_in_units(scale.unit))
+    if scale.names:
+        width = (scale.high - scale.low) / len(scale.names)
+        middles = scale.low + width * (np.arange(len(scale.names)) + 0.5)
+        bar.set_ticks(middles.tolist(), labels=list(scale.names))
+        bar.ax.tick_params(length=0)
+    else:
+        bar.long_axis.set_major_formatter(_in_units(scale.unit))
     bar.set_label(scale.label)
     bar.outline.set_linewidth(0.5)
+
+
+def _colour_map(scale: ColourScale) -> Colormap:
+    if isinstance(scale.colours, str):
+        return colormaps[scale.colours]
+    return ListedColormap(scale.colours)

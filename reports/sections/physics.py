@@ -30,6 +30,7 @@ from mortarbench.reports.figures.deformed import (
     clipped_at,
     deformed_figure,
 )
+from mortarbench.reports.figures.maps import traction_maps
 from mortarbench.reports.figures.tractions import traction_figure
 from mortarbench.reports.sections import Analysis, section
 
@@ -158,18 +159,24 @@ def deformed(a: Analysis) -> Iterator[Part]:
     "Tractions along the contact: no verified answer has a contact side.",
 )  # fmt: skip
 def tractions(a: Analysis) -> Iterator[Part]:
-    """Draw the tractions along the contacts of the largest case of each family."""
-    for family, mine in grouped(_drawable(a), lambda o: o.first.family).items():
+    """Draw the tractions of the largest case of each family and law."""
+    laws = grouped(_drawable(a), lambda o: (o.first.family, o.first.params.get("law")))
+    for (family, law), mine in laws.items():
         chosen = max(reversed(mine), key=_importance)
+        name = f"tractions-{family}" + f"-{law}" * (law is not None)
         try:
             fields = load_fields(a.evidence.directory, chosen.first.fields or "")
         except InputError:  # reported by the section `deformed`
             continue
-        if (figure := traction_figure(fields)) is not None:
+        if (maps := traction_maps(fields)) is not None:
+            rough = fields.contacts[0].friction is not None
+            caption = TEXT("maps", chosen, rough, fields.contacts[0].exact is not None)
+            yield Picture(name=name, caption=caption, figure=maps)
+        elif (figure := traction_figure(fields)) is not None:
             rough = any(side.friction is not None for side in fields.contacts)
             exact = any(side.exact is not None for side in fields.contacts)
             caption = TEXT("tractions", chosen, rough, exact)
-            yield Picture(name=f"tractions-{family}", caption=caption, figure=figure)
+            yield Picture(name=name, caption=caption, figure=figure)
 
 
 def _drawable(a: Analysis) -> list[Outcome]:
@@ -183,6 +190,6 @@ def _drawable(a: Analysis) -> list[Outcome]:
 def _importance(outcome: Outcome) -> tuple[float, float, float, str, str]:
     """Order by size, then load step, then accuracy; names break ties."""
     step = outcome.first.params.get("step", 0)
-    size = outcome.size("dofs") or 0
+    size = outcome.size("dofs") or outcome.size("contact_rows") or 0
     last = float(step) if isinstance(step, int | float) else 0.0
     return (size, last, -outcome.tol, outcome.first.form, outcome.solver)

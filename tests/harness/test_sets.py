@@ -19,8 +19,7 @@ from mortarbench.harness import (
     save_qp,
 )
 from mortarbench.harness.conformance.metamorphic import change_units, permute_unknowns
-from mortarbench.harness.files.matfile import read_mat, save_mat, to_qp
-from mortarbench.harness.files.qpfile import load_qp, qp_digest
+from mortarbench.harness.files.qpfile import qp_digest
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.harness.verify.measure import ReasonError, reason_to_decline
@@ -491,50 +490,6 @@ def test_clarabel_solves_planted_discs(seed, tmp_path):
     best = qp.objective(s.x)
     assert qp.objective(answer.solution.x) == pytest.approx(best, rel=1e-6)
     assert mb.solve(qp, "osqp").verdict is mb.Verdict.DECLINED
-
-
-@pytest.mark.parametrize(
-    "sets",
-    [
-        (Discs(BALLS.index, BALLS.radius),),
-        (Discs([[3, 2, 1]], [1.0]),),
-        (Cones([[0, 1]], [0.3]), Discs([[2, 3], [5, 4]], [1e-300, 0])),
-        (Discs([[5, 1, 2]], [1.0]), Discs([[3, 4]], [0.5]), Cones([[0, 7]], [1e300])),
-        (Cones([[0, 1, 2]], [1.0]), Cones([[5, 3]], [0.5]), Cones([[7, 6]], [0.0])),
-    ],
-    ids=["discs", "one disc", "discs and cones", "two kinds of discs", "cones"],
-)
-@pytest.mark.parametrize("suffix", [".npz", ".mat"])
-def test_files_hold_discs_and_cones(tmp_path, suffix, sets):
-    def load_mat(path):
-        return to_qp(read_mat(path))
-
-    qp = qp_with(FREE, *sets)
-    save, load = {".npz": (save_qp, load_qp), ".mat": (save_mat, load_mat)}[suffix]
-    save(tmp_path / f"a{suffix}", qp, *([{}] if suffix == ".npz" else [{}, {}]))
-    back = load(tmp_path / f"a{suffix}")[0].sets
-
-    expected = sorted(sets, key=lambda one: type(one).__name__, reverse=True)
-    assert [type(one) for one in back] == [Box, *map(type, expected)]
-    for here, there in zip(expected, back[1:], strict=True):
-        arrays, others = here.arrays(), there.arrays()
-        assert {k: v.tolist() for k, v in arrays.items()} == {
-            k: v.tolist() for k, v in others.items()
-        }
-        assert [v.dtype for v in arrays.values()] == [v.dtype for v in others.values()]
-
-
-def test_a_file_with_half_a_set_is_refused(tmp_path):
-    qp = qp_with(FREE, Discs([[5, 1, 2]], [1.0]), Discs([[3, 4]], [0.5]))
-    save_qp(tmp_path / "a.npz", qp)
-    arrays = dict(np.load(tmp_path / "a.npz"))
-    assert {"disc_index", "disc_radius", "disc2_index", "disc2_radius"} <= {*arrays}
-    del arrays["disc2_radius"]
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(
-        InputError, match=r"a.npz: disc2_radius is missing beside disc2_i"
-    ):
-        load_qp(tmp_path / "a.npz")
 
 
 def test_discs_of_one_variable_are_bounds_to_the_last_bit():

@@ -3,13 +3,14 @@
 import io
 import json
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pyarrow.parquet as pq
 from scipy.io import savemat
 from scipy.sparse import csc_array, random_array
 
-from mortarbench.harness import QP, InputError
+from mortarbench.harness import QP, Cones, Discs, InputError
 from mortarbench.harness.files.matfile import save_mat
 from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import save_qp
@@ -75,7 +76,11 @@ def seeds(folder):
         write(path)
         found[kind].append(path.read_bytes())
 
-    for each in (qp, tiny_qp(dense=True)):
+    over_sets = replace(
+        tiny_qp(), lb=np.full(6, -np.inf), ub=np.full(6, np.inf),
+        sets=(Discs([[0, 2], [4, 1]], [1.0, 0.0]), Cones([[3, 5]], [0.5])),
+    )  # fmt: skip
+    for each in (qp, tiny_qp(dense=True), over_sets):
         written("npz", lambda path, each=each: save_qp(path, each, meta))
         written("mat", lambda path, each=each: save_mat(path, each, meta, {}))
         written("parquet", lambda path, each=each: save_parquet(path, each, meta))

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from mortarbench.problems import PROBLEMS
+from mortarbench.reports.figures.maps import traction_maps
 from mortarbench.reports.figures.tractions import LOOKS, places, traction_figure
+from mortarbench.reports.render.saving import save
+from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
 from mortarbench.solvers.reference.solve import reference_solution
 
 
@@ -75,3 +78,56 @@ def test_nodes_that_slide_without_contact_have_shear_and_no_pressure():
 
     assert abs(side.shear[apart]).max() > 1e7
     assert abs(side.pressure[apart]).max() < 1e-6 * side.pressure.max()
+
+
+def point_contact(**given):
+    """Return the deformed state of half-spaces, of the spectral projected gradient."""
+    family = PROBLEMS["half-space"]
+    case = family.build("dual", family.complete(given), reference_solution)
+    return case.fields(ProjectedGradient().prepare(case.qp, 1e-8)())
+
+
+def test_maps_show_pressure_shear_and_the_direction_of_slip():
+    fields = point_contact(n=41, law="mindlin", nu=0.0, Q=0.6)
+    (side,) = fields.contacts
+    pressure, shear, state = traction_maps(fields).panels
+
+    for panel, values in ((pressure, side.pressure), (shear, side.shear)):
+        raster = panel.marks[0]
+        shown = raster.values[np.isfinite(raster.values)]
+        assert sorted(shown) == pytest.approx(sorted(values))
+        assert raster.values == pytest.approx(raster.values[::-1], nan_ok=True)
+    raster, contact, stick, arrows = state.marks
+    names = np.array(raster.scale.names)
+    kinds = names[raster.values[np.isfinite(raster.values)].astype(int)]
+    assert (kinds == "stick").sum() == (side.friction == "stick").sum()
+    assert (kinds == "slip").sum() == (side.friction == "slip").sum()
+    # the upper body slips along +x, at cells that slip, evenly about the middle
+    assert (arrows.vectors[:, 0] > 0).all()
+    assert abs(arrows.vectors[:, 1]).max() < 1e-9 * arrows.vectors.max()
+    middles = arrows.feet + arrows.vectors / 2
+    radii = np.linalg.norm(middles, axis=1)
+    c, a = (np.linalg.norm(path.points, axis=1)[0] for path in (stick, contact))
+    assert c / a == pytest.approx(0.4 ** (1 / 3), abs=3e-3)
+    assert ((radii > 0.93 * c) & (radii < 1.02 * a)).all()
+    assert middles.mean(axis=0) == pytest.approx([0, 0], abs=1e-9 * a)
+
+
+def test_a_map_leaves_out_cells_without_contact():
+    fields = point_contact(n=20)
+    (panel,) = traction_maps(fields).panels
+    (side,) = fields.contacts
+
+    raster = panel.marks[0].values
+    assert np.isnan(raster[0, 0])
+    assert np.isfinite(raster).sum() == (side.pressure > 0).sum()
+    assert panel.title == "pressure"
+    side.pressure[:] = 0
+    assert traction_maps(fields) is None
+    assert traction_figure(fields) is None
+
+
+def test_maps_are_drawn(tmp_path):
+    for given in (dict(n=16), dict(n=16, law="mindlin")):
+        save(traction_maps(point_contact(**given)), tmp_path / "map.png")
+        assert (tmp_path / "map.png").stat().st_size > 5000

@@ -1,0 +1,1 @@
+"""Contact of elastic half-spaces without a mesh: kernels, exact solutions, cases."""

@@ -1,0 +1,185 @@
+"""Files hold discs and cones: the same QP is read again, and half a set is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.io import loadmat, savemat
+
+import mortarbench as mb
+from mortarbench.harness.files.qpfile import qp_digest
+
+N = 8
+SETS = {
+    "discs": (mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]),),
+    "one disc": (mb.Discs([[3, 2, 1]], [1.0]),),
+    "discs and cones": (
+        mb.Discs([[2, 3], [5, 4]], [1e-300, 0]), mb.Cones([[0, 1]], [0.3]),
+    ),
+    "two kinds of discs": (
+        mb.Discs([[5, 1, 2]], [1 / 3]), mb.Discs([[3, 4]], [0.5]),
+        mb.Cones([[0, 7]], [1e300]),
+    ),
+    "three kinds of cones": (
+        mb.Cones([[0, 1, 2]], [1.0]), mb.Cones([[5, 3]], [0.5]),
+        mb.Cones([[7, 6]], [0.0]),
+    ),
+}  # fmt: skip
+
+
+def qp_over(*sets):
+    rng = np.random.default_rng(1)
+    M = rng.standard_normal((N, N))
+    return mb.QP.from_arrays(M @ M.T, M[0], G=M[:2], h=[1, 1], sets=sets)
+
+
+def arrays_of(qp):
+    return [
+        (type(one), name, array.dtype, array.tolist())
+        for one in qp.sets[1:]
+        for name, array in one.arrays().items()
+    ]
+
+
+@pytest.mark.parametrize("sets", SETS.values(), ids=SETS)
+@pytest.mark.parametrize("suffix", ["npz", "mat", "parquet"])
+def test_a_qp_over_sets_is_the_same_after_writing(tmp_path, suffix, sets):
+    qp = qp_over(*sets)
+    path = mb.export(qp, tmp_path / f"qp.{suffix}")
+    back = mb.build(f"file:{path}").qp
+
+    assert arrays_of(back) == arrays_of(qp)
+    assert qp_digest(back) == qp_digest(qp)
+    assert back.sizes == qp.sizes
+
+
+def test_sizes_count_the_blocks_of_every_kind():
+    qp = qp_over(*SETS["two kinds of discs"])
+    assert qp.sizes["discs"] == 2
+    assert repr(qp).endswith("0 bounds, 2 discs, 1 cones>")
+    assert "discs" not in qp_over().sizes
+
+
+def test_digests_tell_sets_apart():
+    """Another radius, block, kind or order is another problem."""
+    discs, cones = mb.Discs([[1, 4], [6, 2]], [2.0, 0.5]), mb.Cones([[0, 5]], [0.5])
+    one = qp_digest(qp_over(discs, cones))
+    assert qp_digest(qp_over(cones, discs)) == one
+    others = [
+        qp_over(discs), qp_over(cones), qp_over(),
+        qp_over(mb.Discs(discs.index, [2.0, np.nextafter(0.5, 1)]), cones),
+        qp_over(mb.Discs([[1, 4], [6, 3]], discs.radius), cones),
+        qp_over(discs, mb.Cones([[5, 0]], [0.5])),
+        qp_over(mb.Discs([[0, 5]], [0.5]), mb.Cones(discs.index, discs.radius)),
+    ]  # fmt: skip
+    assert len({one, *map(qp_digest, others)}) == 1 + len(others)
+
+
+def test_arrays_saved_by_numpy_alone_are_read(tmp_path):
+    qp = qp_over(*SETS["discs"])
+    path = tmp_path / "plain.npz"
+    arrays = {name: getattr(qp, name) for name in ("P", "q", "G", "h")}
+    np.savez(path, **arrays, disc_index=[[1, 4], [6, 2]], disc_radius=[2, 0.5])
+    assert arrays_of(mb.build(f"file:{path}").qp) == arrays_of(qp)
+
+
+def test_octave_may_store_rows_columns_and_doubles(tmp_path):
+    qp = qp_over(*SETS["discs"])
+    path = mb.export(qp, tmp_path / "qp.mat")
+    arrays = {k: v for k, v in loadmat(path).items() if not k.startswith("__")}
+    assert arrays["disc_radius"].shape == (2, 1)
+    arrays["disc_index"] = arrays["disc_index"].astype(float)
+    arrays["disc_radius"] = arrays["disc_radius"].T
+    savemat(path, arrays)
+    assert arrays_of(mb.build(f"file:{path}").qp) == arrays_of(qp)
+
+
+def test_other_readers_of_parquet_find_the_sets_as_columns(tmp_path):
+    path = mb.export(qp_over(*SETS["two kinds of discs"]), tmp_path / "qp.parquet")
+    row = pd.read_parquet(path).iloc[0]
+    assert row["disc_index"].tolist() == [5, 1, 2]
+    assert row["disc2_radius"].tolist() == [0.5]
+    assert row["cone_slope"].tolist() == [1e300]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("disc_radius", None, "disc_radius is missing beside disc_index"),
+        ("disc2_index", None, "disc2_index is missing beside disc2_radius"),
+        ("disc4_index", [5], "disc4_index belongs to no set; expected disc_index"),
+        ("disc1_index", [5], "disc1_index belongs to no set; expected disc_index"),
+        ("disc_slope", [5], "disc_slope belongs to no set; expected disc_index"),
+        ("disc2_radius", [-1.0], r"Discs: radius\[0\] = -1.0; expected finite numbers"),
+        ("cone_slope", [np.nan], r"Cones: slope\[0\] = nan; expected finite numbers"),
+        ("disc_radius", [1.0, 2.0], r"Discs: radius has shape \(2,\); expected \(1,\)"),
+        ("cone_index", [[0, 8]], "Cones: index 8 is out of range; expected 0 … 7"),
+        (
+            "cone_index",
+            [[0, 0.5]],
+            "Cones: index holds a number that is not an integer",
+        ),
+        ("cone_index", [[3, 7]], "variable 3 is in two sets"),
+        ("cone_index", [["a", "b"]], "Cones: index = .*; expected an array of numbers"),
+    ],
+)
+def test_files_with_broken_sets_are_refused_in_one_line(tmp_path, name, value, message):
+    path = mb.export(qp_over(*SETS["two kinds of discs"]), tmp_path / "qp.npz")
+    arrays = dict(np.load(path)) | {name: value}
+    np.savez(path, **{k: np.array(v) for k, v in arrays.items() if v is not None})
+    with pytest.raises(mb.InputError, match=message) as e:
+        mb.build(f"file:{path}")
+    assert "\n" not in str(e.value)
+    assert str(path) in str(e.value)
+
+
+def test_mat_and_parquet_with_broken_sets_are_refused(tmp_path):
+    qp = qp_over(*SETS["two kinds of discs"])
+    path = mb.export(qp, tmp_path / "qp.mat")
+    arrays = {k: v for k, v in loadmat(path).items() if k[0] != "_"}
+    savemat(path, arrays | {"disc_index": "text"})
+    with pytest.raises(mb.InputError, match=r"qp.mat: Discs: index = .*; expected an"):
+        mb.build(f"file:{path}")
+    path = mb.export(qp, tmp_path / "qp.parquet")
+    frame = pd.read_parquet(path)
+    for name, value, message in (
+        (
+            "disc_index",
+            None,
+            "qp.parquet: Discs: index = .*None.*; expected an array",
+        ),
+        ("cone_slope", ["steep"], "qp.parquet: cone_slope is not a list of numbers"),
+    ):
+        frame.assign(**{name: [value]}).to_parquet(path)
+        with pytest.raises(mb.InputError, match=message):
+            mb.build(f"file:{path}")
+
+
+def test_qps_holds_no_sets(tmp_path):
+    with pytest.raises(
+        mb.InputError, match="QPS has no sets of the kind Discs; expect"
+    ):
+        mb.export(qp_over(*SETS["discs"]), tmp_path / "qp.qps")
+    assert not [*tmp_path.iterdir()]
+
+
+def test_a_suite_runs_a_file_with_discs_and_replays_it(tmp_path):
+    qp = qp_over(*SETS["discs"])
+    path = mb.export(replace(qp, q=10 * qp.q), tmp_path / "qp.npz")
+    suite = {
+        "name": "sets", "tolerances": [1e-6], "repeats": 1,
+        "solvers": ["clarabel", "osqp"],
+        "problems": [{"family": "file", "params": {"path": str(path)}}],
+    }  # fmt: skip
+    results = mb.run(suite, out=tmp_path / "out")
+    frame = results.df.set_index("solver")
+
+    assert frame.loc["clarabel", "status"] == "verified"
+    assert frame.loc["osqp", "status"] == "declined"
+    assert "Discs" in frame.loc["osqp", "message"]
+    path.unlink()
+    again = mb.replay(tmp_path / "out", frame.loc["clarabel", "run_id"])
+    assert again.reproduced
+    assert again.same_qp
+    assert again.distance == 0
