@@ -71,6 +71,9 @@ class SMALBE:
     def precondition(
         self, free: NDArray[np.bool_], v: Vector, rho: float
     ) -> Vector: ...
+    def face_and_gradients(
+        self, x: Vector, g: Vector
+    ) -> tuple[Array, Array, Array]: ...
     def solve(
         self,
         options: Options,

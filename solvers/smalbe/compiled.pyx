@@ -8,7 +8,7 @@ factors and preconditioners call back into Python.
 
 * operations.pxi: sums over processes, products with F, orthonormal rows
 * coarse.pxi: sparse rows and the factor of GGᵀ
-* box.pxi: the feasible set: steps to its boundary, projections, parts of the gradient
+* feasible_set.pxi: steps to the boundary of the set, projections, parts of the gradient
 * model.pxi: the model of H, minimised over the set and inverted on a face
 * preparation.pxi: orthonormal rows, Lanczos, the normalised problem
 * incomplete.pxi: incomplete Cholesky factors of the free part of a sparse P
@@ -191,10 +191,32 @@ cdef extern from "incomplete.h" nogil:
     void scaled_matrix(const int *indptr, const int *indices, const double *data,
                        const double *s, double *scaled, Py_ssize_t n, double *told)
 
+cdef extern from "discs.h" nogil:
+    ctypedef struct discs:
+        Py_ssize_t count, ranges
+        const int *start
+        const int *index
+        const double *radius
+        const double *slack
+        const double *centre
+        const Py_ssize_t *range
+    void project_discs(const discs *D, double *y)
+    double first_disc(const discs *D, const double *x, const double *p, double least)
+    void split_discs(const discs *D, const double *x, const double *g, double tau,
+                     double *phi, double *free, double *result)
+    void advance_discs(const discs *D, double alpha, double *x, double *g,
+                       const double *p, const double *Hp, double tau, double *phi,
+                       double *free, double *result)
+    void chop_discs(const discs *D, const double *x, const double *g, double *beta)
+    void step_on_discs(const discs *D, const double *x, const double *g, double tau,
+                       bint free_only, double *s)
+    double inward_energy_of_discs(const discs *D, const double *x, const double *g,
+                                  const double *diagonal, double norm, double noise)
+
 include "operations.pxi"
 include "coarse.pxi"
 include "preparation.pxi"
-include "box.pxi"
+include "feasible_set.pxi"
 include "model.pxi"
 include "incomplete.pxi"
 include "judge.pxi"

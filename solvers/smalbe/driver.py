@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness import QP, Solution, Status, Vector, kkt_residuals
+from mortarbench.harness import QP, Discs, Solution, Status, Vector, kkt_residuals
 from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.elimination import Eliminated, FreeBlock, eliminate_free
@@ -59,6 +59,9 @@ RHO = 1e4
 #: default penalty if P offers a preconditioner. Each multiplier step restarts CG on the
 #: thousands of rows of decomposed bodies, so that fewer outer iterations pay there
 PRECONDITIONED_RHO = 1e6
+#: default penalty with discs. Spectral steps know no model, and a larger ρ would make H
+#: worse conditioned
+RHO_ON_DISCS = 1.0
 MAX_IDLE_TIGHTENINGS = 3  #: tightenings in a row that may fail to halve the residuals
 #: preconditioners that need no data of the eliminated variables
 ELIMINATION_PRECONDITIONERS = ("model", "none")
@@ -100,6 +103,9 @@ def prepared(
     in_sequence : whether further QPs take over the results; a factor of the free block
         and a good spectrum then pay off several times
     """
+    has_discs = len(qp.sets) > 1
+    if has_discs:
+        options = _on_discs(qp, options)
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
     kind = resolved_preconditioner(qp, options.preconditioner)
@@ -130,6 +136,21 @@ def prepared(
     return lambda: _solve_to_tolerance(task, tol)
 
 
+def _on_discs(qp: QP, options: Options) -> Options:
+    """Replace the options that are for bounds alone.
+
+    Models are minimised over boxes only, and −β leaves a disc that it is tangent to.
+    """
+    kind = resolved_preconditioner(qp, options.preconditioner)
+    return replace(
+        options,
+        rho=options.rho or RHO_ON_DISCS,
+        expansion="spectral" if options.expansion == "model" else options.expansion,
+        proportioning="model",
+        preconditioner="none" if kind == "model" else kind,
+    )
+
+
 def _scaled(qp: QP, options: Options, kind: Preconditioner) -> Scaled | None:
     """Scale the variables of a sparse QP with bounds, but not for a subclass."""
     with_factor = kind == "incomplete"
@@ -150,7 +171,7 @@ def _eliminated(
         kind == "incomplete" and options.preconditioner == "auto"
     )
     # the functions of a subclass expect the variables of the QP as given
-    if options.is_extended or not may_follow:
+    if options.is_extended or not may_follow or len(qp.sets) > 1:
         return None
     if options.eliminate == "always" or carry is None:
         return eliminate_free(qp, carry and carry.block)
@@ -166,6 +187,9 @@ def _projected(
     steps : of the Lanczos process
     """
     find = partial(_estimated_spectrum, options, steps, carry)
+    if options.expansion == "spectral" and not qp.b.size and qp.q.any():
+        # no step depends on the norm, and q is nearer to the first eigenvector
+        find = partial(by_lanczos, steps=1, start=qp.q)
     if scaled is not None and scaled.with_factor:
         problem = projected_problem(qp, lambda _F, _C: scaled.spectrum())
         problem.factor = scaled.factor()
@@ -220,7 +244,9 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     the 24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
     few = qp.q.size // (6 if qp.b.size or in_sequence else 10)
-    if isinstance(qp.P, np.ndarray):
+    if options.expansion == "spectral":
+        few = MIN_LANCZOS_STEPS
+    elif isinstance(qp.P, np.ndarray):
         if not qp.b.size and not in_sequence:
             few = min(few, BOUNDS_LANCZOS_STEPS)
     elif preconditioned_operator(qp):
@@ -271,7 +297,7 @@ class OuterLoop:
         """Continue the outer loop from `at` to a tolerance."""
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
-            self.options, tol, at, partial(infeasible, problem.rows, problem.bounds),
+            self.options, tol, at, partial(infeasible, problem.rows, problem.hull),
             self.watch,
         )  # fmt: skip
         outer = (*at.outer, *[OuterIteration(*one) for one in done])
@@ -296,7 +322,11 @@ def outer_loop(
         M = structural_preconditioner(qp, kind) if own is None else checked(own)
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
-    watch = None if history is None else partial(history.watch, problem)
+    watch = (
+        None
+        if history is None
+        else partial(history.watch, problem, solver.face_and_gradients)
+    )
     return OuterLoop(solver, problem, options, watch)
 
 
@@ -422,21 +452,45 @@ def recovered(
     """
     C = problem.rows.C
     at_lower, at_upper = at.nu <= problem.bounds[0], at.nu >= problem.bounds[1]
+    free = ~(at_lower | at_upper)
     x = np.where(
         at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
     )
     x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
+    boundaries = [(one, _on_boundary(one, x)) for one in problem.discs]
+    for one, active in boundaries:
+        x = one.project(x)
+        free[one.index[active]] = False
     Fx = problem.F(x)
     r = Fx + qp.q
     if not r.any():  # a minimum of the cost without any constraint
         return x, np.zeros_like(at.mu), np.zeros_like(x), Fx
-    free = ~(at_lower | at_upper)
     a = problem.spectrum.norm * at.mu - C @ r
     a += problem.rows.fitted(free, r + C.T @ a)
     r = r + C.T @ a
     z_box = np.where(at_lower, -np.maximum(r, 0), 0.0)
     z_box += np.where(at_upper, -np.minimum(r, 0), 0.0)
+    for one, active in boundaries:
+        at_disc = one.index[active]
+        z_box[at_disc] = _normal_part(x[at_disc], -r[at_disc])
     return x, a, z_box, Fx
+
+
+def _on_boundary(discs: Discs, x: Vector) -> NDArray[np.bool_]:
+    """Return which discs (k,) have x (n,) on their boundary."""
+    sizes = np.linalg.norm(x[discs.index], axis=1)
+    on_boundary: NDArray[np.bool_] = sizes >= discs.radius * (1 - 16 * EPS)
+    return on_boundary
+
+
+def _normal_part(x: Vector, v: Vector) -> Vector:
+    """Return the parts of v (k, d) that are normal to discs at x (k, d) on them."""
+    square = (x * x).sum(axis=1, keepdims=True)
+    share = np.maximum((x * v).sum(axis=1, keepdims=True), 0)
+    # at a radius of zero every vector is normal
+    scaled = np.divide(share, square, out=np.zeros_like(share), where=square > 0) * x
+    normal: Vector = np.where(square > 0, scaled, v)
+    return normal
 
 
 def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> float:
@@ -448,7 +502,9 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
     over = task.problem.F.over
-    bound = compiled.residual_bound(qp, point, Fx, diagonal, G, over)
+    bound = np.inf
+    if not task.problem.discs:
+        bound = compiled.residual_bound(qp, point, Fx, diagonal, G, over)
     if bound <= enough or isinstance(qp.q, DistributedVector):
         return bound
     task.problem.F.count += 1
@@ -487,25 +543,34 @@ class History:
     began: float = field(default_factory=perf_counter)
     rows: list[tuple[Any, ...]] = field(default_factory=list)
 
-    def watch(self, problem: Projected, outer: int, rhs: Vector) -> Note:
-        """Return the observer of one inner run with the right-hand side `rhs`."""
+    def watch(
+        self,
+        problem: Projected,
+        parts: Callable[[Vector, Vector], tuple[Vector, Vector, Vector]],
+        outer: int,
+        rhs: Vector,
+    ) -> Note:
+        """Return the observer of one inner run with the right-hand side `rhs`.
+
+        parts : x, g → `free` (1 on the face), φ and β
+        """
         C, x_tilde = problem.rows.C, problem.rows.x_tilde
         size = float(np.linalg.norm(x_tilde))
-        lower, upper = problem.bounds
+        lower, upper = problem.hull
         between = np.isfinite(lower) & np.isfinite(upper) & (lower < upper)
         boxes = bool(between.any())
 
         def note(letter: str, x: Vector, g: Vector) -> None:
             error = np.linalg.norm(C @ x) if len(C) else 0.0
-            free = (x > lower) & (x < upper)
-            leads = ((g < 0) & (x < upper)) | ((g > 0) & (x > lower))
+            free, phi, beta = parts(x, g)
+            active = free == 0
             self.rows.append((
                 letter, outer, problem.F.count,
-                np.linalg.norm(np.where(free, g, 0.0)),
-                np.linalg.norm(np.where(leads & ~free, g, 0.0)),
+                np.linalg.norm(phi),
+                np.linalg.norm(beta),
                 error / (size or np.linalg.norm(x) or 1.0),
-                np.count_nonzero(~free),
-                np.count_nonzero(between & ~free) if boxes else None,
+                np.count_nonzero(active),
+                np.count_nonzero(between & active) if boxes else None,
                 0.5 * x @ (g - rhs), perf_counter() - self.began,
             ))  # fmt: skip
 

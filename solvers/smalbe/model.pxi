@@ -42,7 +42,7 @@ cdef class Model:
             return Model.of_norm(tau, self.n)
         return self.basis.model(self.k, self.w, self.tau - tau, tau)
 
-    cdef int step(self, const double *x, const double *g, Box box, double *s) except -1:
+    cdef int step(self, const double *x, const double *g, FeasibleSet box, double *s) except -1:
         """s ← argmin gᵀs + ½sᵀBs, x + s in the set.
 
         With the multiplier y = WUs, s(y) minimises (g + Uᵀy)ᵀs + τ/2‖s‖² over the set,
@@ -156,7 +156,7 @@ cdef class Basis:
         """Return a model of the first k rows with weights w + shift, where positive."""
         raise NotImplementedError
 
-    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
                    double *s) except -1:
         """Compute s, piece and slope for y = 0."""
         raise NotImplementedError
@@ -165,7 +165,7 @@ cdef class Basis:
         """Compute the Newton step dy from `slope` and `piece`."""
         raise NotImplementedError
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
                   double *s) except -1:
         """Compute s(y) and its piece at `y_there`, for the components with bounds."""
         raise NotImplementedError
@@ -174,7 +174,7 @@ cdef class Basis:
         """Compute Us(y) − W⁻¹y at `y_there`, after `minimise_lagrangian`."""
         raise NotImplementedError
 
-    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
                     double *s) except -1:
         """Complete s(y) at `y_there` for the components without bounds."""
         raise NotImplementedError
@@ -341,7 +341,7 @@ cdef class DenseBasis(Basis):
             raise ArithmeticError("the core of a model is not positive definite")
         return 0
 
-    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
                    double *s) except -1:
         cdef Py_ssize_t i, n = self.n, k = B.k
         self.split()
@@ -366,7 +366,7 @@ cdef class DenseBasis(Basis):
             self.dy[i] *= B.root[i] * B.tau
         return 0
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
                   double *s) except -1:
         cdef Py_ssize_t o = self.first
         combination(1.0, self.bounded, self.y_there, g + o, self.t, B.k, self.size)
@@ -385,7 +385,7 @@ cdef class DenseBasis(Basis):
                 self.slope_there[i] += self.fixed[i] - self.c[i] / B.tau
         return 0
 
-    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
                     double *s) except -1:
         if self.size < self.n:
             combination(1.0, self.U, self.y_there, g, self.t, B.k, self.n)
@@ -479,7 +479,7 @@ cdef class FactoredBasis(Basis):
         B.w, B.w[0] = B.room.at, w[0] + shift
         return B
 
-    cdef int begin(self, Model B, const double *x, const double *g, Box box,
+    cdef int begin(self, Model B, const double *x, const double *g, FeasibleSet box,
                    double *s) except -1:
         cdef Py_ssize_t i, j
         for i in range(self.places):
@@ -503,7 +503,7 @@ cdef class FactoredBasis(Basis):
         scale(B.tau, self.dy, self.k)
         return 0
 
-    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, Box box,
+    cdef int minimise_lagrangian(self, Model B, const double *x, const double *g, FeasibleSet box,
                   double *s) except -1:
         self.coarse.combine_bounded(self.g_b, self.y_there, self.gradient_b)
         model_minimiser(self.x_b, self.gradient_b, B.tau, self.low_b, self.high_b,
@@ -521,7 +521,7 @@ cdef class FactoredBasis(Basis):
             self.slope_there[i] -= self.Gg[i] / B.tau + (1 / B.tau + 1 / B.w[0]) * GGy[i]
         return 0
 
-    cdef int finish(self, Model B, const double *x, const double *g, Box box,
+    cdef int finish(self, Model B, const double *x, const double *g, FeasibleSet box,
                     double *s) except -1:
         cdef Py_ssize_t i
         self.coarse.combine(-1 / B.tau, g, -1 / B.tau, self.y_there, s)

@@ -36,8 +36,28 @@ cdef enum:
     MIXED = 2
     MODEL = 3
     OWN = 4
+    SPECTRAL = 5
+    # Costs with which the nonmonotone line search compares. On Mindlin's problem with
+    # 88 to 1468 discs 5 takes 2 % more products in the mean and 20 as many; 1, which is
+    # monotone, takes 35 % more.
+    MEMORY = 10
 
-EXPANSIONS = {"std": STD, "projcg": PROJCG, "mixed": MIXED, "model": MODEL}
+
+# Share of the linear decrease that a spectral step must achieve (Armijo).
+cdef double SUFFICIENT_DECREASE = 1e-4
+# Share of the CG step from which on the step to the boundary is the whole expansion.
+# With 1, where a spectral step follows always, Mindlin's problem with 88 discs takes up
+# to 11 % more products.
+cdef double LONG_STEP = 0.5
+
+
+# Factor of Γ² for spectral steps, which decrease φ as well as β. Over Mindlin's problem
+# with 60 to 1468 discs 0.01 and 1 take 5 % more products in the mean.
+cdef double SPECTRAL_GAMMA = 0.1
+
+EXPANSIONS = {
+    "std": STD, "projcg": PROJCG, "mixed": MIXED, "model": MODEL, "spectral": SPECTRAL,
+}
 
 
 cdef double change_along(const Line *line, double alpha) noexcept:
@@ -148,12 +168,19 @@ cdef class MPRGP:
     * e, expansion of the active set, by one of the expansions of
       `solvers.smalbe.options`
     * f, fallback: the safe expansion, after one that gained too little
-    * p, proportioning: free components, by the model or along −β
+    * p, proportioning: free components, by the model, along −β or by a spectral step
 
     Proportioning if  ‖β‖² > Γ² φ̃ᵀφ,  with the reduced free gradient φ̃, for which
     x − φ̃/τ stays in the set.
 
-    Every step except that of projcg decreases the cost, and with the model τI by as much
+    A *spectral step* is x ← x + t(P(x − αg) − x) with the length α = sᵀs/sᵀHs of Barzilai
+    and Borwein, s the last step, and the nonmonotone line search of Birgin, Martínez and
+    Raydan (SIAM J. Optim. 10, 2000, Algorithm 2.2). On discs, whose boundary is curved,
+    steps of a fixed length take products in proportion to the condition of H. Where
+    directions of slip vary, CG cannot follow them: it begins on a face only if a step of
+    length α along φ stays in the set.
+
+    Every step except those of projcg and spectral steps decreases the cost, and with the model τI by as much
     as the rate of the book requires. Except for the first expansion by a model with
     directions, an expansion does not free components that the half step left on the
     boundary: from one proportioning to the next the active set only grows.
@@ -163,8 +190,8 @@ cdef class MPRGP:
     cdef Product F
     cdef Py_ssize_t n
     cdef Rows rows
-    cdef Box set
-    cdef Box face_set  # set of the step that follows a half step
+    cdef FeasibleSet set
+    cdef FeasibleSet face_set  # set of the step that follows a half step
     cdef Reduction over
     cdef double inverse_norm, rho
     cdef double alpha, Gamma_square
@@ -207,6 +234,10 @@ cdef class MPRGP:
     cdef IncompleteFactor factor  # of the free part of a sparse P; None for none
     cdef long layers  # of neighbours that a proportioning lets go as well
     cdef Directions directions
+    cdef double spectral_length  # α of the last step; 0 before the first one
+    cdef double cost_now  # relative to the cost at the start of the run
+    cdef double costs[MEMORY]  # the last ones
+    cdef long n_costs
 
     cdef int make_room(self) except -1:
         """Allocate the vectors."""
@@ -219,7 +250,7 @@ cdef class MPRGP:
         at += 4 * n
         self.Hs, self.t, self.x2, self.g2 = at, at + n, at + 2 * n, at + 3 * n
         at += 4 * n
-        self.face_set = Box.of(at, at + n, n, self.over)
+        self.face_set = FeasibleSet.of(at, at + n, n, self.over)
         self.rhs, self.g0 = at + 2 * n, at + 3 * n
         self.x0 = self.z  # z is recomputed after each expansion
         at += 4 * n
@@ -248,7 +279,9 @@ cdef class MPRGP:
         cdef double weight, began, gamma = 0.0  # of the deferred update p ← φ − γp
         self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
             not self.is_preconditioned()
-        )
+        ) and not self.set.D.count and self.expansion != SPECTRAL
+        self.cost_now, self.n_costs = 0.0, 0
+        self.record_cost(0.0)
         # 1. The face of x, the minimum along the stored directions on it, and the first
         #    direction of conjugate gradients.
         self.split()
@@ -280,6 +313,8 @@ cdef class MPRGP:
                     self.proportions_by_model
                     and (idle < MAX_IDLE or self.B.basis is None)
                 )
+            elif not inside and self.spectral_step_leaves():
+                letter = b"e" if self.step_spectrally() else 0
             else:
                 # 4. The trial step of conjugate gradients: α_cg, and α_f, the largest
                 #    feasible length.
@@ -406,6 +441,8 @@ cdef class MPRGP:
         """
         cdef double *beta = self.s
         cdef double length
+        if self.expansion == SPECTRAL:
+            return b"p" if self.step_spectrally() else 0
         if by_model and self.factor is not None:
             return b"p" if step_by_factor(self) else 0
         if by_model:
@@ -426,8 +463,11 @@ cdef class MPRGP:
         raised; the line search decreases the cost in either case.
         """
         cdef double length
-        self.B.step(self.x, self.g, self.set, self.s)
-        length = self.searched(self.s, self.Hs)
+        if self.set.D.count:  # where a longer or shorter step leaves curved boundaries
+            length = self.searched_projection(self.B.tau, 0.0)
+        else:
+            self.B.step(self.x, self.g, self.set, self.s)
+            length = self.searched(self.s, self.Hs)
         if length == 0 or isinf(length):
             return 0
         if self.line.cg < 1:
@@ -453,6 +493,59 @@ cdef class MPRGP:
         self.over.add(sums, 2)
         self.B = self.B.raised(s, sums[0], sums[1])
         return 0
+
+    # 3, 6. Spectral steps
+
+    cdef int record_cost(self, double change) noexcept:
+        self.cost_now += change
+        self.costs[self.n_costs % MEMORY] = self.cost_now
+        self.n_costs += 1
+        return 0
+
+    cdef bint spectral_step_leaves(self) noexcept:
+        """Return True if x − αp is not in the set; False without an α."""
+        return self.expansion == SPECTRAL and self.spectral_length > 0 and (
+            self.set.feasible_length(self.x, self.p) < self.spectral_length
+        )
+
+    cdef int step_spectrally(self) except -1:
+        """Take a spectral step; one product. Returns 0 if the step is zero.
+
+        The cost is quadratic along the step: its product serves the line search as well
+        as the next α.
+        """
+        cdef Py_ssize_t i
+        cdef double length, most = self.cost_now
+        cdef double tau = 1 / self.spectral_length if self.spectral_length else self.B.tau
+        for i in range(min(self.n_costs, MEMORY)):
+            most = fmax(most, self.costs[i])
+        length = self.searched_projection(tau, most - self.cost_now)
+        if not length:
+            return 0
+        self.record_cost(change_along(&self.line, length))
+        self.to(length, self.s, self.Hs)
+        return 1
+
+    cdef double searched_projection(self, double tau, double rise) except? -1:
+        """Return the length of the step −s = P(x − g/τ) − x; 0 for s = 0. One product.
+
+        It is 1 if the cost then falls enough below `rise` above its value, else that of
+        least cost. Stores s, Hs and `line`, and 1/τ of the next spectral step.
+        """
+        cdef double square
+        self.set.minimise(self.x, self.g, tau, self.s, NULL)
+        if not negate(self.s, self.n):
+            return 0
+        self.lengths_along(self.s, self.Hs)
+        square = dot(self.s, self.s, self.n)
+        # gᵀs ≥ τ‖s‖² for projections. At the end of a run rounding of the large normal
+        # components of g hides it, and the step would be refused.
+        self.line.slope = fmax(self.line.slope, tau * square)
+        if self.line.curvature > NOISE * self.line.slope:
+            self.spectral_length = square / self.line.curvature
+        if change_along(&self.line, 1.0) > rise - SUFFICIENT_DECREASE * self.line.slope:
+            return self.line.slope / self.line.curvature
+        return 1.0
 
     # 4. The trial step
 
@@ -516,6 +609,9 @@ cdef class MPRGP:
             self.line.slope < MIN_SLOPE_RATIO * self.expected_slope
             and 4 * self.parts.phi_square < self.phi_square_at_drift
         )
+        self.record_cost(change_along(&self.line, length))
+        if self.expansion == SPECTRAL:
+            self.spectral_length = dot(self.p, self.p, self.n) / curvature
         if drifts and self.line.slope <= 0:
             length = 0.0
         elif not self.in_two:
@@ -584,12 +680,23 @@ cdef class MPRGP:
                 return b"e"
         if self.expansion == MODEL:
             return self.expand_by_model(is_first, most, enough, trace)
+        if self.expansion == SPECTRAL:
+            return b"e" if self.expand_spectrally() else 0
         self.to(self.line.feasible, self.p, self.Hp)
         self.set.project_free(self.x, self.g, self.B.tau, self.x2)
         memcpy(self.x, self.x2, n * sizeof(double))
         self.gradient(self.x, self.g)
         self.split()
         return b"f" if self.expansion in (MIXED, OWN) else b"e"
+
+    cdef int expand_spectrally(self) except -1:
+        """Step to the boundary, then spectrally unless that was most of the CG step."""
+        cdef double feasible = self.line.feasible, cg = self.line.cg
+        if self.line.curvature > NOISE * self.line.slope:
+            self.spectral_length = dot(self.p, self.p, self.n) / self.line.curvature
+        self.record_cost(change_along(&self.line, feasible))
+        self.to(feasible, self.p, self.Hp)
+        return feasible > LONG_STEP * cg or self.step_spectrally()
 
     cdef int trial_of_rule(self, double *y) except -1:
         """y ← P(x_trial − x̃), where the step rule of a subclass leads.

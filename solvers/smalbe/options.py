@@ -19,9 +19,14 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: model: the CG point, projected in the metric of the model (ours; 2, or 1 if the step
 #: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
 #: decrease is below that of gradient projection)
-Expansion = Literal["std", "projcg", "mixed", "model"]
+#: spectral: to the boundary, and unless that is most of the CG step, a projected
+#: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps replace
+#: every proportioning, too, and CG where it would leave the set at once (1).
+#: With discs, model, whose steps are for bounds, stands for spectral
+Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
-#: cg: minimise along −β, as far as feasible (textbook)
+#: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
+#: feasible, model
 #: model: minimise the model over the box; for B = I/ᾱ a projected gradient step. After
 #: two such steps that did not halve ‖β‖², one of cg
 Proportioning = Literal["cg", "model"]
@@ -37,7 +42,8 @@ class Options:
     expansion: Expansion = "model"  #: see `solvers.smalbe.options`
     proportioning: Proportioning = "model"
     preconditioner: Preconditioner = "auto"  #: see `solvers.smalbe.preconditioner`
-    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, and 1e6 where P offers a preconditioner
+    #: penalty ρ, relative to ‖𝒫F𝒫‖; 0: 1e4, 1e6 where P offers a preconditioner, and 1
+    #: with discs
     rho: float = 0.0
     rho_growth: float = 1.0  #: factor of ρ if the Lagrangian grew too little
     M: float = 1.0  #: initial precision of the inner runs, relative to ‖𝒫F𝒫‖

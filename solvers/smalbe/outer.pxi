@@ -63,21 +63,30 @@ cdef class SMALBE(MPRGP):
         self.owners, self.rows = [], problem.C
         self.b, self.q = read(problem.b, self.owners), read(problem.q, self.owners)
         lower, upper = read(bounds[0], self.owners), read(bounds[1], self.owners)
-        self.set = Box.of(lower, upper, self.n, self.over)
+        self.set = FeasibleSet.of(lower, upper, self.n, self.over)
+        if problem.discs:
+            self.set.add_discs(
+                problem.discs, self.rows.x_tilde if self.rows.exist else NULL
+            )
         if len(problem.diagonal):
             self.diagonal = read(problem.diagonal, self.owners)
         self.alpha, self.Gamma_square = options.alpha, options.Gamma
         self.Gamma_square *= self.Gamma_square
         self.reduced = options.reduced
+        if options.expansion == "spectral":
+            self.Gamma_square *= SPECTRAL_GAMMA
         self.expansion = EXPANSIONS[options.expansion]
         self.step_rule = step_rule
         if step_rule is not None:
             self.expansion = OWN
         self.proportions_by_model = options.proportioning == "model"
         self.plain = self.expansion != MODEL
+        self.spectral_length = 0.0
         self.preconditioned = preconditioned
         self.factor, self.judge, self.tail = problem.factor, problem.judge, 1.0
         kept = MAX_DIRECTIONS if options.recycle and not self.F.is_sparse else 0
+        if problem.discs:  # CG takes few steps on a face
+            kept = 0
         self.directions = Directions(self.n, kept, self.over)
         self.choose_directions(spectrum.ritz)
         self.make_room()
@@ -126,9 +135,9 @@ cdef class SMALBE(MPRGP):
                 self.above.at[i] += (value[i - r] + residual[i - r]) / self.norm
         if not self.n_directions:
             return 0
-        while first < n and not self.set.has_bound(first):
+        while first < n and not self.set.has_bound(first) and not self.set.D.count:
             first += 1
-        while last > first and not self.set.has_bound(last - 1):
+        while last > first and not self.set.has_bound(last - 1) and not self.set.D.count:
             last -= 1
         basis = DenseBasis.zeros(self.n_directions, n, first, last - first)
         memcpy(basis.U, self.rows.C, r * n * sizeof(double))
@@ -188,6 +197,16 @@ cdef class SMALBE(MPRGP):
         self.choose_models()
         self.first_direction()
         return self.over.vector(copied(self.p, n))
+
+    def face_and_gradients(self, x, g):
+        """Return `free` (1 on the face, else 0), φ and β, (n,) each."""
+        cdef list owners = []
+        cdef Parts parts
+        free, phi, beta = np.empty(self.n), np.empty(self.n), np.empty(self.n)
+        self.set.split(read(x, owners), read(g, owners), self.B.tau, address(phi),
+                       address(free), &parts)
+        self.set.chop(read(x, owners), read(g, owners), address(beta))
+        return free, phi, beta
 
     # the start
 
@@ -415,13 +434,15 @@ cdef class SMALBE(MPRGP):
         """Return x, multipliers a (r,) of Cx = Cx̃, z_box and Fx; one product.
 
         The computation of `solvers.smalbe.driver.recovered`, with normal equations for
-        the correction of a. None if a dense C is so nearly dependent on the free
+        the correction of a. None with discs, or if a dense C is so nearly dependent on the free
         components that normal equations would lose the correction.
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef int order = r, one = 1, info = 0
         cdef bint any_left = False
         cdef list owners = []
+        if self.set.D.count:
+            return None
         restored_x, multipliers, boxes, product = empty(n), zeros(r), zeros(n), empty(n)
         cdef Room room = Room(r * r if self.rows.C else 0)
         cdef double *S = room.at

@@ -10,9 +10,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mortarbench.harness import QP, Status, Vector
+from mortarbench.harness import QP, Discs, Status, Vector
 from mortarbench.harness.distributed.vectors import DistributedVector, distributed
-from mortarbench.solvers.common.conversion import has_bound
+from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product, Reduction
 from mortarbench.solvers.smalbe.rows import (
@@ -58,6 +58,18 @@ class Projected:
     factor: compiled.IncompleteFactor | None = None
     #: of KKT residuals of the QP as given; None where ‖g^P‖ decides when to stop
     judge: compiled.Judge | None = None
+    discs: tuple[Discs, ...] = ()  #: of x
+
+    @property
+    def hull(self) -> tuple[Vector, Vector]:
+        """The smallest box that contains ν."""
+        if not self.discs:
+            return self.bounds
+        lower, upper = (bound.copy() for bound in self.bounds)
+        for one in self.discs:
+            shift, radius = self.rows.x_tilde[one.index], one.radius[:, None]
+            lower[one.index], upper[one.index] = -radius - shift, radius - shift
+        return lower, upper
 
 
 class OuterIteration(NamedTuple):
@@ -98,11 +110,13 @@ def projected_problem(
     if isinstance(qp.q, DistributedVector):
         over, whole = Reduction(qp.q.ranks, distributed), False
     F = Product(qp.P, qp.q.size, over)
+    discs = tuple(one for one in qp.sets if isinstance(one, Discs))
     rows: Rows
     if (whole and not qp.b.size) or not is_sparse(qp.A):
         rows = orthonormal_rows(qp.A, qp.b)
     else:
-        rows = equality_rows(qp.A, qp.b, has_bound(qp))
+        lower, upper = hull(qp.sets, qp.q.size)
+        rows = equality_rows(qp.A, qp.b, np.isfinite(lower) | np.isfinite(upper))
     C, diagonal = compiled.Rows(rows, over), _diagonal(qp)
     spectrum, box = find(F, C), qp.box
     b, bounds, norm = compiled.homogenised(
@@ -110,7 +124,7 @@ def projected_problem(
     )
     if norm != spectrum.norm:
         spectrum = spectrum._replace(norm=norm)
-    return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal)
+    return Projected(F, rows, C, spectrum, b, bounds, qp.q, diagonal, discs=discs)
 
 
 def _diagonal(qp: QP) -> Vector:
@@ -121,9 +135,15 @@ def _diagonal(qp: QP) -> Vector:
     return np.zeros(0) if diagonal is None else np.array(diagonal)
 
 
-def by_lanczos(F: Product, C: compiled.Rows, *, steps: int) -> Spectrum:
-    """Estimate the norm and the upper Ritz pairs by `steps` products."""
-    ritz = Ritz(*compiled.lanczos(F, C, random_start(C.n), steps))
+def by_lanczos(
+    F: Product, C: compiled.Rows, *, steps: int, start: Vector | None = None
+) -> Spectrum:
+    """Estimate the norm and the upper Ritz pairs by `steps` products.
+
+    start : (n,), by default random
+    """
+    start = random_start(C.n) if start is None else start
+    ritz = Ritz(*compiled.lanczos(F, C, start, steps))
     return Spectrum(ritz.norm or 1.0, ritz)
 
 

@@ -1,7 +1,9 @@
-"""SMALBE: semimonotonic augmented Lagrangians for bounds and equalities.
+"""SMALBE: semimonotonic augmented Lagrangians for bounds, discs and equalities.
 
 Minimises ½xᵀFx − dᵀx subject to Gx = e and l ≤ x ≤ u (Dostál 2009, the paper's
-reference [3], Chapter 6; equation (2) of the paper).
+reference [3], Chapter 6; equation (2) of the paper), and to ‖x_I‖ ≤ r on discs: then
+the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's reference [12]; Bouchala,
+Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps (mprgp.pxi).
 
 1. C: orthonormal rows that span those of G; e is transformed with them.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
@@ -22,7 +24,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
-from mortarbench.harness import QP, About, Solution
+from mortarbench.harness import QP, About, Box, Discs, Solution
+from mortarbench.harness.distributed.vectors import DistributedVector
 from mortarbench.solvers.smalbe.driver import Carry, prepared
 from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import missing_data
@@ -31,6 +34,8 @@ from mortarbench.solvers.smalbe.preconditioner import missing_data
 @dataclass(frozen=True)
 class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equalities; needs only products with P.
+
+    Discs, which bound friction in space, are taken as well.
 
     `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. The solver claims
     success only if the KKT residuals of the original QP are within 5·tol as well.
@@ -50,11 +55,14 @@ class SMALBE(Options):
         ),
     )  # fmt: skip
 
+    accepts: ClassVar[tuple[type, ...]] = (Box, Discs)
     on_ranks: ClassVar[bool] = True  #: see `harness.processes.ranks`
 
     def declines(self, qp: QP) -> str | None:
         if qp.h.size:
             return "takes bounds and equality rows, no inequality rows"
+        if len(qp.sets) > 1 and isinstance(qp.q, DistributedVector):
+            return "takes discs on one process only"
         return missing_data(qp, self.preconditioner)
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:

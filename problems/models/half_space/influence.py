@@ -35,7 +35,7 @@ NAME = "half-space"  #: name in `problems.OPERATORS`, stored in files
 #: Error of computed eigenvalues of C, relative to the largest. The FFTs of M × M values
 #: have errors below 2⁻⁵³·log₂(M²)·‖C‖, 4e-15·‖C‖ for M = 8192; the margin is safe.
 EIGENVALUE_ROUNDING = 1e-12
-_BLOCK_ROWS = 32  #: of the transforms multiplied at a time, so that they stay in cache
+_STRIP_BYTES = 2**19  #: of the transforms that are multiplied while they are in cache
 
 Array = NDArray[np.float64]
 
@@ -79,9 +79,6 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
 class Influence:
     """The product x ↦ Fx on cells of a grid, for πE* = 1 or πG = 1.
 
-    Not for several threads at a time: the work arrays are kept from call to call, since
-    allocating them costs a quarter of a product.
-
     cells : (k, 2) integers, place of each cell along x and along y
     h : side of a cell
     nu : Poisson's ratio for shear: two components per cell, consecutive in x;
@@ -91,56 +88,63 @@ class Influence:
     def __init__(self, cells: NDArray[Any], h: float, nu: float | None) -> None:
         i, j = (cells - cells.min(axis=0)).astype(np.int64).T
         m0, m1 = int(i.max()) + 1, int(j.max()) + 1
-        M0 = scipy.fft.next_fast_len(2 * m0 - 1)
-        M1 = scipy.fft.next_fast_len(2 * m1 - 1, real=True)
+        M0 = scipy.fft.next_fast_len(2 * m0 - 1, real=True)
+        M1 = scipy.fft.next_fast_len(2 * m1 - 1)
+        # an odd length of rows, as transforms along columns whose distance is a power
+        # of two take half as long again: they compete for places in the cache
+        m1 |= 1
         self._period = M0, M1
         kernels = _kernels(cell_integrals(M0 // 2 + 1, M1 // 2 + 1), self._period, nu)
         self._diagonal = float(kernels[0][0, 0]) / h
-        #: eigenvalues of C (c, M0, M1/2 + 1): F_n, or those of xx, yy and xy
-        self._symbol = np.array([scipy.fft.rfft2(K).real / h for K in kernels])
-        components = 1 if nu is None else 2
-        self._forces = np.zeros((components, m0, m1))
-        self._transform = np.empty((components, M0, M1 // 2 + 1), dtype=complex)
-        self._force_places, self._displacement_places = i * m1 + j, i * M1 + j
+        #: eigenvalues of C (c, M0/2 + 1, M1): F_n, or those of xx, yy and xy
+        self._symbol = np.array(
+            [scipy.fft.rfft2(K, axes=(1, 0)).real / h for K in kernels]
+        )
+        self._shape = 1 if nu is None else 2, m0, m1
+        self._places = i * m1 + j  # in the grid of m0 × m1 cells around all cells
 
     def __call__(self, x: Array) -> Array:
         """Multiply F by (n,) or (n, k)."""
         if x.ndim == 2:
             return np.array([self(column) for column in x.T]).reshape(x.shape[::-1]).T
-        components, rows, _ = self._forces.shape
-        force, U = x.reshape(-1, components), self._transform
-        for c, grid in enumerate(self._forces):
-            grid.reshape(-1)[self._force_places] = force[:, c]
-        # axis by axis, since half of the rows are zero, and half are not needed
-        U[:, :rows] = scipy.fft.rfft(self._forces, n=self._period[1], axis=2)
-        U[:, rows:] = 0
-        self._transform = U = scipy.fft.fft(U, axis=1, overwrite_x=True)
-        self._multiply(U)
-        U = scipy.fft.ifft(U, axis=1, overwrite_x=True)
-        u = scipy.fft.irfft(U[:, :rows], n=self._period[1], axis=2)
+        (M0, M1), (components, m0, m1) = self._period, self._shape
+        force, grid = x.reshape(-1, components), np.zeros(self._shape)
+        for c in range(components):
+            grid[c].reshape(-1)[self._places] = force[:, c]
+        U = scipy.fft.rfft(grid, n=M0, axis=1)
+        # along y in strips that stay in cache; half of each row is zero before, and
+        # half is not needed afterwards
+        height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
+        strip = np.empty((components, height, M1), dtype=complex)
+        for start in range(0, U.shape[1], height):
+            part = U[:, start : start + height]
+            V = strip[:, : part.shape[1]]
+            V[:, :, :m1], V[:, :, m1:] = part, 0
+            V = scipy.fft.fft(V, axis=2, overwrite_x=True)
+            self._multiply(V, self._symbol[:, start : start + height])
+            part[:] = scipy.fft.ifft(V, axis=2, overwrite_x=True)[:, :, :m1]
+        grid = scipy.fft.irfft(U, n=M0, axis=1)[:, :m0]
         product = np.empty(force.shape)
-        for c, grid in enumerate(u):
-            product[:, c] = grid.reshape(-1)[self._displacement_places]
+        for c in range(components):
+            product[:, c] = grid[c].reshape(-1)[self._places]
         return product.reshape(-1)
 
-    def _multiply(self, U: NDArray[np.complex128]) -> None:
-        """Multiply transforms by the eigenvalues, in place."""
-        for start in range(0, U.shape[1], _BLOCK_ROWS):
-            block = slice(start, start + _BLOCK_ROWS)
-            if len(U) == 1:
-                U[0, block] *= self._symbol[0, block]
-                continue
-            (xx, yy, xy), (x, y) = self._symbol[:, block], U[:, block]
-            coupled = xy * x
-            x *= xx
-            x += xy * y
-            y *= yy
-            y += coupled
+    @staticmethod
+    def _multiply(V: NDArray[np.complex128], symbol: Array) -> None:
+        """Multiply transforms by eigenvalues, in place."""
+        if len(V) == 1:
+            V *= symbol
+            return
+        (xx, yy, xy), (x, y) = symbol, V
+        coupled = xy * x
+        x *= xx
+        x += xy * y
+        y *= yy
+        y += coupled
 
     def diagonal(self) -> Array:
         """Return Fᵢᵢ (n,)."""
-        n = self._forces.shape[0] * self._force_places.size
-        return np.full(n, self._diagonal)
+        return np.full(self._shape[0] * self._places.size, self._diagonal)
 
     @property
     def least_eigenvalue(self) -> float:

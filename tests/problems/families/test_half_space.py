@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mortarbench.harness import InputError, kkt_residuals
+from mortarbench.harness import InputError, Solution, Status, kkt_residuals
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.names import parse
 from mortarbench.harness.operators import assembled
@@ -258,6 +258,50 @@ def test_a_disc_that_hardly_slips_is_as_stiff_as_a_rigid_punch(nu):
     assert got["tangential_force"] / unit == pytest.approx(0.02, rel=0.03)
     assert got["stick"] > 0.8 * got["cells"]
     assert got["open"] == 0
+
+
+def test_results_of_a_given_point_are_sums_in_newtons_and_metres():
+    """Rigid disc, Johnson 3.7: δ = (2 − ν)Q/(4Ga), with Q a part of the bound·πa²."""
+    case = built(n=12, friction="tresca", bound=2e8, nu=0.2, Q=0.3)
+    k, length = case.qp.q.size // 2, np.cbrt(0.75 * 100 * 4e-3 / (100e9 / 0.96))
+    unit, G = 2e8 * np.pi * length**2, 200e9 / 2.4
+    x = np.tile([0.01, -0.003], k)
+    z_box = np.tile([0.3, 0.4], k)
+    s = Solution(
+        status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0), z_box=z_box
+    )  # fmt: skip
+    got, (discs,) = case.quantities(s), case.qp.sets[1:]
+
+    assert discs.radius.sum() == pytest.approx(1, rel=0.05)
+    assert got["displacement"] == pytest.approx(0.3 * unit * 1.8 / (4 * length * G))
+    assert got["tangential_force"] == pytest.approx(0.01 * k * unit)
+    assert got["transverse_force"] == pytest.approx(-0.003 * k * unit)
+    work = 0.5 * discs.radius.sum() * unit**2 / (np.pi * G * length)
+    assert got["dissipation"] == pytest.approx(work)
+    assert case.recover(s) == pytest.approx(case.qp.P @ x * unit / (np.pi * G * length))
+
+
+@pytest.mark.parametrize("keys", [dict(), dict(law="mindlin")])
+def test_the_objective_is_minus_the_energy_with_the_work_of_friction(keys):
+    case = built(n=16, **keys)
+    s = ProjectedGradient().prepare(case.qp, TOL)()
+    got = case.quantities(s)
+
+    total = case.scale * case.qp.objective(s.x) + case.constant
+    assert total == pytest.approx(got["energy"] + got.get("dissipation", 0), rel=1e-6)
+
+
+def test_cells_in_contact_are_counted_relative_to_the_largest_force():
+    case = built(n=16)
+    s = SMALBE().prepare(case.qp, TOL)()
+    small = replace(s, x=1e-5 * s.x)
+    assert case.quantities(small)["active"] == case.quantities(s)["active"]
+    side = case.fields(s).contacts[0]
+    a = side.exact[side.exact[:, 1] > 0, 0].max()
+    assert side.exact[-1, 0] == pytest.approx(a / 0.9, rel=2e-3)
+    assert side.force.sum(axis=0)[2] == pytest.approx(100, rel=2e-3)
+    assert side.gap[s.x > 0] == pytest.approx(0, abs=1e-9 * a)
+    assert side.gap[0] > 0.01 * a**2 / 4e-3
 
 
 def test_tresca_s_problem_does_not_depend_on_the_unit_of_its_bound():

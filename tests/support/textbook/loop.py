@@ -82,8 +82,19 @@ def outer_loop(
 
 
 def _watched(history: History, problem: Projected, outer: int, rhs: Vector) -> Watch:
-    note = history.watch(problem, outer, rhs)
+    note = history.watch(problem, partial(_face, problem.bounds), outer, rhs)
     return lambda letter, at, face: note(letter, at.x, at.g)
+
+
+def _face(
+    bounds: tuple[Vector, Vector], x: Vector, g: Vector
+) -> tuple[Vector, Vector, Vector]:
+    """Return the mask of the face, and free and chopped gradient."""
+    lower, upper = bounds
+    free = (x > lower) & (x < upper)
+    leads = ((g < 0) & (x < upper)) | ((g > 0) & (x > lower))
+    phi, beta = np.where(free, g, 0.0), np.where(leads & ~free, g, 0.0)
+    return free.astype(float), phi, beta
 
 
 def face_preconditioner(

@@ -1,5 +1,10 @@
 # The feasible set and every operation on it that MPRGP uses. The loop itself contains no
-# bounds, so that another set (discs of friction) only has to extend these operations.
+# bounds and no discs.
+
+
+# Relative rounding of the norm of a disc about its centre: sixteen operations. With zero,
+# discs that a step put on their boundary would count as free.
+cdef double DISC_ROUNDING = 16 * 2.0 ** -52
 
 
 cdef struct Line:
@@ -17,11 +22,13 @@ cdef struct Parts:
 
 
 @cython.final
-cdef class Box:
-    """The box l ≤ x ≤ u for vectors that may be distributed over processes.
+cdef class FeasibleSet:
+    """The box l ≤ x ≤ u, and discs of variables that have no bounds.
 
-    Each operation passes over its vectors once and accumulates all sums that the step
-    needs: separate operations would read each vector several times per CG step.
+    Vectors may be distributed over processes, but not with discs. Each operation passes
+    over its vectors once and accumulates all sums that the step needs: separate
+    operations would read each vector several times per CG step. A disc is free or
+    active as a whole (discs.h).
     """
 
     cdef Py_ssize_t n
@@ -29,10 +36,12 @@ cdef class Box:
     cdef const double *upper
     cdef const double *upper_if_any  # NULL where all are inf
     cdef Reduction over
+    cdef discs D  # count is zero without any
+    cdef object arrays  # that D points to
 
     @staticmethod
-    cdef Box of(const double *lower, const double *upper, Py_ssize_t n, Reduction over):
-        cdef Box new = Box.__new__(Box)
+    cdef FeasibleSet of(const double *lower, const double *upper, Py_ssize_t n, Reduction over):
+        cdef FeasibleSet new = FeasibleSet.__new__(FeasibleSet)
         cdef Py_ssize_t i
         new.n, new.over, new.lower, new.upper = n, over, lower, upper
         for i in range(n):
@@ -40,6 +49,42 @@ cdef class Box:
                 new.upper_if_any = upper
                 break
         return new
+
+    cdef int add_discs(self, sets, const double *shift) except -1:
+        """Add discs ‖x_I + shift_I‖ ≤ r.
+
+        sets : `harness.sets.discs.Discs`
+        shift : (n,), NULL for zero
+        """
+        cdef const int[::1] start, index
+        cdef const double[::1] radius
+        cdef double[::1] slack
+        cdef Py_ssize_t[::1] ranges
+        cdef Py_ssize_t i
+        cdef double square
+        sizes = [one.index.shape[1] for one in sets for _ in one.radius]
+        starts = np.concatenate([[0], np.cumsum(sizes)])
+        start = starts.astype(np.int32)
+        indices = np.concatenate([one.index.ravel() for one in sets])
+        index = indices.astype(np.int32)
+        radius = np.concatenate([one.radius for one in sets])
+        slack = np.empty(len(sizes))
+        is_off = np.ones(self.n + 2, dtype=bool)
+        is_off[indices + 1] = is_off[0] = is_off[self.n + 1] = False
+        ranges = np.flatnonzero(np.diff(is_off)).astype(np.intp)
+        self.arrays = start, index, radius, slack, ranges
+        self.D.count, self.D.ranges = len(sizes), ranges.size // 2
+        self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
+        self.D.slack, self.D.centre = &slack[0], shift
+        if ranges.size:
+            self.D.range = &ranges[0]
+        for i in range(self.D.count):
+            square = 0.0
+            if shift:
+                for k in index[start[i]:start[i + 1]]:
+                    square += shift[k] * shift[k]
+            slack[i] = DISC_ROUNDING * (radius[i] + sqrt(square))
+        return 0
 
     cdef bint has_bound(self, Py_ssize_t i) noexcept:
         return self.lower[i] > -INFINITY or self.upper[i] < INFINITY
@@ -51,12 +96,16 @@ cdef class Box:
         cdef Py_ssize_t i
         for i in range(self.n):
             y[i] = fmin(fmax(x[i] - alpha * p[i], self.lower[i]), self.upper[i])
+        if self.D.count:
+            project_discs(&self.D, y)
 
     cdef int lengths(self, const double *x, const double *g, const double *p,
                      const double *Hp, Line *line) except -1:
         """Compute the step lengths along x − αp."""
         if self.over.ranks is None:
             lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
+            if self.D.count:
+                self.limit_by_discs(x, p, line)
             return 0
         line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
         line.feasible = first_bound(x, p, self.lower, self.upper_if_any, self.n)
@@ -64,23 +113,53 @@ cdef class Box:
         line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
         return 0
 
+    cdef void limit_by_discs(self, const double *x, const double *p, Line *line) noexcept:
+        """Reduce the feasible length to that at which the first disc is left."""
+        cdef double least = fmin(line.feasible, line.cg)
+        cdef double first = first_disc(&self.D, x, p, least)
+        if first < least:
+            line.feasible = first
+
+    cdef double feasible_length(self, const double *x, const double *p) noexcept:
+        """Return the largest α for which x − αp is in the set; one process only."""
+        cdef double first = first_bound(x, p, self.lower, self.upper_if_any, self.n)
+        return first_disc(&self.D, x, p, first) if self.D.count else first
+
     cdef void product_and_lengths(
         self, const sparse *F, double s, const double *x, const double *g, double *p,
         double *Hp, Line *line
     ) noexcept:
         """Hp ← s F p, and the `lengths` along p, in one pass over memory."""
         sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
+        if self.D.count:
+            self.limit_by_discs(x, p, line)
 
     cdef void next_product_and_lengths(
         self, const sparse *F, double s, double gamma, const double *x, const double *g,
         double *p, double *Hp, Line *line
     ) noexcept:
-        """p ← φ − γp, Hp ← s F p, and the `lengths` along p, in one pass over memory."""
+        """p ← φ − γp, Hp ← s F p, and the `lengths` along p, in one pass over memory.
+
+        Not for sets with discs.
+        """
         sparse_update_direction(F, s, gamma, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
 
     cdef int split(self, const double *x, const double *g, double tau, double *phi,
                    double *free, Parts *parts) except -1:
         """Compute φ and `free` (1 off the boundary, else 0) for the face of x."""
+        cdef Py_ssize_t i, o, size
+        cdef double sums[3]
+        if self.D.count:
+            parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
+            for i in range(self.D.ranges):
+                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
+                split(x + o, g + o, self.lower + o, self.upper + o, tau, phi + o,
+                      free + o, size, sums)
+                parts.phi_square += sums[0]
+                parts.beta_square += sums[1]
+                parts.reduced_square += sums[2]
+            split_discs(&self.D, x, g, tau, phi, free, &parts.phi_square)
+            return 0
         split(x, g, self.lower, self.upper, tau, phi, free, self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 3)
 
@@ -92,8 +171,23 @@ cdef class Box:
         Components within rounding of their bound are set to it: otherwise a step of
         the largest feasible length could stop just short of the face.
 
-        phi, free : NULL if they are not stored
+        phi, free : NULL if they are not stored; not for sets with discs
         """
+        cdef Py_ssize_t i, o, size
+        cdef double sums[4]
+        if self.D.count:
+            parts.phi_square = parts.beta_square = parts.reduced_square = 0.0
+            parts.phi_Hp = 0.0
+            for i in range(self.D.ranges):
+                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
+                advance(alpha, x + o, g + o, p + o, Hp + o, self.lower + o,
+                        self.upper + o, tau, phi + o, free + o, size, sums)
+                parts.phi_square += sums[0]
+                parts.beta_square += sums[1]
+                parts.reduced_square += sums[2]
+                parts.phi_Hp += sums[3]
+            advance_discs(&self.D, alpha, x, g, p, Hp, tau, phi, free, &parts.phi_square)
+            return 0
         advance(alpha, x, g, p, Hp, self.lower, self.upper_if_any, tau, phi, free,
                 self.n, &parts.phi_square)
         return self.over.add(&parts.phi_square, 4)
@@ -108,12 +202,23 @@ cdef class Box:
                 or (g[i] > 0 and x[i] > self.lower[i])
             ):
                 beta[i] = g[i]
+        if self.D.count:
+            chop_discs(&self.D, x, g, beta)
 
     cdef void project_free(
         self, const double *x, const double *g, double tau, double *y
     ) noexcept:
         """y ← P(x − φ/τ), which is x − φ̃/τ."""
         projected(x, g, tau, self.lower, self.upper, y, self.n)
+        if self.D.count:
+            step_on_discs(&self.D, x, g, tau, True, y)
+            self.add_on_discs(x, y)
+
+    cdef void add_on_discs(self, const double *x, double *y) noexcept:
+        """y ← x + y on discs."""
+        cdef int k
+        for k in range(self.D.start[self.D.count]):
+            y[self.D.index[k]] += x[self.D.index[k]]
 
     cdef void minimise(self, const double *x, const double *g, double tau, double *s,
                        double *piece) noexcept:
@@ -122,6 +227,8 @@ cdef class Box:
         piece : −1 at the lower bound, 1 at the upper, 0 between; may be NULL
         """
         model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
+        if self.D.count:
+            step_on_discs(&self.D, x, g, tau, False, s)
 
     cdef void minimise_part(
         self, Py_ssize_t first, Py_ssize_t size, const double *x, const double *g_part,
@@ -133,7 +240,7 @@ cdef class Box:
 
     cdef void leave_box(self, double alpha, double beta, bint release, double *x, double *g,
                     const double *p, const double *Hp, double *x0, double *g0,
-                    double *free, Box face, double *z, double *z_g) noexcept:
+                    double *free, FeasibleSet face, double *z, double *z_g) noexcept:
         """Step to the boundary, x ← x − αp; save the state before in x₀, g₀ and `free`.
 
         face : receives the set of the next step; it fixes the components that are on
@@ -169,6 +276,16 @@ cdef class Box:
 
         noise : components with a smaller gradient are left out
         """
+        cdef double energy = 0.0
+        cdef Py_ssize_t i, o, size
+        if self.D.count:
+            for i in range(self.D.ranges):
+                o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
+                energy += inward_energy(x + o, g + o, self.lower + o, self.upper + o,
+                                        diagonal + o, norm, noise, size)
+            return energy + inward_energy_of_discs(
+                &self.D, x, g, diagonal, norm, noise
+            )
         return self.over.total(inward_energy(
             x, g, self.lower, self.upper, diagonal, norm, noise, self.n
         ))
