@@ -41,7 +41,13 @@ from mortarbench.harness.qp import Vector, numeric_vector
 from mortarbench.harness.record import finite
 from mortarbench.harness.registry import SolverSpec, check_solver, options_of, resolve
 from mortarbench.harness.solution import History
-from mortarbench.harness.verify.kkt import allowed, kkt_residuals, verdict
+from mortarbench.harness.verify.kkt import (
+    Normality,
+    allowed,
+    kkt_residuals,
+    normality,
+    verdict,
+)
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.harness.verify.optimum import decided, proves
 from mortarbench.harness.verify.verdicts import has_point, new_record, plain
@@ -104,11 +110,26 @@ class Answer:
         """True if the solver returned a finite point."""
         return self.solution is not None and has_point(self.solution)
 
+    @property
+    def normality(self) -> Normality | None:
+        """Further measures over discs and cones; None without such sets or a point."""
+        if "family_case" not in vars(self.case) or not self.has_point:
+            return None
+        assert self.solution is not None
+        with one_thread():
+            qp = self.case.family_case.qp
+            return normality(qp, self.solution, allowed(self.record.tol))
+
     def to_dict(self) -> dict[str, Any]:
-        """Return record, history of the iterations and remarks as plain data."""
+        """Return record, history of the iterations and remarks as plain data.
+
+        For a QP over discs or cones, the values of `normality` are added.
+        """
         history = finite(plain(self.history))
+        further = self.normality
         return {
             **json.loads(self.record.to_json()),
+            **({} if further is None else finite(further._asdict())),
             "history": history,
             "remarks": [*self.remarks],
         }
@@ -456,6 +477,9 @@ class Verification:
     multipliers: Multipliers  #: those passed to `verify`; computed ones for the others
     objective: float  #: ½xᵀPx + qᵀx
     optimum_error: float | None  #: distance from a proven optimum if that decided
+    normality: (
+        Normality | None
+    )  #: further measures over discs and cones, if there are any
     tol: float  #: verified: every residual ≤ 10·tol, or decided by a proven optimum
 
     def __repr__(self) -> str:
@@ -523,5 +547,6 @@ def verify(
         multipliers=Multipliers(s.y, s.z, s.z_box),
         objective=objective,
         optimum_error=error,
+        normality=normality(problem, s, allowed(tol)),
         tol=tol,
     )

@@ -78,6 +78,13 @@ class Blocks:
                 f"{kind}: variable {twice[0]} is listed twice; expected disjoint blocks"
             )
 
+    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
+        """Return the distances (k,) of z to the normal cones at x, block by block.
+
+        tol : relative slack below which x is on the boundary
+        """
+        raise NotImplementedError
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return the fields by their names in files, such as `disc_index`."""
         names = (field.name for field in fields(self))  # type: ignore[arg-type]

@@ -95,6 +95,25 @@ class Cones(Blocks):
         work = (self.admissible(z) * x)[self.index]
         return [Sum(-work.sum(axis=1), np.abs(work).sum(axis=1))]
 
+    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
+        """Return the distances of z to polar cones at apices, to rays elsewhere.
+
+        As the apex count points that are `tol` times shorter than the longest block.
+        """
+        at, force = x[self.index], z[self.index]
+        sizes, tangents = norms(at), norms(at[:, 1:])
+        pull = self.slope * at[:, 0]
+        is_active = pull - tangents <= tol * (np.abs(pull) + tangents)
+        outward = at / np.where(tangents > 0, tangents, 1)[:, None]
+        outward[:, 0] = -self.slope
+        outward /= np.hypot(1, self.slope)[:, None]
+        along = np.maximum((force * outward).sum(axis=1), 0) * is_active
+        rest = norms(force - along[:, None] * outward)
+        rest = np.where(self.slope > 0, rest, np.abs(force[:, 0]))
+        is_apex = sizes <= tol * sizes.max(initial=0.0)
+        off_polar = norms((z - self.admissible(z))[self.index])
+        return np.where(is_apex, off_polar, rest)
+
     def substituted(self, T: Any, a: Vector) -> Cones:
         """Return the cones of x' for x = T x' + a, if T scales tangents evenly.
 

@@ -85,6 +85,15 @@ class Discs(Blocks):
         value = self.radius * self._norms(z)
         return [Sum(value - work.sum(axis=1), value + np.abs(work).sum(axis=1))]
 
+    def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
+        """Return ‖z_I − max(zᵀn, 0)n‖ with n = x_I/‖x_I‖, or ‖z_I‖ inside a disc."""
+        at, force, sizes = x[self.index], z[self.index], self._norms(x)
+        outward = at / np.where(sizes > 0, sizes, 1)[:, None]
+        along = np.maximum((force * outward).sum(axis=1), 0)
+        is_active = self.radius - sizes <= tol * self.radius
+        rest = norms(force - (along * is_active)[:, None] * outward)
+        return np.where(self.radius > 0, rest, 0 * rest)
+
     def substituted(self, T: Any, a: Vector) -> Discs:
         """Return the discs of x' for x = T x' + a, if T scales each disc evenly.
 

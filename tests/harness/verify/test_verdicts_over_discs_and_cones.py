@@ -1,0 +1,413 @@
+"""Verdicts over discs and cones, attacked by points that are no solutions.
+
+The planted solutions are exact: components are integers times powers of two, on discs
+and cones through Pythagorean pairs, so that f* and every error are known in fractions.
+"""
+
+import json
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import mortarbench as mb
+from mortarbench.cli.main import main
+from mortarbench.harness import QP, Cones, Discs, Solution, Status, kkt_residuals
+from mortarbench.harness.verify.kkt import ROUNDING, normality, own_sizes
+from mortarbench.harness.verify.multipliers import with_multipliers
+from mortarbench.registries import Registries
+from tests.harness.verify.test_optimum_over_sets import (
+    PAIRS,
+    AttackOverSets,
+    exact_objective,
+)
+
+INF = np.inf
+#: ways to deceive, each alone and all of them in pairs
+TRAPS = (
+    "tiny", "wide", "point", "flat", "steep", "no friction", "apex", "degenerate",
+    "touching", "singular", "cancelled", "weak", "units",
+)  # fmt: skip
+SMALL, LARGE = 2.0**-27, 2.0**27  #: about 1e∓8, beside discs of size one
+FLAT, STEEP = 2.0**-16, 2.0**16  #: slopes, with which all sums are exact
+
+
+class ExactProblem:
+    """A QP over discs, cones, bounds and rows, its solution and f*, all of them exact.
+
+    "touching": a row x₁ − x₂ = c on two discs leaves them one common point.
+    """
+
+    def __init__(self, traps, seed):
+        rng = self.rng = np.random.default_rng(seed)
+        discs, cones = (int(rng.integers(0, 3)) for _ in range(2))
+        discs = max(discs, 2 if "touching" in traps else 0)
+        if not discs + cones:
+            discs = cones = 1
+        alone = int(rng.integers(1, 4))
+        n = 2 * discs + 3 * cones + alone
+        order = rng.permutation(n)
+        on_discs, on_cones, others = np.split(order, [2 * discs, 2 * discs + 3 * cones])
+        self.x, self.z = np.zeros(n), np.zeros(n)
+        index = on_discs.reshape(discs, 2), on_cones.reshape(cones, 3)
+        radius = [self.disc(b, traps if i == 0 else ()) for i, b in enumerate(index[0])]
+        slope = [self.cone(b, traps if i == 0 else ()) for i, b in enumerate(index[1])]
+        x, z = self.x, self.z
+        lb, ub = np.full(n, -INF), np.full(n, INF)
+        x[others] = rng.integers(-4, 5, alone)
+        for j in others:
+            lb[j], ub[j] = x[j] - rng.integers(0, 2), x[j] + rng.integers(1, 9)
+            z[j] = -float(rng.integers(0, 4)) if lb[j] == x[j] else 0
+        m, p = rng.integers(0, 3, 2)
+        M = rng.integers(-3, 4, (n - (2 if "singular" in traps else 0), n))
+        P = (M.T @ M + (0 if "singular" in traps else np.eye(n))).astype(float)
+        if "weak" in traps:
+            P *= 2.0**-20
+        A, G = (rng.integers(-3, 4, (r, n)).astype(float) for r in (m, p))
+        if "touching" in traps:  # x₁ = a, x₂ = −a·(r₂/r₁): opposite points, one line
+            one, two = index[0][:2]
+            x[two] = -x[one]
+            radius[1] = radius[0] = float(np.hypot(*x[one]))
+            z[two] = -z[one]
+            A = np.vstack([A, np.zeros((2, n))])
+            A[-2:, one], A[-2:, two] = np.eye(2), -np.eye(2)
+        y = rng.integers(-9, 10, len(A)) * (2.0**20 if "cancelled" in traps else 1)
+        mu = rng.integers(0, 9, p).astype(float)
+        h = G @ x + np.where(mu == 0, rng.integers(0, 9, p), 0)
+        u = 2.0**30 if "units" in traps else 1.0
+        q = -(P @ x + A.T @ y + G.T @ mu + z)
+        sets = (Discs(index[0], u * np.array(radius)), Cones(index[1], slope))
+        self.qp = QP(
+            P=P / u**2, q=q / u, A=A, b=u * (A @ x), G=G, h=u * h, lb=u * lb, ub=u * ub,
+            sets=sets,
+        )  # fmt: skip
+        self.solution = Solution(
+            status=Status.SOLVED, x=u * x, y=y / u, z=mu / u, z_box=z / u
+        )
+        self.exact = exact_objective(self.qp, u * x)
+        self.value = float(self.exact)
+
+    def pair(self):
+        a, b, c = PAIRS[self.rng.integers(len(PAIRS))]
+        return np.array([a, b], dtype=float), float(c)
+
+    def disc(self, block, traps):
+        """Plant a solution on or in a disc; return its radius."""
+        at, radius = self.pair()
+        unit = SMALL if "tiny" in traps else LARGE if "wide" in traps else 1.0
+        if "point" in traps:  # any force is normal
+            self.z[block] = self.rng.integers(-9, 10, 2)
+            return 0.0
+        self.x[block] = unit * at
+        if self.rng.random() < 0.3:  # inside
+            return 2 * unit * radius
+        if "degenerate" not in traps:
+            self.z[block] = self.rng.integers(1, 9) * at
+        return unit * radius
+
+    def cone(self, block, traps):
+        """Plant a solution on or in a cone; return its slope."""
+        at, size = self.pair()
+        normal, tangents = block[0], block[1:]
+        slope = 2.0 ** int(self.rng.integers(-2, 2))
+        slope *= FLAT if "flat" in traps else STEEP if "steep" in traps else 1.0
+        pull = self.rng.integers(1, 9) * (0.0 if "degenerate" in traps else 1.0)
+        if "no friction" in traps:
+            self.z[tangents] = self.rng.integers(-9, 10, 2)
+            if self.rng.random() < 0.5:
+                self.x[normal] = size
+            else:
+                self.z[normal] = -float(self.rng.integers(0, 9))
+            return 0.0
+        state = self.rng.random()
+        if "apex" in traps or state < 0.3:  # open
+            self.z[tangents] = pull * at
+            self.z[normal] = -slope * pull * size - self.rng.integers(0, 3)
+        elif state < 0.7:  # slips
+            self.x[tangents], self.x[normal] = at, size / slope
+            self.z[tangents], self.z[normal] = pull * at, -slope * pull * size
+        else:  # sticks
+            self.x[tangents], self.x[normal] = at, 2 * size / slope
+        return slope
+
+
+@pytest.mark.parametrize("trap", ["", *TRAPS])
+def test_planted_points_are_solutions_to_the_last_digit(trap):
+    for seed in range(10):
+        planted = ExactProblem({trap}, seed)
+        qp, s = planted.qp, planted.solution
+        force = [Fraction(0)] * qp.q.size
+        for j in range(qp.q.size):
+            for a, v in (
+                (qp.P[j], s.x), (qp.A[:, j], s.y), (qp.G[:, j], s.z),
+                ([1.0, 1.0], [qp.q[j], s.z_box[j]]),
+            ):  # fmt: skip
+                for b, c in zip(a, v, strict=True):
+                    force[j] += Fraction(b) * Fraction(c)
+        if trap != "cancelled":
+            assert not any(force)
+        assert (qp.A @ s.x == qp.b).all()
+        assert (qp.G @ s.x <= qp.h).all()
+        assert (s.z * (qp.h - qp.G @ s.x) == 0).all()
+        assert ((qp.lb <= s.x) & (s.x <= qp.ub)).all()
+        for one in qp.sets[1:]:
+            sizes = one.radius if isinstance(one, Discs) else one.slope
+            for block, size in zip(one.index, sizes, strict=True):
+                x, z = ([Fraction(c) for c in v[block]] for v in (s.x, s.z_box))
+                if isinstance(one, Discs):
+                    assert x[0] ** 2 + x[1] ** 2 <= Fraction(size) ** 2
+                    if size and any(z):  # normal: along x, and x is on the boundary
+                        assert x[0] * z[1] == x[1] * z[0]
+                        assert x[0] * z[0] + x[1] * z[1] > 0
+                        assert x[0] ** 2 + x[1] ** 2 == Fraction(size) ** 2
+                else:
+                    slope = Fraction(size)
+                    assert x[0] >= 0 >= z[0]
+                    assert x[1] ** 2 + x[2] ** 2 <= (slope * x[0]) ** 2
+                    assert slope**2 * (z[1] ** 2 + z[2] ** 2) <= z[0] ** 2
+                    assert sum(a * b for a, b in zip(x, z, strict=True)) == 0
+        assert kkt_residuals(qp, s).worst <= 1e-14
+
+
+class AttackOnBlocks(AttackOverSets):
+    """Moves on discs and cones: along their boundaries, and balanced multipliers."""
+
+    def violation(self, x, at):
+        """The worst row, bound or disc, relative to its own terms at the solution.
+
+        Rows, bounds and cones through the origin have no length of their own.
+        """
+        qp, own = self.qp, np.maximum(own_sizes(self.qp, self.s.x) / 10, at)
+        limits = [
+            (abs(qp.A @ x - qp.b), abs(qp.b), abs(qp.A) @ own),
+            (qp.G @ x - qp.h, abs(qp.h), abs(qp.G) @ own),
+        ]
+        for one in qp.sets:
+            limits += [(-l.slack, l.size, l.sized(own)) for l in one.limits(x)]
+        worst = 0.0
+        for off, size, terms in limits:
+            if not self.is_unique:
+                off = off - ROUNDING * (size + terms)
+            has_length = size > 0
+            worst = max(worst, (off / (size + terms))[has_length].max(initial=0.0))
+        return worst
+
+    def moved(self, s):
+        rng, qp = self.rng, self.qp
+        if rng.random() < 0.6:
+            s = super().moved(s)
+        if rng.random() < 0.5:
+            s = replace(s, x=self.turned(s.x, 10 ** rng.uniform(-9, 0.5)))
+        choice = rng.random()
+        if choice < 0.5:  # stationary to rounding, whatever is normal
+            block = np.zeros(qp.q.size, dtype=bool)
+            for one in qp.sets[1:]:
+                block[one.block] = True
+            force = qp.P @ s.x + qp.q + qp.A.T @ s.y + qp.G.T @ s.z
+            s = replace(s, z_box=np.where(block, -force, s.z_box))
+        elif choice < 0.6:
+            s = replace(s, z_box=self.turned(s.z_box, 10 ** rng.uniform(-9, 0.5)))
+        elif choice < 0.65:  # the wrong sign, and the gradient reversed
+            s = replace(s, z_box=-s.z_box)
+        return s
+
+    def turned(self, v, angle):
+        """Turn the tangents of one block."""
+        one = self.qp.sets[1 + self.rng.integers(len(self.qp.sets) - 1)]
+        block = one.index[self.rng.integers(len(one.index))][-2:]
+        c, s = np.cos(angle), np.sin(angle)
+        v = v.copy()
+        v[block] = np.array([[c, -s], [s, c]]) @ v[block]
+        return v
+
+
+def search(seed, tries, each=200, traps=None):
+    """Attack QPs with up to two traps; list what was wrongly judged."""
+    rng = np.random.default_rng(seed)
+    wrong, refuted, verified, proven = [], [], 0, 0
+    with np.errstate(all="ignore"):
+        for _ in range(tries // each):
+            some = {str(t) for t in rng.choice(TRAPS, rng.integers(0, 3))}
+            some = some if traps is None else traps
+            number = int(rng.integers(2**30))
+            planted = ExactProblem(some, number)
+            attack = AttackOnBlocks(
+                planted, rng, is_unique=not some & {"singular", "weak"}
+            )
+            optimum = attack.prove(planted.qp)
+            if optimum is not None:
+                proven += 1
+                off = abs(Fraction(optimum.value) - planted.exact)
+                assert off <= optimum.doubt, (some, number)
+            for _ in range(3):
+                s = attack.rounded()
+                if attack.error(s) < 1e-9 and not attack.verified(s):
+                    refuted.append((sorted(some), number))
+            for s in attack.points(each - 3):
+                if attack.verified(s):
+                    verified += 1
+                    is_wrong = optimum is not None and attack.is_wrong(s)
+                    if attack.error(s) > 1e-3 or is_wrong:
+                        wrong.append((sorted(some), number, s, optimum is not None))
+    return wrong, refuted, verified, proven / (tries // each)
+
+
+def test_a_short_search_deceives_no_verdict():
+    wrong, refuted, verified, proven = search(271828, 120, 40)
+
+    assert (wrong, refuted) == ([], [])
+    assert verified > 10
+    assert proven > 0.8
+
+
+@pytest.mark.slow
+def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
+    wrong, refuted, verified, proven = search(314159, 100_000)
+
+    assert (wrong, refuted) == ([], [])
+    assert verified > 10_000
+    assert proven > 0.9
+
+
+@pytest.mark.slow
+def test_residuals_alone_deceive_no_verdict_without_traps():
+    """For QPs that are not solved once more; f is right to ten times the residuals."""
+    rng, verified = np.random.default_rng(161803), 0
+    for _ in range(200):
+        planted = ExactProblem(set(), int(rng.integers(2**30)))
+        attack = AttackOnBlocks(planted, rng)
+        for s in attack.points(200):
+            if kkt_residuals(planted.qp, s).worst <= 1e-7:
+                verified += 1
+                assert attack.error(s) <= 1e-6
+    assert verified > 5_000
+
+
+@pytest.mark.parametrize("trap", ["", "tiny", "units"])
+def test_multipliers_of_the_wrong_sign_or_direction_are_refuted(trap):
+    """Once as they are, and once balanced by another q, so that they are stationary."""
+    count = 0
+    for seed in range(20):
+        planted = ExactProblem({trap}, seed)
+        qp, s = planted.qp, planted.solution
+        for one in qp.sets[1:]:
+            for block in one.index:
+                if not s.z_box[block].any():
+                    continue
+                for way in (_reverse, _turn, _shorten_normal):
+                    z_box = s.z_box.copy()
+                    z_box[block] = way(z_box[block], one, block)
+                    if (z_box == s.z_box).all():
+                        continue
+                    count += 1
+                    other = replace(s, z_box=z_box)
+                    assert kkt_residuals(qp, other).worst > 1e-7
+                    balanced = replace(qp, q=qp.q + s.z_box - z_box)
+                    r = kkt_residuals(balanced, other)
+                    if np.linalg.norm(s.x[block]) > 1e-3 * np.linalg.norm(s.x):
+                        assert r.worst > 1e-7, (seed, block, way)
+                    if way is _shorten_normal:
+                        assert r.dual > 1e-7
+    assert count > 20
+
+
+def _reverse(z, one, block):
+    return -z
+
+
+def _turn(z, one, block):
+    """Turn the tangents by 0.1."""
+    c, s = np.cos(0.1), np.sin(0.1)
+    return np.append(z[:-2], np.array([[c, -s], [s, c]]) @ z[-2:])
+
+
+def _shorten_normal(z, one, block):
+    """Leave the polar cone."""
+    if isinstance(one, Discs):
+        return z
+    slope = one.slope[(one.index == block).all(axis=1)]
+    return np.append(-0.9 * slope * np.linalg.norm(z[1:]), z[1:])
+
+
+@pytest.mark.parametrize("trap", ["", *TRAPS])
+def test_further_measures_vanish_at_solutions_and_are_of_first_order(trap):
+    for seed in range(10):
+        planted = ExactProblem({trap}, seed)
+        qp, s = planted.qp, planted.solution
+        at = normality(qp, s, 1e-8)
+        assert (
+            at.natural_map <= 1e-9 if trap == "cancelled" else at.natural_map <= 1e-12
+        )
+        assert at.normal_distance <= 1e-14
+        discs = qp.sets[1]
+        if trap or not isinstance(discs, Discs):
+            continue
+        for block in discs.index:
+            if s.z_box[block].any():
+                x = s.x.copy()
+                c, t = np.cos(1e-4), np.sin(1e-4)
+                x[block] = np.array([[c, -t], [t, c]]) @ x[block]
+                off = normality(qp, replace(s, x=x), 1e-8)
+                ratio = np.linalg.norm(s.z_box[block])
+                force = max(abs(v).max() for v in (qp.P @ x, qp.q))
+                assert off.normal_distance <= 1.01e-4 * ratio / force + 1e-15
+                assert off.normal_distance >= 0.9e-4 * ratio / force
+                assert off.natural_map >= 1e-7
+
+
+def test_distances_to_normal_cones_are_euclidean():
+    cones = Cones([[0, 1, 2]], [0.75])
+    slip, inside, apex = np.array([[4.0, 3, 0], [8, 3, 0], [0, 0, 0]])
+    for x, z, distance in [
+        (slip, [-3, 4, 0], 0),  # −z_N = ¾‖z_T‖
+        (slip, [3, -4, 0], 5),  # the wrong sign
+        (slip, [-3, 4, 2], 2),  # the wrong direction
+        (slip, [4, 3, 0], 5),
+        (inside, [-3, 4, 0], 5),
+        (apex, [-3, 4, 0], 0),
+        (apex, [-9, 4, 0], 0),
+        (apex, [4, 3, 0], 5),
+        (apex, [1, 0, 0], 1),
+    ]:
+        # beside a longer block, which is the scale of the apex
+        both = Cones([[0, 1, 2], [3, 4, 5]], [0.75, 1])
+        x, z = np.append(x, [9, 0, 0]), np.append(np.array(z, float), [0, 0, 0])
+        assert both.normal_distances(x, z, 1e-9)[0] == pytest.approx(distance)
+    assert cones.normal_distances(0 * slip, slip, 1e-9) == pytest.approx([5])
+    flat = Cones([[0, 1, 2]], [0.0])
+    assert flat.normal_distances(np.array([1.0, 0, 0]), slip, 1e-9) == [4]
+    discs = Discs([[0, 1], [2, 3], [4, 5]], [1.0, 0.0, 1.0])
+    x = np.array([0.6, 0.8, 0, 0, 0.1, 0])
+    z = np.array([-0.8, 0.6, 7, 8, 0, 2])
+    assert discs.normal_distances(x, z, 1e-9) == pytest.approx([1, 0, 2])
+
+
+@pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny")])
+def test_multipliers_are_found_for_points_alone(trap):
+    worst = []
+    for seed in range(10):
+        planted = ExactProblem({trap}, seed)
+        s = with_multipliers(planted.qp, planted.solution.x)
+        worst.append(kkt_residuals(planted.qp, s).worst)
+    assert np.median(worst) <= 1e-11
+    assert np.quantile(worst, 0.8) <= 1e-7
+
+
+def test_verify_and_solve_report_the_further_measures(tmp_path, capsys):
+    planted = ExactProblem(set(), 5)
+    found = mb.verify(planted.qp, planted.solution.x)
+    assert found.verdict is mb.Verdict.VERIFIED
+    assert found.normality.natural_map <= 1e-11
+    assert mb.verify("contact-patch/dual", np.zeros(19)).normality is None
+
+    discs = mb.QP.from_arrays(np.eye(2), [-3, -4], sets=[Discs([[0, 1]], [1])])
+    path = mb.export(discs, tmp_path / "qp.npz")
+    assert (
+        main(Registries(), ["solve", f"file:{path}", "--solver", "clarabel", "--json"])
+        == 0
+    )
+    record = json.loads(capsys.readouterr().out)
+    assert 0 <= record["natural_map"] <= 1e-6
+    assert 0 <= record["normal_distance"] <= 1e-6
+    assert record["sizes"]["discs"] == 1
