@@ -27,9 +27,12 @@ from mortarbench.harness.conformance.equivalence import (
 )
 from mortarbench.harness.conformance.manufactured import (
     FORMS,
+    SET_SHAPES,
     SHAPES,
+    degenerate_cone,
     infeasible,
     manufactured,
+    manufactured_over_sets,
     membrane,
     one_of_each,
     unbounded,
@@ -50,6 +53,12 @@ from mortarbench.harness.verify.measure import (
 
 #: beginning of the names of checks that need a solution
 SOLUTION_PREFIX = "finds the planted solution"
+#: beginning of the names of checks of QPs over discs and cones
+SETS_PREFIX = "solves over"
+#: name of the check that reports errors in x at the degenerate cone
+DEGENERATE = f"{SETS_PREFIX} the degenerate cone"
+#: tolerances of that check
+DEGENERATE_TOLERANCES = (1e-6, 1e-8)
 #: beginning of the names of checks that compare equivalent formulations
 INVARIANCE_PREFIX = "keeps its answer"
 #: advice for solvers that need the entries of P
@@ -143,6 +152,35 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
     _near("objective", qp.objective(s.x), objective, 1e-6 * abs(objective))
     if shape != "singular":
         _near("x", s.x, expected.x, 1e-6)
+
+
+def _solves_over_sets(shape: str, solver: Solver) -> Result:
+    """Require the objective to 1e-8, and report the error in x.
+
+    An error δ of x costs at least 0.05 δ², as the eigenvalues of P exceed 0.1: so the
+    points of interior-point methods may be off by √(20·1e-8·|f|).
+    """
+    qp, expected = manufactured_over_sets(shape)
+    s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
+    objective = qp.objective(expected.x)
+    allowed = 1e-8 * abs(objective)
+    _near("objective", qp.objective(s.x), objective, allowed)
+    _near("x", s.x, expected.x, np.sqrt(20 * allowed))
+    return Result(Grade.PASS, f"error in x {np.abs(s.x - expected.x).max():.0e}")
+
+
+def _solves_the_degenerate_cone(solver: Solver) -> Result:
+    """Require verified answers, and report their errors in x, of the order of √tol."""
+    qp, x = degenerate_cone()
+    errors = [
+        float(np.abs(_solved(solver, qp, tol, VERIFIED_FACTOR).x - x).max())
+        for tol in DEGENERATE_TOLERANCES
+    ]
+    texts = (
+        f"{error:.0e} at {tol:g}"
+        for error, tol in zip(errors, DEGENERATE_TOLERANCES, strict=True)
+    )
+    return Result(Grade.PASS, f"error in x {', '.join(texts)}")
 
 
 def _reaches_the_tolerance(shape: str, tol: float, solver: Solver) -> None:
@@ -309,7 +347,9 @@ def _near(
 def _buffers(qp: QP) -> Iterator[Vector]:
     for M in (qp.P, qp.A, qp.G):
         yield M if isinstance(M, np.ndarray) else M.data
-    yield from (qp.q, qp.b, qp.h, qp.lb, qp.ub)
+    yield from (qp.q, qp.b, qp.h)
+    for one in qp.sets:
+        yield from one.arrays().values()
 
 
 def _all_checks() -> Iterator[tuple[str, Check]]:
@@ -322,6 +362,9 @@ def _all_checks() -> Iterator[tuple[str, Check]]:
         for tol in (1e-3, 1e-6):
             name = f"reaches the tolerance {tol:g}: {shape}"
             yield name, partial(_reaches_the_tolerance, shape, tol)
+    for shape in SET_SHAPES:
+        yield f"{SETS_PREFIX} {shape}", partial(_solves_over_sets, shape)
+    yield DEGENERATE, _solves_the_degenerate_cone
     yield "finds where a membrane of 400 nodes touches", _many_bounds_and_no_rows
     yield "gives multipliers our signs", _multipliers_have_our_signs
     yield "puts none on absent bounds", _absent_bounds_have_no_multipliers

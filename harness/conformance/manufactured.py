@@ -9,6 +9,8 @@ import numpy as np
 from scipy.sparse import csr_array, diags_array, eye_array, kron
 
 from mortarbench.harness.qp import QP, Matrix, Structure, Vector, no_rows
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution, Status
 
 #: keys: m equality rows, p inequality rows, finite lower and upper bounds (of some
@@ -80,6 +82,85 @@ def _plant(
         lb=lb, ub=np.where(fixed, lb, ub),
     )  # fmt: skip
     return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+
+
+#: discs, cones and rows of QPs over sets, by name
+SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
+    "discs": (6, 0, 0),
+    "discs and rows": (6, 0, 2),
+    "cones": (0, 6, 0),
+    "cones and rows": (0, 6, 2),
+    "discs and cones": (3, 3, 2),
+}
+
+
+def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solution]:
+    """Return a random QP over discs and cones, with its solution.
+
+    The blocks have two tangents and sizes between 0.1 and 10. In turn, discs are
+    active, active and not; cones slip, are open (at the apex) and stick. Forces on
+    active blocks are at least 0.5 from the boundary of the normal cone: complementarity
+    is strict. P is positive definite with eigenvalues above 0.1. Two more variables
+    have bounds, one of them active.
+
+    shape : a key of `SET_SHAPES`
+
+    >>> qp, point = manufactured_over_sets("cones")
+    >>> bool(np.allclose(qp.P @ point.x + qp.q + point.z_box, 0))
+    True
+
+    """
+    discs, cones, rows = SET_SHAPES[shape]
+    rng = np.random.default_rng(seed)
+    n = 2 * discs + 3 * cones + 2
+    on_discs, on_cones, alone = np.split(
+        rng.permutation(n), np.cumsum([2 * discs, 3 * cones])
+    )
+    x, z_box = rng.standard_normal(n), np.zeros(n)
+    angles, sizes = 2 * np.pi * rng.random(n), 10.0 ** rng.uniform(-1, 1, n)
+    forces: Vector = 0.5 + rng.exponential(size=n)
+    slopes: Vector = rng.uniform(0.1, 1, cones)
+    along = np.column_stack([np.cos(angles), np.sin(angles)])
+    for i, block in enumerate(on_discs.reshape(discs, 2)):
+        x[block] = sizes[i] * along[i] * (0.5 if i % 3 == 2 else 1)
+        z_box[block] = forces[i] * along[i] * (i % 3 != 2)
+    for i, block in enumerate(on_cones.reshape(cones, 3), start=discs):
+        slope, normal, tangents = slopes[i - discs], block[0], block[1:]
+        x[normal] = sizes[i] * (i % 3 != 1)
+        x[tangents] = slope * x[normal] * along[i] * (0.5 if i % 3 == 2 else 1)
+        z_box[tangents] = forces[i] * along[i] * (i % 3 != 2)
+        z_box[normal] = -slope * forces[i] * (i % 3 != 2) - 0.5 * (i % 3 == 1)
+    lb = np.full(n, -np.inf)
+    lb[alone] = x[alone] - [0, 1]
+    z_box[alone[0]] = -0.5
+    M, A = rng.standard_normal((n, n)), rng.standard_normal((rows, n))
+    G, y = rng.standard_normal((rows, n)), rng.standard_normal(rows)
+    z = np.where(np.arange(rows) == 0, 0.7, 0.0)
+    P = M @ M.T / n + 0.1 * np.eye(n)
+    qp = QP(
+        P=csr_array(P), q=-(P @ x + A.T @ y + G.T @ z + z_box),
+        A=csr_array(A), b=A @ x, G=csr_array(G), h=G @ x + (z == 0),
+        lb=lb, ub=np.full(n, np.inf),
+        sets=(
+            Discs(on_discs.reshape(discs, 2), sizes[:discs]),
+            Cones(on_cones.reshape(cones, 3), slopes),
+        ),
+    )  # fmt: skip
+    return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
+
+
+def degenerate_cone() -> tuple[QP, Vector]:
+    """Return min ½‖x‖² − 4x₁ − 4x₂ over the cone ‖(x₂, x₃)‖ ≤ x₁, and x* = (4, 4, 0).
+
+    The unconstrained minimum is on the boundary, with multiplier zero: the error in x
+    is of the order of the square root of an error in complementarity.
+    """
+    qp = QP(
+        P=csr_array(np.eye(3)), q=np.array([-4.0, -4.0, 0.0]), A=no_rows(3),
+        b=np.zeros(0), G=no_rows(3), h=np.zeros(0),
+        sets=(Cones(np.arange(3)[None], np.ones(1)),),
+    )  # fmt: skip
+    return qp, np.array([4.0, 4.0, 0.0])
 
 
 def one_of_each() -> tuple[QP, dict[str, Vector]]:

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 
-from mortarbench.harness.conformance.conformance import INVARIANCE_PREFIX, Grade, Result
+from mortarbench.harness.conformance.conformance import (
+    DEGENERATE,
+    INVARIANCE_PREFIX,
+    Grade,
+    Result,
+)
 from mortarbench.harness.conformance.equivalence import (
     CHANGES,
     TOL,
@@ -45,6 +50,18 @@ form that the solver solves.
 """
 
 
+DEGENERATE_HEAD = """\
+## The degenerate cone
+
+min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁ has the solution (4, 4, 0) with multiplier
+zero. The error in x is of the order of the square root of that in complementarity, also
+of a verified answer.
+
+| solver | largest error in x |
+| --- | --- |
+"""
+
+
 def weaknesses_page(results: Mapping[str, Results]) -> str:
     """Return a Markdown page with the results of the checks of equivalence."""
     heads = [change for change in CHANGES if change != UNCHANGED]
@@ -61,13 +78,22 @@ def weaknesses_page(results: Mapping[str, Results]) -> str:
             *(_cell(checks, solved, change) for change in heads),
         ]
         lines.append(f"| `{name}` | {' | '.join(cells)} |")
-    entries = _weaknesses(results)
+    entries = [*_weaknesses(results), "", *_degenerate(results)]
     return HEAD + "\n".join([*lines, "", "## Evidence", "", *entries]) + "\n"
 
 
 def line_of(name: str, form: str, change: str) -> str:
     """Return the beginning of the line that describes a weakness."""
     return f"- `{name}`, {form}, {change}: "
+
+
+def _degenerate(results: Mapping[str, Results]) -> Iterator[str]:
+    """Yield the errors of all solvers that accept cones at the degenerate cone."""
+    yield from DEGENERATE_HEAD.splitlines()
+    for name, checks in results.items():
+        result = checks.get(DEGENERATE)
+        if result is not None and result.grade is not Grade.DECLINE:
+            yield f"| `{name}` | {result.message} |"
 
 
 def _units() -> Iterator[str]:
