@@ -86,7 +86,7 @@ class Answer:
 
     @property
     def energy_bound(self) -> float | None:
-        """Certified bound of the relative error in the energy norm; None: unknown."""
+        """Certified bound on the relative error in the energy norm; None if unknown."""
         return self.record.energy_bound
 
     @property
@@ -116,7 +116,7 @@ class Answer:
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
         """Estimate the discretisation error, which adds to the error of the solver.
 
-        The case is solved on finer meshes, by the reference solve.
+        The reference solver solves the case on finer meshes.
 
         budget : seconds; meshes that would exceed it are not solved
         """
@@ -186,7 +186,7 @@ class Answer:
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
 
-        For a .pvd the earlier load steps are solved by the same solver.
+        For a .pvd, the same solver also solves the earlier load steps.
 
         Raises
         ------

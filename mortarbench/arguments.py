@@ -1,4 +1,4 @@
-"""Checks of arguments, made before any work is done and any library is imported."""
+"""Checks of arguments, before any work is done or any library is imported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     Raises
     ------
     InputError
-        If its suffix is none of `suffixes`, it is a folder, or its folder is missing.
+        If its suffix is not in `suffixes`, it is a folder, or its folder is missing.
 
     """
     path = checked.path("path", path)
@@ -56,7 +56,7 @@ def check_result_folder(folder: Path) -> Path:
 
 
 def tolerance(tol: float, where: str = "tol") -> float:
-    """Return a relative accuracy.
+    """Return a valid relative accuracy.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
 
 
 def check_scale(scale: float, where: str = "scale") -> float:
-    """Return a factor of displacements in pictures.
+    """Return a valid factor of displacements in pictures.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
 
 
 def budget(seconds: float, where: str = "budget") -> float:
-    """Return a number of seconds.
+    """Return a valid number of seconds.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def check_names(
     Raises
     ------
     InputError
-        With the nearest allowed name, or all of them.
+        If a name is not allowed; the message lists the nearest name or all of them.
 
     """
     for name in names:

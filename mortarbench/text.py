@@ -43,16 +43,19 @@ _LEGEND = {
     "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
     "outer": "outer: number of the outer iteration",
     "products": "products: of the QP's matrix P with a vector, so far",
-    "free_gradient": "‖φ‖: free gradient, of the variables off their bounds",
-    "chopped_gradient": "‖β‖: chopped gradient, of those that should leave theirs",
-    "infeasibility": "‖Ax−b‖: how far the equality rows are from holding, relative",
+    "free_gradient": "‖φ‖: free gradient, of the variables that are not at a bound",
+    "chopped_gradient": "‖β‖: chopped gradient, of the variables that should leave "
+    "their bounds",
+    "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
     "active": "at bound: variables at one of their bounds",
-    "two_sided": "of two: those among them with two bounds; with friction, rows that "
+    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
     "slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }
-_HIDDEN = ("seconds",)  #: columns of a history not shown: one run measures no times
+_HIDDEN = (
+    "seconds",
+)  #: columns of a history that are not shown: a single run gives no reliable times
 CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED` in a record
 _MAX_ROWS = 15  #: rows of a table of convergence
 
@@ -77,7 +80,7 @@ def first_comment(path: Path) -> str:
 
 
 def listing(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return a line per row: name, description, keys or options, forms."""
+    """Return one line per row: name, description, keys or options, forms."""
     return align(
         [
             row["name"],
@@ -209,7 +212,7 @@ def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
 
 
 def _bound(r: Record) -> str:
-    """Return the text of the certified error; rigid motions may be excluded."""
+    """Return the text of the certified error, which may exclude rigid motions."""
     if r.energy_bound is None:
         return ""
     beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
@@ -223,7 +226,7 @@ def convergence(history: History) -> str:
     """Return a table of the iterations that a solver reports; empty without a history.
 
     There is a row for the end of each outer iteration, or, without outer iterations,
-    for at most 15 steps. Kinds of steps since the row before are counted: "c12 e3".
+    for at most 15 steps. A row counts the steps since the previous row: "c12 e3".
     """
     columns = {k: v for k, v in history.items() if v.size and k not in _HIDDEN}
     if not columns:
@@ -312,6 +315,6 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text of a solver or plug-in in one line without control characters."""
+    """Return text of a solver or plug-in in one line, without control characters."""
     line = " ".join(text.split())
     return "".join(c if c.isprintable() else "\ufffd" for c in line)

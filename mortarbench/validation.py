@@ -43,7 +43,9 @@ from mortarbench.text import align, printable
 COMPARED_WITH = "smalbe"  #: solver with which the others are compared
 TIME_LIMIT = 60.0  #: s per check of the conformance suite
 MEMORY_LIMIT = 4096.0  #: MiB per check
-_MAX_ENTRIES = 12  #: entries of a list on the terminal; the page has all of them
+_MAX_ENTRIES = (
+    12  #: maximum number of entries of a list on the terminal; the page has all of them
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -76,7 +78,7 @@ def validate(
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
 ) -> Validation:
-    """Cross-validate the stored answers of a result folder, on cases built anew.
+    """Cross-validate the stored answers of a result folder on newly built cases.
 
     Write validation.json and the page report/validation.html.
 
@@ -120,7 +122,7 @@ def validate(
     cases = []
     for r in records.values():
         if r.family in families:
-            # a case of another version is listed as not validate_folder
+            # a case of another version is listed as not validated
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
@@ -134,7 +136,7 @@ def validate(
 
 
 def _refines(case: CaseId) -> bool:
-    """Return True if there is a finer mesh, or a reason why its family has none."""
+    """Return True if there is a finer mesh, or a reason why there is none."""
     try:
         return case.family.refined(case.params) is not None
     except InputError:  # the reason, which `discretisation_errors` repeats
@@ -142,7 +144,7 @@ def _refines(case: CaseId) -> bool:
 
 
 def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
-    """Return the data of `harness.crossval.summary.as_data` as a screen of text."""
+    """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
@@ -205,7 +207,7 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line per refuted claim; if there are many, the worst of each solver."""
+    """Return one line per refuted claim; of many claims, only the worst per solver."""
     if len(wrong) <= _MAX_ENTRIES:
         return list(map(_wrong, wrong))
     by_solver: dict[str, list[Mapping[str, Any]]] = {}
@@ -228,7 +230,7 @@ def _measured(d: Mapping[str, Any]) -> str:
 
 
 def _count_equal(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for each different entry, with the number of its answers."""
+    """Return one line for each distinct entry, with the number of its answers."""
     counted = Counter((d["case"], d["text"]) for d in entries)
     return [
         f"{case} ({n} answer{'s' * (n != 1)}): {text}"

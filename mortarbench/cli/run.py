@@ -68,7 +68,7 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _strict_failure(results: Results) -> str:
-    """Return the reason why a strict run fails, in a line."""
+    """Return the reason why a strict run fails, in one line."""
     counts = (
         (
             results.refuted,

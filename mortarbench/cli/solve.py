@@ -104,7 +104,7 @@ def _build(case: Case, pictures: Sequence[str]) -> None:
 
 
 def _hint(answer: Answer) -> str:
-    """Return a hint to the dual form if inequality rows are the reason to decline."""
+    """Return a hint to the dual form if `declines` is due to inequality rows."""
     case = answer.case
     if case.form != "primal" or "dual" not in case.id.family.forms:
         return ""
@@ -121,7 +121,7 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        # a QP with bounds in place of inequality rows stands for the dual
+        # a QP with bounds instead of inequality rows represents the dual
         reason = reason_to_decline(solver, like_dual)
     except Exception:  # code of a plug-in failed: no hint
         return ""

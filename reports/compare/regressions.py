@@ -39,7 +39,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 
 Floats = NDArray[np.float64]
 
-CELLS = 8  #: least number of cells for an estimate of their scatter
+CELLS = 8  #: minimum number of cells for an estimate of their scatter
 _NORMAL = 1.4826  #: standard deviation of a normal law over its median distance
 
 

@@ -17,7 +17,7 @@ from mortarbench.harness.running.pairs import ratio_of
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
-#: Least number of cases of a comparison. With fewer no difference can be significant at
+#: Minimum number of cases of a comparison. With fewer, no difference is significant at
 #: 95 %: five of five signs agree by chance in 2 of 2⁵ sets of cases.
 CASES = 6
 POOLED = "all forms"  #: name, instead of a form, of a group with cases of all forms
@@ -39,7 +39,7 @@ def _no_pairs() -> Pairs:
 class GroupKey(NamedTuple):
     """Attributes that the cases of one group share."""
 
-    sweep: bool  #: whether the tolerance is swept
+    sweep: bool  #: True if several tolerances are measured for one accuracy
     mode: str
     form: str
     at: float  #: accuracy at which answers are judged
@@ -236,7 +236,7 @@ def _answers(cells: Cells) -> dict[str, Row]:
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Select the answer of a solver to a case: of a sweep, the fastest verified one.
+    """Select the answer of a solver to a case: in a sweep, the fastest verified one.
 
     If none is verified, select the answer at the tightest tolerance.
     """
@@ -247,7 +247,7 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def time_of(outcome: Outcome) -> float | None:
-    """Return the median total time of a verified answer, s; None without one."""
+    """Return the median total time of a verified answer, s; None if not verified."""
     time = outcome.seconds("total") if outcome.verified else None
     return time.value if time is not None and time.value > 0 else None
 
@@ -281,7 +281,7 @@ def group_key(r: Record, *, pool_forms: bool = False) -> GroupKey:
 
 
 def _seconds(outcome: Outcome) -> float:
-    """Return the median total time, s; NaN without one."""
+    """Return the median total time, s; NaN if it is unknown."""
     time = outcome.seconds("total")
     return np.nan if time is None else time.value
 
@@ -321,7 +321,7 @@ def _group(
 
 
 def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
-    """Return the entries of `times`, `claimed`, `stopped` of a cell; 1 if declined."""
+    """Return the entries of `times`, `claimed` and `stopped`, and 1 if declined."""
     times = [(_seconds(o), o) for o in outcomes]
     verified = [t for t, o in times if o.verified and t > 0]
     claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]

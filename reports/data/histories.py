@@ -40,7 +40,7 @@ class SolverRun:
         return int(next(iter(self.history.values())).size)
 
     def numbers(self, name: str) -> Vector | None:
-        """Return a column (rows,), NaN where not finite; None without finite values."""
+        """Return a column (rows,), NaN where not finite; None if no value is finite."""
         values = self.history.get(name, np.zeros(0))
         if values.dtype.kind not in "if" or not np.isfinite(values).any():
             return None

@@ -42,7 +42,7 @@ _ALIKE = Look(colour=INK, width=0.8)  #: line of equal times
 def fastest_figure(
     found: Sequence[FastestSolver], solvers: Sequence[str], most: int = SOLVERS
 ) -> Figure | None:
-    """Draw a panel for each form with a row for each solver; None without answers.
+    """Draw a panel per form with a row per solver; None if there are no answers.
 
     solvers : all solvers of the report, whose order determines colours and markers
     most : largest number of rows in a panel

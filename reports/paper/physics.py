@@ -40,7 +40,7 @@ QUANTITIES = {  #: name in the figure → columns of its components
     "tip displacement": ("tip_x", "tip_y"),
     "contact force": ("force_x", "force_y"),
 }
-SINCE = 5  #: least number of steps in fits; coarser stepping is pre-asymptotic
+SINCE = 5  #: minimum number of steps in fits; coarser stepping is pre-asymptotic
 PAPER = 10  #: load steps of the paper, with one linearisation each
 _PRESSURE = "contact pressure in GPa"
 #: colours and markers of node-to-segment and mortar

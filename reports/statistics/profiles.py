@@ -23,7 +23,7 @@ from scipy.special import betainccinv, betaincinv
 
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-POINTS = 200  #: most points of a curve; with more cases it is sampled
+POINTS = 200  #: maximum number of points of a curve; with more cases it is sampled
 
 Array = NDArray[np.float64]
 
@@ -46,8 +46,8 @@ class Curve(NamedTuple):
 def performance_ratios(times: Array) -> Array:
     """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
-    A case without any solution is kept with infinite ratios, so that no profile reaches
-    one. The profile of a solver is the share of cases with r ≤ τ.
+    A case that no solver solved is kept with infinite ratios, so that no profile
+    reaches one. The profile of a solver is the share of cases with r ≤ τ.
 
     Parameters
     ----------
