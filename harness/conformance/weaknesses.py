@@ -28,11 +28,11 @@ weaknesses` measures this and writes this page, with the versions in `constraint
 The test problem consists of two strings in contact
 (`harness.conformance.manufactured.strings`). It has three forms: the primal QP with 42
 unknowns, 4 equality and 23 inequality rows, its dual, and its dual with bounds only.
-Each form is first solved at tolerance {TOL:g} in non-dimensional form. It is then solved
-in equivalent formulations: in other units, in another order, with rows scaled by powers
-of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the opposite
-sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither verdict
-nor answer should change.
+Each form is first solved at tolerance {TOL:g} in non-dimensional form. It is then
+solved in equivalent formulations: in other units, in another order, with rows scaled by
+powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
+opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
+verdict nor answer should change.
 
 The units are those of the paper's benchmark, rounded to powers of two. They multiply
 the non-dimensional quantities by these factors:
@@ -47,7 +47,6 @@ The entries of the next table have these meanings:
 - **form**: verdict or answer change in this form; the evidence is below the table;
 - (form): the solver declines the changed QP of this form;
 - blank: the change does not apply to any form that the solver solves.
-
 """
 
 
