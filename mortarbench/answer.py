@@ -178,7 +178,7 @@ class Answer:
             if len(fields.cells) else traction_figure(fields)
         )  # fmt: skip
         if figure is None:
-            raise InputError("no bodies and no tractions: there is no picture")
+            raise InputError("no picture: the case has neither bodies nor tractions")
         if path is not None:
             save(figure, check_output_file(path, PICTURES))
         return draw(figure)
@@ -199,7 +199,9 @@ class Answer:
 
         path, fields = check_output_file(path, GRIDS), self.fields()
         if not len(fields.cells):
-            raise InputError(f"{path}: {self.case.name} has no bodies to write")
+            raise InputError(
+                f"{path}: {self.case.name} has no bodies that could be written"
+            )
         if path.suffix == ".vtu":
             write_vtu(fields, path)
             return path
@@ -214,7 +216,10 @@ class Answer:
                 options=self.spec.options,
             )
             if not earlier.has_point:
-                raise InputError(f"{path}: no point at step {step}; write a .vtu")
+                raise InputError(
+                    f"{path}: the solver returned no point at step "
+                    f"{step}; expected a .vtu file instead"
+                )
             states.append((float(step), earlier.fields()))
         write_series([*states, (float(last), fields)], path)
         return path
@@ -247,13 +252,14 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     bound = record.energy_bound
     if bound is not None and bound == np.inf:
         reasons.append(
-            "the certificate does not bound the solver's error: the displacements may "
-            "be as small as rounding, or a load may act on supports"
+            "the certificate does not bound the solver's error, because the "
+            "displacements may be as small as rounding, or because a load may act on "
+            "supports"
         )
     elif bound is not None and bound > MAX_CERTIFIED_ERROR:
         reasons.append(
             f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
-            "a smaller tolerance may give a better bound"
+            "a smaller tolerance may give a smaller bound"
         )
     # a remark must not fail a solve: recovery may be code of a plug-in, and on ranks
     # there is no case in this process
@@ -261,7 +267,8 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
         if _is_open(case, record, solution):
             reasons.append(
                 "no node is in contact: the sides stay apart, and the answer is that "
-                "of bodies without contact; check the direction of the load and the gap"
+                "of bodies without contact; check the direction of the load and the "
+                "initial gap"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)
@@ -302,8 +309,8 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
             name = repr(mechanics.names[body]) if mechanics.names else str(body)
             text = (
                 f"body {name} moves by up to {lengths[nodes].max():.3g} m and is "
-                f"{size:.3g} m large; linear kinematics is for small displacements: "
-                "check the moduli, the loads and the supports"
+                f"{size:.3g} m large; linear kinematics is valid only for small "
+                "displacements: check the moduli, the loads and the supports"
             )
     if text:
         yield text

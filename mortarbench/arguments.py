@@ -36,7 +36,10 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     if path.is_dir():
         raise InputError(f"{path} is a folder; expected a file")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
+        raise InputError(
+            f"{path}: the folder {path.parent} does not exist; expected "
+            "an existing folder"
+        )
     return path
 
 
@@ -82,12 +85,12 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
     options = {} if options is None else options
     if not isinstance(options, Mapping) or not all(isinstance(k, str) for k in options):
         raise InputError(
-            f"options = {shown(options)}; expected a dict from names to values, such "
-            "as {'max_iter': 50}"
+            f"options = {shown(options)}; expected a dict that maps names to values, "
+            f"such as {{'max_iter': 50}}"
         )
     twice = sorted(options.keys() & more.keys())
     if twice:
-        raise InputError(f"{twice[0]} is given twice: in `options` and as a keyword")
+        raise InputError(f"{twice[0]} is given twice, in `options` and as a keyword")
     return {**options, **more}
 
 

@@ -252,8 +252,8 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
             return Case(id=parse(problem, registries.families), registries=registries)
     hint = f"; a file is 'file:{problem}'" if isinstance(problem, Path) else ""
     raise InputError(
-        f"case = {shown(problem)}; expected the name of a case, what build() returns, "
-        f"or a QP{hint}"
+        f"case = {shown(problem)}; expected the name of a case, the result of "
+        f"build(), or a QP{hint}"
     )
 
 

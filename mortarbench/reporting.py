@@ -119,8 +119,8 @@ def report(
         return Report(files=tuple(files), said=tuple(answer(first, factor)[:1]))
     if pool_forms:
         raise InputError(
-            "forms are pooled in the report on one folder (--pool-forms), not in a "
-            "comparison of two, which pairs equal cases; leave one of them out"
+            "--pool-forms applies to the report on one folder, not to a comparison of "
+            "two folders, which pairs equal cases; leave one of them out"
         )
     from mortarbench.reports import write_comparisons
 

@@ -136,7 +136,7 @@ def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
 def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return names and values that describe one measurement, in SI units.
 
-    defaults : options of the solver that are not shown at these values
+    defaults : default options of the solver; options with these values are omitted
     """
     options = ", ".join(
         f"{key}={value}"
@@ -215,7 +215,7 @@ def _bound(r: Record) -> str:
     """Return the text of the certified error, which may exclude rigid motions."""
     if r.energy_bound is None:
         return ""
-    beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
+    beside = ", excluding rigid motions" if r.certificate.get("seminorm") else ""
     return (
         f"at most {r.energy_bound:.2g} in the energy norm (certified, relative{beside};"
         " the mesh adds more)"

@@ -112,7 +112,7 @@ def validate(
     data = as_data(result, path.resolve().name, ours=COMPARED_WITH)
     if not (data["counts"]["answers"] or result.false_claims or result.proven):
         reasons = [entry.text for entry in result.not_validated]
-        why = reasons[0] if reasons else "none is a claim"
+        why = reasons[0] if reasons else "none of the answers is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
@@ -148,12 +148,12 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
-        "Apart without a culprit": [
+        "Contradicting answers, with neither refuted": [
             f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
             f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
             for d in data["unresolved"]
         ],
-        "Certificates contradicted (a fault of ours)": [
+        "Certificates contradicted (an error of this program)": [
             f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
         ],
         "Not validated": _count_equal(data["not_validated"]),
@@ -165,7 +165,11 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     counts = [
         f"{data['counts'][key]} {words}"
         for key, words in (
-            ("remarks", "stand out from the other solvers, within what they claim"),
+            (
+                "remarks",
+                "answers within their claims, but far less accurate than "
+                "those of other solvers",
+            ),
             ("unanswered", "measurements ended without an answer"),
         )
         if data["counts"][key]
@@ -173,8 +177,8 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     parts += ["; ".join(counts) + "."] if counts else []
     if meshes:
         title = (
-            "Errors of the meshes, relative, in the energy norm, to which the "
-            "certified ones add; `report` shows what they are worth"
+            "Relative errors of the meshes in the energy norm, which add to the "
+            "certified errors; `report` compares the two"
         )
         parts.append(_list(title, [f"{d.case}: {d}" for d in meshes]))
     return "\n\n".join(parts)
@@ -201,8 +205,8 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     table = align([head, *lines], right=range(1, len(head)))
     return (
-        "Certified errors: relative, in the energy norm. They are those of the "
-        f"solvers; the mesh adds its own.\n{table}"
+        "Certified relative errors of the solvers in the energy norm; the mesh adds "
+        f"its own error.\n{table}"
     )
 
 

@@ -70,7 +70,7 @@ def run(registries: Registries, options: Namespace) -> int:
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
-            raise InputError("--markdown is for list solvers only")
+            raise InputError("--markdown is only for list solvers")
         print(solvers_page(registries.solvers), end="")
         return 0
     functions = {

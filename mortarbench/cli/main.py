@@ -268,8 +268,8 @@ _COMMANDS = {
             _Option("--case", "PATTERN",
                     "measure only these cases, e.g. '*/dual'; may be repeated",
                     _SEVERAL),
-            _option("set an option of every solver that has it; with several values, "
-                    "measure each of them"),
+            _option("set an option of every solver that has it; each of several "
+                    "values is measured"),
             _PLUGIN,
             _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
             _Option("--time-limit", "SECONDS", _INSTEAD),
@@ -284,7 +284,7 @@ _COMMANDS = {
             _JSON,
         ],
         "Results are stored in a folder. The same command continues an interrupted "
-        "run and repeats no measurement.",
+        "run without repeating a measurement.",
     ),
     "solve": _Command(
         "solve",
@@ -301,8 +301,9 @@ _COMMANDS = {
             _Option("--plot", "FILE.png|pdf|svg", "draw the deformed bodies with their "
                     "stresses, and each contact enlarged"),
             _Option("--scale", "S", "factor of the displacements in the picture; "
-                    "default: 1 if they are visible, else a round factor that the "
-                    "picture states; above 1, bodies in contact may seem to overlap"),
+                                    "default: 1 if they are visible, else a round "
+                                    "factor that the picture states; above 1, bodies "
+                                    "in contact may appear to overlap"),
             _Option("--vtu", "FILE.vtu", "write the deformed bodies for ParaView, and "
                     "a CSV file along each contact; FILE.pvd: all load steps up to "
                     "this one"),
@@ -328,8 +329,9 @@ _COMMANDS = {
         "compare the answers in a result folder with each other and with references",
         [
             _RESULTS,
-            _Option("--budget", "SECONDS", "time for finer meshes, from which "
-                    "discretisation errors are estimated; default: 300",
+            _Option("--budget", "SECONDS", "time for finer meshes, which are used to "
+                                           "estimate discretisation errors; default: "
+                                           "300",
                     {"default": 300.0}),
             _PLUGIN,
             _JSON,
@@ -350,10 +352,11 @@ _COMMANDS = {
                     "within F times the tolerance; default: 10"),
             _Option("--pool-forms", "", "compare solvers over the cases of all forms "
                     "together (means, ranks and profiles) instead of form by form"),
-            _Option("--fail-on", ",".join(GATES), "exit with 1 if from DIR to DIR2 a "
-                    "verdict became worse, or a solver significantly slower"),
+            _Option("--fail-on", ",".join(GATES), "exit with 1 if, from DIR to DIR2, "
+                                                  "a verdict became worse or a solver "
+                                                  "became significantly slower"),
             _Option("--verbose", "", "print the paths of all files written, not only "
-                    "of the page"),
+                                     "that of the page"),
             _JSON,
         ],
     ),
@@ -362,8 +365,9 @@ _COMMANDS = {
         "repeat one stored measurement and compare it with the old one",
         [
             _RESULTS,
-            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its first "
-                    "digits; a report shows it when one points at a number"),
+            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its "
+                                        "first digits; a report shows it when you "
+                                        "point at a number"),
             _PLUGIN,
             _JSON,
         ],

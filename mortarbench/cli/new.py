@@ -41,9 +41,7 @@ def run(registries: Registries, options: Namespace) -> int:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise InputError(
-            f"{path} exists; expected another name, or no such file"
-        ) from None
+        raise InputError(f"{path} exists already; expected another name") from None
     print(path)
     say(f"try it: {_NEXT[kind].format(name)}")
     return 0

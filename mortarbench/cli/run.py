@@ -73,9 +73,13 @@ def _strict_failure(results: Results) -> str:
         (
             results.refuted,
             "answer that refutes its claim",
-            "answers that refute theirs",
+            "answers that refute their claims",
         ),
-        (results.failed, "measurement without an answer", "measurements without one"),
+        (
+            results.failed,
+            "measurement without an answer",
+            "measurements without an answer",
+        ),
     )
     texts = [
         f"{len(records)} {one if len(records) == 1 else several} "

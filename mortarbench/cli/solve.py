@@ -39,7 +39,7 @@ def run(registries: Registries, options: Namespace) -> int:
         check_scale(options.scale, "--scale")
     if options.plot is None and options.scale is not None:
         raise InputError(
-            f"--scale {options.scale:g} without --plot; expected a picture"
+            f"--scale {options.scale:g} without --plot; expected both options"
         )
     if options.vtu is not None:
         check_output_file(options.vtu, GRIDS)
@@ -83,7 +83,7 @@ def _print(answer: Answer, options: Namespace) -> None:
     elif record.verdict is not Verdict.DECLINED:
         print(answer)
         if mesh is not None:
-            print(f"error of the mesh, relative, in the energy norm: {mesh}")
+            print(f"relative error of the mesh in the energy norm: {mesh}")
         from mortarbench.text import convergence, legend
 
         if table := convergence(answer.history):

@@ -213,7 +213,7 @@ def _unpaired(c: Comparison) -> Iterator[Part]:
         ("only", lambda each: Cell.words(each[0])),
         ("verdict", lambda each: verdict_cell(each[1])),
     )
-    return _listed("Cells that are in one folder only.", alone, columns)
+    return _listed("Cells that are only in one folder.", alone, columns)
 
 
 _PAIR = answer_columns(lambda pair: pair.after)

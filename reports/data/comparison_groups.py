@@ -85,9 +85,11 @@ class ComparisonGroup:
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
     incomplete: int = 0  #: number of cases left out: not measured with every solver
     apart: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) True if two share no block on some case; may be empty."""
+    "(solvers, solvers) True if two solvers have no common block on some case; may be "
+    "empty."
     faster: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) True if `apart` and row is faster than column on all cases."""
+    "(solvers, solvers) True if `apart` and the row is faster than the column on all "
+    "cases."
 
     @property
     def title(self) -> str:
@@ -104,7 +106,7 @@ class ComparisonGroup:
             f"Pooled forms: {counted}. Cases of a form that a solver declines count as "
             "unsolved."
         )
-        refused = f"All cases declined by: {listing(self.refused, 6)}."
+        refused = f"Solvers that declined all cases: {listing(self.refused, 6)}."
         notes = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
         return notes + self.unmeasured + self.sessions
 
@@ -114,10 +116,15 @@ class ComparisonGroup:
         notes = []
         if self.rare:
             rare = listing(self.rare, 6)
-            notes.append(f"Left out, measured on less than half of the cases: {rare}.")
+            notes.append(
+                "Left out because they were measured on less than half of "
+                f"the cases: {rare}."
+            )
         if self.incomplete:
             cases = plural(self.incomplete, "case")
-            notes.append(f"Left out, not measured with all solvers: {cases}.")
+            notes.append(
+                f"Left out because they were not measured with all solvers: {cases}."
+            )
         return tuple(notes)
 
     @property
@@ -133,10 +140,9 @@ class ComparisonGroup:
         if not pairs:
             return ()
         return (
-            "Measured in different sessions, without common blocks, so that a "
+            "Measured in different sessions, without common blocks; therefore a "
             "difference is significant only if the unpaired interval excludes 1 on "
-            "every case: "
-            f"{'; '.join(pairs)}.",
+            f"every case: {'; '.join(pairs)}.",
         )
 
     @property

@@ -271,7 +271,9 @@ def read_evidence(
     """
     records = read_journal(directory, warn)
     if not records:
-        raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
+        raise InputError(
+            f"{directory}: no measurement in journal/*.jsonl; run a suite first"
+        )
     _warn_of_contradictions(directory, records, warn)
     journal = tuple(records)
     environment = _environment(directory / "environment.json")
@@ -341,9 +343,9 @@ def _warn_of_contradictions(
             wrong.append(r.run_id)
     if wrong:
         warn(
-            f"{directory}: journal says verified, but residuals exceed "
-            f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
-            "such records; judge the points again with `validate`"
+            f"{directory}: the journal says verified, but residuals exceed "
+            f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; `run` does not "
+            "write such records; judge the points again with `validate`"
         )
 
 

@@ -114,11 +114,11 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
     """
     if fields.dim != 2:
-        raise InputError("bodies in space cannot be drawn: expected a .vtu")
+        raise InputError("bodies in space cannot be drawn; expected a .vtu file")
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError(
-            "displacement or stress contains NaN or inf: expected finite values"
+            "displacement or stress contains NaN or inf; expected finite values"
         )
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies have no width or no height and cannot be drawn")

@@ -232,8 +232,8 @@ def orders(rows: Sequence[Row]) -> Table:
         for head in (f"{q}: order [95 %]", f"error at {PAPER} steps")
     ]  # fmt: skip
     return Table(
-        caption=f"Order in 1/steps, fitted from {SINCE} steps on, and relative error "
-        f"at {PAPER} steps. The first row is the scheme of the paper.",
+        caption=f"Order in 1/steps, fitted to {SINCE} and more steps, and relative "
+        f"error at {PAPER} steps. The first row is the scheme of the paper.",
         columns=("linearisations per step", *heads),
         rows=tuple(lines),
         text_columns=0,

@@ -189,7 +189,7 @@ def _statement(
         TEXT("failed", failed, "case" if len(found) == 1 else "answer"),
         TEXT("declined", declined),
         *_reservations(found),
-        f"{len(found) - len(selected)} more tolerances are in the evidence."
+        f"{len(found) - len(selected)} more tolerances are in the sections below."
         if len(selected) < len(found)
         else "",
     )

@@ -100,7 +100,7 @@ def _exponent(law: PowerLaw | None, runs: str) -> Cell:
 
 @section(
     62, "growth", "Do iterations grow?",
-    "Do iterations grow?: cases of four or more sizes are needed.",
+    "Do iterations grow?: the section needs cases of four or more sizes.",
 )  # fmt: skip
 def growth(a: Analysis) -> Iterator[Part]:
     """Judge the growth of iterations in every series of at least four sizes."""

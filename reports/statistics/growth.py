@@ -113,7 +113,7 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     """
     x, y = np.asarray(n, dtype=float), np.asarray(values, dtype=float)
     if np.unique(x).size < SIZES or not ((x > 0).all() and (y > 0).all()):
-        raise ValueError("growth needs four different sizes, positive values")
+        raise ValueError("growth needs four different sizes and positive values")
     law = power_law(x, y)
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
     half = student(x.size - 2)

@@ -234,9 +234,7 @@ def test_nothing_is_written_over(starting, tmp_path, kind):
     code, out, err = starting("new", kind, "mine")
 
     assert (code, out) == (2, "")
-    assert err == (
-        f"mortarbench: {name} exists; expected another name, or no such file\n"
-    )
+    assert err == (f"mortarbench: {name} exists already; expected another name\n")
     assert (tmp_path / name).read_text() == "precious"
     assert starting("new", "solver", "other")[0] == 2
     assert not (tmp_path / "gone").exists()

@@ -216,7 +216,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     (found,) = comparison_groups(evidence(records))
     assert found.solvers == ("s00", "s01", "some")
     assert np.isinf(found.times[:2, 2]).all()
-    assert found.notes == ("All cases declined by: never.",)
+    assert found.notes == ("Solvers that declined all cases: never.",)
 
 
 def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
@@ -228,8 +228,8 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
     assert len(found.cases) == 6
     assert found.solvers == ("late", "s00", "s01")
     assert found.notes == (
-        "Left out, measured on less than half of the cases: rare.",
-        "Left out, not measured with all solvers: 2 cases.",
+        "Left out because they were measured on less than half of the cases: rare.",
+        "Left out because they were not measured with all solvers: 2 cases.",
     )
 
 

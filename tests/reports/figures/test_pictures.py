@@ -449,7 +449,7 @@ def test_bodies_in_space_are_not_drawn(bodies):
         bodies, points=lifted(bodies.points), displacement=lifted(bodies.displacement)
     )
     with pytest.raises(
-        InputError, match=r"^bodies in space cannot be drawn: expected a \.vtu$"
+        InputError, match=r"^bodies in space cannot be drawn; expected a \.vtu file$"
     ):
         deformed_figure(space)
     loaded = (side("up on low", [4, 5], [[0, 0], [0, -3e6]]),)

@@ -330,7 +330,7 @@ def test_many_tolerances_are_no_wall_of_text(record, opened):
     assert [re.search(r"tol (\S+),", c)[1] for c in statement.claims] == [
         "1e-9", "1e-5", "1e-2",
     ]  # fmt: skip
-    assert "5 more tolerances are in the evidence." in statement.remarks
+    assert "5 more tolerances are in the sections below." in statement.remarks
 
 
 def test_a_null_arm_is_nobodys_rival(record, opened):
