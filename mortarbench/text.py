@@ -180,12 +180,12 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
 
 
 def _units(per: str) -> Mapping[str, str]:
-    """Return units of quantities; `per` is "/m", per thickness, or "" in space."""
+    """Return units of quantities; `per` is "/m" for plane bodies, and "" in space."""
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _quantity(r: Record, name: str, unit: str) -> str:
-    """Return the text of a quantity; for sliding without contact with its shear."""
+    """Return the text of a quantity, with the share of shear for sliding nodes."""
     text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
     if name != "sliding_without_contact" or not isinstance(share, float):
         return text

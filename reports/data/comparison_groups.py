@@ -327,7 +327,7 @@ def _group(
 
 
 def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
-    """Return the entries of `times`, `claimed` and `stopped`, and 1 if declined."""
+    """Return a solver's entries of `times`, `claimed`, `stopped`; 1 if it declined."""
     times = [(_seconds(o), o) for o in outcomes]
     verified = [t for t, o in times if o.verified and t > 0]
     claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]

@@ -270,7 +270,7 @@ def _fitted(panel: Panel, panels: Iterable[Panel]) -> Panel:
 
 
 def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
-    """Return the ends of an axis shared by panels: those set, or beyond the points.
+    """Return the ends of an axis shared by panels: given, or just beyond the points.
 
     A single value is centred; without values a default range is used.
     """

@@ -53,7 +53,7 @@ TEXT = Sentences(
 def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
     """List the groups that are not compared over cases.
 
-    reasons : state the reasons, or else refer to the section that states them
+    reasons : True to state the reasons, False to refer to the section that does
     """
     lacking = [group for group in a.groups if not group.comparable]
     if not lacking:

@@ -75,7 +75,7 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Return the growth of reductions, messages and bytes on other ranks, (…, 3)."""
+    """Return growth factors (…, 3) of reductions, messages and bytes on other ranks."""
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)

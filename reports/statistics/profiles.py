@@ -78,7 +78,7 @@ def share(counts: ArrayLike, cases: int) -> Share:
 
 
 def solved_within(values: Array, places: ArrayLike) -> Share:
-    """Return the share of the cases with value ≤ place, for each finite place.
+    """Return the share of the cases with value ≤ place, for each place, all finite.
 
     values : (cases,) ratios for a performance profile, seconds for a data profile [2]_
     """
@@ -87,7 +87,7 @@ def solved_within(values: Array, places: ArrayLike) -> Share:
 
 
 def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
-    """Return the profile between two finite places."""
+    """Return the profile between two finite places on the axis."""
     inside = np.unique(values[(values > start) & (values < stop)])
     if inside.size > points:
         inside = np.geomspace(start, stop, points)[1:-1]
