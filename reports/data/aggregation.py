@@ -140,7 +140,7 @@ class Ranking:
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
-        """Rank intervals: after all significantly faster solvers, before all slower ones.
+        """Rank intervals: after all significantly faster solvers, before all slower.
 
         They jointly contain the true ranks with 95 % [1]_.
 

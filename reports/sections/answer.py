@@ -279,7 +279,7 @@ def _roughly(f: FastestSolver) -> str:
 
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
-    """Name entrants faster than the first that were not verified on every case."""
+    """Name entrants that are faster than the first but not verified on every case."""
     faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 
