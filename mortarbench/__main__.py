@@ -7,7 +7,7 @@ import sys
 
 
 def main() -> None:
-    """Run the command line, with one thread in every library."""
+    """Run the command line with one thread in every library."""
     # before any other import: libraries read these variables once, when they load
     from mortarbench.harness.limits import ONE_THREAD
 

@@ -92,7 +92,7 @@ class Answer:
 
     @property
     def energy_bound(self) -> float | None:
-        """Certified bound of the relative error in the energy norm; None: unknown."""
+        """Certified bound on the relative error in the energy norm; None if unknown."""
         return self.record.energy_bound
 
     @property
@@ -137,7 +137,7 @@ class Answer:
     def mesh_error(self, budget: float = 60.0) -> Discretisation:
         """Estimate the discretisation error, which adds to the error of the solver.
 
-        The case is solved on finer meshes, by the reference solve.
+        The reference solver solves the case on finer meshes.
 
         budget : seconds; meshes that would exceed it are not solved
         """
@@ -201,7 +201,7 @@ class Answer:
             if len(fields.cells) else traction_figure(fields) or traction_maps(fields)
         )  # fmt: skip
         if figure is None:
-            raise InputError("no bodies and no tractions: there is no picture")
+            raise InputError("no picture: the case has neither bodies nor tractions")
         if path is not None:
             save(figure, check_output_file(path, PICTURES))
         return draw(figure)
@@ -209,7 +209,7 @@ class Answer:
     def save_vtu(self, path: str | Path) -> Path:
         """Write the deformed bodies for ParaView: .vtu, or .pvd with all load steps.
 
-        For a .pvd the earlier load steps are solved by the same solver.
+        For a .pvd, the same solver also solves the earlier load steps.
 
         Raises
         ------
@@ -222,7 +222,9 @@ class Answer:
 
         path, fields = check_output_file(path, GRIDS), self.fields()
         if not len(fields.cells):
-            raise InputError(f"{path}: {self.case.name} has no bodies to write")
+            raise InputError(
+                f"{path}: {self.case.name} has no bodies that could be written"
+            )
         if path.suffix == ".vtu":
             write_vtu(fields, path)
             return path
@@ -237,7 +239,10 @@ class Answer:
                 options=self.spec.options,
             )
             if not earlier.has_point:
-                raise InputError(f"{path}: no point at step {step}; write a .vtu")
+                raise InputError(
+                    f"{path}: the solver returned no point at step "
+                    f"{step}; expected a .vtu file instead"
+                )
             states.append((float(step), earlier.fields()))
         write_series([*states, (float(last), fields)], path)
         return path
@@ -270,13 +275,14 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
     bound = record.energy_bound
     if bound is not None and bound == np.inf:
         reasons.append(
-            "the certificate does not bound the solver's error: the displacements may "
-            "be as small as rounding, or a load may act on supports"
+            "the certificate does not bound the solver's error, because the "
+            "displacements may be as small as rounding, or because a load may act on "
+            "supports"
         )
     elif bound is not None and bound > MAX_CERTIFIED_ERROR:
         reasons.append(
             f"the solver's error is only certified to be at most {100 * bound:.2g} %; "
-            "a smaller tolerance may give a better bound"
+            "a smaller tolerance may give a smaller bound"
         )
     # a remark must not fail a solve: recovery may be code of a plug-in, and on ranks
     # there is no case in this process
@@ -284,7 +290,8 @@ def remarks(case: Case, record: Record, solution: Solution | None) -> tuple[str,
         if _is_open(case, record, solution):
             reasons.append(
                 "no node is in contact: the sides stay apart, and the answer is that "
-                "of bodies without contact; check the direction of the load and the gap"
+                "of bodies without contact; check the direction of the load and the "
+                "initial gap"
             )
     with suppress(Exception), one_thread():
         reasons += _large_displacements(case, solution)
@@ -325,8 +332,8 @@ def _large_displacements(case: Case, solution: Solution) -> Iterator[str]:
             name = repr(mechanics.names[body]) if mechanics.names else str(body)
             text = (
                 f"body {name} moves by up to {lengths[nodes].max():.3g} m and is "
-                f"{size:.3g} m large; linear kinematics is for small displacements: "
-                "check the moduli, the loads and the supports"
+                f"{size:.3g} m large; linear kinematics is valid only for small "
+                "displacements: check the moduli, the loads and the supports"
             )
     if text:
         yield text

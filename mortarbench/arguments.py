@@ -1,4 +1,4 @@
-"""Checks of arguments, made before any work is done and any library is imported."""
+"""Checks of arguments, before any work is done or any library is imported."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     Raises
     ------
     InputError
-        If its suffix is none of `suffixes`, it is a folder, or its folder is missing.
+        If its suffix is not in `suffixes`, it is a folder, or its folder is missing.
 
     """
     path = checked.path("path", path)
@@ -36,7 +36,10 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
     if path.is_dir():
         raise InputError(f"{path} is a folder; expected a file")
     if not path.parent.is_dir():
-        raise InputError(f"{path}: no folder {path.parent}; expected one that exists")
+        raise InputError(
+            f"{path}: the folder {path.parent} does not exist; expected "
+            "an existing folder"
+        )
     return path
 
 
@@ -56,7 +59,7 @@ def check_result_folder(folder: Path) -> Path:
 
 
 def tolerance(tol: float, where: str = "tol") -> float:
-    """Return a relative accuracy.
+    """Return a valid relative accuracy.
 
     Raises
     ------
@@ -82,17 +85,17 @@ def solver_options(options: object, more: Mapping[str, Any] = {}) -> dict[str, A
     options = {} if options is None else options
     if not isinstance(options, Mapping) or not all(isinstance(k, str) for k in options):
         raise InputError(
-            f"options = {shown(options)}; expected a dict from names to values, such "
-            "as {'max_iter': 50}"
+            f"options = {shown(options)}; expected a dict that maps names to values, "
+            f"such as {{'max_iter': 50}}"
         )
     twice = sorted(options.keys() & more.keys())
     if twice:
-        raise InputError(f"{twice[0]} is given twice: in `options` and as a keyword")
+        raise InputError(f"{twice[0]} is given twice, in `options` and as a keyword")
     return {**options, **more}
 
 
 def check_scale(scale: float, where: str = "scale") -> float:
-    """Return a factor of displacements in pictures.
+    """Return a valid factor of displacements in pictures.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
 
 
 def budget(seconds: float, where: str = "budget") -> float:
-    """Return a number of seconds.
+    """Return a valid number of seconds.
 
     Raises
     ------
@@ -131,7 +134,7 @@ def check_names(
     Raises
     ------
     InputError
-        With the nearest allowed name, or all of them.
+        If a name is not allowed; the message lists the nearest name or all of them.
 
     """
     for name in names:

@@ -1,4 +1,4 @@
-"""Cases by name, and bare QPs: the QP with its recovery of physical results."""
+"""Cases by name, and QPs without mechanics, with the recovery of physical results."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 class Case(plugin.Case):
-    """One QP of one problem, built at its first use."""
+    """One QP of one problem, built at first use."""
 
     def __init__(self, *, id: CaseId, registries: Registries) -> None:  # noqa: A002
         self.id = id  #: family, parameters and form
@@ -37,7 +37,7 @@ class Case(plugin.Case):
 
     @cached_property
     def family_case(self) -> plugin.Case:
-        """Case as its family builds it, at the first access.
+        """Case built by its family, at the first access.
 
         Raises
         ------
@@ -59,7 +59,7 @@ class Case(plugin.Case):
 
     @property
     def name(self) -> str:
-        """Canonical name FAMILY/key=value/…/FORM, without keys that others imply."""
+        """Canonical name FAMILY/key=value/…/FORM, without keys implied by others."""
         return self.id.name
 
     @cached_property
@@ -89,7 +89,7 @@ class Case(plugin.Case):
 
     @property
     def dualise_seconds(self) -> float | None:
-        """Time to assemble a dual form, factorisation included; None for a primal."""
+        """Time to assemble a dual form, with factorisation; None for primal forms."""
         return self.family_case.dualise_seconds
 
     @property
@@ -108,12 +108,12 @@ class Case(plugin.Case):
 
     @property
     def params(self) -> Mapping[str, plugin.Value]:
-        """Values of all keys of the family, defaults included."""
+        """Values of all keys of the family, including defaults."""
         return self.id.params
 
     @property
     def form(self) -> str:
-        """Form of the QP among equivalent ones of the problem: primal, dual, …."""
+        """Formulation of the problem as a QP: primal, dual, …."""
         return self.id.form
 
     @property
@@ -146,7 +146,7 @@ class Case(plugin.Case):
         Raises
         ------
         InputError
-            If the suffix is none of these, the format cannot store the QP, or the file
+            If the suffix is another one, the format cannot store the QP, or the file
             cannot be written.
 
         """
@@ -201,7 +201,7 @@ def _exported(M: Matrix) -> Matrix:
 
 
 class BareQP(plugin.Family):
-    """Family of a single problem, a QP without physical results."""
+    """Family of a single problem: a QP without physical results."""
 
     name = "qp"
     defaults: Mapping[str, plugin.Value] = MappingProxyType({})
@@ -221,7 +221,7 @@ class BareQP(plugin.Family):
 
 
 def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
-    """Return the case for a name or a QP, not built yet; a case is returned as it is.
+    """Return an unbuilt case for a name or a QP; a case is returned unchanged.
 
     plugins : Python files with more families or solvers
 
@@ -252,8 +252,8 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
             return Case(id=parse(problem, registries.families), registries=registries)
     hint = f"; a file is 'file:{problem}'" if isinstance(problem, Path) else ""
     raise InputError(
-        f"case = {shown(problem)}; expected the name of a case, what build() returns, "
-        f"or a QP{hint}"
+        f"case = {shown(problem)}; expected the name of a case, the result of "
+        f"build(), or a QP{hint}"
     )
 
 
@@ -269,7 +269,7 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
     Raises
     ------
     InputError
-        If there is no such case, it cannot be built, the suffix is none of these, the
+        If there is no such case, it cannot be built, the suffix is another one, the
         format cannot store the QP, or the file cannot be written.
 
     Examples
@@ -284,7 +284,7 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
 
 @TURN
 def build(name: str, *, plugins: Plugins = ()) -> Case:
-    """Build the case of a name, such as ``beam-ring/Nr=4/Nh=3/steps=1/dual``.
+    """Build the case with a name such as ``beam-ring/Nr=4/Nh=3/steps=1/dual``.
 
     plugins : Python files with more families
 

@@ -21,13 +21,13 @@ from mortarbench.text import first_comment, first_sentence, listing
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-#: data of our solvers for `list solvers`, so that it need not import all of them;
+#: data of our solvers for `list solvers`, which need not import them;
 #: written by `make docs`, and compared with the solvers by a test
 CATALOGUE = Path(__file__).with_name("catalogue.json")
 
 
 class Listing(tuple[Mapping[str, Any], ...]):
-    """Rows of plain data, shown as a table."""
+    """Rows of plain data, which a notebook shows as a table."""
 
     __slots__ = ()
 
@@ -52,7 +52,7 @@ class Listing(tuple[Mapping[str, Any], ...]):
             f"<td style='text-align:left'>{escape(row['description'])}</td></tr>"
             for row in self
         )
-        return f"<table><tr><th>name</th><th>what it is</th></tr>{rows}</table>"
+        return f"<table><tr><th>name</th><th>description</th></tr>{rows}</table>"
 
 
 def solvers(*, plugins: Plugins = (), registries: Registries | None = None) -> Listing:
@@ -146,7 +146,7 @@ def describe(solver: Solver) -> dict[str, Any]:
 
 
 def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row for a solver; its description names a library that is missing."""
+    """Return a row for a solver; its description names the library if it is missing."""
     line = entry["sentence"]
     if entry["about"] is not None:
         facts = About(**entry["about"])
@@ -157,7 +157,7 @@ def _row(name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
 
 @cache
 def catalogue() -> dict[str, Any]:
-    """Read the catalogue of our own solvers, which are not imported."""
+    """Read the catalogue of our own solvers, without importing them."""
     entries: dict[str, Any] = json.loads(CATALOGUE.read_text("utf-8"))
     return entries
 

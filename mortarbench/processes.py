@@ -39,7 +39,7 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         family = registries.families[case["family"]]
         emission = family.emission(case["form"], case["params"])
         if emission is None:
-            raise InputError(f"{family.name}: ranks cannot emit this case")
+            raise InputError(f"{family.name}: ranks cannot assemble this case")
         return emission(ranks, reference_over_ranks)
 
     serve(

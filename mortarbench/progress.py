@@ -20,16 +20,16 @@ from mortarbench.harness.errors import shown as repeated
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.running.progress import Progress
 
-_REASON_LENGTH = 120  #: characters shown of a reason to decline
-_BAR_WIDTH = 60  #: columns of a terminal that is wide enough for a bar and numbers
-_UPDATE_SECONDS = 0.2  #: between two updates of a bar in a notebook
+_REASON_LENGTH = 120  #: characters of a reason to decline that are shown
+_BAR_WIDTH = 60  #: minimum number of columns of a terminal for a bar and numbers
+_UPDATE_SECONDS = 0.2  #: seconds between two updates of a bar in a notebook
 
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
     """State of a run at one moment, passed to the function `progress` of `run`."""
 
-    done: int  #: measurements so far, those of earlier runs included
+    done: int  #: measurements so far, including those of earlier runs
     total: int
     now: str = ""  #: current activity
     warning: str = ""  #: message if something went wrong, else empty
@@ -82,7 +82,7 @@ class _Silent(_Display):
 
 
 class _EventDisplay(_Display):
-    """Display that calls a function with every change."""
+    """Display that calls a function at every change."""
 
     def __init__(self, callback: Callback) -> None:
         super().__init__()
@@ -105,20 +105,20 @@ class _EventDisplay(_Display):
 
 
 class _Warnings(_Display):
-    """Display that writes warnings only."""
+    """Display that writes only warnings."""
 
     def __init__(self, stream: TextIO) -> None:
         super().__init__()
         self._stream = stream
 
     def warn(self, text: str) -> None:
-        # a closed reader of the output must not end the run
+        # the run must continue if the reader of its output has been closed
         with suppress(BrokenPipeError):
             print(text, file=self._stream, flush=True)
 
 
 class _Lines(_Warnings):
-    """Display that writes a line per measurement."""
+    """Display that writes one line per measurement."""
 
     def start(self, total: int) -> None:
         super().start(total)
@@ -131,7 +131,7 @@ class _Lines(_Warnings):
 
 
 def measurement_line(record: Record) -> str:
-    """Return the result of a measurement in a line."""
+    """Return the result of a measurement in one line."""
     seconds = record.total_seconds
     detail = "" if seconds is None else f" in {seconds:.3g} s"
     if record.verdict is Verdict.DECLINED and record.message:
@@ -255,7 +255,7 @@ def display_on(stream: TextIO) -> Iterator[Progress]:
     class TimeLeft(ProgressColumn):
         """Remaining time over all measurements.
 
-        The column of rich uses the last half minute, in which there may be none.
+        The column of rich uses the last half minute, which may contain no measurement.
         """
 
         def render(self, task: Task) -> Text:

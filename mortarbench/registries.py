@@ -100,8 +100,8 @@ def one_thread() -> Iterator[None]:
 def defer_parts_of_numpy() -> None:
     """Defer the execution of numpy's modules f2py and testing to their first use.
 
-    Nothing here uses them, but `scipy._lib.array_api_compat.numpy` accesses every name
-    of numpy, and importing them takes a quarter of the start-up time of a worker.
+    mortarbench does not use them, but `scipy._lib.array_api_compat.numpy` accesses
+    every name of numpy. Importing them takes a quarter of a worker's start-up time.
     """
     import numpy
 
@@ -116,7 +116,7 @@ def defer_parts_of_numpy() -> None:
 
 
 def reference(qp: QP) -> Solution:
-    """Solve to about rounding, without any of the solvers under test."""
+    """Solve to about rounding, without using a solver under test."""
     from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)
@@ -151,7 +151,7 @@ def _validation_page(
 
 
 class _FamiliesWithCopies(Mapping[str, Family]):
-    """Families that read files from their copies in a result folder."""
+    """Families that read files from the copies in a result folder."""
 
     def __init__(self, families: Mapping[str, Family], folder: Path | None) -> None:
         self._families = families
@@ -182,15 +182,15 @@ class Registries:
     validation_page: ValidationPage = _validation_page
     #: functions that construct an operator P, see `harness.operators`
     operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
-    #: those among them that are not from plug-in files
+    #: the operators among them that do not come from plug-in files
     own_operators: Mapping[str, Maker] = field(default_factory=lambda: OPERATORS)
     suites: Path = field(default_factory=suites_folder)
     #: plug-in files, which the processes of a run load as well
     files: tuple[PluginFile, ...] = ()
-    #: plug-in of each family that is from a plug-in
+    #: plug-in of each family that comes from a plug-in
     origins: Mapping[str, str] = field(default_factory=dict)
-    #: command line without the name of the process. -P: a file in the working directory
-    #: must not be imported in place of a library
+    #: command line without the name of the process. -P prevents the import of a file in
+    #: the working directory in place of a library
     start: Sequence[str] = (sys.executable, "-P", "-m", "mortarbench")
 
     def extended(self, plugin: Plugin) -> Registries:
@@ -231,7 +231,7 @@ class Registries:
         return extended
 
     def missing(self, files: Plugins) -> list[PluginFile]:
-        """Return the plug-ins of `files` that are not loaded yet.
+        """Return the plug-ins in `files` that are not loaded yet.
 
         Raises
         ------
@@ -284,7 +284,7 @@ class Registries:
     def families_with_copies(self, folder: Path | None) -> Mapping[str, Family]:
         """Return the families, which read files from the copies in a result folder.
 
-        folder : result folder, checked by `refuse_links`; None: there are no copies
+        folder : result folder, checked by `refuse_links`; None if there are no copies
         """
         return _FamiliesWithCopies(self.families, folder)
 
@@ -309,8 +309,8 @@ class Registries:
     def environment(self) -> dict[str, Any]:
         """Return the environment of the processes of a run; see `capture`.
 
-        It is captured in a new process unless this one is limited to one thread as
-        well: other programs, such as a notebook, load other libraries and use threads.
+        It is captured in a new process unless this one is also limited to one thread,
+        because programs such as a notebook load other libraries and use threads.
         """
         from mortarbench.harness.environment.environment import capture, capture_in
         from mortarbench.solvers.common.libraries import PACKAGES
@@ -330,7 +330,7 @@ class Registries:
         Raises
         ------
         InputError
-            If there is neither.
+            If neither exists.
 
         """
         path = checked.path("suite", text)
@@ -364,7 +364,7 @@ def load_registries(
 ) -> Registries:
     """Return our registries with those of installed plug-ins and of plug-in files.
 
-    registries : returned instead, unless None
+    registries : if not None, this value is returned instead
 
     Raises
     ------

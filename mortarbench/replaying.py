@@ -1,4 +1,4 @@
-"""Replay of a stored measurement, and comparison of the two."""
+"""Replay of a stored measurement, and comparison of old and new result."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from mortarbench.text import align
 
 _RESIDUALS = ("primal", "dual", "complementarity", "gap")
 _SECONDS = ("prepare_seconds", "solve_seconds", "total_seconds")
-_VALUE_LENGTH = 48  #: characters shown of a value of an environment
+_VALUE_LENGTH = 48  #: characters of an environment value that are shown
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -47,9 +47,9 @@ class Replay:
     then: Record
     now: Record
     same_qp: bool | None  #: None if the old record has no digest of its QP
-    same_options: bool  #: compared with all defaults filled in
+    same_options: bool  #: compared after filling in all defaults
     same_counts: bool  #: iterations and all counts
-    distance: float | None  #: ‖x_now − x_then‖∞ / ‖x_then‖∞; None without two points
+    distance: float | None  #: ‖x_now − x_then‖∞ / ‖x_then‖∞; None if a point is missing
     ratios: Mapping[str, tuple[float, float, float] | None]
     """Ratios of times: the new one, the smallest and the largest stored repeat, each
     relative to the median of the stored repeats. None if a time was not measured."""
@@ -58,7 +58,7 @@ class Replay:
 
     @property
     def reproduced(self) -> bool:
-        """True if the verdict is the same and the QP is not known to differ."""
+        """True if the verdict is the same and no difference of the QPs is known."""
         return self.same_qp is not False and self.then.verdict is self.now.verdict
 
     def __repr__(self) -> str:
@@ -166,7 +166,7 @@ def compare(
 
 
 def render(c: Replay) -> str:
-    """Return a comparison as a table: then, now, and whether they are equal."""
+    """Return a comparison as a table: old value, new value, and whether they agree."""
     rows = [["", "then", "now", ""], *_verdicts(c), *_numbers(c), *_times(c)]
     lines = [f"{c.now.run_id}  {c.now.solver} on {c.now.case}, tolerance {c.now.tol:g}"]
     lines += ["", align(rows), ""]
@@ -179,7 +179,7 @@ def render(c: Replay) -> str:
     if c.reproduced:
         lines.append("Reproduced: the same verdict.")
     elif c.same_qp is False:
-        lines.append("Not reproduced: the case builds another QP than it did.")
+        lines.append("Not reproduced: the case now has another QP.")
     else:
         lines.append(f"Not reproduced: {c.then.verdict} then, {c.now.verdict} now.")
     return "\n".join(lines)

@@ -27,7 +27,7 @@ class Report:
     """Files of a report, with its main statements."""
 
     files: tuple[Path, ...]
-    said: tuple[str, ...] = ()  #: main statements, a line each
+    said: tuple[str, ...] = ()  #: main statements, one line each
     #: changes from the first folder to each of the others, as plain data
     changes: tuple[dict[str, Any], ...] = ()
     failed_on: tuple[str, ...] = ()  #: conditions of `fail_on` that are met
@@ -71,8 +71,8 @@ def report(
     Parameters
     ----------
     folder : result folder; its report is written to DIR/report
-    others : if any, the changes from `folder` to each of them are reported instead, in
-        the folder ``report`` of the latter
+    others : if given, the changes from `folder` to each of these folders are reported
+        instead, in the folder ``report`` of the latter
     formats : among html, md, tex, csv, parquet
     factor : verified means that every residual is within factor·tol
     fail_on : conditions listed in `Report.failed_on` if they are met: ``worse``, a
@@ -85,8 +85,9 @@ def report(
     Raises
     ------
     InputError
-        If a folder contains no measurements, a format or the factor is invalid, forms
-        are to be pooled in a comparison, or a condition of `fail_on` cannot be decided.
+        If a folder contains no measurements, a format or the factor is invalid,
+        `pool_forms` is requested for a comparison, or a condition of `fail_on` cannot
+        be decided.
 
     Examples
     --------
@@ -118,8 +119,8 @@ def report(
         return Report(files=tuple(files), said=tuple(answer(first, factor)[:1]))
     if pool_forms:
         raise InputError(
-            "forms are pooled in the report on one folder (--pool-forms), not in a "
-            "comparison of two, which pairs equal cases; leave one of them out"
+            "--pool-forms applies to the report on one folder, not to a comparison of "
+            "two folders, which pairs equal cases; leave one of them out"
         )
     from mortarbench.reports import write_comparisons
 
@@ -202,7 +203,7 @@ def _slower(one: Slower) -> dict[str, Any]:
 
 
 def _interval(ratio: Ratio | Any) -> dict[str, float | None]:
-    """Return a ratio with the ends of its interval, None if it has no interval."""
+    """Return a ratio with the ends of its interval; None if it has no interval."""
     bounded = 0 < ratio.low <= ratio.high < float("inf")
     return {
         "value": ratio.value,

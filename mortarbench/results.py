@@ -58,12 +58,12 @@ class Results:
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
     solvers: tuple[str, ...] = ()  #: labels of the suite, in its order; `load`: of all
     cases: frozenset[str] = frozenset()  #: names of the requested cases; empty: all
-    #: requested measurements that are missing; the same call tries them again
+    #: requested measurements that are missing; repeating the call measures them
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
 
     @cached_property
     def df(self) -> DataFrame:
-        """Table with a row per measurement and a column per field of the journal.
+        """Table with one row per measurement and one column per field of the journal.
 
         An empty mapping becomes None, because Parquet has no type for it.
         """
@@ -83,7 +83,7 @@ class Results:
     def failed(self) -> tuple[Record, ...]:
         """Requested measurements that ended without an answer.
 
-        Those that reached a limit are included, declined ones are not.
+        This includes measurements that reached a limit, but not declined ones.
         """
         excluded = (*REFUTED, Verdict.DECLINED)
         return tuple(
@@ -117,7 +117,7 @@ class Results:
 
     @property
     def shortfall(self) -> list[str]:
-        """Reasons why requested measurements are missing, a line each."""
+        """Reasons why requested measurements are missing, one line each."""
         lines = []
         if count := len(self.missing.unbuilt):
             cases = "case" if count == 1 else "cases"
@@ -138,7 +138,7 @@ class Results:
         Parameters
         ----------
         kind : name of the figure in the folder ``figures`` of the report, such as
-            ``accuracy`` or ``scaling-1``; ``scaling`` if there is only one of these
+            ``accuracy`` or ``scaling-1``; ``scaling`` if there is only one such figure
         path : file to which the figure is also written: .png, .pdf or .svg
 
         Raises
@@ -183,7 +183,7 @@ class Results:
 
 
 def _named(r: Record) -> dict[str, Any]:
-    """Return the identity of a measurement and how it ended."""
+    """Return the identity and the verdict of a measurement."""
     return {
         "run_id": r.run_id,
         "case": r.case,
@@ -243,8 +243,8 @@ def merge(
     ----------
     folders : result folders
     out : a new folder, or one of an earlier merge
-    tell : called with a line about records that `out` already has, and about solutions
-        and environments that are missing
+    tell : called with messages about records that `out` already contains, and about
+        missing solutions and environments
 
     Raises
     ------
@@ -267,8 +267,8 @@ def _refuse_objects(solvers: object) -> None:
     for one in solvers if isinstance(solvers, list | tuple) else [solvers]:
         if is_solver(one):
             raise InputError(
-                "solver objects are for mb.solve; in a suite name them by "
-                "plugins=['FILE.py']"
+                "a suite cannot contain solver objects, only names; pass "
+                "plugins=['FILE.py'] and name the solver"
             )
 
 
@@ -289,17 +289,17 @@ def run(
     progress: bool | Callback | Progress | None = None,
     registries: Registries | None = None,
 ) -> Results:
-    """Measure a suite into a result folder; measurements already there are kept.
+    """Measure a suite and store the results in a folder; existing results are kept.
 
     Parameters
     ----------
     suite : path of a TOML file, the name of one of `suites`, or a dict with the keys of
         such a file, whose relative paths start in the working directory
     out : result folder; default: ``out/NAME`` for the suite NAME
-    solvers : only these; solvers that are not in the suite are added
-    cases : only these, by names or patterns
-    repeats, time_limit, memory_limit : override those of the suite; s, MiB
-    options : options for every solver that has them; a list of values is a sweep
+    solvers : measure only these solvers; solvers that are not in the suite are added
+    cases : measure only these cases, given by names or patterns
+    repeats, time_limit, memory_limit : override the values of the suite; s, MiB
+    options : options for every solver that has them; each value of a list is measured
     fresh : delete the contents of the folder first
     dask : address of a scheduler, or ``local``
     plugins : Python files with more solvers or families
@@ -350,7 +350,7 @@ def run(
     folder = folder or Path("out") / name_in(text)
     fresh = checked.flag("fresh", fresh)  # True deletes the copies of files as well
     if folder.is_dir():
-        # before copies of files are read: a link could lead outside the folder
+        # before copies of files are read, since a link could lead outside the folder
         refuse_links(folder)
     families = registries.families_with_copies(None if fresh else folder)
     known_solvers = registries.solvers
@@ -374,7 +374,7 @@ def run(
         if load_advice(busy := os.getloadavg()[0]):
             display.warn(
                 f"mortarbench: other programs keep {busy:.1f} cores busy; times will "
-                "be less certain"
+                "be less precise"
             )
         engine: EngineFactory
         if dask is None:

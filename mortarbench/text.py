@@ -44,16 +44,19 @@ _LEGEND = {
     "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
     "outer": "outer: number of the outer iteration",
     "products": "products: of the QP's matrix P with a vector, so far",
-    "free_gradient": "‖φ‖: free gradient, of the variables off their bounds",
-    "chopped_gradient": "‖β‖: chopped gradient, of those that should leave theirs",
-    "infeasibility": "‖Ax−b‖: how far the equality rows are from holding, relative",
+    "free_gradient": "‖φ‖: free gradient, of the variables that are not at a bound",
+    "chopped_gradient": "‖β‖: chopped gradient, of the variables that should leave "
+    "their bounds",
+    "infeasibility": "‖Ax−b‖: relative violation of the equality rows",
     "active": "at bound: variables at one of their bounds",
-    "two_sided": "of two: those among them with two bounds; with friction, rows that "
+    "two_sided": "of two: those of them that have two bounds; with friction, rows that "
     "slip",
     "cost": "own cost: the function that the solver itself minimises, in its own "
     "scaling;\n          neither a time nor the objective above",
 }
-_HIDDEN = ("seconds",)  #: columns of a history not shown: one run measures no times
+_HIDDEN = (
+    "seconds",
+)  #: columns of a history that are not shown: a single run gives no reliable times
 CLAIMED_SOLVED = "solved"  #: `harness.Status.SOLVED` in a record
 _MAX_ROWS = 15  #: rows of a table of convergence
 
@@ -78,7 +81,7 @@ def first_comment(path: Path) -> str:
 
 
 def listing(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Return a line per row: name, description, keys or options, forms."""
+    """Return one line per row: name, description, keys or options, forms."""
     return align(
         [
             row["name"],
@@ -134,7 +137,7 @@ def outcome(r: Record, defaults: Mapping[str, Any]) -> str:
 def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]]:
     """Return names and values that describe one measurement, in SI units.
 
-    defaults : options of the solver that are not shown at these values
+    defaults : default options of the solver; options with these values are omitted
     """
     options = ", ".join(
         f"{key}={value}"
@@ -178,12 +181,12 @@ def outcome_rows(r: Record, defaults: Mapping[str, Any]) -> list[tuple[str, str]
 
 
 def _units(per: str) -> Mapping[str, str]:
-    """Return units of quantities; `per` is "/m", per thickness, or "" in space."""
+    """Return units of quantities; `per` is "/m" for plane bodies, and "" in space."""
     return {name: unit.replace("/m", per) for name, unit in UNITS.items()}
 
 
 def _quantity(r: Record, name: str, unit: str) -> str:
-    """Return the text of a quantity; for sliding without contact with its shear."""
+    """Return the text of a quantity, with the share of shear for sliding nodes."""
     text, share = _text(r.quantities[name], unit), r.quantities.get(_SHARE)
     if name != "sliding_without_contact" or not isinstance(share, float):
         return text
@@ -210,10 +213,10 @@ def _contacts(pairs: object, force: str) -> list[tuple[str, str]]:
 
 
 def _bound(r: Record) -> str:
-    """Return the text of the certified error; rigid motions may be excluded."""
+    """Return the text of the certified error, which may exclude rigid motions."""
     if r.energy_bound is None:
         return ""
-    beside = ", rigid motions aside" if r.certificate.get("seminorm") else ""
+    beside = ", excluding rigid motions" if r.certificate.get("seminorm") else ""
     return (
         f"at most {r.energy_bound:.2g} in the energy norm (certified, relative{beside};"
         " the mesh adds more)"
@@ -224,7 +227,7 @@ def convergence(history: History) -> str:
     """Return a table of the iterations that a solver reports; empty without a history.
 
     There is a row for the end of each outer iteration, or, without outer iterations,
-    for at most 15 steps. Kinds of steps since the row before are counted: "c12 e3".
+    for at most 15 steps. A row counts the steps since the previous row: "c12 e3".
     """
     columns = {k: v for k, v in history.items() if v.size and k not in _HIDDEN}
     if not columns:
@@ -313,6 +316,6 @@ def _text(value: Any, unit: str = "", digits: int = 9) -> str:
 
 
 def printable(text: str) -> str:
-    """Return text of a solver or plug-in in one line without control characters."""
+    """Return text of a solver or plug-in in one line, without control characters."""
     line = " ".join(text.split())
     return "".join(c if c.isprintable() else "\ufffd" for c in line)

@@ -43,7 +43,9 @@ from mortarbench.text import align, printable
 COMPARED_WITH = "smalbe"  #: solver with which the others are compared
 TIME_LIMIT = 60.0  #: s per check of the conformance suite
 MEMORY_LIMIT = 4096.0  #: MiB per check
-_MAX_ENTRIES = 12  #: entries of a list on the terminal; the page has all of them
+_MAX_ENTRIES = (
+    12  #: maximum number of entries of a list on the terminal; the page has all of them
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -76,7 +78,7 @@ def validate(
     progress: Callable[[str], None] = ignore,
     registries: Registries | None = None,
 ) -> Validation:
-    """Cross-validate the stored answers of a result folder, on cases built anew.
+    """Cross-validate the stored answers of a result folder on newly built cases.
 
     Write validation.json and the page report/validation.html.
 
@@ -110,7 +112,7 @@ def validate(
     data = as_data(result, path.resolve().name, ours=COMPARED_WITH)
     if not (data["counts"]["answers"] or result.false_claims or result.proven):
         reasons = [entry.text for entry in result.not_validated]
-        why = reasons[0] if reasons else "none is a claim"
+        why = reasons[0] if reasons else "none of the answers is a claim"
         raise InputError(f"{path}: no stored answer can be judged: {why}")
     text = json.dumps(data, allow_nan=False) + "\n"
     with report_full_disk(path):
@@ -120,7 +122,7 @@ def validate(
     cases = []
     for r in records.values():
         if r.family in families:
-            # a case of another version is listed as not validate_folder
+            # a case of another version is listed as not validated
             with suppress(InputError):
                 case = assemble(families[r.family], r.params, r.form)
                 if r.energy_bound is not None or _refines(case):
@@ -134,7 +136,7 @@ def validate(
 
 
 def _refines(case: CaseId) -> bool:
-    """Return True if there is a finer mesh, or a reason why its family has none."""
+    """Return True if there is a finer mesh, or a reason why there is none."""
     try:
         return case.family.refined(case.params) is not None
     except InputError:  # the reason, which `discretisation_errors` repeats
@@ -142,16 +144,16 @@ def _refines(case: CaseId) -> bool:
 
 
 def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> str:
-    """Return the data of `harness.crossval.summary.as_data` as a screen of text."""
+    """Return the data of `harness.crossval.summary.as_data` as text for a terminal."""
     parts = [printable(data["headline"]), _solvers(data["solvers"])]
     entries = {
         "Refuted claims": _refuted(data["disagreements"]),
-        "Apart without a culprit": [
+        "Contradicting answers, with neither refuted": [
             f"{d['problem']}, tol {d['tol']:g}: {' and '.join(d['between'])} are "
             f"{_e(d['distance'])} apart, allowed {_e(d['allowed'])}"
             for d in data["unresolved"]
         ],
-        "Certificates contradicted (a fault of ours)": [
+        "Certificates contradicted (an error of this program)": [
             f"{_measured(d)}: {d['text']}" for d in data["contradictions"]
         ],
         "Not validated": _count_equal(data["not_validated"]),
@@ -163,7 +165,11 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     counts = [
         f"{data['counts'][key]} {words}"
         for key, words in (
-            ("remarks", "stand out from the other solvers, within what they claim"),
+            (
+                "remarks",
+                "answers within their claims, but far less accurate than "
+                "those of other solvers",
+            ),
             ("unanswered", "measurements ended without an answer"),
         )
         if data["counts"][key]
@@ -171,8 +177,8 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
     parts += ["; ".join(counts) + "."] if counts else []
     if meshes:
         title = (
-            "Errors of the meshes, relative, in the energy norm, to which the "
-            "certified ones add; `report` shows what they are worth"
+            "Relative errors of the meshes in the energy norm, which add to the "
+            "certified errors; `report` compares the two"
         )
         parts.append(_list(title, [f"{d.case}: {d}" for d in meshes]))
     return "\n\n".join(parts)
@@ -199,13 +205,13 @@ def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     ]
     table = align([head, *lines], right=range(1, len(head)))
     return (
-        "Certified errors: relative, in the energy norm. They are those of the "
-        f"solvers; the mesh adds its own.\n{table}"
+        "Certified relative errors of the solvers in the energy norm; the mesh adds "
+        f"its own error.\n{table}"
     )
 
 
 def _refuted(wrong: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line per refuted claim; if there are many, the worst of each solver."""
+    """Return one line per refuted claim; of many claims, only the worst per solver."""
     if len(wrong) <= _MAX_ENTRIES:
         return list(map(_wrong, wrong))
     by_solver: dict[str, list[Mapping[str, Any]]] = {}
@@ -228,7 +234,7 @@ def _measured(d: Mapping[str, Any]) -> str:
 
 
 def _count_equal(entries: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return a line for each different entry, with the number of its answers."""
+    """Return one line for each distinct entry, with the number of its answers."""
     counted = Counter((d["case"], d["text"]) for d in entries)
     return [
         f"{case} ({n} answer{'s' * (n != 1)}): {text}"

@@ -26,27 +26,32 @@ Results = Mapping[str, Result]  #: of one solver, by the name of the check
 HEAD = f"""\
 # Effects of equivalent formulations
 
-Measured by `make weaknesses`, which writes this page, with the versions in
-`constraints.txt`. `mortarbench test-solver NAME` measures one solver.
+**Does the answer of a solver change if the same QP is written in another way?** `make
+weaknesses` measures this and writes this page, with the versions in `constraints.txt`.
+`mortarbench test-solver NAME` measures one solver.
 
-The test problem is two strings in contact (`harness.conformance.manufactured.strings`):
-the primal QP with 42 unknowns, 4 equality and 23 inequality rows; its dual; and its
-dual with bounds only. Each is solved at tolerance {TOL:g} in non-dimensional form, and
-then in equivalent formulations: in other units, in another order, with rows scaled by
+The test problem consists of two strings in contact
+(`harness.conformance.manufactured.strings`). It has three forms: the primal QP with 42
+unknowns, 4 equality and 23 inequality rows, its dual, and its dual with bounds only.
+Each form is first solved at tolerance {TOL:g} in non-dimensional form. It is then
+solved in equivalent formulations: in other units, in another order, with rows scaled by
 powers of two from 2⁻¹⁰ to 2¹⁰ or duplicated, and with unknowns shifted or of the
 opposite sign. The equivalence is exact (`harness.conformance.metamorphic`), so neither
 verdict nor answer should change.
 
-The units are those of the paper's benchmark, as powers of two. They multiply the
-non-dimensional quantities by these factors:
+The units are those of the paper's benchmark, rounded to powers of two. They multiply
+the non-dimensional quantities by these factors:
 
 """
 
 KEY = """
-"·": verdict and answer are the same in every form. ×k: in the worst form, k times as
-many iterations (for k ≥ 2). **form**: verdict or answer change; the evidence is below
-the table. (form): the solver declines the changed QP. Blank: the change applies to no
-form that the solver solves.
+The entries of the next table have these meanings:
+
+- "·": verdict and answer are the same in every form;
+- ×k: in the worst form, the solver takes k times as many iterations (for k ≥ 2);
+- **form**: verdict or answer change in this form; the evidence is below the table;
+- (form): the solver declines the changed QP of this form;
+- blank: the change does not apply to any form that the solver solves.
 """
 
 

@@ -1,4 +1,4 @@
-"""The command `doctor`: check whether this machine is fit for measuring times."""
+"""The command `doctor`: check whether this machine is suitable for measurements."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mortarbench.registries import Registries
 
 
 def run(registries: Registries, options: Namespace) -> int:
-    """Print a description of this machine and advice on what to change."""
+    """Print a description of this machine and recommended changes."""
     from rich.console import Console
 
     from mortarbench.harness.environment.doctor import as_json, examine, render

@@ -23,44 +23,45 @@ if TYPE_CHECKING:
 HEAD = """\
 # Solvers
 
-**Which solvers are there, and which one do I choose?** `make docs` writes this page
-from the adapters in `solvers/`, together with the notes on [our
+**Which solvers are available, and which one should I choose?** `make docs` writes this
+page from the adapters in `solvers/`, together with the notes on [our
 solvers](solvers-own.md) and on [libraries](solvers-libraries.md).
 
-Every solver is asked for the same accuracy: `tol`, the relative KKT accuracy of the
-non-dimensional QP. The notes explain how each solver translates it to its own stopping
-test. The claim of a solver is recorded beside our verdict and never trusted
+Every solver is called with the same `tol`, the relative KKT accuracy of the
+non-dimensional QP. The notes explain how each adapter translates it to the stopping
+test of its solver. The claim of a solver is recorded, but verdicts do not rely on it
 ([comparison policy](fair-play.md)).
 
 | your QP | try first |
 | --- | --- |
 | bounds and equality rows only, such as a dual | `smalbe` |
-| the same, dense, a few hundred unknowns or fewer | `smalbe-direct` |
+| the same, dense, with at most a few hundred unknowns | `smalbe-direct` |
 | inequality rows, such as a primal form | `piqp`, `clarabel` |
 | inequality rows, small and dense | `daqp` |
 | bodies in subdomains (P is an operator) | `smalbe`; without contact `feti` |
-| load steps and other sequences | *yes* in the column "sequences" |
+| load steps and other sequences | a solver with *yes* in the column "sequences" |
 
 `mortarbench test-solver NAME` runs the conformance suite on any of them, and on your
-own solver with `--plugin FILE.py`. A solver whose library is missing declines, and
-names the command that installs it; `make setup` installs all of them (the extra
-`fleet`).
+own solver with `--plugin FILE.py`. If the library of a solver is missing, the solver
+declines, and the message names the command that installs the library; `make setup`
+installs all of them (the extra `fleet`).
 
-How units, order, scaled or repeated rows, an offset or a mirror change the answers is
-measured in [weaknesses.md](weaknesses.md).
+[weaknesses.md](weaknesses.md) shows how the answers change with the units, with the
+order of unknowns and rows, with scaled or repeated rows, and with shifted or mirrored
+unknowns.
 """
 OURS = """\
 # Our solvers
 
-Written by `make docs` from `solvers/`; change the docstrings there, not this file.
-[Solvers](solvers.md) lists all.
+`make docs` writes this page from `solvers/`; change the docstrings there, not this
+file. [Solvers](solvers.md) lists all solvers.
 """
 LIBRARIES = """\
 # Solvers of libraries
 
-Written by `make docs` from `solvers/adapters/`; change the docstrings there, not this
-file. [Solvers](solvers.md) lists all, with the interfaces `qpsolvers:NAME` and
-`cvxpy:NAME`.
+`make docs` writes this page from `solvers/adapters/`; change the docstrings there, not
+this file. [Solvers](solvers.md) lists all solvers and describes the interfaces
+`qpsolvers:NAME` and `cvxpy:NAME`.
 """
 
 
@@ -69,7 +70,7 @@ def run(registries: Registries, options: Namespace) -> int:
     registries = registries.with_files(options.plugin)
     if options.markdown:
         if options.what != "solvers":
-            raise InputError("--markdown is for list solvers only")
+            raise InputError("--markdown is only for list solvers")
         print(solvers_page(registries.solvers), end="")
         return 0
     functions = {
@@ -90,8 +91,8 @@ def solvers_page(solvers: Mapping[str, Solver]) -> str:
 def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
     """Describe the solvers of a registry on several pages, by the names of their files.
 
-    The first page has the table and the solvers with a backend of their own choice; the
-    others have the sections of our solvers and of those of libraries.
+    The first page has the table and the solvers whose backend can be chosen. The others
+    have the sections of our solvers and of the solvers of libraries.
     """
     pages: dict[str, list[str]] = {
         "solvers.md": [HEAD, *_overview(solvers)],
@@ -151,7 +152,7 @@ def _section(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> str
 
 
 def _options(kind: type, names: list[str], solvers: Mapping[str, Solver]) -> list[str]:
-    """Return the table of options, with a column of values per name of a solver."""
+    """Return the table of options, with a column of values for each solver name."""
     columns = {name: options_of(solvers[name]) for name in names}
     options = list(columns[names[0]])
     if not options:

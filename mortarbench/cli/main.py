@@ -1,8 +1,8 @@
 """Command line: commands with their options, and exit codes.
 
-Exit codes: 0 done; 1 done, and the answer is no; 2 wrong input, with one line on
-stderr; 3 a fault of ours, with a traceback; 129 hung up (SIGHUP), 130 interrupted, 143
-terminated (SIGTERM).
+Exit codes: 0 success; 1 completed with a negative result; 2 invalid input, with one
+line on stderr; 3 an internal error, with a traceback; 129 hung up (SIGHUP), 130
+interrupted, 143 terminated (SIGTERM).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _Run = Callable[[Registries, argparse.Namespace], int]  #: returns the exit code
 
 
 class _Parser(argparse.ArgumentParser):
-    """Parser that raises `InputError`, with one line, for a wrong command line."""
+    """Parser that raises `InputError`, with one line, for an invalid command line."""
 
     def error(self, message: str) -> NoReturn:
         usage = " ".join(self.format_usage().split())
@@ -43,10 +43,10 @@ class _Parser(argparse.ArgumentParser):
         args: Sequence[str] | None = None,
         namespace: argparse.Namespace | None = None,
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse the options of a command, after refusing unknown ones.
+        """Refuse unknown options of a command, then parse the others.
 
-        argparse would first complain about a required option that is missing, perhaps
-        because it is misspelt.
+        argparse would first report a missing required option, which may only be
+        misspelt.
         """
         if self._subparsers is None:  # a command
             options = [name for name in self._option_string_actions if len(name) > 2]
@@ -83,7 +83,7 @@ def main(registries: Registries, argv: Sequence[str]) -> int:
         _discard_output()
         return 0
     except OSError as e:
-        # imported here because a help text needs no files
+        # imported here because a help text does not access files
         from mortarbench.harness.files.durable import FULL
 
         if e.filename is not None:
@@ -111,7 +111,7 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
     for argument in takewhile(lambda text: text != "--", argv):
         if re.fullmatch(r"--[\w-]+=--", argument):  # argparse drops this value
             option = argument.removesuffix("=--")
-            raise InputError(f"{argument}: -- is no value; expected {option}=VALUE")
+            raise InputError(f"{argument}: -- is not a value; expected {option}=VALUE")
     options, left = _parser().parse_known_args(argv)
     if left:
         options.parser.error(f"unknown argument {left[0]!r}")
@@ -129,15 +129,15 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
 
 
 def _file_error(e: OSError, path: Path) -> str:
-    """Return the message for an error of a file, with its remedy if there is one."""
+    """Return the message for a file error, with a remedy if one is known."""
     if isinstance(e, FileExistsError | NotADirectoryError):
         path = next((p for p in (path, *path.parents) if p.is_file()), path)
-        return f"{path}: a file is where a folder is needed; move the file away"
+        return f"{path}: a file exists where a folder is needed; move the file away"
     return f"{path}: {e.strerror}"
 
 
 def _print_error(message: str) -> int:
-    """Print an error in one line; return the exit code of wrong input."""
+    """Print an error in one line; return the exit code of invalid input."""
     with suppress(OSError):  # stderr may be closed
         print(f"mortarbench: {one_line(message)}", file=sys.stderr, flush=True)
     return 2
@@ -227,7 +227,7 @@ _CASE = _Option(
     "see docs/cases.md",
 )  # fmt: skip
 _RESULTS = _Option("folder", "DIR", "result folder of `run`")
-_INSTEAD = "limit of each measurement, in place of the suite's"
+_INSTEAD = "limit of each measurement; overrides that of the suite"
 
 
 def _option(what: str) -> _Option:
@@ -268,10 +268,10 @@ _COMMANDS = {
             _Option("--case", "PATTERN",
                     "measure only these cases, e.g. '*/dual'; may be repeated",
                     _SEVERAL),
-            _option("set an option of every solver that has it; with several values, "
-                    "measure each of them"),
+            _option("set an option of every solver that has it; each of several "
+                    "values is measured"),
             _PLUGIN,
-            _Option("--repeats", "N", "number of repeats, in place of the suite's"),
+            _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
             _Option("--time-limit", "SECONDS", _INSTEAD),
             _Option("--memory-limit", "MIB", _INSTEAD),
             _Option("--fresh", "", "delete the contents of the folder first"),
@@ -284,11 +284,11 @@ _COMMANDS = {
             _JSON,
         ],
         "Results are stored in a folder. The same command continues an interrupted "
-        "run and repeats no measurement.",
+        "run without repeating a measurement.",
     ),
     "solve": _Command(
         "solve",
-        "run one solver on one case once and verify its answer",
+        "run one solver on one case, once, and verify its answer",
         [
             _CASE,
             _Option("--solver", "NAME", "a name of `list solvers`",
@@ -301,8 +301,9 @@ _COMMANDS = {
             _Option("--plot", "FILE.png|pdf|svg", "draw the deformed bodies with their "
                     "stresses, and each contact enlarged"),
             _Option("--scale", "S", "factor of the displacements in the picture; "
-                    "default: 1 if they are visible, else a round factor that the "
-                    "picture states; above 1, bodies in contact may seem to overlap"),
+                                    "default: 1 if they are visible, else a round "
+                                    "factor that the picture states; above 1, bodies "
+                                    "in contact may appear to overlap"),
             _Option("--vtu", "FILE.vtu", "write the deformed bodies for ParaView, and "
                     "a CSV file along each contact; FILE.pvd: all load steps up to "
                     "this one"),
@@ -328,8 +329,9 @@ _COMMANDS = {
         "compare the answers in a result folder with each other and with references",
         [
             _RESULTS,
-            _Option("--budget", "SECONDS", "time for finer meshes, from which "
-                    "discretisation errors are estimated; default: 300",
+            _Option("--budget", "SECONDS", "time for finer meshes, which are used to "
+                                           "estimate discretisation errors; default: "
+                                           "300",
                     {"default": 300.0}),
             _PLUGIN,
             _JSON,
@@ -350,10 +352,11 @@ _COMMANDS = {
                     "within F times the tolerance; default: 10"),
             _Option("--pool-forms", "", "compare solvers over the cases of all forms "
                     "together (means, ranks and profiles) instead of form by form"),
-            _Option("--fail-on", ",".join(GATES), "exit with 1 if from DIR to DIR2 a "
-                    "verdict became worse, or a solver significantly slower"),
+            _Option("--fail-on", ",".join(GATES), "exit with 1 if, from DIR to DIR2, "
+                                                  "a verdict became worse or a solver "
+                                                  "became significantly slower"),
             _Option("--verbose", "", "print the paths of all files written, not only "
-                    "of the page"),
+                                     "that of the page"),
             _JSON,
         ],
     ),
@@ -362,8 +365,9 @@ _COMMANDS = {
         "repeat one stored measurement and compare it with the old one",
         [
             _RESULTS,
-            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its first "
-                    "digits; a report shows it when one points at a number"),
+            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its "
+                                        "first digits; a report shows it when you "
+                                        "point at a number"),
             _PLUGIN,
             _JSON,
         ],
@@ -404,7 +408,7 @@ _COMMANDS = {
     ),
     "doctor": _Command(
         "doctor",
-        "check whether this machine is fit for measuring times",
+        "check whether this machine is suitable for measurements",
         [_JSON],
     ),
     "new": _Command(
@@ -415,7 +419,7 @@ _COMMANDS = {
                     {"choices": ("solver", "problem", "suite")}),
             _Option("name", "NAME", "the file is NAME.py, or NAME.toml for a suite"),
         ],
-        "The file passes its checks as it is. Existing files are not overwritten.",
+        "The file passes all checks unchanged. Existing files are not overwritten.",
     ),
 }  # fmt: skip
 

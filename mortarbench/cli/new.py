@@ -12,7 +12,7 @@ from mortarbench.registries import Registries
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
-#: first command to try with the new file
+#: command that is recommended for the new file
 _NEXT = {
     "solver": "mortarbench test-solver {0} --plugin {0}.py",
     "problem": "mortarbench solve {0}/primal --solver clarabel --plugin {0}.py",
@@ -33,7 +33,7 @@ def run(registries: Registries, options: Namespace) -> int:
         "suite": {path.stem: path for path in registries.suites.glob("*.toml")},
     }[kind]
     if name in taken:
-        raise InputError(f"there is a {kind} {name!r}; expected a name of its own")
+        raise InputError(f"{kind} {name!r} exists already; expected another name")
     (template,) = _TEMPLATES.glob(f"{kind}.*")
     path = Path(f"{name}{template.suffix}")
     text = re.sub(r"\bNAME\b", name, template.read_text("utf-8"))
@@ -41,9 +41,7 @@ def run(registries: Registries, options: Namespace) -> int:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError:
-        raise InputError(
-            f"{path} exists; expected another name, or no such file"
-        ) from None
+        raise InputError(f"{path} exists already; expected another name") from None
     print(path)
     say(f"try it: {_NEXT[kind].format(name)}")
     return 0

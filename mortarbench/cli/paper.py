@@ -14,7 +14,7 @@ from mortarbench.registries import Registries
 if TYPE_CHECKING:
     from mortarbench.harness.plugin import Reference
 
-#: suites with results that the paper does not have, and their reduction for --quick
+#: suites with results beyond those of the paper, and their reduction for --quick
 BEYOND: Mapping[str, Mapping[str, Any]] = {
     "paper-fleet": {
         "cases": ("*/Nr=4/*", "*/Nr=8/*", "*/Nr=15/*", "*/Nr=30/*dual*"),
@@ -35,7 +35,7 @@ def run(registries: Registries, options: Namespace) -> int:
         options.out.mkdir(parents=True, exist_ok=True)
     except OSError as e:
         raise InputError(
-            f"--out {options.out}: {e.strerror}; expected a folder, or none yet"
+            f"--out {options.out}: {e.strerror}; expected a folder, or a new path"
         ) from None
     with report_full_disk(options.out):
         written = measure_and_write(registries, options.out, options.quick, say)
@@ -54,7 +54,7 @@ def measure_and_write(
     Raises
     ------
     InputError
-        If the folder is in use, or contains other files than such results.
+        If the folder is in use, or contains other files than results of this command.
 
     """
     from mortarbench.harness.files.experiment import save_experiment
@@ -86,6 +86,6 @@ def measure_and_write(
 
 
 def _answer(registries: Registries, name: str) -> Reference:
-    """Return the solve of one of our solvers, to 1e-8: the paper states no accuracy."""
+    """Return the solve of one of our solvers at 1e-8; the paper states no accuracy."""
     solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

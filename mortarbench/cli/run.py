@@ -68,14 +68,18 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _strict_failure(results: Results) -> str:
-    """Return the reason why a strict run fails, in a line."""
+    """Return the reason why a strict run fails, in one line."""
     counts = (
         (
             results.refuted,
             "answer that refutes its claim",
-            "answers that refute theirs",
+            "answers that refute their claims",
         ),
-        (results.failed, "measurement without an answer", "measurements without one"),
+        (
+            results.failed,
+            "measurement without an answer",
+            "measurements without an answer",
+        ),
     )
     texts = [
         f"{len(records)} {one if len(records) == 1 else several} "

@@ -39,7 +39,7 @@ def run(registries: Registries, options: Namespace) -> int:
         check_scale(options.scale, "--scale")
     if options.plot is None and options.scale is not None:
         raise InputError(
-            f"--scale {options.scale:g} without --plot; expected a picture"
+            f"--scale {options.scale:g} without --plot; expected both options"
         )
     if options.vtu is not None:
         check_output_file(options.vtu, GRIDS)
@@ -83,7 +83,7 @@ def _print(answer: Answer, options: Namespace) -> None:
     elif record.verdict is not Verdict.DECLINED:
         print(answer)
         if mesh is not None:
-            print(f"error of the mesh, relative, in the energy norm: {mesh}")
+            print(f"relative error of the mesh in the energy norm: {mesh}")
         from mortarbench.text import convergence, legend
 
         if table := convergence(answer.history):
@@ -104,7 +104,7 @@ def _build(case: Case, pictures: Sequence[str]) -> None:
 
 
 def _hint(answer: Answer) -> str:
-    """Return a hint to the dual form if inequality rows are the reason to decline."""
+    """Return a hint to the dual form if `declines` is due to inequality rows."""
     case = answer.case
     if case.form != "primal" or "dual" not in case.id.family.forms:
         return ""
@@ -121,7 +121,7 @@ def _hint(answer: Answer) -> str:
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name
-        # a QP with bounds in place of inequality rows stands for the dual
+        # a QP with bounds instead of inequality rows represents the dual
         reason = reason_to_decline(solver, like_dual)
     except Exception:  # code of a plug-in failed: no hint
         return ""

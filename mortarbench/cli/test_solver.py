@@ -54,7 +54,7 @@ def run(registries: Registries, options: Namespace) -> int:
 
 
 def _named(pattern: str, solvers: Collection[str]) -> list[str]:
-    """Return the solvers that match a pattern; the pattern itself if none does."""
+    """Return the solvers that match a pattern; the pattern itself if none matches."""
     if "*" not in pattern or pattern in solvers:
         return [pattern]
     matches = [s for s in fnmatch.filter(solvers, pattern) if not s.endswith(":*")]

@@ -1,10 +1,10 @@
-"""A family of problems to start from: replace the mathematics of `build`, and the keys.
+"""Template of a family of problems: replace the keys and the mathematics of `build`.
 
     mortarbench solve NAME/n=100/primal --solver clarabel --plugin NAME.py
 
 Its name in suites is NAME, and its cases are NAME/key=value/…/FORM. Scale the data of
-the QP to order one: tolerances then mean the same as elsewhere. `recover`, `quantities`
-and energy = scale · objective + constant lead back to physical units.
+the QP to order one, so that tolerances have the same meaning as elsewhere. `recover`,
+`quantities` and energy = scale · objective + constant convert to physical units.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Problem(Family):
     forms: tuple[str, ...] = ("primal",)
 
     def check(self, params: Mapping[str, Value]) -> None:
-        """Refuse values out of range in one line, before anything is built."""
+        """Refuse values out of range with a one-line message, before building."""
         n, depth = int(params["n"]), float(params["depth"])
         if n < 2:
             raise InputError(f"NAME: n = {n}; expected at least 2")

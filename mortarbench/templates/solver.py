@@ -1,4 +1,4 @@
-"""A QP solver to start from: replace `iterates` by your method, or by a library's call.
+"""Template of a QP solver: replace `iterates` by your method or by a library call.
 
     mortarbench test-solver NAME --plugin NAME.py
     mortarbench solve beam-ring/Nr=4/Nh=3/dual --solver NAME --plugin NAME.py
@@ -9,7 +9,7 @@ A solver receives the QP
 
 in which absent constraints have no rows and absent bounds are ±inf. It returns x and
 multipliers with Px + q + Aᵀy + Gᵀz + z_box = 0, where z ≥ 0, and z_box is ≤ 0 at an
-active lb, ≥ 0 at an active ub. The harness verifies every claim by itself.
+active lb, ≥ 0 at an active ub. The harness verifies every claim independently.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ class Solver:
             raise ValueError(f"max_iter = {self.max_iter}; expected at least 1")
 
     def declines(self, qp: QP) -> str | None:
-        """Return the reason why this solver cannot take `qp`, or None if it can."""
+        """Return the reason why this solver cannot solve `qp`, or None if it can."""
         if reason := needs_matrices(qp):  # P may be an operator without a matrix
             return reason
         return "takes at most 2000 variables" if qp.q.size > 2000 else None
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
-        """Convert the QP; the returned call solves it. Both are timed."""
+        """Convert the QP and return a function that solves it. Both are timed."""
         P, A, G = (M if isinstance(M, np.ndarray) else M.toarray()
                    for M in (qp.P, qp.A, qp.G))  # fmt: skip
         # Gx ≤ h and the finite bounds, as one system Cx ≤ d
@@ -86,7 +86,7 @@ def iterates(
     p = d.size
     x, y = solve_kkt(P, A, C, np.ones(p), C.T @ d - q, b)
     gap = d - C @ x
-    # start far inside; relative to |gap|, so that it is independent of units
+    # start far inside, relative to |gap|, so that the start is independent of units
     s = np.maximum(gap, np.abs(gap).max(initial=0.0) or 1.0)
     z = np.full(p, np.abs(q).max(initial=0.0) or 1.0)
 

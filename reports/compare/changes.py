@@ -23,7 +23,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 
 DRAWS = 2000
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] around 1 counts as "no change seen"
-FEWEST = 3  #: least number of cells for an interval over cells
+FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
 
 #: case (of a QP from a file its digest), tolerance, solver with its mode
@@ -115,7 +115,7 @@ class Pair:
 
     @property
     def other_answer(self) -> bool:
-        """True if both answers are verified and yet differ beyond the allowed gaps."""
+        """True if both answers are verified but differ more than their gaps allow."""
         return self.answers is not None and self.answers[2] > self.may_differ
 
 
@@ -187,7 +187,7 @@ def compare(before: Evidence, after: Evidence, folders: int = 1) -> Comparison:
 
 
 def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
-    """Average the ratios of times over cells; see `mean_of`. None without any time."""
+    """Average the ratios of times over cells (see `mean_of`); None if unknown."""
     return _over_cells((p, p.log) for p in pairs)
 
 

@@ -19,7 +19,7 @@ Difference = tuple[str, Any, Any]  #: dotted key, value before, value after
 
 
 def hardware(evidence: Evidence) -> dict[str, str]:
-    """Map the digest of each environment to a text of its hardware parts.
+    """Map the digest of each environment to a description of its hardware.
 
     A digest without a stored environment is mapped to itself.
     """

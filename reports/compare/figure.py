@@ -1,4 +1,4 @@
-"""Ratios of times after over before, solver by solver."""
+"""Ratios of times, after over before, by solver."""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def overview(found: Sequence[Comparison]) -> Page:
         title=f"{clean(found[-1].after.name)}: {', '.join(names)} against {first}",
         dateline=dateline(found[-1].after),
         sections=tuple(s for s in sections if s is not None),
-        footer="Each folder has its own page on the changes since the first one, in "
+        footer="The changes in each folder since the first are on a separate page, in "
         "report/against-….",
     )
 
@@ -41,7 +41,7 @@ def _summary(
     def mean(c: Comparison, solver: str) -> Cell:
         ratio = mean_ratio(c.of(solver))
         if ratio is None:
-            return Cell(title="no cell with times in both folders")
+            return Cell(title="no cell has times in both folders")
         kind = "over" if side(ratio) > 0 else ""
         return Cell.number(ratio, ratio_text, after=change_word(ratio), kind=kind)
 

@@ -147,7 +147,7 @@ def _change(p: Pair) -> Cell:
 
 
 def time_cell(outcome: Outcome, *, voided: bool) -> Cell:
-    """Show a time, with the verdict where it is not verified."""
+    """Show a time, with the verdict if it is not verified."""
     return Cell.number(
         outcome.seconds("total"),
         seconds,
@@ -213,7 +213,7 @@ def _unpaired(c: Comparison) -> Iterator[Part]:
         ("only", lambda each: Cell.words(each[0])),
         ("verdict", lambda each: verdict_cell(each[1])),
     )
-    return _listed("Cells that are in one folder only.", alone, columns)
+    return _listed("Cells that are only in one folder.", alone, columns)
 
 
 _PAIR = answer_columns(lambda pair: pair.after)
@@ -222,7 +222,7 @@ _PAIR = answer_columns(lambda pair: pair.after)
 def _listed(
     caption: str, items: Sequence[Any], columns: Sequence[Column]
 ) -> Iterator[Table]:
-    """Yield a table of the items; none without items."""
+    """Yield a table of the items, if there are items."""
     if items:
         yield explained(Table.of(caption, items, columns, text_columns=2))
 

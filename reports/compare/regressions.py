@@ -39,7 +39,7 @@ from mortarbench.reports.statistics.intervals import COVERAGE
 
 Floats = NDArray[np.float64]
 
-CELLS = 8  #: least number of cells for an estimate of their scatter
+CELLS = 8  #: minimum number of cells for an estimate of their scatter
 _NORMAL = 1.4826  #: standard deviation of a normal law over its median distance
 
 
@@ -107,7 +107,7 @@ def regressions(c: Comparison) -> Regressions:
 
 
 def _unverified(c: Comparison, folders: int) -> tuple[str, ...]:
-    """Describe solvers without a verified answer in that many of the two folders."""
+    """Describe the solvers without a verified answer in that number of `folders`."""
     found = []
     for solver in c.solvers:
         pairs = [p for p in c.of(solver) if not p.after.first.role]
@@ -144,7 +144,7 @@ def _why_not(c: Comparison) -> str:
 
 
 def _changes(c: Comparison) -> list[_Change]:
-    """Return the changes of cells with times, and other solvers, in both folders."""
+    """Return the changes of cells that have times and other solvers in both folders."""
     timed = [p for p in c.timed if not p.after.first.role]
     rows = grouped(timed, lambda p: (p.after.case, p.after.tol, p.after.first.mode))
     found = []
@@ -185,7 +185,7 @@ def _of_solver(
 ) -> Slower:
     """Average logarithms of ratios over cases, with Student's interval.
 
-    miss : probability that the interval does not hold the mean, on either side
+    miss : probability that the mean is outside the interval, on either side
     """
 
     def student(x: Floats) -> Ratio:

@@ -22,7 +22,7 @@ from mortarbench.reports.render.writing import RENDERED, write_page, write_text
 def write_comparison(
     before: Path, after: Path, formats: Sequence[str], factor: float = VERIFIED_FACTOR
 ) -> tuple[list[str], list[Path]]:
-    """Write AFTER/report/against-NAME, NAME being that of the folder `before`.
+    """Write AFTER/report/against-NAME, where NAME is the name of the folder `before`.
 
     html: index.html. md: report.md. tex: tables/. csv, parquet: tables/changes, a row
     per cell. The same journals give the same bytes.
@@ -36,7 +36,7 @@ def write_comparison(
     Raises
     ------
     InputError
-        When one is not a result folder, or has no measurements.
+        If a folder is not a result folder, or has no measurements.
 
     """
     _, lines, written = write_comparisons(before, [after], formats, factor)
@@ -70,8 +70,8 @@ def write_comparisons(
 ) -> tuple[list[Comparison], list[str], list[Path]]:
     """Compare several folders with the first one, each as `write_comparison` does.
 
-    For more than one, LAST/report/since-NAME has a page on all of them, NAME being that
-    of the first.
+    If there are several, LAST/report/since-NAME contains a page on all of them, where
+    NAME is the name of the first.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def write_comparisons(
     Raises
     ------
     InputError
-        When one is not a result folder, or has no measurements.
+        If a folder is not a result folder, or has no measurements.
 
     """
     before = read_evidence(first, factor)

@@ -140,7 +140,7 @@ class Ranking:
 
     @cached_property
     def spans(self) -> list[tuple[int, int]]:
-        """Rank intervals: after all significantly faster, before all slower solvers.
+        """Rank intervals: after all significantly faster solvers, before all slower.
 
         They jointly contain the true ranks with 95 % [1]_.
 
@@ -201,7 +201,7 @@ class Panel(NamedTuple):
 
 
 def panel(group: ComparisonGroup) -> Panel:
-    """Rank under the usual convention, with one choice changed, and combinations."""
+    """Rank under the usual convention, each changed choice, and all combinations."""
     usual = geometric_means(group, USUAL)
 
     def changed(convention: Convention) -> Changed:

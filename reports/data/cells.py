@@ -66,7 +66,7 @@ def answer_columns(
 ) -> tuple[Column, ...]:
     """Return the leading columns of tables of answers: case, solver and tolerance.
 
-    of : returns the object of an item with these attributes; by default the item
+    of : returns the object of an item that has these attributes; default: the item
     """
     return (
         ("case", lambda item: Cell.name(of(item).case)),

@@ -17,7 +17,7 @@ from mortarbench.harness.running.pairs import ratio_of
 from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, listing, plural, tolerance
 
-#: Least number of cases of a comparison. With fewer no difference can be significant at
+#: Minimum number of cases of a comparison. With fewer, no difference is significant at
 #: 95 %: five of five signs agree by chance in 2 of 2⁵ sets of cases.
 CASES = 6
 POOLED = "all forms"  #: name, instead of a form, of a group with cases of all forms
@@ -39,7 +39,7 @@ def _no_pairs() -> Pairs:
 class GroupKey(NamedTuple):
     """Attributes that the cases of one group share."""
 
-    sweep: bool  #: whether the tolerance is swept
+    sweep: bool  #: True if several tolerances are measured for one accuracy
     mode: str
     form: str
     at: float  #: accuracy at which answers are judged
@@ -85,9 +85,11 @@ class ComparisonGroup:
     forms: Mapping[str, int] = field(default_factory=dict)  #: cases by form, if pooled
     incomplete: int = 0  #: number of cases left out: not measured with every solver
     apart: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) True if two share no block on some case; may be empty."""
+    "(solvers, solvers) True if two solvers have no common block on some case; may be "
+    "empty."
     faster: Pairs = field(default_factory=_no_pairs)
-    """(solvers, solvers) True if `apart` and row is faster than column on all cases."""
+    "(solvers, solvers) True if `apart` and the row is faster than the column on all "
+    "cases."
 
     @property
     def title(self) -> str:
@@ -104,7 +106,7 @@ class ComparisonGroup:
             f"Pooled forms: {counted}. Cases of a form that a solver declines count as "
             "unsolved."
         )
-        refused = f"All cases declined by: {listing(self.refused, 6)}."
+        refused = f"Solvers that declined all cases: {listing(self.refused, 6)}."
         notes = (pooled,) * bool(self.forms) + (refused,) * bool(self.refused)
         return notes + self.unmeasured + self.sessions
 
@@ -114,10 +116,15 @@ class ComparisonGroup:
         notes = []
         if self.rare:
             rare = listing(self.rare, 6)
-            notes.append(f"Left out, measured on less than half of the cases: {rare}.")
+            notes.append(
+                "Left out because they were measured on less than half of "
+                f"the cases: {rare}."
+            )
         if self.incomplete:
             cases = plural(self.incomplete, "case")
-            notes.append(f"Left out, not measured with all solvers: {cases}.")
+            notes.append(
+                f"Left out because they were not measured with all solvers: {cases}."
+            )
         return tuple(notes)
 
     @property
@@ -133,10 +140,9 @@ class ComparisonGroup:
         if not pairs:
             return ()
         return (
-            "Measured in different sessions, without common blocks, so that a "
+            "Measured in different sessions, without common blocks; therefore a "
             "difference is significant only if the unpaired interval excludes 1 on "
-            "every case: "
-            f"{'; '.join(pairs)}.",
+            f"every case: {'; '.join(pairs)}.",
         )
 
     @property
@@ -236,7 +242,7 @@ def _answers(cells: Cells) -> dict[str, Row]:
 
 
 def representative(outcomes: Sequence[Outcome]) -> Outcome:
-    """Select the answer of a solver to a case: of a sweep, the fastest verified one.
+    """Select the answer of a solver to a case: in a sweep, the fastest verified one.
 
     If none is verified, select the answer at the tightest tolerance.
     """
@@ -247,7 +253,7 @@ def representative(outcomes: Sequence[Outcome]) -> Outcome:
 
 
 def time_of(outcome: Outcome) -> float | None:
-    """Return the median total time of a verified answer, s; None without one."""
+    """Return the median total time of a verified answer, s; None if not verified."""
     time = outcome.seconds("total") if outcome.verified else None
     return time.value if time is not None and time.value > 0 else None
 
@@ -281,7 +287,7 @@ def group_key(r: Record, *, pool_forms: bool = False) -> GroupKey:
 
 
 def _seconds(outcome: Outcome) -> float:
-    """Return the median total time, s; NaN without one."""
+    """Return the median total time, s; NaN if it is unknown."""
     time = outcome.seconds("total")
     return np.nan if time is None else time.value
 
@@ -321,7 +327,7 @@ def _group(
 
 
 def _cell(outcomes: Sequence[Outcome]) -> tuple[float, ...]:
-    """Return the entries of `times`, `claimed`, `stopped` of a cell; 1 if declined."""
+    """Return a solver's entries of `times`, `claimed`, `stopped`; 1 if it declined."""
     times = [(_seconds(o), o) for o in outcomes]
     verified = [t for t, o in times if o.verified and t > 0]
     claimed = [t for t, o in times if t > 0 and all(r.claims_answer for r in o.records)]

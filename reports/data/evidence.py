@@ -50,7 +50,7 @@ def _seconds(r: Record, phase: str) -> float | None:
 
 
 def _median(seconds: Iterable[float | None]) -> Interval | None:
-    """Return the median of the known times with its interval; None without any."""
+    """Return the median of the known times with its interval; None if all are None."""
     times = [t for t in seconds if t is not None]
     return median_interval(times) if times else None
 
@@ -136,16 +136,16 @@ class Outcome:
         return max(known) if len(known) == len(RESIDUALS) else None
 
     def seconds(self, phase: str) -> Interval | None:
-        """Return the median prepare, solve or total time of the repeats with one."""
+        """Return the median prepare, solve or total time of repeats that have it."""
         return self._intervals[phase]
 
     @property
     def by_block(self) -> dict[Block, float]:
-        """Total seconds of each repeat that has them; see `harness.running.pairs`."""
+        """Total seconds of each repeat that has them, see `harness.running.pairs`."""
         return self.seconds_by_block("total")
 
     def seconds_by_block(self, phase: str) -> dict[Block, float]:
-        """Return the seconds of one phase by block; repeats without are left out."""
+        """Return the seconds of one phase by block, without repeats that lack them."""
         times = {(r.session, r.repeat): _seconds(r, phase) for r in self.records}
         return {block: t for block, t in times.items() if t}
 
@@ -185,7 +185,7 @@ class Outcome:
 
     @cached_property
     def quantities(self) -> Mapping[str, Any]:
-        """Physical results of the first repeat with any."""
+        """Physical results of the first repeat that has some."""
         return next((r.quantities for r in self.records if r.quantities), {})
 
     def size(self, *names: str) -> int | None:
@@ -195,7 +195,7 @@ class Outcome:
 
     @property
     def energy(self) -> float | None:
-        """Potential energy of the recovered answer, where the case has one."""
+        """Potential energy of the recovered answer, if the case has an energy."""
         value = self.quantities.get("energy")
         return float(value) if isinstance(value, int | float) else None
 
@@ -271,7 +271,9 @@ def read_evidence(
     """
     records = read_journal(directory, warn)
     if not records:
-        raise InputError(f"{directory}: no measurement in journal/*.jsonl; run first")
+        raise InputError(
+            f"{directory}: no measurement in journal/*.jsonl; run a suite first"
+        )
     _warn_of_contradictions(directory, records, warn)
     journal = tuple(records)
     environment = _environment(directory / "environment.json")
@@ -341,9 +343,9 @@ def _warn_of_contradictions(
             wrong.append(r.run_id)
     if wrong:
         warn(
-            f"{directory}: journal says verified, but residuals exceed "
-            f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; no run writes "
-            "such records; judge the points again with `validate`"
+            f"{directory}: the journal says verified, but residuals exceed "
+            f"{VERIFIED_FACTOR:g} times the tolerance: {some(wrong)}; `run` does not "
+            "write such records; judge the points again with `validate`"
         )
 
 
@@ -362,8 +364,8 @@ def _judged_and_labelled(
 ) -> Record:
     """Judge a record at `factor`, and append mode and environment to the solver.
 
-    The mode is appended unless it is cold, the environment where a folder has the same
-    measurements from several.
+    The mode is appended unless it is cold. The environment is appended if a folder has
+    the same measurements from several environments.
     """
     changes: dict[str, Any] = {}
     if factor != VERIFIED_FACTOR:
@@ -375,9 +377,9 @@ def _judged_and_labelled(
 
 
 def _marks(records: Iterable[Record], first: str) -> dict[str, str]:
-    """Return marks of environments that share measurements, except for one of them.
+    """Return marks of environments that share measurements, except one of them.
 
-    first : digest of the one without a mark, if it is among them
+    first : digest of the environment without a mark, if it is among them
     """
     cells: dict[tuple[Any, ...], dict[str, None]] = {}
     for r in records:

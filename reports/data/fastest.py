@@ -113,11 +113,11 @@ class FastestSolver:
 
     @property
     def following(self) -> Competitor | None:
-        """The next significantly slower competitor; None without one."""
+        """The next significantly slower competitor; None if there is none."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
-        """Return, by case, the fastest and all whose ratio to it may be 1."""
+        """Return, by case, the fastest solver and all others that may be as fast."""
         fronts = {}
         for case in self.cases:
             answers = [(c, c.outcomes[case]) for c in self.competitors]

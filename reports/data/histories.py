@@ -20,9 +20,9 @@ MOST = 4  #: cases that are drawn
 
 #: the selection rule of `chosen` in words
 RULE = (
-    "For each family and form, the largest case with a stored history is drawn, at its "
-    "last load step and tightest tolerance, with all solvers that stored one; at most "
-    f"the {MOST} largest of these cases are shown."
+    "For each family and form, the largest case with a stored history is drawn, at "
+    "its last load step and tightest tolerance, with all solvers that stored a "
+    f"history; at most the {MOST} largest of these cases are shown."
 )
 
 
@@ -40,7 +40,7 @@ class SolverRun:
         return int(next(iter(self.history.values())).size)
 
     def numbers(self, name: str) -> Vector | None:
-        """Return a column (rows,), NaN where not finite; None without finite values."""
+        """Return a column (rows,), NaN where not finite; None if no value is finite."""
         values = self.history.get(name, np.zeros(0))
         if values.dtype.kind not in "if" or not np.isfinite(values).any():
             return None
@@ -74,7 +74,7 @@ class SolverRun:
         return self.numbers("two_sided")
 
     def steps(self, kind: str) -> NDArray[np.bool_]:
-        """Return a mask (rows,) of the steps of one kind."""
+        """Return a mask (rows,) of the steps of one type."""
         kinds = self.history.get("step", np.full(self.rows, ""))
         return np.asarray(kinds.astype(str) == kind, dtype=bool)
 
@@ -89,14 +89,14 @@ class SolverRun:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CaseHistories:
-    """Histories on one case at one tolerance, drawn over one axis of work."""
+    """Histories on one case at one tolerance, with a common axis of work."""
 
     runs: tuple[SolverRun, ...]  #: at least one, in the order of the suite
     solvers: tuple[str, ...]  #: all of the report, in the order of their looks
 
     @property
     def counted(self) -> bool:
-        """True if the axis of work is products with P; False for iterations."""
+        """True if work is counted in products with P; False if in iterations."""
         return all(c.products is not None for c in self.runs)
 
     def work(self, run: SolverRun) -> Vector:
@@ -105,7 +105,7 @@ class CaseHistories:
         return np.arange(1.0, run.rows + 1) if products is None else products
 
     def taken(self, kind: str) -> bool:
-        """Return whether any run has a step of that kind."""
+        """Return whether any run has a step of this type."""
         return any(c.steps(kind).any() for c in self.runs)
 
 

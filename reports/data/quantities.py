@@ -130,7 +130,7 @@ def quantity(
 
 
 def _rounded(leaf: Leaf, digits: int) -> str:
-    """Print a number; a component has no smaller digits than its vector."""
+    """Format a number; a component is rounded like the largest of its vector."""
     if not leaf.value or not math.isfinite(leaf.value):
         return significant(leaf.value)
     below = math.floor(math.log10(leaf.scale)) - math.floor(math.log10(abs(leaf.value)))

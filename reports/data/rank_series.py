@@ -142,7 +142,7 @@ class WeakSeries(_Scaling):
         return _ratio(self.members[0].answer, member.answer, phase, paired=False)
 
     def against_copies(self, member: Member, phase: str) -> Interval | None:
-        """Return t(copies)/t(N), for as many simultaneous copies of the first case."""
+        """Return t(copies)/t(N), with N simultaneous copies of the first case."""
         return _ratio(self.copies.get(member.ranks), member.answer, phase, paired=False)
 
 

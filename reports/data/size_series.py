@@ -11,7 +11,7 @@ from mortarbench.reports.data.evidence import Evidence, Outcome
 from mortarbench.reports.document.formatting import clean, tolerance
 from mortarbench.reports.statistics.intervals import PowerLaw, power_law
 
-SIZES = 3  #: least number of different sizes of a series
+SIZES = 3  #: minimum number of different sizes of a series
 
 Sized = tuple[int, Outcome]
 
@@ -86,7 +86,7 @@ class SeriesKey(NamedTuple):
 
 
 def sized(evidence: Evidence) -> list[Sized]:
-    """Return verified answers with their number of dofs, where it is known."""
+    """Return the verified answers whose number of dofs is known, with this number."""
     return [(n, o) for o in evidence.flat if o.verified and (n := o.size("dofs"))]
 
 

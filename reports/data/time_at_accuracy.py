@@ -57,7 +57,8 @@ def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccurac
     """Interpolate the time of answers with a certified error of at most `error`.
 
     The interval is a bootstrap over the repeats of each tolerance, seeded by run_ids
-    and widened for few repeats (see `resampling.limits`); one repeat has none.
+    and widened for few repeats (see `resampling.limits`). A single repeat has no
+    interval.
 
     outcomes : of one solver on one case, at all tolerances
     """

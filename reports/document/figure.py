@@ -22,8 +22,8 @@ Direction = Literal["x", "y"]
 
 INK = "#20242a"  #: colour of text and axes; a page replaces it by its text colour
 WIDTH = 6.9  #: of a figure, inches
-#: Least ratio of the ends of an automatic logarithmic axis: on a shorter axis, 19 to 22
-#: iterations would look like growth.
+#: Smallest ratio of the ends of an automatic logarithmic axis: on a shorter axis, 19 to
+#: 22 iterations would look like growth.
 SPAN = 10.0
 MARGIN = 0.05  #: between points and ends of an axis, relative to the range of points
 
@@ -63,8 +63,8 @@ class Series:
     look: Look
     intervals: Intervals | None = None
     step: bool = False  #: step function, constant until the next point
-    few: bool = False  #: draw marks at a few points only
-    clipped: bool = True  #: at the edge of the panel
+    few: bool = False  #: draw marks only at a few points
+    clipped: bool = True  #: cut at the edge of the panel
     solver: str = ""  #: solver of the points; empty for none
     runs: Runs = ()  #: run_ids behind each point, or one entry for all points
 
@@ -143,7 +143,7 @@ class Axis:
     most: int | None = None  #: approximate number of automatic ticks
     integers: bool = False  #: ticks are integers
     plain: bool = False  #: tick labels without powers of ten
-    span: float = SPAN  #: least ratio of the ends of a logarithmic axis
+    span: float = SPAN  #: smallest ratio of the ends of a logarithmic axis
     numbered: bool = True  #: ticks have labels
     marked: bool = True  #: ticks have strokes
     line: bool = True
@@ -270,7 +270,7 @@ def _fitted(panel: Panel, panels: Iterable[Panel]) -> Panel:
 
 
 def limits(panels: Sequence[Panel], direction: Literal["x", "y"]) -> Limits:
-    """Return the ends of an axis shared by panels: those set, or beyond the points.
+    """Return the ends of an axis shared by panels: given, or just beyond the points.
 
     A single value is centred; without values a default range is used.
     """

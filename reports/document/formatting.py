@@ -16,8 +16,8 @@ ABSENT = "–"  #: a value that was not or cannot be measured
 
 #: definition of a time, stated wherever times are shown
 TIMED = (
-    "Times are solver times, from the assembled QP on: assembly, linearisation and, "
-    "for dual forms, dualisation are not included."
+    "Times are solver times, which start with the assembled QP: assembly, "
+    "linearisation and, for dual forms, dualisation are not included."
 )
 
 #: Symbol and words of every verdict, since many readers cannot see its colour.
@@ -84,7 +84,7 @@ def plain_value(value: object, limit: int = 96) -> str:
 
 
 def significant(value: float | None, digits: int = 3) -> str:
-    """Print with `digits` significant digits, without an exponent if that is short."""
+    """Print with `digits` significant digits; short results have no exponent."""
     if value is None or not math.isfinite(value):
         return ABSENT
     if value == 0:

@@ -127,7 +127,7 @@ class Picture:
 
 @dataclass(frozen=True, kw_only=True)
 class Statement:
-    """Conclusions on one subject in whole sentences, which precede the evidence."""
+    """Conclusions on one subject in complete sentences, which precede the evidence."""
 
     subject: str
     claims: tuple[str, ...]
@@ -163,7 +163,7 @@ class Section:
 
     @classmethod
     def of(cls, name: str, title: str, parts: Iterable[Part]) -> Section | None:
-        """Build a section from parts of any type; None without parts."""
+        """Build a section from parts of any type; None if there are no parts."""
         kinds: dict[type, list[Any]] = {}
         for part in parts:
             kinds.setdefault(type(part), []).append(part)
@@ -196,7 +196,7 @@ class Page:
 
 
 def sources(records: Iterable[Record]) -> str:
-    """Return a title that names measurements; empty without any."""
+    """Return a title that names measurements; empty if there are none."""
     names = ", ".join(short(r.run_id) for r in records)
     return _RUN + names if names else ""
 

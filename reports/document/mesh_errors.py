@@ -31,7 +31,7 @@ def mesh_table(meshes: Sequence[Discretisation]) -> Table:
         return Cell.words(clean(text, 200))
 
     return Table.of(
-        "Discretisation errors: relative, in the energy norm.",
+        "Relative discretisation errors in the energy norm.",
         meshes,
         (
             ("physical case", lambda d: Cell.name(d.case)),
@@ -43,7 +43,7 @@ def mesh_table(meshes: Sequence[Discretisation]) -> Table:
         ),
         notes=(
             "Estimated from reference solutions on meshes with every cell halved once "
-            "and twice; no solver under test is involved. Rate: exponent of h in the "
+            "and twice, without a solver under test. Rate: exponent of h in the "
             "error.",
         ),
     )

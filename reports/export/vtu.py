@@ -88,7 +88,7 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
-    """Return pressure and gap at the nodes (N,); of several sides, the tightest.
+    """Return pressure and gap at the nodes (N,); on several sides, the tightest one.
 
     With friction also the shear traction and the index of each state in `STATES`.
     """

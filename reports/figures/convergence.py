@@ -32,8 +32,8 @@ from mortarbench.reports.figures.style import TITLE, below, legible, look
 
 #: letter, name and marker of a kind of step; other steps, mostly CG, have no marker
 KINDS = (("e", "expansion", "^"), ("f", "fallback", "x"), ("p", "proportioning", "o"))
-WIDE = 10.0  #: ratio of longest to shortest run beyond which the axis is logarithmic
-CLOSEST = 5.0  #: least distance of markers of one kind on a curve, points
+WIDE = 10.0  #: ratio of longest to shortest run above which the axis is logarithmic
+CLOSEST = 5.0  #: minimum distance between markers of one step type on a curve, points
 COLUMNS = 4  #: columns of a legend
 FLOOR = 1e-5  #: times the tolerance; smaller values are rounding and are not shown
 _BESIDE = 0.8  #: width of the labels left of the axes, inches
@@ -43,7 +43,7 @@ Curves = Sequence[tuple[SolverRun, Vector]]
 
 
 def convergence_figure(c: CaseHistories) -> Figure | None:
-    """Plot projected gradient and infeasibility against work; None without either."""
+    """Plot projected gradient and infeasibility against work; None if unknown."""
     gradients = [(one, y) for one in c.runs if (y := one.gradient) is not None]
     errors = [(one, y) for one in c.runs if (y := one.infeasibility) is not None]
     rows = []

@@ -35,7 +35,7 @@ from mortarbench.reports.figures.projection import (
     visible_faces,
 )
 
-#: of the nodal stresses, where colours end: stresses are singular at corners
+#: quantile of the nodal stresses at which colours end: stresses are singular at corners
 PERCENTILE = 99.5
 SCALE = 1.0  #: factor of the displacement in figures drawn to scale
 #: Displacements below `SEEN` times the size of the bodies are not visible. They are
@@ -43,7 +43,9 @@ SCALE = 1.0  #: factor of the displacement in figures drawn to scale
 SEEN, SHOWN = 0.01, 0.05
 #: largest number of cells with mesh lines; more lines would hide the colours
 _MESH_SHOWN = 6000
-_ACTIVE = 1e-6  #: of the largest force: contact nodes with larger forces are loaded
+_ACTIVE = (
+    1e-6  #: share of the largest force above which a contact node counts as loaded
+)
 _LENGTHS = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))  #: units of axes
 _ARROW = "#101214"  #: dark on any page, as arrows are drawn on coloured bodies
 #: colours of arrows by friction state; arrows of frictionless pairs are dark
@@ -61,7 +63,7 @@ _PLAIN = ColourScale(colours="Greys", low=0, high=1)
 #: font size of subdomain numbers → largest number of subdomains; the labels of more
 #: subdomains would overlap
 _NUMBERED = {9.5: 16, 6.5: 100}
-_TORN = Look(colour="white", width=0.9)  #: borders of subdomains
+_SUBDOMAIN = Look(colour="white", width=0.9)  #: borders of subdomains
 #: arrows of open nodes that carry a share of their neighbours' forces
 _OPEN = "#6b7480"
 _OUTLINE = Look(colour=INK, width=0.7)
@@ -70,7 +72,7 @@ _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
 
 def clipped_at(fields: Fields) -> tuple[float, float] | None:
-    """Return end of colour scale and largest stress, Pa; None without stresses."""
+    """Return end of colour scale and largest stress, Pa; None if they are unknown."""
     stress = fields.nodal.get("von_mises")
     if stress is None:
         return None
@@ -126,7 +128,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     shown = (fields.displacement, fields.nodal.get("von_mises", 0.0))
     if not all(np.isfinite(values).all() for values in shown):
         raise InputError(
-            "displacement or stress contains NaN or inf: expected finite values"
+            "displacement or stress contains NaN or inf; expected finite values"
         )
     if not np.ptp(fields.points, axis=0).all():
         raise InputError("bodies have no width or no height and cannot be drawn")
@@ -300,7 +302,7 @@ def moved(fields: Fields, scale: float = SCALE) -> Points:
 
 
 def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
-    """Outline the subdomains of torn bodies; number them if the labels are legible."""
+    """Outline subdomains of the bodies; number them if the labels are legible."""
     if fields.subdomains is None:
         return []
     numbers = np.unique(fields.subdomains)
@@ -308,7 +310,9 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
     marks: list[FieldMark] = []
     for number in numbers:
         cells = fields.cells[fields.subdomains == number]
-        marks += [Path(points=points[loop], look=_TORN) for loop in outlines(cells)]
+        marks += [
+            Path(points=points[loop], look=_SUBDOMAIN) for loop in outlines(cells)
+        ]
         if size is not None:
             centres = points[cells].mean(axis=1)
             middle = np.linalg.norm(centres - centres.mean(axis=0), axis=1).argmin()
@@ -327,7 +331,7 @@ def _pair(point: Vector) -> tuple[float, float]:
 
 
 def _scale(fields: Fields) -> ColourScale | None:
-    """Return the colour scale in Pa common to all bodies, or None without stress."""
+    """Return the colour scale in Pa common to all bodies; None if it is unknown."""
     limits = clipped_at(fields)
     if limits is None:
         return None
@@ -371,7 +375,7 @@ def _bodies(
 
 
 def triangles(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Split quadrilaterals into triangles; return node numbers (t, 3)."""
+    """Split quadrilaterals into triangles; return their node numbers (t, 3)."""
     halves = cells[cells[:, 2] != cells[:, 3]]
     return np.vstack([cells[:, [0, 1, 2]], halves[:, [0, 2, 3]]])
 
@@ -422,7 +426,7 @@ def _axes(span: float) -> dict[str, Any]:
 
 
 def _loaded(fields: Fields) -> list[_Loaded]:
-    """List the contacts under load, as one if the fields do not distinguish pairs."""
+    """List the contacts under load; a single one if the fields do not name pairs."""
     sides = [
         (side.name, side.nodes, side.force, side.friction) for side in fields.contacts
     ]
@@ -445,7 +449,7 @@ def _loaded(fields: Fields) -> list[_Loaded]:
 
 
 def _bands(contact: _Loaded, points: Points) -> list[FieldMark]:
-    """Mark the nodes that slide without contact, as arrows of shear are short."""
+    """Mark the nodes that slide without contact, because their arrows are short."""
     if not len(contact.sliding):
         return []
     at, beside = points[contact.sliding[:, 0]], points[contact.sliding[:, 1]]

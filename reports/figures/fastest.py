@@ -32,7 +32,7 @@ PANELS = 4  #: largest number of forms in a figure
 SOLVERS = 12  #: largest number of solvers in a panel
 _NAME = 28  #: characters of a name beside an axis
 _ROW = 0.3  #: height of a row, inches
-_BESIDE = 0.24  #: distance of a mean from the ratios of its cases, rows
+_BESIDE = 0.24  #: distance between a mean and the ratios of its cases, rows
 _TALL = 0.38  #: height of rows with ratios and a verdict, inches
 _RAISED, _BELOW = 0.16, 0.32  #: offsets of ratios above and of a verdict below, rows
 _BARS = {"cap": 0.0, "width": 1.1}
@@ -42,7 +42,7 @@ _ALIKE = Look(colour=INK, width=0.8)  #: line of equal times
 def fastest_figure(
     found: Sequence[FastestSolver], solvers: Sequence[str], most: int = SOLVERS
 ) -> Figure | None:
-    """Draw a panel for each form with a row for each solver; None without answers.
+    """Draw a panel per form with a row per solver; None if there are no answers.
 
     solvers : all solvers of the report, whose order determines colours and markers
     most : largest number of rows in a panel

@@ -37,7 +37,9 @@ from mortarbench.reports.statistics.profiles import Array, curve, performance_ra
 ROW = 4  #: solvers in colour in one panel
 ROWS = 4  #: rows of panels; further solvers are grey in all of them
 PAIRS = 6  #: largest number of pairwise panels
-BANDED = 20  #: least number of cases for bands of three or more solvers, which overlap
+BANDED = (
+    20  #: minimum number of cases for bands of three or more solvers, which overlap
+)
 _COLUMNS = 3  #: columns of pairwise panels
 _GREY = Look(colour="#d3d7dc", width=0.5)
 _COARSE = 60  #: points of a grey curve; a figure may have hundreds of them
@@ -74,7 +76,7 @@ def rows_of(ranking: Ranking, solvers: Sequence[str]) -> list[list[int]]:
 
 
 def rivals(ranking: Ranking) -> list[int]:
-    """Choose the solvers that the leader is paired with: the next in that order."""
+    """Choose the solvers that the leader is paired with: the next ones by rank."""
     return [int(i) for i in ranking.order[1 : PAIRS + 1]]
 
 

@@ -75,7 +75,7 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
         keys.append(Key(label="as many simultaneous copies", look=_copies_look(INK)))
     if any(s.crowded(n) for s in series for n in s.several):
         crowded = replace(look(0), dash=None, fill="none")
-        keys.append(Key(label="more ranks than CPUs (time-shared)", look=crowded))
+        keys.append(Key(label="more ranks than CPUs (CPUs shared)", look=crowded))
     keys.append(Key(label="as many times as ranks", look=GUIDE))
     return _figure(panels, keys, 1)
 

@@ -53,7 +53,7 @@ PANELS = (
 )
 KAPPA = "kappa"  #: prefix of the names of condition numbers
 _FITTED = 24  #: points of a fitted curve
-_FOOT = 0.04  #: least share of the axis below and above the guides
+_FOOT = 0.04  #: minimum share of the axis below and above the guides
 
 
 def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
@@ -83,7 +83,7 @@ def scaling_figure(series: SizeSeries, solvers: Sequence[str]) -> Figure:
 
 
 def iterations_figure(plotted: Sequence[SizeSeries], solver: str) -> Figure | None:
-    """Plot the iterations of one solver in every series; return None without any."""
+    """Plot the iterations of one solver in every series; None if there are none."""
     curves = list[Series]()
     keys = list[Key]()
     for series in plotted[:MOST_SERIES]:
@@ -139,15 +139,15 @@ def along(ends: Limits, part: float) -> float:
 
 
 def steps_figure(series: SizeSeries, solver: str) -> Figure | None:
-    """Plot the counts of one solver against dofs with fits c·nᵖ; None without any."""
+    """Plot counts of one solver against dofs with fits c·nᵖ; None if there are none."""
     points = [(float(n), o) for n, o in series.curve(solver)]
     laws = {name: series.count_law(solver, name) for name in series.counts(solver)}
     title = f"{solver}, {series.title}"
     return _counted(points, log("degrees of freedom $n$"), laws, solver, title)
 
 
-def torn_figure(sweep: Sweep) -> Figure | None:
-    """Plot the counts of one solver against H/h; return None without any."""
+def subdomain_figure(sweep: Sweep) -> Figure | None:
+    """Plot the counts of one solver against H/h; None if it reports no counts."""
     points = [(float(value), o) for value, o in sweep.answers]
     shown = tuple((x, f"{x:g}") for x, _ in points)
     low, high = points[0][0] / 1.15, points[-1][0] * 1.15

@@ -31,7 +31,7 @@ LOOKS = {"open": _NODE} | {
 
 
 def traction_figure(fields: Fields) -> Figure | None:
-    """Plot tractions of each contact under load in one row; None without load.
+    """Plot tractions of each loaded contact in one row; None if no contact is loaded.
 
     Only plane bodies are supported. Positions are distances from the middle of the
     undeformed slave side.

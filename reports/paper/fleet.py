@@ -211,8 +211,9 @@ def totals_table(evidence: Evidence) -> Table:
         rows.append((Cell(text=clean(solver, 40)), *cells))
     return Table(
         caption=f"Total times at n = {n}, prepare and solve. The dualisation of one "
-        "load step, including the factorisation, is measured once for all solvers; the "
-        "intervals in the last column are therefore those of the solver alone.",
+        "load step, including the factorisation, is measured once for all "
+        "solvers, so the intervals in the last column are those of the "
+        "solver alone.",
         columns=("", "primal", "dual", "dualising", "dual with dualising"),
         rows=tuple(rows),
     )
@@ -251,7 +252,7 @@ def swept(
 
 
 def certified_table(evidence: Evidence) -> Table:
-    """Tabulate the least time to a certified error, and the tolerance of that solve."""
+    """Tabulate the smallest time to a certified error, and its tolerance."""
     rows = []
     for form in DUALS:
         for solver, answers in swept(evidence, form).items():
@@ -271,8 +272,8 @@ def certified_table(evidence: Evidence) -> Table:
                 )  # fmt: skip
             rows.append(tuple(cells))
     return Table(
-        caption="Least median time to a certified relative error in the energy norm, "
-        "and the requested tolerance.",
+        caption="Smallest median time to a certified relative error in the energy "
+        "norm, and the tolerance of this solve.",
         notes=(TIMED,),
         columns=("form", "solver", *(f"error ≤ {tolerance(t)}" for t in TARGETS)),
         rows=tuple(rows),

@@ -40,7 +40,7 @@ QUANTITIES = {  #: name in the figure → columns of its components
     "tip displacement": ("tip_x", "tip_y"),
     "contact force": ("force_x", "force_y"),
 }
-SINCE = 5  #: least number of steps in fits; coarser stepping is pre-asymptotic
+SINCE = 5  #: minimum number of steps in fits; coarser stepping is pre-asymptotic
 PAPER = 10  #: load steps of the paper, with one linearisation each
 _PRESSURE = "contact pressure in GPa"
 #: colours and markers of node-to-segment and mortar
@@ -232,8 +232,8 @@ def orders(rows: Sequence[Row]) -> Table:
         for head in (f"{q}: order [95 %]", f"error at {PAPER} steps")
     ]  # fmt: skip
     return Table(
-        caption=f"Order in 1/steps, fitted from {SINCE} steps on, and relative error "
-        f"at {PAPER} steps. The first row is the scheme of the paper.",
+        caption=f"Order in 1/steps, fitted to {SINCE} and more steps, and relative "
+        f"error at {PAPER} steps. The first row is the scheme of the paper.",
         columns=("linearisations per step", *heads),
         rows=tuple(lines),
         text_columns=0,

@@ -146,8 +146,8 @@ def compose(
                 name="errata", title="Errata of the paper", points=published.ERRATA
             ),
         ),
-        footer="Every sample is in data/, the medians in tables/*.csv; the figures are "
-        "drawn from these files only.",
+        footer="All samples are in data/ and their medians in tables/*.csv; the "
+        "figures are drawn from these files only.",
     )
 
 
@@ -255,8 +255,8 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             f"Growth with Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
             "repeats. (c): the condensed curve includes the factorisation, which "
-            "dominates its work; the other does not. (d): complete analysis. "
-            f"Star and cross: published for Nr = 30 ({published.MACHINE}).",
+            "dominates its time; the other curve does not. (d): complete analysis. "
+            f"Star and cross: published values for Nr = 30 ({published.MACHINE}).",
         ),
     )  # fmt: skip
 
@@ -344,13 +344,15 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
                 Picture(
                     name="verification",
                     figure=verification_figure(tables["verification"]),
-                    caption="Contact rows compared with exact solutions. (a): largest "
-                    "error of σy at any Gauss point of the patch test, 3 elements "
-                    "meeting 2 (errors below 1e-12 are rounding, drawn at 1e-12): "
-                    f"node-to-segment {100 * float(left['error']):.2g} % on the "
-                    f"finest mesh, mortar at most {mortar:.0e}. (b): pressure "
-                    "between two cylinders compared with Hertz's, in L²; its error "
-                    "is at least of order a²/R² because the bodies are finite.",
+                    caption="Contact rows compared with exact solutions. (a): "
+                            "largest error of σy at the Gauss points of the patch "
+                            "test with 3 elements meeting 2 (errors below 1e-12 are "
+                            "rounding, drawn at 1e-12). On the finest mesh it is "
+                            f"{100 * float(left['error']):.2g} % for node-to-segment, "
+                            f"and at most {mortar:.0e} for mortar. (b): pressure "
+                            "between two cylinders compared with Hertz's, in L²; its "
+                            "error is at least of order a²/R² because the bodies are "
+                            "finite.",
                 ),
             ),
         ),
@@ -360,8 +362,8 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
             f"Error of the load steps at Nr = {Nr}, Nh = {Nh} (node-to-segment) "
             f"against their number. The reference has {settled['relin']} "
             f"linearisations in each of {settled['steps']} steps and satisfies the "
-            "contact conditions linearised at the solution. The errors are those of "
-            "the load steps only, as every QP is solved to rounding.",
+            "contact conditions linearised at the solution. The errors are due to "
+            "the load steps alone, because every QP is solved up to rounding.",
             prose=(
                 "The paper linearises the contact once per step, at the solution of "
                 "the previous step, and does not state the error. The method is of "
@@ -388,10 +390,11 @@ def _fleet(evidence: Evidence) -> tuple[Section, ...]:
         _section(
             "totals", "Beyond the paper: primal against dual",
             primal_dual_figure(evidence),
-            "Total times of the primal and dual forms, the latter with the dualisation "
-            "of one load step including the factorisation (which ten steps share); "
-            "verified answers only; crosses: unverified answers. SMALBE accepts "
-            "bounds and equalities only and hence not the primal form.",
+            "Total times of the primal and dual forms, for verified answers only. "
+            "Dual forms include the dualisation of one load step with the "
+            "factorisation, which ten steps share. Crosses: unverified answers. "
+            "SMALBE accepts only bounds and equalities, and therefore declines the "
+            "primal form.",
             tables=(totals_table(evidence),),
         ),
     )  # fmt: skip
@@ -402,9 +405,9 @@ def _certified(evidence: Evidence) -> tuple[Section, ...]:
     n = max((o.size("dofs") or 0) for o in evidence.flat)
     caption = (
         "Certified relative error of the displacement in the energy norm against the "
-        f"median time at n = {n}, a curve over the requested tolerances for each "
-        "solver. The certificate is an upper bound computed from the answer alone, "
-        "independent of the claims of the solver."
+        f"median time at n = {n}, one curve over the requested tolerances for each "
+        "solver. The certificate is an upper bound that is computed from the answer "
+        "alone, independently of the solver's claims."
     )
     return (
         _section(

@@ -51,7 +51,7 @@ def details(records: Sequence[Record]) -> str:
 
 
 def _as_journalled(record: Record) -> Record:
-    """Remove the suffix that the report gives to a solver that drove a sequence."""
+    """Remove the suffix that the report gives to a solver that solved a sequence."""
     mode = f" ({record.mode})"
     suffixed = record.mode != "cold" and record.solver.endswith(mode)
     return (

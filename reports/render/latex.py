@@ -1,4 +1,4 @@
-"""Tables as LaTeX, in the booktabs manner."""
+"""Tables as LaTeX, in the style of booktabs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _SPECIAL = {
     "⋆": r"$\star$", "\0": "{}",
 }  # fmt: skip
 
-#: text that needs no escaping
+#: text that need not be escaped
 _PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
 
 
-#: most rows of a float; longer tables use longtable, since floats do not break
+#: maximum number of rows of a float; longer tables use longtable, which can break pages
 ROWS = 36
 
 

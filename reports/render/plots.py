@@ -32,7 +32,8 @@ from mortarbench.reports.document.figure import (
 
 Data = dict[str, Any]
 
-MOST = 4000  #: most points of a line; longer lines keep extremes of short stretches
+#: maximum number of points of a line; longer lines keep extremes of short stretches
+MOST = 4000
 _NAMED = {
     "lambda": "λ", "sigma": "σ", "tau": "τ", "rho": "ρ", "mu": "µ", "nu": "ν",
     "alpha": "α", "kappa": "κ", "Gamma": "Γ", "times": "×", "cdot": "·",

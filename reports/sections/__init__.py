@@ -119,7 +119,7 @@ def sections(analysis: Analysis) -> Iterator[Section]:
     for entry in _entries():
         if entry.place >= APPENDIX and missing:
             prose = (
-                "These sections are missing because measurements for them are missing.",
+                "These sections are missing because their measurements are missing.",
             )
             title = "Not in this report"
             yield Section(name="absent", title=title, prose=prose, points=(*missing,))

@@ -42,11 +42,15 @@ from mortarbench.reports.sections.scaling import iteration_growth, per_decade
 from mortarbench.reports.sections.sweeps import ERRORS, Sweeps, certified_sweeps, places
 from mortarbench.reports.statistics.growth import Trend
 
-ACCURACIES = 3  #: sentences per form; of more accuracies, the ends and the middle
+ACCURACIES = (
+    3  #: most sentences per form: the loosest, a middle and the tightest accuracy
+)
 FAILURES = 3  #: failures per form that are described one by one
-FIRST_ROWS = 8  #: rows of the first figure: a phone shows it below the first sentence
-REPEATS = 9  #: least number of repeats recommended to resolve a tie
-MOST_SERIES = 4  #: series of sizes with a sentence of their own
+FIRST_ROWS = (
+    8  #: rows of the first figure, so that a phone shows it below the first sentence
+)
+REPEATS = 9  #: minimum number of repeats recommended to resolve a tie
+MOST_SERIES = 4  #: number of series of sizes that are described in a separate sentence
 _FROM_MESH = "From the mesh to a verified answer, including dualisation: "
 _TRENDS = {
     Trend.FLAT: "stay flat",
@@ -100,7 +104,7 @@ def forms(a: Analysis) -> Iterator[Part]:
 
 
 def _within(text: str, f: FastestSolver) -> str:
-    """Write a sentence in lower case, as after a colon, unless a name begins it."""
+    """Return a sentence for use after a colon; lower case unless a name begins it."""
     named = f.finding in (Finding.FASTEST, Finding.ONE_BLOCK)
     return text if named else text[0].lower() + text[1:]
 
@@ -185,7 +189,7 @@ def _statement(
         TEXT("failed", failed, "case" if len(found) == 1 else "answer"),
         TEXT("declined", declined),
         *_reservations(found),
-        f"{len(found) - len(selected)} more tolerances are in the evidence."
+        f"{len(found) - len(selected)} more tolerances are in the sections below."
         if len(selected) < len(found)
         else "",
     )
@@ -201,7 +205,7 @@ def _statement(
 
 
 def claim(f: FastestSolver) -> str:
-    """Return one sentence that names the fastest solver, or the reason why none is."""
+    """Return a sentence that names the fastest solver, or says why none is named."""
     return TEXT("claim", f)
 
 
@@ -227,7 +231,7 @@ def _forms(f: FastestSolver) -> list[str]:
 def _next_behind(
     f: FastestSolver,
 ) -> tuple[Competitor | None, list[tuple[str, Competitor | None]]]:
-    """Return the next significantly slower one, and the best of every other form."""
+    """Return the next significantly slower entry, and the best of every other form."""
     slower = [c for c in f.competitors[1:] if c.slower and c.closest]
     following = slower[0] if slower else None
     named = {c.form for c in (f.first, *f.tied, *slower[:1])}
@@ -275,7 +279,7 @@ def _roughly(f: FastestSolver) -> str:
 
 
 def _faster_elsewhere(f: FastestSolver) -> list[str]:
-    """Name entrants faster than the first that were not verified on every case."""
+    """Name entrants that are faster than the first but not verified on every case."""
     faster = [c for c in f.others if c.ratio and c.ratio.high < 1]
     return TEXT.parts("faster_elsewhere", f, faster)
 

@@ -50,11 +50,16 @@ TEXT = Sentences(
 )  # fmt: skip
 
 
-def not_compared(a: Analysis) -> list[str]:
-    """List the groups that are not compared over cases, and the reasons."""
+def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
+    """List the groups that are not compared over cases.
+
+    reasons : True to state the reasons, False to refer to the section that does
+    """
     lacking = [group for group in a.groups if not group.comparable]
     if not lacking:
         return []
+    if not reasons:
+        return TEXT.parts("not_repeated", a.groups, lacking)
     poolable = not a.pool_forms and len(a.pooled) < len(a.groups) and any(
         group.comparable for group in a.pooled
     )  # fmt: skip
@@ -66,7 +71,7 @@ def means(a: Analysis) -> Iterator[Part]:
     """Tabulate the means of every group."""
     if a.rankings:
         yield from TEXT.parts("means", any(r.group.forms for r in a.rankings))
-    yield from not_compared(a)
+    yield from not_compared(a, reasons=True)
     yield from map(_means_table, a.rankings)
 
 
@@ -134,7 +139,7 @@ def _share(p: float) -> str:
 
 
 def _pairs(group: ComparisonGroup, i: int, leader: int) -> Cell:
-    """Compare with the leader on the cases that both solved, without any charge."""
+    """Compare with the leader on the cases that both solved, without a penalty."""
     mine, its = (
         {p: float(t) for p, t in enumerate(group.times[:, s]) if np.isfinite(t)}
         for s in (i, leader)

@@ -17,7 +17,7 @@ from mortarbench.reports.figures.scaling import (
     MOST_SERIES,
     scaling_figure,
     steps_figure,
-    torn_figure,
+    subdomain_figure,
 )
 from mortarbench.reports.sections import Analysis, section
 from mortarbench.reports.statistics.growth import (
@@ -100,7 +100,7 @@ def _exponent(law: PowerLaw | None, runs: str) -> Cell:
 
 @section(
     62, "growth", "Do iterations grow?",
-    "Do iterations grow?: cases of four or more sizes are needed.",
+    "Do iterations grow?: the section needs cases of four or more sizes.",
 )  # fmt: skip
 def growth(a: Analysis) -> Iterator[Part]:
     """Judge the growth of iterations in every series of at least four sizes."""
@@ -184,7 +184,7 @@ def per_decade(fit: Growth) -> str:
 )  # fmt: skip
 def steps(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw the counts of each solver, by kind, against n and H/h."""
-    torn = sweeps(a.evidence, "feti")
+    by_subdomain = sweeps(a.evidence, "feti")
     against_size = [
         (series, solver)
         for series in a.sizes
@@ -192,7 +192,7 @@ def steps(a: Analysis) -> Iterator[Part]:
         if len(series.curve(solver)) >= SERIES
     ]
     tables = [_step_table(*each) for each in against_size if each[0].counts(each[1])]
-    tables += [_torn_table(sweep) for sweep in torn]
+    tables += [_subdomain_table(sweep) for sweep in by_subdomain]
     if not tables:
         return
     yield from TEXT.parts("steps")
@@ -201,7 +201,10 @@ def steps(a: Analysis) -> Iterator[Part]:
         (steps_figure(series, solver), "n", solver, series.title)
         for series, solver in against_size
     ]
-    drawn += [(torn_figure(sweep), "H/h", sweep.solver, sweep.title) for sweep in torn]
+    drawn += [
+        (subdomain_figure(sweep), "H/h", sweep.solver, sweep.title)
+        for sweep in by_subdomain
+    ]
     known = [each for each in drawn if each[0] is not None]
     for i, (figure, *names) in enumerate(known[:MOST_DRAWN], 1):
         caption = TEXT("counts_drawn", *names, len(known), MOST_DRAWN)
@@ -232,7 +235,7 @@ def _step_table(series: SizeSeries, solver: str) -> Table:
     )
 
 
-def _torn_table(sweep: Sweep) -> Table:
+def _subdomain_table(sweep: Sweep) -> Table:
     """Tabulate the counts of one solver against H/h."""
     named = [n for n in FIRST if sweep.answers[0][1].counted(n) is not None]
     return Table.of(

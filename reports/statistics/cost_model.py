@@ -12,8 +12,9 @@ neighbours, with the latencies α_R and α of a reduction and of a message, and 
 per byte.
 
 W and C are fitted to measured times, s and the latencies are measured, and R, M and b
-are counted, all on the ranks of the run. Superlinear speed-up even with s = 1 cannot be
-fitted and shows in the misfit. The model is extended beyond the measured ranks thus:
+are counted, all on the ranks of the run. Superlinear speed-up cannot be fitted even
+with s = 1, and shows in the misfit. Beyond the measured ranks, the model is extended as
+follows:
 
 - s is constant: further ranks bring their own memory, like the measured ones;
 - α_R grows with ⌈log₂N⌉, the depth of a tree of ranks;
@@ -74,7 +75,7 @@ class Communication:
 
 
 def growth(ranks: ArrayLike, measured: int) -> Array:
-    """Return the growth of reductions, messages and bytes on other ranks, (…, 3)."""
+    """Return growth factors (…, 3) of reductions, messages and bytes on other ranks."""
     N = np.asarray(ranks, dtype=float)
     depth = np.ceil(np.log2(N)) / np.ceil(np.log2(measured))
     neighbours = np.minimum(N - 1, NEIGHBOURS) / min(measured - 1, NEIGHBOURS)
@@ -156,9 +157,9 @@ def cost_model(
     """
     ranks = sorted(seconds)
     if len(ranks) < 2 or ranks[0] != 1:
-        raise ValueError("a model of ranks needs times on one rank and on several")
+        raise ValueError("a cost model needs times on one rank and on several ranks")
     if not communication or {c.ranks for c in communication} != {ranks[-1]}:
-        raise ValueError(f"a model needs the communication on {ranks[-1]} ranks")
+        raise ValueError(f"a cost model needs the communication on {ranks[-1]} ranks")
     from scipy.optimize import nnls  # imported here: slow, and few reports need it
 
     N = np.array(ranks, dtype=float)
@@ -194,7 +195,7 @@ def cost_model(
 
 
 def _geometric(values: ArrayLike, rng: np.random.Generator, count: int) -> Array:
-    """Return geometric means of all values, then of `count` resamples, (1 + count,)."""
+    """Return (1 + count,) geometric means: of the values, then of `count` resamples."""
     with np.errstate(divide="ignore"):  # zero where nothing was sent
         logs = np.log(np.asarray(values, dtype=float))
     drawn = rng.integers(logs.size, size=(count, logs.size))

@@ -26,7 +26,7 @@ from mortarbench.reports.statistics.intervals import (
     student,
 )
 
-SIZES = 4  #: least number of sizes: leaves two degrees of freedom
+SIZES = 4  #: minimum number of sizes, which leaves two degrees of freedom
 PRACTICAL = 0.10  #: relative change per decade of n below which growth is irrelevant
 _ROUNDING = 1e-12  #: scatter of logarithms below this is rounding
 
@@ -113,7 +113,7 @@ def growth_of(n: ArrayLike, values: ArrayLike) -> Growth:
     """
     x, y = np.asarray(n, dtype=float), np.asarray(values, dtype=float)
     if np.unique(x).size < SIZES or not ((x > 0).all() and (y > 0).all()):
-        raise ValueError("growth needs four different sizes, positive values")
+        raise ValueError("growth needs four different sizes and positive values")
     law = power_law(x, y)
     spread = float(np.linalg.norm(np.log(x) - np.log(x).mean()))
     half = student(x.size - 2)

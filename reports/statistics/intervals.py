@@ -82,8 +82,8 @@ class PowerLaw(NamedTuple):
 def power_law(n: ArrayLike, t_of_n: ArrayLike) -> PowerLaw:
     """Fit t = c·nᵖ by least squares on logarithms, one point per size.
 
-    The interval of p is Student's with points − 2 degrees of freedom: exact if the
-    logarithms scatter normally about the line, and it widens where the law does not
+    The interval of p is Student's with points − 2 degrees of freedom. It is exact if
+    the logarithms scatter normally about the line, and it is wide if the law does not
     hold. A bootstrap over the three to ten sizes of a scaling suite would cover far
     less than its nominal level.
 

@@ -23,7 +23,7 @@ from scipy.special import betainccinv, betaincinv
 
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-POINTS = 200  #: most points of a curve; with more cases it is sampled
+POINTS = 200  #: maximum number of points of a curve; with more cases it is sampled
 
 Array = NDArray[np.float64]
 
@@ -46,8 +46,8 @@ class Curve(NamedTuple):
 def performance_ratios(times: Array) -> Array:
     """Return ratios r = t/min t to the best solver of each case [1]_; inf for failures.
 
-    A case without any solution is kept with infinite ratios, so that no profile reaches
-    one. The profile of a solver is the share of cases with r ≤ τ.
+    A case that no solver solved is kept with infinite ratios, so that no profile
+    reaches one. The profile of a solver is the share of cases with r ≤ τ.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def share(counts: ArrayLike, cases: int) -> Share:
 
 
 def solved_within(values: Array, places: ArrayLike) -> Share:
-    """Return the share of the cases with value ≤ place, for each finite place.
+    """Return the share of the cases with value ≤ place, for each place, all finite.
 
     values : (cases,) ratios for a performance profile, seconds for a data profile [2]_
     """
@@ -87,7 +87,7 @@ def solved_within(values: Array, places: ArrayLike) -> Share:
 
 
 def curve(values: Array, start: float, stop: float, points: int = POINTS) -> Curve:
-    """Return the profile between two finite places."""
+    """Return the profile between two finite places on the axis."""
     inside = np.unique(values[(values > start) & (values < stop)])
     if inside.size > points:
         inside = np.geomspace(start, stop, points)[1:-1]

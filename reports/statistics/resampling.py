@@ -144,13 +144,13 @@ def _ranks(values: Array) -> Array:
 
 
 def _p_values(values: Array, by: Array) -> Array:
-    """Return the shares of `values` that reach each of `by`, up to rounding."""
+    """Return, for each entry of `by`, the share of `values` ≥ it, up to rounding."""
     below = np.searchsorted(np.sort(values), by - 1e-9)
     return np.asarray(1 - below / values.size)
 
 
 def firsts(draws: Array) -> Array:
-    """Return the share of the draws in which each solver is fastest; ties share one.
+    """Return the share of the draws in which each solver is fastest; ties are divided.
 
     draws : (draws, solvers)
     """

@@ -24,7 +24,7 @@ from mortarbench.reports.document.formatting import tolerance
 from mortarbench.reports.figures.style import COLOURS, below, legible
 
 _SPREAD = 0.3  #: vertical offset of marks within a row, so that none hides another
-_FLOOR = 1e-17  #: where errors of zero are drawn
+_FLOOR = 1e-17  #: value at which errors of zero are drawn
 _LIMIT = Look(colour=INK, width=0.6, dash=(4, 2))
 
 Answer = Mapping[str, Any]
@@ -41,7 +41,7 @@ _KINDS: tuple[tuple[str, Callable[[Answer], bool], Look], ...] = (
 
 
 def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
-    """Draw the errors of the answers at one tolerance; return None without any.
+    """Draw the errors of the answers at one tolerance; None if there are no answers.
 
     answers : those of the data of `validate`
     """

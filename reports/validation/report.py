@@ -139,7 +139,7 @@ def _disagreements(data: Data) -> Iterator[Part]:
     """Tabulate refuted claims, and contradicting pairs of which neither is refuted."""
     if wrong := data["disagreements"]:
         yield Table.of(
-            "Refuted claims, with our verdict and its reason.",
+            "Refuted claims, with our verdict and the reason.",
             wrong,
             (
                 *_CASE,
@@ -152,7 +152,7 @@ def _disagreements(data: Data) -> Iterator[Part]:
         )
     if apart := data["unresolved"]:
         yield Table.of(
-            "Pairs of answers that contradict each other, with neither refuted.",
+            "Pairs of answers that contradict each other although neither is refuted.",
             apart,
             (
                 ("problem", lambda d: Cell.name(d["problem"])),
@@ -165,7 +165,8 @@ def _disagreements(data: Data) -> Iterator[Part]:
         )
     if broken := data["contradictions"]:
         yield Table.of(
-            "Certificates contradicted by the reference, an error of this program.",
+            "Certificates contradicted by the reference, which is an error of this "
+            "program.",
             broken,
             (*_CASE, ("contradiction", lambda d: Cell.words(clean(d["text"], 240)))),
             text_columns=2,

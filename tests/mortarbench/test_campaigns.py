@@ -473,7 +473,7 @@ def test_a_value_of_two_dashes_is_refused_in_one_line(cli, stored, tmp_path, com
     code, printed, err = cli(*command, "--out=--")
 
     assert (code, printed) == (2, "")
-    assert err == "mortarbench: --out=--: -- is no value; expected --out=VALUE\n"
+    assert err == "mortarbench: --out=--: -- is not a value; expected --out=VALUE\n"
     assert sorted(tmp_path.iterdir()) == there
 
 

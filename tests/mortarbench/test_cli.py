@@ -467,7 +467,7 @@ WRONG = {
     ),
     "scale without picture": (
         (*SOLVE, "--scale", "3"),
-        "--scale 3 without --plot; expected a picture",
+        "--scale 3 without --plot; expected both options",
     ),
     "scale": (
         (*SOLVE, "--plot", "a.pdf", "--scale", "nan"),
@@ -475,7 +475,7 @@ WRONG = {
     ),
     "picture nowhere": (
         (*SOLVE, "--plot", "no/a.png"),
-        "no/a.png: no folder no; expec",
+        "no/a.png: the folder no does not exist; expec",
     ),
     "picture a folder": (
         (*SOLVE, "--plot", "dir.png"),

@@ -71,8 +71,8 @@ def test_a_suite_refuses_solver_objects(tmp_path, solvers):
         with pytest.raises(mb.InputError) as refused:
             mb.run(**arguments, out=tmp_path / "out")
         assert str(refused.value) == (
-            "solver objects are for mb.solve; in a suite name them by "
-            "plugins=['FILE.py']"
+            "a suite cannot contain solver objects, only names; pass "
+            "plugins=['FILE.py'] and name the solver"
         )
     assert not (tmp_path / "out").exists()
 

@@ -236,9 +236,7 @@ def test_nothing_is_written_over(starting, tmp_path, kind):
     code, out, err = starting("new", kind, "mine")
 
     assert (code, out) == (2, "")
-    assert err == (
-        f"mortarbench: {name} exists; expected another name, or no such file\n"
-    )
+    assert err == (f"mortarbench: {name} exists already; expected another name\n")
     assert (tmp_path / name).read_text() == "precious"
     assert starting("new", "solver", "other")[0] == 2
     assert not (tmp_path / "gone").exists()
@@ -247,12 +245,12 @@ def test_nothing_is_written_over(starting, tmp_path, kind):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("solver", "osqp"), "there is a solver 'osqp'; expected a name of its own"),
+        (("solver", "osqp"), "solver 'osqp' exists already; expected another name"),
         (
             ("problem", "obstacle"),
-            "there is a problem 'obstacle'; expected a name of its",
+            "problem 'obstacle' exists already; expected another name",
         ),
-        (("suite", "demo"), "there is a suite 'demo'; expected a name of its own"),
+        (("suite", "demo"), "suite 'demo' exists already; expected another name"),
         (("solver", "a/b"), "name 'a/b'; expected letters, digits, '-' and '_'"),
         (("solver", "../b"), "name '../b'; expected letters"),
         (("solver", ""), "name ''; expected letters"),

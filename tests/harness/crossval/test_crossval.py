@@ -631,7 +631,7 @@ def test_a_file_in_the_way_of_the_page_is_told_with_its_remedy(truths, tmp_path,
 
     assert code == 2
     assert err.splitlines()[-1] == (
-        f"mortarbench: {folder / 'report'}: a file is where a folder is needed; "
+        f"mortarbench: {folder / 'report'}: a file exists where a folder is needed; "
         "move the file away"
     )
 

@@ -66,6 +66,8 @@ def some_records(record, solvers, cases=6):
 
 
 OVER_CASES = ("means", "ranking", "profiles")
+#: end of the sentence in the sections after the first, which states the reasons
+ELSEWHERE = "of cases, for the reasons given under “Means over cases”."
 
 
 def over_cases(page):
@@ -82,13 +84,16 @@ def test_fewer_than_six_cases_or_one_solver_make_no_statement_and_it_is_said(
     record, evidence, solvers, cases, said
 ):
     page = compose(evidence(some_records(record, solvers, cases=cases)))
+    texts = []
     for section in over_cases(page):
         assert (section.tables, section.pictures) == ((), ())
         (text,) = section.prose
-        assert text.startswith(
-            f"Nothing is compared here: {said} A comparison needs at least 6 cases of"
-        )
+        texts.append(text)
         assert "--pool-forms" not in text
+    assert texts[0].startswith(
+        f"Nothing is compared here: {said} A comparison needs at least 6 cases of"
+    )
+    assert set(texts[1:]) == {f"Nothing is compared here: 1 group {ELSEWHERE}"}
 
 
 def of_two_forms(record, primal):
@@ -102,10 +107,11 @@ def of_two_forms(record, primal):
 
 
 def test_forms_with_few_cases_are_named_with_how_to_put_them_together(record, evidence):
-    for section in over_cases(compose(evidence(of_two_forms(record, 3)))):
-        (text,) = section.prose
-        assert "dual, tol 1e-6: 3 cases; primal, tol 1e-6: 3 cases." in text
-        assert '"mortarbench report DIR --pool-forms"' in text
+    sections = over_cases(compose(evidence(of_two_forms(record, 3))))
+    ((text,), *others) = (section.prose for section in sections)
+    assert "dual, tol 1e-6: 3 cases; primal, tol 1e-6: 3 cases." in text
+    assert '"mortarbench report DIR --pool-forms"' in text
+    assert set(others) == {(f"Nothing is compared here: 2 groups {ELSEWHERE}",)}
 
 
 def test_a_form_that_is_left_out_is_named_beside_those_that_are_compared(
@@ -113,7 +119,9 @@ def test_a_form_that_is_left_out_is_named_beside_those_that_are_compared(
 ):
     for section in over_cases(compose(evidence(of_two_forms(record, 6)))):
         assert len(section.tables) == 1
-        assert section.prose[-1].startswith("Not compared here: dual, tol 1e-6: 3 case")
+        is_first = section.name == "means"
+        named = "dual, tol 1e-6: 3 cases." if is_first else f"1 group {ELSEWHERE}"
+        assert section.prose[-1].startswith(f"Not compared here: {named}")
 
 
 def test_pooled_forms_are_cases_of_one_group(record, evidence):
@@ -208,7 +216,7 @@ def test_who_declines_all_takes_no_part_and_who_declines_some_has_no_answer(
     (found,) = comparison_groups(evidence(records))
     assert found.solvers == ("s00", "s01", "some")
     assert np.isinf(found.times[:2, 2]).all()
-    assert found.notes == ("All cases declined by: never.",)
+    assert found.notes == ("Solvers that declined all cases: never.",)
 
 
 def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence):
@@ -220,8 +228,8 @@ def test_cases_that_some_have_not_been_measured_on_are_left_out(record, evidence
     assert len(found.cases) == 6
     assert found.solvers == ("late", "s00", "s01")
     assert found.notes == (
-        "Left out, measured on less than half of the cases: rare.",
-        "Left out, not measured with all solvers: 2 cases.",
+        "Left out because they were measured on less than half of the cases: rare.",
+        "Left out because they were not measured with all solvers: 2 cases.",
     )
 
 

@@ -212,7 +212,7 @@ def test_a_form_that_nobody_solves_everywhere_is_named(record, evidence):
         for r in four_ways(record)
     ]
     claim = first_sentence(evidence(records))
-    assert claim.endswith("; no solver was verified on all in the primal form.")
+    assert claim.endswith("; no solver was verified on every case in the primal form.")
 
 
 def test_problems_without_seconds_of_dualising_are_left_out_and_counted(

@@ -8,7 +8,7 @@ from mortarbench.harness import Record, Verdict
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.size_series import size_series, sweeps
 from mortarbench.reports.document.figure import Series
-from mortarbench.reports.figures.scaling import steps_figure, torn_figure
+from mortarbench.reports.figures.scaling import steps_figure, subdomain_figure
 from mortarbench.reports.sections import Analysis
 from mortarbench.reports.sections.scaling import steps
 
@@ -84,7 +84,7 @@ def test_counts_against_cells_of_a_subdomain_have_their_values_as_ticks():
     ]  # fmt: skip
     found = evidence(torn)
     (sweep,) = sweeps(found, "feti")
-    figure = torn_figure(sweep)
+    figure = subdomain_figure(sweep)
     assert [name for _, name in figure.panels[0].x.ticks] == ["4", "8", "16", "32"]
     section = steps(Analysis(found))
     assert [p.name for p in section.pictures] == ["steps-1"]

@@ -222,7 +222,7 @@ def test_nobody_is_named_where_every_solver_failed_somewhere(record, opened):
     statement = opened(a + b)["dual"]
     assert statement.claims == (
         "No solver is named the fastest over 8 cases at tol 1e-6: no solver was "
-        "verified on all of them; a was on most, 7.",
+        "verified on all of them; a was verified on most (7).",
     )
     assert "b crashed on 2 of 8 cases (signal 11)" in statement.remarks[0]
 
@@ -330,7 +330,7 @@ def test_many_tolerances_are_no_wall_of_text(record, opened):
     assert [re.search(r"tol (\S+),", c)[1] for c in statement.claims] == [
         "1e-9", "1e-5", "1e-2",
     ]  # fmt: skip
-    assert "5 more tolerances are in the evidence." in statement.remarks
+    assert "5 more tolerances are in the sections below." in statement.remarks
 
 
 def test_a_null_arm_is_nobodys_rival(record, opened):
