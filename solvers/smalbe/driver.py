@@ -171,19 +171,19 @@ def _projected(
         problem.factor = scaled.factor()
     else:
         problem = projected_problem(qp, find)
-    norm, bounds_only = problem.spectrum.norm, not qp.b.size
+    norm, diagonal = problem.spectrum.norm, problem.diagonal
     if scaled is not None:
         problem.judge = compiled.Judge(
             scaled.given, qp, scaled.root, scaled.root**2, norm
         )
-    elif options.expansion == "model" and bounds_only and _is_whole(qp, problem):
-        problem.judge = compiled.Judge(qp, qp, None, problem.diagonal, norm)
+    elif (
+        options.expansion == "model"
+        and not qp.b.size
+        and diagonal.size
+        and not isinstance(qp.q, DistributedVector)
+    ):
+        problem.judge = compiled.Judge(qp, qp, None, diagonal, norm)
     return problem
-
-
-def _is_whole(qp: QP, problem: Projected) -> bool:
-    """Return whether this process has all of the QP, and P has a known diagonal."""
-    return problem.diagonal.size > 0 and not isinstance(qp.q, DistributedVector)
 
 
 def _estimated_spectrum(
@@ -219,12 +219,14 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     enough. A sequence reuses the spectrum, so that further steps pay there: with fewer,
     the 24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
-    few = qp.q.size // (6 if qp.b.size or in_sequence else 10)
-    if isinstance(qp.P, np.ndarray):
-        if not qp.b.size and not in_sequence:
-            few = min(few, BOUNDS_LANCZOS_STEPS)
-    elif preconditioned_operator(qp):
-        few = MIN_LANCZOS_STEPS
+    if preconditioned_operator(qp):
+        few = 0
+    elif qp.b.size or in_sequence:
+        few = qp.q.size // 6
+    elif isinstance(qp.P, np.ndarray):
+        few = min(qp.q.size // 12, BOUNDS_LANCZOS_STEPS)
+    else:
+        few = qp.q.size // 10
     return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))
 
 
@@ -235,7 +237,7 @@ def _start(task: _Task, tol: float) -> Iterate:
     rows that slip continue to slip when the bound of friction changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
-    x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
+    x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
         at = carry.x if task.scaled is None else carry.x * task.scaled.root

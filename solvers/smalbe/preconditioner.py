@@ -56,7 +56,7 @@ DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
 
 def preconditioned_operator(qp: QP) -> Preconditioned | None:
     """Return the operator by which P offers preconditioners, or None."""
-    if qp.is_explicit:
+    if isinstance(qp.P, np.ndarray) or issparse(qp.P):
         return None
     product = qp.P.build() if isinstance(qp.P, SerialisableOperator) else qp.P
     return product if isinstance(product, Preconditioned) else None
@@ -92,7 +92,9 @@ def scalable(qp: QP) -> bool:
 
 
 def _is_sparse(qp: QP) -> bool:
-    if not issparse(qp.P) or qp.b.size or qp.h.size or not qp.q.size:
+    if isinstance(qp.P, np.ndarray) or not issparse(qp.P):
+        return False
+    if qp.b.size or qp.h.size or not qp.q.size:
         return False
     whole = not isinstance(qp.q, DistributedVector)
     return whole and len(qp.sets) == 1 and bool(qp.P.nnz < 2**31)
