@@ -21,8 +21,8 @@ from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import (
     Preconditioner,
     preconditioned_operator,
+    resolved,
     resolved_preconditioner,
-    scalable,
     structural_preconditioner,
 )
 from mortarbench.solvers.smalbe.projected import (
@@ -102,7 +102,7 @@ def prepared(
     """
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
-    kind = resolved_preconditioner(qp, options.preconditioner)
+    kind, is_scaled = resolved(qp, options.preconditioner)
     inner, scaled, eliminated = qp, None, None
     if options.eliminate == "always" or (
         in_sequence and options.eliminate == "sequences"
@@ -110,12 +110,15 @@ def prepared(
         eliminated = _eliminated(qp, options, kind, carry)
     if eliminated is not None:
         inner = eliminated.qp
-    elif (scaled := _scaled(qp, options, kind)) is not None:
+        kind = resolved_preconditioner(inner, options.preconditioner)
+    elif is_scaled and not options.is_extended:
+        scaled = Scaled.of(qp, with_factor=kind == "incomplete")
         inner = scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
     steps = _lanczos_steps(options, inner, in_sequence=in_sequence)
     problem = _projected(inner, options, steps, carry, scaled)
+    problem.preconditioner = kind
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
@@ -128,14 +131,6 @@ def prepared(
         qp, inner, eliminated, scaled, problem, options, rho, loop, history, carry
     )
     return lambda: _solve_to_tolerance(task, tol)
-
-
-def _scaled(qp: QP, options: Options, kind: Preconditioner) -> Scaled | None:
-    """Scale the variables of a sparse QP with bounds, but not for a subclass."""
-    with_factor = kind == "incomplete"
-    if not with_factor and (options.preconditioner != "auto" or not scalable(qp)):
-        return None
-    return None if options.is_extended else Scaled.of(qp, with_factor=with_factor)
 
 
 def _eliminated(
@@ -174,7 +169,7 @@ def _projected(
     norm, diagonal = problem.spectrum.norm, problem.diagonal
     if scaled is not None:
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, scaled.root**2, norm
+            scaled.given, qp, scaled.root, scaled.diagonal, norm
         )
     elif (
         options.expansion == "model"
@@ -294,7 +289,9 @@ def outer_loop(
         solver = compiled.SMALBE(problem, options, False)
     else:
         own = options.preconditioner_for(qp)
-        kind = resolved_preconditioner(qp, options.preconditioner)
+        kind = problem.preconditioner
+        if kind is None:
+            kind = resolved_preconditioner(qp, options.preconditioner)
         M = structural_preconditioner(qp, kind) if own is None else checked(own)
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
@@ -445,7 +442,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     """Return an upper bound of the worst KKT residual, exact if it exceeds `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
-        diagonal = task.scaled.root**2
+        diagonal = task.scaled.diagonal
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()
