@@ -37,7 +37,7 @@ from libc.stdlib cimport calloc, free as release_memory, realloc
 from libc.string cimport memcpy, memset
 from scipy.linalg.cython_blas cimport dsymv
 from scipy.linalg.cython_lapack cimport (
-    dgeqp3, dorgqr, dpotrf, dpotrs, dstev,
+    dgeqp3, dorgqr, dpotrf, dpotrs,
 )
 
 from mortarbench.harness.distributed.sparse cimport (

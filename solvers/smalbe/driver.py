@@ -21,8 +21,8 @@ from mortarbench.solvers.smalbe.options import Options
 from mortarbench.solvers.smalbe.preconditioner import (
     Preconditioner,
     preconditioned_operator,
+    resolved,
     resolved_preconditioner,
-    scalable,
     structural_preconditioner,
 )
 from mortarbench.solvers.smalbe.projected import (
@@ -108,7 +108,7 @@ def prepared(
         options = _on_discs(qp, options)
     rho = options.rho or (PRECONDITIONED_RHO if preconditioned_operator(qp) else RHO)
     history = History() if options.history else None
-    kind = resolved_preconditioner(qp, options.preconditioner)
+    kind, is_scaled = resolved(qp, options.preconditioner)
     inner, scaled, eliminated = qp, None, None
     if options.eliminate == "always" or (
         in_sequence and options.eliminate == "sequences"
@@ -116,12 +116,15 @@ def prepared(
         eliminated = _eliminated(qp, options, kind, carry)
     if eliminated is not None:
         inner = eliminated.qp
-    elif (scaled := _scaled(qp, options, kind)) is not None:
+        kind = resolved_preconditioner(inner, options.preconditioner)
+    elif is_scaled and not options.is_extended:
+        scaled = Scaled.of(qp, with_factor=kind == "incomplete")
         inner = scaled.qp
     if carry is not None and carry.x.size != inner.q.size:
         carry = None
     steps = _lanczos_steps(options, inner, in_sequence=in_sequence)
     problem = _projected(inner, options, steps, carry, scaled)
+    problem.preconditioner = kind
     if not problem.rows.consistent:
         message = "the equality rows contradict each other"
         nowhere = Solution.without_point(qp, Status.INFEASIBLE, message)
@@ -149,14 +152,6 @@ def _on_discs(qp: QP, options: Options) -> Options:
         proportioning="model",
         preconditioner="none" if kind == "model" else kind,
     )
-
-
-def _scaled(qp: QP, options: Options, kind: Preconditioner) -> Scaled | None:
-    """Scale the variables of a sparse QP with bounds, but not for a subclass."""
-    with_factor = kind == "incomplete"
-    if not with_factor and (options.preconditioner != "auto" or not scalable(qp)):
-        return None
-    return None if options.is_extended else Scaled.of(qp, with_factor=with_factor)
 
 
 def _eliminated(
@@ -195,19 +190,19 @@ def _projected(
         problem.factor = scaled.factor()
     else:
         problem = projected_problem(qp, find)
-    norm, bounds_only = problem.spectrum.norm, not qp.b.size
+    norm, diagonal = problem.spectrum.norm, problem.diagonal
     if scaled is not None:
         problem.judge = compiled.Judge(
-            scaled.given, qp, scaled.root, scaled.root**2, norm
+            scaled.given, qp, scaled.root, scaled.diagonal, norm
         )
-    elif options.expansion == "model" and bounds_only and _is_whole(qp, problem):
-        problem.judge = compiled.Judge(qp, qp, None, problem.diagonal, norm)
+    elif (
+        options.expansion == "model"
+        and not qp.b.size
+        and diagonal.size
+        and not isinstance(qp.q, DistributedVector)
+    ):
+        problem.judge = compiled.Judge(qp, qp, None, diagonal, norm)
     return problem
-
-
-def _is_whole(qp: QP, problem: Projected) -> bool:
-    """Return whether this process has all of the QP, and P has a known diagonal."""
-    return problem.diagonal.size > 0 and not isinstance(qp.q, DistributedVector)
 
 
 def _estimated_spectrum(
@@ -243,14 +238,14 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     enough. A sequence reuses the spectrum, so that further steps pay there: with fewer,
     the 24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
     """
-    few = qp.q.size // (6 if qp.b.size or in_sequence else 10)
-    if options.expansion == "spectral":
-        few = MIN_LANCZOS_STEPS
+    if preconditioned_operator(qp) or options.expansion == "spectral":
+        few = 0
+    elif qp.b.size or in_sequence:
+        few = qp.q.size // 6
     elif isinstance(qp.P, np.ndarray):
-        if not qp.b.size and not in_sequence:
-            few = min(few, BOUNDS_LANCZOS_STEPS)
-    elif preconditioned_operator(qp):
-        few = MIN_LANCZOS_STEPS
+        few = min(qp.q.size // 12, BOUNDS_LANCZOS_STEPS)
+    else:
+        few = qp.q.size // 10
     return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))
 
 
@@ -261,7 +256,7 @@ def _start(task: _Task, tol: float) -> Iterate:
     rows that slip continue to slip when the bound of friction changes.
     """
     problem, carry, rho = task.problem, task.carry, _penalty(task.rho, tol)
-    x, mu = np.zeros(problem.b.size), problem.rows.no_multipliers
+    x, mu = np.zeros(problem.F.n), problem.rows.no_multipliers
     if carry is not None:
         lower, upper = (bound + problem.rows.x_tilde for bound in problem.bounds)
         at = carry.x if task.scaled is None else carry.x * task.scaled.root
@@ -318,7 +313,9 @@ def outer_loop(
         solver = compiled.SMALBE(problem, options, False)
     else:
         own = options.preconditioner_for(qp)
-        kind = resolved_preconditioner(qp, options.preconditioner)
+        kind = problem.preconditioner
+        if kind is None:
+            kind = resolved_preconditioner(qp, options.preconditioner)
         M = structural_preconditioner(qp, kind) if own is None else checked(own)
         rule = options.step_rule_for(qp)
         solver = compiled.SMALBE(problem, options, kind != "none", M, rule)
@@ -497,7 +494,7 @@ def _worst_residual(task: _Task, point: Solution, Fx: Vector, enough: float) -> 
     """Return an upper bound of the worst KKT residual, exact if it exceeds `enough`."""
     qp, G, diagonal = task.qp, task.problem.rows.G, task.problem.diagonal
     if task.scaled is not None:
-        diagonal = task.scaled.root**2
+        diagonal = task.scaled.diagonal
     if task.eliminated is not None:
         task.problem.F.count += 1
         G, Fx, diagonal = task.eliminated.G, qp.P @ point.x, qp.P.diagonal()

@@ -30,29 +30,30 @@ cdef inline Py_ssize_t distance(Py_ssize_t i, Py_ssize_t j) noexcept nogil:
     return i - j if i > j else j - i
 
 
-def pairs_of_columns(matrix):
-    """Count the pairs of entries below the diagonal in the columns of a symmetric P.
+def sparsity(matrix):
+    """Return the fields of `solvers.smalbe.preconditioner.Sparsity` for a symmetric P.
 
-    The work of an incomplete factor is one step for each. inf where a diagonal entry is
-    not a positive number.
-
-    matrix : P in SciPy's csr or csc format
+    matrix : P (n, n), n > 0, in SciPy's csr or csc format
     """
-    cdef Py_ssize_t i, k, n = matrix.shape[0], below
-    cdef double pairs = 0.0, diagonal
-    cdef list held = []
-    cdef int[::1] indptr = _integers(matrix.indptr), indices = _integers(matrix.indices)
+    cdef Py_ssize_t i, k, n = matrix.shape[0], below, away = 0, others = 0
+    cdef double pairs = 0.0, least = INFINITY, most = 0.0, diagonal
+    cdef list held = [_integers(matrix.indptr), _integers(matrix.indices)]
+    cdef const int *indptr = <const int *> cnp.PyArray_DATA(held[0])
+    cdef const int *indices = <const int *> cnp.PyArray_DATA(held[1])
     cdef const double *data = read(matrix.data, held)
     for i in range(n):
         below, diagonal = 0, 0.0
         for k in range(indptr[i], indptr[i + 1]):
             below += indices[k] > i
+            away += indices[k] - i if indices[k] > i else 0
             if indices[k] == i:
                 diagonal += data[k]
         if not 0 < diagonal < INFINITY:
-            return INFINITY
+            return INFINITY, 0.0, INFINITY
+        least, most = fmin(least, diagonal), fmax(most, diagonal)
         pairs += below * (below - 1) // 2
-    return pairs
+        others += below
+    return pairs, n * <double> others / (2 * away) if away else 0.0, most / least
 
 
 def scaled_by_diagonal(matrix, scale):

@@ -36,7 +36,7 @@ cdef class Judge:
     def __init__(self, qp, scaled, root, diagonal, double norm):
         cdef Py_ssize_t n = len(diagonal)
         self.n, self.norm, self.held = n, norm, []
-        box, scaled_box = qp.box, scaled.box
+        box, scaled_box = qp.sets[0], scaled.sets[0]
         self.q, self.lb = read(qp.q, self.held), read(box.lower, self.held)
         self.ub = read(box.upper, self.held)
         if root is not None:

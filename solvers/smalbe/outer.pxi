@@ -272,7 +272,7 @@ cdef class SMALBE(MPRGP):
         """
         cdef Py_ssize_t i, n = self.n, r = self.rows.r
         cdef double before = -INFINITY, lagrangian, error, growth = options.rho_growth
-        cdef long left = options.max_steps - len(at.steps) - len(at.outer)
+        cdef long left = options.max_steps
         cdef bint stopped, enough, solved, stalled
         memcpy(self.x, address(at.nu), n * sizeof(double))
         memcpy(self.g, address(at.g), n * sizeof(double))
@@ -280,7 +280,7 @@ cdef class SMALBE(MPRGP):
             self.directions.begin(self.free)
         self.rho, self.M_now, self.tol, self.energy = at.rho, at.M, tol, options.energy
         self.most_products, self.knows_Cx = 0, False
-        multipliers = np.array(at.mu)
+        multipliers = copied(address(at.mu), r)
         cdef double *mu = address(multipliers)
         self.b_size = sqrt(self.over.total(dot(self.b, self.b, n)))
         if not self.b_size:
@@ -288,7 +288,9 @@ cdef class SMALBE(MPRGP):
         self.small_gradient = tol * self.b_size
         self.coarse_gradient = options.eta * self.b_size
         self.next_judged = FIRST_JUDGED * self.small_gradient
-        done, errors = [], [o.infeasibility for o in at.outer][max(len(at.outer) - 2, 0):]
+        done, errors = [], [o.infeasibility for o in at.outer[-2:]]
+        for o in at.outer:
+            left -= len(o.trace) + 1
         status = Status.ITERATION_LIMIT
         while True:
             # 1. The inner problem.

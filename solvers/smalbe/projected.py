@@ -15,6 +15,7 @@ from mortarbench.harness.distributed.vectors import DistributedVector, distribut
 from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.smalbe import compiled
 from mortarbench.solvers.smalbe.compiled import Product, Reduction
+from mortarbench.solvers.smalbe.preconditioner import Preconditioner
 from mortarbench.solvers.smalbe.rows import (
     DenseRows,
     Rows,
@@ -54,6 +55,8 @@ class Projected:
     diagonal: Vector  #: of F; empty for an operator without one
     #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
+    #: in the face; None for that of the options
+    preconditioner: Preconditioner | None = None
     #: of the free part of a sparse F in scaled variables; None for none
     factor: compiled.IncompleteFactor | None = None
     #: of KKT residuals of the QP as given; None where ‖g^P‖ decides when to stop

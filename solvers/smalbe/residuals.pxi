@@ -35,7 +35,7 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
     cdef const double *y = read(s.y, owners)
     cdef const double *z = read(s.z_box, owners)
     cdef const double *Fx = read(Px, owners)
-    box = qp.box
+    box = qp.sets[0]
     cdef const double *lb = read(box.lower, owners)
     cdef const double *ub = read(box.upper, owners)
     cdef const double *e = read(qp.b, owners)

@@ -15,6 +15,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Matrix, Solution, Vector
 from mortarbench.solvers.smalbe.compiled import IncompleteFactor, scaled_by_diagonal
+from mortarbench.solvers.smalbe.preconditioner import MAX_UNSCALED
 from mortarbench.solvers.smalbe.projected import Spectrum
 
 #: Sums Σⱼ Pᵢⱼwⱼ below zero by no more than this, relative to Pᵢᵢwᵢ, are rounding.
@@ -27,28 +28,36 @@ class Scaled:
 
     given: QP
     P: Matrix  #: of that, sorted, by rows or columns
-    qp: QP  #: in y = D¹ᐟ²x
-    root: Vector  #: (n,) D¹ᐟ²
-    norm: float  #: the largest sum Σⱼ|Hᵢⱼ| of a row: an upper bound for ‖H‖
+    diagonal: Vector  #: (n,) of that
+    qp: QP  #: in y = D¹ᐟ²x; the given one if its diagonal is nearly constant
+    root: Vector  #: (n,) D¹ᐟ², or ones
+    norm: float  #: an upper bound for the norm of its matrix, by sums Σⱼ|Hᵢⱼ| of rows
     weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
     has_weights: bool
     with_factor: bool  #: whether to precondition by a factor
 
     @classmethod
     def of(cls, qp: QP, *, with_factor: bool) -> Scaled:
-        """Scale a QP for which `solvers.smalbe.preconditioner.scalable` holds."""
+        """Scale a QP with bounds alone and a sparse P with a positive diagonal."""
         P = _canonical(qp.P)
-        root = np.sqrt(P.diagonal())
+        diagonal = P.diagonal()
+        root, scaled, one = np.sqrt(diagonal), qp, np.ones(diagonal.size)
         inverse = 1 / root
         data, norm, least, least_scaled = scaled_by_diagonal(P, inverse)
-        scaled = QP(
-            P=csr_array((data, P.indices, P.indptr), shape=P.shape), q=qp.q * inverse,
-            A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=qp.lb * root, ub=qp.ub * root,
-        )  # fmt: skip
-        weights, has_weights = np.ones(root.size), True
+        if (most := diagonal.max()) > MAX_UNSCALED * diagonal.min():
+            P_scaled = csr_array((data, P.indices, P.indptr), shape=P.shape)
+            scaled = QP(
+                P=P_scaled, q=qp.q * inverse, A=qp.A, b=qp.b, G=qp.G, h=qp.h,
+                lb=qp.lb * root, ub=qp.ub * root,
+            )  # fmt: skip
+        else:  # ‖P‖ ≤ ‖H‖ max D
+            root, norm = one, float(norm * most)
+        weights, has_weights = one, True
         if least < -ROUNDING:
             weights, has_weights = inverse, least_scaled >= -ROUNDING
-        return cls(qp, P, scaled, root, norm, weights, has_weights, with_factor)
+        return cls(
+            qp, P, diagonal, scaled, root, norm, weights, has_weights, with_factor
+        )
 
     def spectrum(self) -> Spectrum:
         """Bound the norm of the matrix by Gershgorin's theorem, without a product."""
@@ -61,6 +70,8 @@ class Scaled:
 
     def recovered(self, s: Solution) -> Solution:
         """Return the point of the QP as given; where y is at a bound, x is."""
+        if self.qp is self.given:
+            return s
         x = np.clip(s.x / self.root, self.given.lb, self.given.ub)
         x = np.where(s.x <= self.qp.lb, self.given.lb, x)
         x = np.where(s.x >= self.qp.ub, self.given.ub, x)

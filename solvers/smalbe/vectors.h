@@ -964,6 +964,13 @@ TWICE static int negate(out s, Py_ssize_t n)
 
 #define LARGER(a, b) ((a) > (b) ? (a) : (b))
 #define SMALLER(a, b) ((a) < (b) ? (a) : (b))
+#define MOST(a, b) CHOSEN((a) > (b), a, b) /* b where a is not a number */
+
+INLINE double largest_of(four t)
+{
+    double a = LARGER(t[0], t[1]), b = LARGER(t[2], t[3]);
+    return LARGER(a, b);
+}
 
 /* x = shift + ν, clipped to [lb, ub], and equal to lb or ub where ν is at its bound: the
    sum alone may differ from it in the last bit. `free` is 1 where ν is at no bound. */
@@ -1019,9 +1026,31 @@ TWICE static double
 terms_of_energy(in q, in diagonal, in x, in z, in Fx, in lb, in ub, in forces, out size,
                 Py_ssize_t n, out sums, out most)
 {
-    double xFx = 0, qx = 0, work = 0, slack = 0, largest = 0, least = INFINITY;
-    Py_ssize_t outside = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
+    four zero = EACH(0), xFx4 = zero, qx4 = zero, work4 = zero, slack4 = zero;
+    four largest4 = zero, least4 = EACH(INFINITY);
+    mask beyond = (mask) zero;
+    Py_ssize_t whole = n & ~(Py_ssize_t) 3, outside;
+    for (Py_ssize_t i = 0; i < whole; i += 4) {
+        four at = FOUR(x + i), push = FOUR(z + i), low = FOUR(lb + i), up = FOUR(ub + i);
+        four product = FOUR(Fx + i), cost = FOUR(q + i), d = FOUR(diagonal + i);
+        four step = (four) ((mask) CHOSEN(push > zero, up, low) & (push != zero));
+        four gap = ABSOLUTE(push * (at - step)), most_here = ABSOLUTE(product);
+        beyond |= ~(low <= at) | ~(at <= up);
+        xFx4 += at * product;
+        qx4 += cost * at;
+        work4 += step * push;
+        slack4 = MOST(gap, slack4);
+        least4 = CHOSEN((d > zero) & (d < least4), d, least4);
+        most_here = MOST(ABSOLUTE(cost), most_here);
+        most_here = MOST(ABSOLUTE(FOUR(forces + i)), most_here);
+        largest4 = MOST(most_here, largest4);
+        *(four *) (size + i) = most_here;
+    }
+    double xFx = total(xFx4), qx = total(qx4), work = total(work4);
+    double slack = largest_of(slack4), largest = largest_of(largest4);
+    double least = -largest_of(-least4);
+    outside = (beyond[0] | beyond[1] | beyond[2] | beyond[3]) != 0;
+    for (Py_ssize_t i = whole; i < n; i++) {
         double step = z[i] > 0 ? ub[i] : lb[i], size_of_all;
         step = z[i] != 0 ? step : 0;
         outside |= !(lb[i] <= x[i]) | !(x[i] <= ub[i]);
@@ -1049,14 +1078,24 @@ TWICE static double
 worst_of_forces(double energy, double largest, in q, in diagonal, in x, in Fx, in lb,
                 in ub, in size, out forces, Py_ssize_t n, double worst)
 {
-    double all = 0;
-    for (Py_ssize_t i = 0; i < n; i++) {
-        forces[i] += Fx[i] + q[i];
-        all += fabs(forces[i]);
+    four sum = EACH(0), most = EACH(0);
+    Py_ssize_t whole = n & ~(Py_ssize_t) 3;
+    for (Py_ssize_t i = 0; i < whole; i += 4) {
+        four r = FOUR(forces + i) + (FOUR(Fx + i) + FOUR(q + i));
+        *(four *) (forces + i) = r;
+        sum += ABSOLUTE(r);
+        most = MOST(ABSOLUTE(r), most);
     }
+    double all = total(sum), at_most = largest_of(most);
+    for (Py_ssize_t i = whole; i < n; i++) {
+        double r = fabs(forces[i] += Fx[i] + q[i]);
+        all += r;
+        at_most = LARGER(r, at_most);
+    }
+    /* none is smaller than its share of all: few are left to look at */
+    worst = LARGER(at_most / largest, worst);
     for (Py_ssize_t i = 0; i < n; i++) {
         double r = fabs(forces[i]), step, room;
-        worst = LARGER(worst, r / largest);
         if (!(r > worst * size[i]))
             continue;
         step = diagonal[i] > 0 ? r / diagonal[i] : INFINITY;

@@ -147,6 +147,34 @@ def test_preparation_is_as_it_is_written(seed):
     )
 
 
+@pytest.mark.parametrize("kind", ["random", "graded", "split", "equal", "huge", "tiny"])
+@pytest.mark.parametrize("k", [1, 2, 3, 5, 6, 12])
+def test_eigenpairs_of_tridiagonal_matrices_are_accurate_and_ascending(k, kind):
+    """Graded over 16 orders, split by zeros, and near the ends of doubles."""
+    rng = np.random.default_rng([k, len(kind)])
+    for _ in range(50):
+        d, e = rng.standard_normal(k), rng.standard_normal(max(k - 1, 0))
+        if kind == "graded":
+            d, e = d * 10 ** rng.uniform(-8, 8, k), e * 10 ** rng.uniform(-8, 8, k - 1)
+        elif kind == "split":
+            e[rng.random(k - 1) < 0.5] = 0
+        elif kind == "equal":
+            d[:] = d[0]
+        size = {"huge": 1e200, "tiny": 1e-200}.get(kind, 1.0)
+        values, vectors = compiled.eigenpairs(size * d, size * e)
+        T = np.diag(d) + np.diag(e, 1) + np.diag(e, -1)
+        most, values = np.abs(np.linalg.eigvalsh(T)).max(), values / size
+
+        assert (np.diff(values) >= 0).all()
+        assert vectors @ vectors.T == pytest.approx(np.eye(k), abs=1e-13)
+        assert vectors @ T == pytest.approx(values[:, None] * vectors, abs=1e-13 * most)
+
+
+def test_eigenpairs_of_zero_and_of_no_numbers_end():
+    assert (compiled.eigenpairs(np.zeros(3), np.zeros(2))[0] == 0).all()
+    assert not np.isfinite(compiled.eigenpairs([1.0, np.nan], [1.0])[0]).all()
+
+
 @pytest.mark.parametrize("kind", ["dense", "sparse", "operator"])
 @pytest.mark.parametrize("name", PRESETS)
 @pytest.mark.parametrize("seed", range(12))

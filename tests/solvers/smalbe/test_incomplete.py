@@ -9,11 +9,12 @@ from scipy.sparse import csr_array, diags_array, kron
 import mortarbench as mb
 from mortarbench.harness import QP, Status, kkt_residuals, no_rows
 from mortarbench.solvers import SOLVERS
-from mortarbench.solvers.smalbe.compiled import IncompleteFactor
+from mortarbench.solvers.smalbe.compiled import IncompleteFactor, sparsity
 from mortarbench.solvers.smalbe.preconditioner import has_sparse_factor
 from tests.support.sparse_qps import laplacian, qp_with_minimum, sparse_matrix
 from tests.support.textbook.incomplete import incomplete_cholesky, incomplete_inverse
 
+FACTORS = replace(SOLVERS["smalbe"], preconditioner="incomplete")
 KEEP = 0.95  #: share of dropped entries that goes to the diagonal
 
 
@@ -224,6 +225,54 @@ def test_who_asks_for_a_factor_that_is_not_there_is_told_why():
     assert "needs a sparse P" in solver.declines(replace(qp, P=qp.P.toarray()))
 
 
+def test_sparsity_by_hand():
+    """A string, a grid in its natural order, and one of which a unit is a hundredth."""
+    unit = diags_array(np.r_[np.full(35, 10.0), 1.0])
+    scaled = csr_array(unit @ grid(6) @ unit)
+
+    assert sparsity(grid(6)) == (25.0, 36 / (2 * 3.5), 1.0)
+    assert sparsity(scaled) == (25.0, 36 / (2 * 3.5), 100.0)
+    assert sparsity(laplacian("line", 9, np.random.default_rng(1)))[:2] == (0.0, 4.5)
+    assert sparsity(csr_array(np.eye(3))) == (0.0, 0.0, 1.0)
+    assert sparsity(csr_array(np.diag([1.0, 0.0])))[0] == np.inf
+
+
+@pytest.mark.parametrize(
+    ("case", "pays"),
+    [
+        ("journal-bearing/n=20/eccentricity=0.9", True),
+        ("journal-bearing/n=60", True),
+        ("torsion/n=70", True),
+        ("string/n=300", True),
+        ("obstacle/dim=2/n=40/shape=flat", False),
+        ("torsion/n=30", False),
+        ("string/n=50", False),
+    ],
+)
+def test_a_factor_is_used_where_it_saves_time(case, pays):
+    qp = primal(case)
+    s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
+
+    assert ("factorisations" in s.counts) is pays
+    assert kkt_residuals(qp, s).worst <= 1e-6
+
+
+@pytest.mark.parametrize(
+    ("case", "pays"),
+    [("journal-bearing/n=30/eccentricity=0.9", True), ("torsion/n=70", False)],
+)
+def test_in_a_random_order_a_factor_needs_a_wide_spread(case, pays):
+    """It is three times less accurate, and costs twice as much, in that order."""
+    qp = primal(case)
+    order = np.random.default_rng(3).permutation(qp.q.size)
+    P = csr_array(qp.P)[order][:, order]
+    qp = boxed(P, qp.q[order], qp.lb[order], qp.ub[order])
+    s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
+
+    assert ("factorisations" in s.counts) is pays
+    assert kkt_residuals(qp, s).worst <= 1e-6
+
+
 # --- the method ---------------------------------------------------------------------
 
 
@@ -231,10 +280,11 @@ def test_who_asks_for_a_factor_that_is_not_there_is_told_why():
     "seeds", [range(40), pytest.param(range(40, 1000), marks=pytest.mark.slow)], ids=str
 )
 @pytest.mark.parametrize("tol", [1e-6, 1e-10])
-def test_a_search_finds_no_sparse_qp_that_it_does_not_solve(seeds, tol):
+@pytest.mark.parametrize("solver", [SOLVERS["smalbe"], FACTORS], ids=["auto", "factor"])
+def test_a_search_finds_no_sparse_qp_that_it_does_not_solve(seeds, tol, solver):
     for seed in seeds:
         qp, x = qp_with_minimum(seed)
-        s = SOLVERS["smalbe"].prepare(qp, tol)()
+        s = solver.prepare(qp, tol)()
 
         assert s.status is Status.SOLVED, seed
         assert kkt_residuals(qp, s).worst <= 5 * tol, seed
@@ -269,7 +319,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
     qp, _ = qp_with_minimum(seed, 100)
     unit = 2.0 ** rng.integers(-9, 9)
     other = boxed(csr_array(qp.P) * unit**2, qp.q * unit, qp.lb / unit, qp.ub / unit)
-    s, t = (SOLVERS["smalbe"].prepare(p, 1e-8)() for p in (qp, other))
+    s, t = (FACTORS.prepare(p, 1e-8)() for p in (qp, other))
 
     assert s.counts == t.counts
     assert t.x * unit == pytest.approx(s.x, rel=1e-12)
@@ -292,7 +342,7 @@ def test_the_unit_of_a_variable_changes_nothing(seed):
 def test_on_the_named_families_it_takes_few_products(case, most):
     """PERMON's unmerged branch takes 74 and 105 on the first two."""
     qp = primal(case)
-    s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
+    s = FACTORS.prepare(qp, 1e-6)()
 
     assert s.status is Status.SOLVED
     assert kkt_residuals(qp, s).worst <= 1e-6
@@ -302,7 +352,7 @@ def test_on_the_named_families_it_takes_few_products(case, most):
 def test_half_a_string_takes_a_tenth_of_the_products_of_a_face_after_the_other():
     """PERMON's branch takes 224, about one for each of the faces on the way."""
     qp = half_string(1000)
-    s = SOLVERS["smalbe"].prepare(qp, 1e-6)()
+    s = FACTORS.prepare(qp, 1e-6)()
 
     assert kkt_residuals(qp, s).worst <= 1e-6
     assert s.counts["P_products"] <= 45
@@ -328,7 +378,7 @@ def test_it_stops_where_the_residual_is_what_was_asked_for():
                  "journal-bearing/n=50"):  # fmt: skip
         for tol in (1e-4, 1e-6, 1e-8):
             qp = primal(case)
-            residual = kkt_residuals(qp, SOLVERS["smalbe"].prepare(qp, tol)()).worst
+            residual = kkt_residuals(qp, FACTORS.prepare(qp, tol)()).worst
 
             assert 0.05 * tol <= residual <= tol
 
@@ -336,7 +386,7 @@ def test_it_stops_where_the_residual_is_what_was_asked_for():
 def test_all_at_their_bounds_from_the_start():
     """No component is free: the first face is empty."""
     qp = boxed(grid(6), np.ones(36), np.zeros(36), np.ones(36))
-    s = SOLVERS["smalbe"].prepare(qp, 1e-8)()
+    s = FACTORS.prepare(qp, 1e-8)()
 
     assert s.status is Status.SOLVED
     assert not s.x.any()
@@ -347,7 +397,7 @@ def test_a_cost_without_a_bound_below_is_not_solved():
     P = grid(5)
     P = csr_array(P - diags_array(np.asarray(P.sum(axis=0)).ravel()))
     inf = np.full(25, np.inf)
-    s = SOLVERS["smalbe"].prepare(boxed(P, np.ones(25), -inf, inf), 1e-6)()
+    s = FACTORS.prepare(boxed(P, np.ones(25), -inf, inf), 1e-6)()
 
     assert s.status is not Status.SOLVED
 
@@ -357,7 +407,7 @@ def test_a_floating_membrane_on_an_obstacle():
     P = grid(8)
     P = csr_array(P - diags_array(np.asarray(P.sum(axis=0)).ravel()))
     qp = boxed(P, np.ones(64), np.linspace(0, 1, 64), np.full(64, np.inf))
-    s = SOLVERS["smalbe"].prepare(qp, 1e-8)()
+    s = FACTORS.prepare(qp, 1e-8)()
 
     assert s.status is Status.SOLVED
     assert kkt_residuals(qp, s).worst <= 1e-8
@@ -365,7 +415,7 @@ def test_a_floating_membrane_on_an_obstacle():
 
 def test_a_sequence_begins_where_the_last_one_ended():
     qp = primal("journal-bearing/n=40/eccentricity=0.9")
-    prepare = SOLVERS["smalbe"].chain(1e-8)
+    prepare = FACTORS.chain(1e-8)
     first = prepare(qp)()
     near = replace(qp, P=csr_array(qp.P) * 3.0, q=qp.q * 3.01)
     second = prepare(near)()
