@@ -344,7 +344,6 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    G = G if isinstance(G, DistributedColumns) else csc_array(G)
     rows = _factored(G, e, bounded)
     if rows is not None:
         return rows
@@ -409,7 +408,7 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
         entries = np.diff(of_bounded.part.indptr)
         changing = unit.ranks.total(entries.astype(float)) > 0
     else:
-        G = csc_array(G)
+        G = G if G.format == "csc" else csc_array(G)
         by_components, size = CompressedRows.of_transpose(G).unit_columns()
         unit, of_bounded = LocalRows(by_components), LocalRows(by_components.rows(b))
         changing = of_bounded.transposed.touched
