@@ -41,7 +41,7 @@ cdef class Coarse:
         self, double s, const double *v, double c, const double *y, double *out
     ) except -1:
         """out ← sv + cGᵀy; out may be v."""
-        total = s * view(v, self.n) + c * np.asarray(self.source.unit.T @ view(y, self.k))
+        total = self.source.combined_rows(s, view(v, self.n), c, view(y, self.k))
         return copy_result(total, self.n, out, "v + Gᵀy")
 
     cdef int weigh_difference(

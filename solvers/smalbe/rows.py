@@ -125,10 +125,13 @@ class SparseRows(Rows):
     of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
-        y, unit = self.gram.backward(a), self.unit
-        if isinstance(unit, LocalRows):
-            return unit.T.combined(s, v, t, y)
-        return np.asarray(s * v + t * np.asarray(unit.T @ y))
+        return self.combined_rows(s, v, t, self.gram.backward(a))
+
+    def combined_rows(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
+        """Return sv + tGᵀy, with the normalised rows G."""
+        if isinstance(self.unit, LocalRows):
+            return self.unit.T.combined(s, v, t, y)
+        return np.asarray(s * v + t * np.asarray(self.unit.T @ y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
         """Return weights times (v − Gᵀy), with the normalised rows G."""
