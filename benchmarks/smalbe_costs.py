@@ -1,6 +1,6 @@
 """Costs of SMALBE besides its products: tables of docs/performance-smalbe.md.
 
-    python -m benchmarks.smalbe_costs dense|sparse|incomplete|kept
+    python -m benchmarks.smalbe_costs dense|sparse|incomplete|subdomains|kept
     python -m benchmarks.smalbe_costs race CASE SOLVER[,SOLVER…] ROUNDS [TOL[,TOL…]]
 
 * dense: preparing and solving duals, in units of products with F. A solve is compared
@@ -9,6 +9,9 @@
 * sparse: time of a solve per product, without a preconditioner, in units of one product
   and five passes w += v over vectors.
 * incomplete: sparse problems with and without incomplete factors.
+* subdomains: duals of bodies in subdomains, with blocks ready, that is, after a solve
+  with the same operator; time in units of products and applications of the
+  preconditioner.
 * kept: the same solves with and without recycling of CG directions.
 * race: preparing and solving a case by several solvers; answers are verified.
 
@@ -59,6 +62,11 @@ INCOMPLETE = {
     ],
     "torsion": [{"n": 30}, {"n": 100}, {"n": 200}],
 }  # fmt: skip
+SUBDOMAINS = (
+    "membranes/S=2/n=8/dual", "membranes/S=4/n=8/dual", "membranes/S=8/n=8/dual",
+    "membranes/S=16/n=16/dual", "beam-ring/Nr=16/Nh=8/feti=8/dual",
+    "beam-ring/Nr=56/Nh=28/feti=16/dual",
+)  # fmt: skip
 KEPT = [("dual", 12, 6, 5), ("dual", 60, 30, 5), ("dual-bounds", 60, 30, 5)]
 REPEATS = 20  #: repeats of a product, which is too short to be timed alone
 
@@ -225,6 +233,43 @@ def _incomplete(name: str, qp: QP, tol: float) -> None:
     )
 
 
+def subdomains(tol: float = 1e-6) -> None:
+    """Print times of duals of bodies in subdomains, with blocks ready."""
+    print(
+        "case, m | products, applications of the preconditioner | one of each | "
+        "prepare, solve | together in units of these | KKT residual"
+    )
+    for case in SUBDOMAINS:
+        _subdomains(case, mb.build(case).qp, tol)
+
+
+def _subdomains(case: str, qp: QP, tol: float) -> None:
+    solver, v = SOLVERS["smalbe"], np.ones(qp.q.size)
+    s = solver.prepare(qp, tol)()
+    products = s.counts["P_products"]
+    applications = s.counts["preconditioner_applies"]
+    P, F = Product(qp.P, v.size), qp.P.build()
+    M = F.preconditioner("dirichlet", "stiffness")
+    ready: list[Callable[[], Solution]] = []
+    times = in_turn(
+        60 if qp.q.size < 5000 else 20,
+        product=timed(lambda: P(v), REPEATS),
+        application=timed(lambda: M(v), REPEATS),
+        warm=timed(lambda: solver.prepare(qp, tol)()),
+        prepare=timed(lambda: ready.append(solver.prepare(qp, tol))),
+        solve=timed(lambda: ready.pop()()),
+    )
+    us = {name: 1e6 * seconds for name, (seconds, _) in times.items()}
+    whole = us["prepare"] + us["solve"]
+    unit = products * us["product"] + applications * us["application"]
+    print(
+        f"{case} {qp.q.size} | {products}, {applications} | {us['product']:.1f}, "
+        f"{us['application']:.1f} µs | {us['prepare']:.0f}, {us['solve']:.0f} µs | "
+        f"{whole / unit:.1f} | {kkt_residuals(qp, s).worst:.1e}",
+        flush=True,
+    )
+
+
 def kept() -> None:
     """Print times of duals with and without recycling of CG directions."""
     for form, *size in KEPT:
@@ -306,7 +351,7 @@ def main() -> None:
     """Parse the command line and print the table."""
     parser = ArgumentParser(description="What a solve of SMALBE costs.")
     tables = parser.add_subparsers(dest="table", required=True)
-    for name in ("dense", "sparse", "incomplete", "kept"):
+    for name in ("dense", "sparse", "incomplete", "subdomains", "kept"):
         tables.add_parser(name)
     race_parser = tables.add_parser("race", help="compare several solvers on a case")
     race_parser.add_argument("case")
@@ -315,8 +360,8 @@ def main() -> None:
     race_parser.add_argument("tolerances", nargs="?", default="1e-6,1e-8")
     arguments = vars(parser.parse_args())
     functions = {
-        "dense": dense, "sparse": sparse, "incomplete": incomplete, "kept": kept,
-        "race": race,
+        "dense": dense, "sparse": sparse, "incomplete": incomplete,
+        "subdomains": subdomains, "kept": kept, "race": race,
     }  # fmt: skip
     try:
         functions[arguments.pop("table")](**arguments)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from scipy.linalg.blas import dsymv
 
+import mortarbench as mb
+from benchmarks.smalbe_costs import SUBDOMAINS
 from mortarbench.harness import Status, kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
@@ -193,6 +195,26 @@ def _prepare_products(solver, qp, tol):
     stopped = replace(solver, max_steps=1)
     s = stopped.prepare(qp, tol)()
     return s.counts["P_products"] - s.iterations - 2  # its point, and the residuals
+
+
+@pytest.mark.parametrize("case", SUBDOMAINS)
+def test_bodies_in_subdomains(race, note, case):
+    """Prepare and solve with blocks ready, against products and applications of M."""
+    qp, tol, solver = mb.build(case).qp, 1e-6, SOLVERS["smalbe"]
+    s, v = solver.prepare(qp, tol)(), np.ones(qp.q.size)
+    P, M = Product(qp.P, v.size), qp.P.build().preconditioner("dirichlet", "stiffness")
+    applies = s.counts["preconditioner_applies"]
+    medians = race(
+        rounds=15, smalbe=partial(seconds, solver, qp, tol),
+        products=lambda: [P(v) for _ in range(products(s))],
+        applies=lambda: [M(v) for _ in range(applies)],
+    )  # fmt: skip
+    stored = medians["products"] + medians["applies"]
+    assert kkt_residuals(qp, s).worst <= tol
+    note(
+        f"{case} m={v.size}: {1e3 * medians['smalbe']:.2f} ms, {products(s)} products "
+        f"and {applies} applications of M × {medians['smalbe'] / stored:.1f}"
+    )
 
 
 ZOO = {

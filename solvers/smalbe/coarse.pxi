@@ -41,7 +41,7 @@ cdef class Coarse:
         self, double s, const double *v, double c, const double *y, double *out
     ) except -1:
         """out ← sv + cGᵀy; out may be v."""
-        total = s * view(v, self.n) + c * np.asarray(self.source.unit.T @ view(y, self.k))
+        total = self.source.combined_rows(s, view(v, self.n), c, view(y, self.k))
         return copy_result(total, self.n, out, "v + Gᵀy")
 
     cdef int weigh_difference(
@@ -117,7 +117,7 @@ cdef class LocalCoarse(Coarse):
         self.by_components = source.unit.transposed
         self.rows = self.by_components.transposed()
         self.of_bounded = source.of_bounded.transposed
-        self.given = CompressedRows.of_transpose(source.G)
+        self.given = transposed_rows(source.G)
         self.matrix, self.factor = symmetric_rows(gram.matrix), gram.factor
         self.has_border, self.missed = gram.has_border, Room(self.given.k)
 
@@ -174,6 +174,11 @@ cdef class LocalCoarse(Coarse):
         memset(self.missed.at, 0, self.given.k * sizeof(double))
         self.given.add_transposed(nu, self.missed.at)
         return sqrt(dot(self.missed.at, self.missed.at, self.given.k))
+
+
+cdef CompressedRows transposed_rows(G):
+    """Return the transpose of sparse rows."""
+    return CompressedRows.of_transpose(G if G.format == "csc" else csc_array(G))
 
 
 cdef CompressedRows symmetric_rows(M):

@@ -44,9 +44,7 @@ def residual_bound(qp, s, Px, diagonal, G, Reduction over):
         memcpy(forces, z, n * sizeof(double))
         add_combination(1.0, read(G, owners), y, forces, m, n)
     elif issparse(G):
-        by_components = CompressedRows.of_transpose(
-            G if G.format == "csc" else csc_array(G)
-        )
+        by_components = transposed_rows(G)
         by_components.combine(1.0, z, 1.0, y, forces)
     else:
         copy_result(G.T @ s.y, n, forces, "Gᵀy")

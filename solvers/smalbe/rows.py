@@ -125,10 +125,13 @@ class SparseRows(Rows):
     of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
 
     def combined(self, s: float, v: Vector, t: float, a: Vector) -> Vector:
-        y, unit = self.gram.backward(a), self.unit
-        if isinstance(unit, LocalRows):
-            return unit.T.combined(s, v, t, y)
-        return np.asarray(s * v + t * np.asarray(unit.T @ y))
+        return self.combined_rows(s, v, t, self.gram.backward(a))
+
+    def combined_rows(self, s: float, v: Vector, t: float, y: Vector) -> Vector:
+        """Return sv + tGᵀy, with the normalised rows G."""
+        if isinstance(self.unit, LocalRows):
+            return self.unit.T.combined(s, v, t, y)
+        return np.asarray(s * v + t * np.asarray(self.unit.T @ y))
 
     def weighted_difference(self, v: Vector, y: Vector, weights: Vector) -> Vector:
         """Return weights times (v − Gᵀy), with the normalised rows G."""
@@ -344,7 +347,6 @@ def equality_rows(G: Matrix, e: Vector, bounded: Mask) -> Rows:
     """
     if not is_sparse(G):
         return orthonormal_rows(G, e)
-    G = G if isinstance(G, DistributedColumns) else csc_array(G)
     rows = _factored(G, e, bounded)
     if rows is not None:
         return rows
@@ -409,7 +411,7 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
         entries = np.diff(of_bounded.part.indptr)
         changing = unit.ranks.total(entries.astype(float)) > 0
     else:
-        G = csc_array(G)
+        G = G if G.format == "csc" else csc_array(G)
         by_components, size = CompressedRows.of_transpose(G).unit_columns()
         unit, of_bounded = LocalRows(by_components), LocalRows(by_components.rows(b))
         changing = of_bounded.transposed.touched

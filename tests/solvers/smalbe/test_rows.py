@@ -159,6 +159,24 @@ def test_of_dependent_rows_that_are_too_many_some_stand_for_all(G, e, monkeypatc
     assert not equality_rows(csr_array(dependent), right, ALL).consistent
 
 
+def test_a_qp_with_dependent_sparse_rows_is_solved(G, e, monkeypatch):
+    """Independent rows stand for all; residuals are those of the rows as given."""
+    dependent = csr_array(np.vstack([G.toarray(), 2 * G.toarray()[3:4]]))
+    qp = QP(
+        P=np.eye(40), q=np.ones(40), A=dependent, b=np.append(e, 2 * e[3]),
+        G=no_rows(40), h=np.zeros(0), lb=np.where(THIRD, -0.5, -np.inf),
+        ub=np.full(40, np.inf),
+    )  # fmt: skip
+    dense = SMALBE().prepare(qp, 1e-8)()
+    monkeypatch.setattr(module, "MAX_DENSE_ENTRIES", 0)
+    monkeypatch.setattr(module, "too_large", lambda n, copies: "too large")
+    sparse = SMALBE().prepare(qp, 1e-8)()
+
+    assert sparse.status is dense.status
+    assert kkt_residuals(qp, sparse).worst <= 1e-7
+    assert sparse.x == pytest.approx(dense.x, abs=1e-6 * np.abs(dense.x).max())
+
+
 @pytest.mark.parametrize("border", [True, False], ids=["border", "whole"])
 @pytest.mark.parametrize("shift", [1e-6, 1e-10, 1e-14])
 def test_a_motion_that_held_components_alone_feel_leaves_a_factor(
