@@ -37,7 +37,6 @@ from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
     StructuredGrid,
-    box,
     join,
     joined_sides,
 )
@@ -127,17 +126,12 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
-    """A box of equal hexahedra; subdomains are blocks of at most size³ cells."""
+class StructuredSolid:
+    """Hexahedra numbered as in a box; subdomains are blocks of at most size³ cells."""
 
-    size: tuple[float, float, float]  #: from (0, 0, 0), m
+    mesh: Mesh  #: m
     divisions: tuple[int, int, int]  #: numbers of cells along x, y and z
     dim = 3
-
-    @cached_property
-    def mesh(self) -> Mesh:
-        """The mesh, m."""
-        return box((0.0, 0.0, 0.0), self.size, self.divisions)
 
     @property
     def body(self) -> NDArray[np.int64]:
@@ -146,11 +140,11 @@ class Box:
 
     @property
     def sides(self) -> Mapping[str, Nodes]:
-        """Faces of the sides by name, see `problems.fem.mesh.box`."""
+        """Faces of the sides by name."""
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
-        """Cut the box into blocks of at most `size` cells a side."""
+        """Cut the body into blocks of at most `size` cells a side."""
         named = np.unique(np.concatenate(list(self.sides.values())))
         return mesh_in_subdomains(
             self.mesh, blocks(self.divisions, size), self.body, named

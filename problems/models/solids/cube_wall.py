@@ -22,14 +22,14 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
-    Box,
     ContactProblem,
     ContactSolution,
     ElasticBodies,
+    StructuredSolid,
     cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh import box, dofs_of, nodal_areas
 
 MATERIAL = Material(E=2e4, nu=0.33)
 SIDE = 1.0  #: of the cube, m
@@ -43,11 +43,13 @@ WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """Return the cube with n × n × n cells."""
     p: Any = params
-    shape = Box((SIDE, SIDE, SIDE), (p["n"], p["n"], p["n"]))
-    top, areas = nodal_areas(shape.mesh.points, shape.sides["top"])
+    divisions = p["n"], p["n"], p["n"]
+    mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions)
+    shape = StructuredSolid(mesh, divisions)
+    top, areas = nodal_areas(mesh.points, shape.sides["top"])
     forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
     fixed = dofs_of(np.unique(shape.sides["bottom"]), 3)
-    corner = dofs_of(np.array([len(shape.mesh.points) - 1]), 3)
+    corner = dofs_of(np.array([len(mesh.points) - 1]), 3)
 
     def results(solution: ContactSolution) -> dict[str, Any]:
         """Return the displacement of the corner (1, 1, 1), m."""
