@@ -17,6 +17,9 @@ PROBLEMS: Registry[Family] = Registry(
         "hertz-plane": entry("mortarbench.problems.families.hertz", "HertzPlane"),
         "hertz-cylinder": entry("mortarbench.problems.families.hertz", "HertzCylinder"),
         "half-plane": entry("mortarbench.problems.families.half_plane", "HalfPlane"),
+        "hertz-sphere": entry(
+            "mortarbench.problems.families.hertz_sphere", "HertzSphere"
+        ),
         "cube-wall": entry("mortarbench.problems.families.cube_wall", "CubeWall"),
         "half-space": entry("mortarbench.problems.families.half_space", "HalfSpace"),
         "greco": entry("mortarbench.problems.families.greco", "Greco"),

@@ -126,8 +126,8 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 
 @dataclass(frozen=True, eq=False)
-class Boxes:
-    """Boxes of hexahedra in space; subdomains are blocks of at most size³ cells."""
+class StructuredSolids:
+    """Hexahedra numbered as in boxes; subdomains are blocks of at most size³ cells."""
 
     parts: tuple[Mesh, ...]  #: see `problems.fem.mesh.box`, with different boundaries
     divisions: tuple[tuple[int, int, int], ...]  #: cells of each along x, y and z

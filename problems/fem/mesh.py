@@ -249,23 +249,32 @@ def box(corner: tuple[float, ...], size: tuple[float, ...],
         divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
     """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
 
-    Boundaries: left and right (x), front and back (y), bottom and top (z); m.
+    Boundaries as of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
     (12, 2, [[8, 9, 11, 10]])
     """
-    counts = np.add(divisions, 1)
-    number = np.arange(counts.prod()).reshape(counts[::-1])
-    ends = (slice(None, -1), slice(1, None))
-    corners = [number[ends[z], ends[y], ends[x]] for x, y, z in HEXAHEDRON.vertices]
-    cells = np.stack([corner.ravel() for corner in corners], axis=-1)
-    axes = [
+    x, y, z = (
         first + length * np.arange(n + 1) / n
         for first, length, n in zip(corner, size, divisions, strict=True)
-    ]
-    z, y, x = np.meshgrid(*axes[::-1], indexing="ij")
-    points = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=-1)
+    )
+    return box_grid(x, y, z)
+
+
+def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
+    """Mesh a box by hexahedra between increasing coordinates, x numbered fastest.
+
+    Boundaries: left and right (x), front and back (y), bottom and top (z).
+    """
+    axes = x, y, z
+    counts = [axis.size for axis in axes]
+    number = np.arange(np.prod(counts)).reshape(counts[::-1])
+    ends = (slice(None, -1), slice(1, None))
+    corners = [number[ends[k], ends[j], ends[i]] for i, j, k in HEXAHEDRON.vertices]
+    cells = np.stack([corner.ravel() for corner in corners], axis=-1)
+    grid = np.meshgrid(*axes[::-1], indexing="ij")
+    points = np.stack([coordinate.ravel() for coordinate in grid[::-1]], axis=-1)
     facets = boundary_facets(cells, 3)
     centre = points[facets].mean(axis=1)
     names = ("left", "right", "front", "back", "bottom", "top")

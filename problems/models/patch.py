@@ -48,11 +48,11 @@ from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.newton import Iteration, NewtonPath
 from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
-    Boxes,
     ContactProblem,
     ContactSolution,
     ElasticBodies,
     StructuredGrids,
+    StructuredSolids,
     cached_problem,
     keyed_linearisation,
 )
@@ -273,7 +273,7 @@ def _bodies_in_space(params: Mapping[str, Value]) -> ElasticBodies:
             zip(NAMES, (0.0, HEIGHT), divisions, strict=True)
         )
     ]
-    shape = Boxes(tuple(meshes), tuple(divisions))
+    shape = StructuredSolids(tuple(meshes), tuple(divisions))
     sides, force = shape.sides, PRESSURE * LENGTH**2
     rollers = [
         dofs_of(np.unique(sides[name]), 3, axis)

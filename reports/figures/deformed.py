@@ -67,6 +67,7 @@ _SUBDOMAIN = Look(colour="white", width=0.9)  #: borders of subdomains
 #: arrows of open nodes that carry a share of their neighbours' forces
 _OPEN = "#6b7480"
 _OUTLINE = Look(colour=INK, width=0.7)
+_ALONG = 0.9  #: cosine of the angle from an axis, above which normals count as parallel
 _CREASE = np.radians(40)  #: least angle between faces whose edge is outlined
 _BEFORE = Look(colour="#8a93a0", width=0.7, dash=(4, 2.5))
 
@@ -241,8 +242,15 @@ def _pressure_panel(
     fields: Fields, side: ContactSide, faces: NDArray[np.int64], normal: Vector,
     letter: str, span: float,
 ) -> FieldPanel:  # fmt: skip
-    """Show the pressure on the undeformed faces of a side, along its mean normal."""
-    camera = camera_towards(normal)
+    """Show the pressure on the undeformed faces of a side, along its mean normal.
+
+    If that is about an axis, the view is along it, with positive axes to the right.
+    """
+    camera = camera_towards(
+        np.where(np.abs(normal).max() > _ALONG, np.rint(normal), normal)
+    )
+    if camera.right.sum() < 0:  # seen through the body
+        camera = camera._replace(right=-camera.right)
     pressure = np.zeros(len(fields.points))
     pressure[side.nodes] = side.pressure
     largest = float(side.pressure.max())
@@ -273,10 +281,8 @@ def _pressure_panel(
 def _axis_name(direction: Vector, unit: str) -> str:
     """Return the label of an axis of a picture, with its name if along x, y or z."""
     axis = int(np.abs(direction).argmax())
-    if abs(direction[axis]) < 1 - 1e-9:
-        return f"in {unit}"
-    sign = "−" if direction[axis] < 0 else ""
-    return f"{sign}${'xyz'[axis]}$ in {unit}"
+    is_along = direction[axis] > 1 - 1e-9
+    return f"${'xyz'[axis]}$ in {unit}" if is_along else f"in {unit}"
 
 
 def _triad(camera: Camera, low: Vector, high: Vector) -> list[FieldMark]:

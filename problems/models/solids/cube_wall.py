@@ -22,10 +22,10 @@ from mortarbench.problems.contact.node_to_segment import ContactRows
 from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
 from mortarbench.problems.duality.problem import (
-    Boxes,
     ContactProblem,
     ContactSolution,
     ElasticBodies,
+    StructuredSolids,
     cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
@@ -43,12 +43,13 @@ WALL = RigidPlane((SIDE + GAP, 0.0, 0.0), (-1.0, 0.0, 0.0))
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """Return the cube with n × n × n cells."""
     p: Any = params
-    divisions = (p["n"], p["n"], p["n"])
-    shape = Boxes((box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions),), (divisions,))
-    top, areas = nodal_areas(shape.mesh.points, shape.sides["top"])
+    divisions = p["n"], p["n"], p["n"]
+    mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, SIDE), divisions)
+    shape = StructuredSolids((mesh,), (divisions,))
+    top, areas = nodal_areas(mesh.points, shape.sides["top"])
     forces = Forces(dofs_of(top, 3, 2), -PRESSURE * areas / FORCE)
     fixed = dofs_of(np.unique(shape.sides["bottom"]), 3)
-    corner = dofs_of(np.array([len(shape.mesh.points) - 1]), 3)
+    corner = dofs_of(np.array([len(mesh.points) - 1]), 3)
 
     def results(solution: ContactSolution) -> dict[str, Any]:
         """Return the displacement of the corner (1, 1, 1), m."""

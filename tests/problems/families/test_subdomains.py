@@ -28,6 +28,7 @@ CASES = [
     ("greco/n=6", "feti=3"),
     ("cube-wall/n=4", "feti=2"),
     ("cube-wall/n=3", "feti=2"),
+    ("hertz-sphere/n=1", "feti=3"),
     ("obstacle/n=8", "feti=3"),
     ("obstacle/dim=1/n=12", "feti=4"),
 ]
