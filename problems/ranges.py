@@ -281,11 +281,20 @@ def check_kinematics(family: str, params: Mapping[str, Value]) -> None:
 
 def check_dimension(family: str, params: Mapping[str, Value]) -> None:
     """Raise InputError for dim=3 with keys of plane problems."""
+    if params["dim"] == 3:
+        check_plane_only(family, params, "dim=3")
+
+
+def check_plane_only(family: str, params: Mapping[str, Value], space: str) -> None:
+    """Raise InputError for keys that families in space do not support.
+
+    space : the key and value that make the family three-dimensional
+    """
     for key, only in PLANE_ONLY.items():
-        if params["dim"] == 3 and params.get(key, only) != only:
+        if params.get(key, only) != only:
             raise InputError(
-                f"{family}: {key}={params[key]} with dim=3 is not built; expected "
-                f"{key}={only}, or dim=2"
+                f"{family}: {key}={params[key]} with {space} is not built; expected "
+                f"{key}={only}, or a plane problem"
             )
 
 

@@ -18,6 +18,8 @@ from mortarbench.problems.ranges import (
     PLANES,
     STEPS,
     check_memory,
+    check_plane_only,
+    choice,
     key,
     refuse_friction,
     schema,
@@ -30,7 +32,7 @@ MAX_NODES = 50_000_000  #: the entries of K are indexed by 32-bit integers
 
 
 class BeamRing(ContactFamily):
-    """The paper's benchmark: beam on a half ring, plane elasticity."""
+    """The paper's benchmark: beam on a half ring, plane or extruded."""
 
     name = "beam-ring"
     keys = schema(
@@ -46,6 +48,8 @@ class BeamRing(ContactFamily):
         **DECOMPOSITION,
         **KINEMATICS,
         **CONTACT_STIFFNESS,
+        depth=key(0, 0),
+        sides=choice("free", "plane-strain"),
     )
     forms = CONTACT_FORMS
     problem = "beam_ring.problem"
@@ -71,7 +75,14 @@ class BeamRing(ContactFamily):
                 f"{self.name}: Nr={p['Nr']}, Nh={p['Nh']} make {nodes:.2g} nodes; "
                 f"expected at most {MAX_NODES:.2g}"
             )
-        check_memory(self.name, 2 * nodes)
+        check_memory(self.name, (3 * (p["depth"] + 1) if p["depth"] else 2) * nodes)
+        if p["depth"]:
+            check_plane_only(self.name, params, f"depth={p['depth']}")
+        elif p["sides"] != self.defaults["sides"]:
+            raise InputError(
+                f"{self.name}: sides={p['sides']} is not used by depth=0; expected no "
+                "sides, or depth=1 or more"
+            )
 
     def refined(self, params: Mapping[str, Value]) -> Mapping[str, Value] | None:
         """Return the case with every cell halved, which runs its own load steps.

@@ -285,6 +285,29 @@ def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
     })  # fmt: skip
 
 
+def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
+    """Extrude a plane mesh of quadrilaterals to layers of hexahedra from z = 0, m.
+
+    Nodes and cells are numbered layer by layer. A chain of nodes becomes faces of the
+    same name; those at both ends of the thickness have no name.
+    """
+    N = len(mesh.points)
+    step = N * np.arange(layers + 1)
+    z = np.repeat(thickness * np.arange(layers + 1) / layers, N)
+    points = np.column_stack([np.tile(mesh.points, (layers + 1, 1)), z])
+    ends = step[:-1, None, None], step[1:, None, None]
+    cells = np.concatenate([mesh.cells + at for at in ends], axis=2)
+    # with the body on the left of the chain, (a, b, b', a') is anticlockwise outside
+    facets = {
+        name: np.stack([chain[:-1], chain[1:], chain[1:] + N, chain[:-1] + N], axis=-1)
+        for name, chain in mesh.boundaries.items()
+    }
+    boundaries = {
+        name: (table + ends[0]).reshape(-1, 4) for name, table in facets.items()
+    }
+    return Mesh(points, cells.reshape(-1, 8), boundaries)
+
+
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
     """Move the nodes of a `box` at random; those of a side stay in its plane.
 

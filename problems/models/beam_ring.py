@@ -9,6 +9,10 @@ Errata of the paper that matter here: its 313 nodes for Nr = 4, Nh = 3 imply a r
 Nh radial layers (``radial=3``), but its text and Table 1 imply 2·Nh (424 nodes). m_E is
 the number of prescribed displacement components, 2(Nr + 1) + 4(radial + 1), not of
 nodes. Plane strain and a force per unit thickness are implied, not stated.
+
+With depth > 0 the bodies are extruded to layers of hexahedra over a thickness of 1 m.
+Their end faces are free, or in plane strain (u_z = 0); the clamped sides do not move in
+any direction, and F₀ = 10⁸ N is spread over the loaded edge.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from mortarbench.harness import Case, Reference, Solution, Value
+from mortarbench.harness import Case, Reference, Solution, Value, Vector
 from mortarbench.problems.contact.bodies import Bodies, ContactPair
 from mortarbench.problems.contact.friction import law_of
 from mortarbench.problems.contact.linearise import linearisation
@@ -29,7 +33,9 @@ from mortarbench.problems.duality.newton_case import newton_case, newton_path
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
+    Shape,
     StructuredGrids,
+    StructuredSolids,
     cached_problem,
     keyed_linearisation,
 )
@@ -37,13 +43,17 @@ from mortarbench.problems.fem.elasticity import Material, Plane
 from mortarbench.problems.fem.mesh import (
     Nodes,
     StructuredGrid,
+    as_vectors,
     dofs_of,
+    extruded,
     half_ring_grid,
+    nodal_lengths,
     rectangle_grid,
 )
 
 LENGTH = 2.0  #: l, length of the beam, m
 LOAD = 1e8  #: F₀ = 0.1 GN per m of thickness
+THICKNESS = 1.0  #: of extruded bodies, m
 NAMES = ("beam", "ring")
 BEAM = Material(E=200e9, nu=0.3)
 RING = Material(E=20e9, nu=0.3)
@@ -53,15 +63,18 @@ RING = Material(E=20e9, nu=0.3)
 def problem(params: Mapping[str, Value]) -> ContactProblem:
     """Return the benchmark, loaded in `steps` equal load steps."""
     p: Any = params
-    elastic = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"])
-    tip = _tip(elastic.shape.sides)
+    elastic = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"], p["depth"], p["sides"])
+    tip, share = _tip(elastic.shape)
     return ContactProblem(
         bodies=elastic, linearise=keyed_linearisation(p),
         stages=load_steps(
             p["steps"], p["relin"], elastic.forces, elastic.fixed, (law_of(p),),
             quasi_static=p["loading"] == "quasi-static",
         ),
-        results=lambda answer: {"tip": (answer.at(tip) * LENGTH).tolist()},
+        results=lambda answer: {
+            "tip": (share @ as_vectors(answer.at(tip), elastic.shape.dim) * LENGTH)
+            .tolist()
+        },
     )  # fmt: skip
 
 
@@ -73,7 +86,7 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
         geometry, (p["contact"], p["basis"]), p["steps"], p["material"],
         p["contact_stiffness"], reference,
     )  # fmt: skip
-    tip = _tip(bodies(*geometry).shape.sides)
+    tip, _ = _tip(bodies(*geometry).shape)
 
     def results(_: Iteration, s: Solution) -> dict[str, Any]:
         return {"tip": (s.x[tip] * LENGTH).tolist()}
@@ -82,18 +95,39 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 
 @lru_cache(maxsize=4)
-def bodies(Nr: int, Nh: int, radial: int, plane: Plane) -> ElasticBodies:
-    """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells."""
-    shape = StructuredGrids(_grids(Nr, Nh, radial))
-    sides = shape.sides
-    # m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
-    clamped = [dofs_of(sides[b], 2) for b in ("left", "left_foot", "right_foot")]
+def bodies(
+    Nr: int, Nh: int, radial: int, plane: Plane, depth: int = 0, sides: str = "free"
+) -> ElasticBodies:
+    """Return a beam of 8Nr × Nr cells above a ring of 12Nh × radial cells.
+
+    depth : number of layers across the thickness; 0 for plane bodies
+    sides : of the end faces in space, "free" or "plane-strain"
+    """
+    grids = _grids(Nr, Nh, radial)
+    shape: Shape = StructuredGrids(grids)
+    if depth:
+        solids = [extruded(grid.mesh(), depth, THICKNESS) for grid in grids]
+        shape = StructuredSolids(
+            tuple(solids), tuple((*grid.divisions, depth) for grid in grids)
+        )
+    by_name = shape.sides
+    # in the plane m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
+    clamped = [
+        dofs_of(_nodes(by_name[b]), shape.dim)
+        for b in ("left", "left_foot", "right_foot")
+    ]
+    if sides == "plane-strain":
+        ends = np.isin(shape.mesh.points[:, 2], (0.0, THICKNESS))
+        clamped.append(dofs_of(np.flatnonzero(ends), 3, 2))
+    fixed = np.concatenate(clamped)
+    tip, share = _tip(shape)
     return ElasticBodies(
-        shape=shape, names=NAMES, materials=(BEAM, RING), plane=plane, length=LENGTH,
-        force=LOAD, fixed=np.concatenate(clamped),
-        forces=Forces(_tip(sides)[1:], np.array([-1.0])),
+        shape=shape, names=NAMES, materials=(BEAM, RING),
+        plane=None if depth else plane, length=LENGTH, force=LOAD,
+        fixed=np.unique(fixed) if depth else fixed,
+        forces=Forces(tip[1 :: shape.dim], -share),
         # as in the paper: the ring is the slave, the beam the master
-        pairs=(ContactPair(slave=sides["outer"], master=sides["bottom"]),),
+        pairs=(ContactPair(slave=by_name["outer"], master=by_name["bottom"]),),
     )  # fmt: skip
 
 
@@ -109,9 +143,26 @@ def _grids(Nr: int, Nh: int, radial: int) -> tuple[StructuredGrid, StructuredGri
     )
 
 
-def _tip(sides: Mapping[str, Nodes]) -> Nodes:
-    """Return both components of the upper right corner of the beam."""
-    return dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)
+def _tip(shape: Shape) -> tuple[Nodes, Vector]:
+    """Return the components of the upper right corner of the beam.
+
+    Returns
+    -------
+    components (dim·k,) of the k nodes of the corner, in space an edge, and the share
+    (k,) of the load that acts on each
+
+    """
+    sides = shape.sides
+    nodes = np.intersect1d(sides["top"], sides["right"])
+    share = np.ones(1)
+    if shape.dim == 3:
+        share = nodal_lengths(shape.mesh.points[nodes]) / THICKNESS
+    return dofs_of(nodes, shape.dim), share
+
+
+def _nodes(side: Nodes) -> Nodes:
+    """Return the nodes of a chain, in its order, or of faces."""
+    return side if side.ndim == 1 else np.unique(side)
 
 
 @lru_cache(maxsize=4)

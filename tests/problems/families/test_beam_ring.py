@@ -315,3 +315,64 @@ def test_smalbe_and_clarabel_agree_in_energy_on_every_case_of_the_demo():
     for values in energies.values():
         assert len(values) == 6  # SMALBE on the dual, Clarabel on both, each two ways
         assert values == pytest.approx(values[:1] * 6, rel=1e-6)
+
+
+def in_space(form="dual", tol=1e-11, **keys):
+    """Return the quantities of a coarse benchmark."""
+    keys = dict(Nr=2, Nh=2, steps=2) | keys
+    params = FAMILY.complete(keys)
+    FAMILY.check(params)
+    case = FAMILY.build(form, params, reference_solution)
+    return case.quantities(SMALBE().prepare(case.qp, tol)())
+
+
+@pytest.mark.parametrize("form", ["dual", "dual-bounds"])
+def test_extruded_bodies_in_plane_strain_are_those_of_the_plane(form):
+    plane = in_space(form)
+    for depth in (1, 3):
+        space = in_space(form, depth=depth, sides="plane-strain")
+        assert space["energy"] == pytest.approx(plane["energy"], rel=1e-10)
+        assert space["tip"] == pytest.approx([*plane["tip"], 0.0], abs=1e-10)
+        assert space["contact_force"] == pytest.approx(
+            [*plane["contact_force"], 0.0], rel=1e-9, abs=1.0
+        )
+        for rows in ("contact_rows", "active"):
+            assert space[rows] == (depth + 1) * plane[rows]
+        assert space["multiplier_sum"] == pytest.approx(plane["multiplier_sum"])
+
+
+def test_the_difference_of_face_mortar_from_the_plane_falls_like_the_square_of_h():
+    """Faces have one normal each, while normals of the plane are interpolated."""
+    gaps = []
+    for n in (2, 4, 8):
+        keys = dict(Nr=n, Nh=n, steps=1, contact="mortar", tol=1e-10)
+        plane, space = in_space(**keys), in_space(**keys, depth=1, sides="plane-strain")
+        gaps.append(abs(space["energy"] / plane["energy"] - 1))
+    assert gaps[0] / gaps[1] > 3
+    assert gaps[1] / gaps[2] > 3
+
+
+def test_free_ends_soften_the_bodies():
+    assert in_space(depth=2)["energy"] < in_space()["energy"] < 0
+
+
+def test_subdomains_of_extruded_bodies_have_the_same_solution():
+    keys = dict(depth=2, sides="plane-strain")
+    whole, parts = in_space(**keys), in_space(**keys, feti=4)
+    assert parts["energy"] == pytest.approx(whole["energy"], rel=1e-9)
+    assert parts["tip"] == pytest.approx(whole["tip"], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        (dict(depth=-1), "depth=-1"),
+        (dict(sides="plane-strain"), "sides=plane-strain is not used by depth=0"),
+        (dict(depth=1, plane="stress"), "plane=stress with depth=1 is not built"),
+        (dict(depth=1, friction="tresca", bound=1.0), "friction=tresca with depth=1"),
+        (dict(depth=1, kinematics="finite"), "kinematics=finite with depth=1 is not"),
+    ],
+)
+def test_keys_of_extruded_bodies_are_checked(bad, message):
+    with pytest.raises(InputError, match=message):
+        FAMILY.check(FAMILY.complete(bad))
