@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import blas, lapack
 from scipy.sparse import csc_array, csc_matrix, diags_array
-from sksparse.cholmod import CholmodNotPositiveDefiniteError, Factor, analyze
+from sksparse.cholmod import CholmodNotPositiveDefiniteError, analyze
 
 from mortarbench.harness.distributed.sparse import BorderedFactor, factor_above
 from mortarbench.harness.distributed.vectors import (
@@ -102,41 +102,33 @@ class LocalFactor:
     """
 
     at: Touched
-    order: Rows  #: (k,) permutation of the local rows: unchanging, changing, shared
-    changing: int  #: number of changing rows
-    #: factor of A_p in that order, with 1 added to the diagonal of shared rows; None
-    #: without rows
-    factor: Factor | None
-    L_bb: Dense  #: (b, b) last block of the factor, of the border
+    changing: int  #: number of changing rows, the first of the border
+    #: of A_p with 1 added to the diagonal of shared rows, in the order of unchanging,
+    #: changing and shared rows
+    factor: BorderedFactor
 
     @property
     def border(self) -> Rows:
         """Positions (b,) of the border in the local rows."""
-        return self.order[self.order.size - len(self.L_bb) :]
+        return self.factor.border_rows
 
     @cached_property
     def complement(self) -> Dense:
         """Schur complement (b, b) of A_p on the border."""
-        T = self.L_bb @ self.L_bb.T
+        T = self.factor.complement
         # less the 1 added to the diagonal of shared rows
         T[np.arange(self.changing, len(T)), np.arange(self.changing, len(T))] -= 1
         return T
 
     def reduced(self, t: Dense) -> tuple[Dense, Dense]:
         """Eliminate an additive t (k,): L_aa⁻¹t_a, and t_b − L_baL_aa⁻¹t_a."""
-        if self.factor is None:
-            return np.zeros(0), np.zeros(0)
-        u = self.factor.solve_L(t[self.order], use_LDLt_decomposition=False)
-        first = u.size - len(self.L_bb)
-        return u[:first], self.L_bb @ u[first:]
+        u = self.factor.reduced(t)
+        first = u.size - len(self.complement)
+        return u[:first], u[first:]
 
     def extended(self, u: Dense, x_b: Dense) -> Dense:
         """Return the x (k,) with  L_aaᵀx_a + L_baᵀx_b = u  and x_b on the border."""
-        y = np.empty(self.order.size)
-        if self.factor is not None:
-            u = np.concatenate([u, self.L_bb.T @ x_b])
-            y[self.order] = self.factor.solve_Lt(u, use_LDLt_decomposition=False)
-        return y
+        return self.factor.extended(np.concatenate([u, x_b]))
 
     def completed(self) -> SummedFactor:
         """Factorise A; called by all ranks.
@@ -183,11 +175,8 @@ class SummedFactor:
     @property
     def least_pivot(self) -> float:
         """Smallest diagonal entry of L on all ranks; inf without rows."""
-        factor, inner = self.local.factor, self.local.order.size - len(self.local.L_bb)
-        of_inner = np.zeros(0) if factor is None else factor.L().diagonal()[:inner]
-        pivots = np.concatenate([
-            self.root * of_inner, np.diag(self.L_cc), np.diag(self.L_ss),
-        ])  # fmt: skip
+        inner = self.root * self.local.factor.least_inner_pivot
+        pivots = np.concatenate([[inner], np.diag(self.L_cc), np.diag(self.L_ss)])
         return self.local.at.ranks.extreme(float(pivots.min(initial=np.inf)), np.min)
 
     def shifted(self, shift: float, less: Dense) -> SummedFactor:
@@ -269,34 +258,25 @@ def local_factor(
 
     """
     changes = np.zeros(at.rows.size, bool) if changing is None else changing
-    first = np.flatnonzero(~changes & ~at.is_shared)
-    second = np.flatnonzero(changes & ~at.is_shared)
-    if first.size:
-        first = first[analyze(with_int32(A[first][:, first]), use_long=False).P()]
-    order = np.concatenate([first, second, np.flatnonzero(at.is_shared)])
-    factor, L_bb, fails = None, np.zeros((0, 0)), 0.0
-    if order.size:
-        raised = np.where(
-            at.is_shared[order], 1.0, 0.0
-        )  # A_p alone may be singular there
-        M = with_int32(csc_array(A[order][:, order]) + diags_array(raised))
-        factor = analyze(M, ordering_method="natural", use_long=False)
-        try:
-            factor.cholesky_inplace(M)
-            L_bb = factor.L()[first.size :, first.size :].toarray()
-        except CholmodNotPositiveDefiniteError:
-            fails = 1.0
-    if at.ranks.extreme(fails, np.max):
+    changing_rows = np.flatnonzero(changes & ~at.is_shared)
+    border = np.concatenate([changing_rows, np.flatnonzero(at.is_shared)])
+    raised = np.where(at.is_shared, 1.0, 0.0)  # A_p alone may be singular there
+    factor, fails = None, 0.0
+    try:
+        factor = bordered_factor(csc_array(A) + diags_array(raised), border)
+    except DependentRowsError:
+        fails = 1.0
+    if at.ranks.extreme(fails, np.max) or factor is None:
         raise DependentRowsError("the rows depend on each other")
-    return LocalFactor(at, order, second.size, factor, np.asarray(L_bb))
+    return LocalFactor(at, changing_rows.size, factor)
 
 
-def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
+def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
     """Factorise a symmetric, positive definite A (n, n), with the border last.
 
     Other rows are ordered for little fill.
 
-    border : (n,) mask of the rows whose block may change
+    border : (b,) rows whose block may change
 
     Raises
     ------
@@ -310,11 +290,11 @@ def bordered_factor(A: Matrix, border: NDArray[np.bool_]) -> BorderedFactor:
             return BorderedFactor.of_array(entries, border)
         except np.linalg.LinAlgError:
             raise DependentRowsError("the rows depend on each other") from None
-    inner, last = np.flatnonzero(~border), np.flatnonzero(border)
+    inner = np.setdiff1d(np.arange(A.shape[0]), border)
     A = csc_array(A)
     if inner.size:
         inner = inner[analyze(with_int32(A[inner][:, inner]), use_long=False).P()]
-    order = np.concatenate([inner, last])
+    order = np.concatenate([inner, border])
     ordered = with_int32(A[order][:, order])
     factor = analyze(ordered, ordering_method="natural", use_long=False)
     try:

@@ -34,7 +34,7 @@ cdef class BorderedFactor(LinearMap):
     cdef const int *indices
     cdef const double *data
     cdef double *L
-    cdef double *complement
+    cdef double *schur
     cdef double *u
 
     cdef int hold(self, order, indptr, indices, data, L_bb) except -1

@@ -478,23 +478,23 @@ cdef class BorderedFactor(LinearMap):
         self.indices = &index[0] if index.shape[0] else NULL
         self.data = &entries[0] if entries.shape[0] else NULL
         self.reserve(b)
-        self.complement = <double *> calloc(max(b * b, 1), sizeof(double))
-        if not self.complement:
+        self.schur = <double *> calloc(max(b * b, 1), sizeof(double))
+        if not self.schur:
             raise MemoryError
         for j in range(b):
             for i in range(j, b):
                 self.L[j * b + i] = corner[i, j]
         if b:  # both triangles of L_bbL_bbᵀ
-            dsyrk(b"L", b"N", &size, &size, &one, self.L, &size, &zero, self.complement,
+            dsyrk(b"L", b"N", &size, &size, &one, self.L, &size, &zero, self.schur,
                   &size)
         for j in range(b):
             for i in range(j):
-                self.complement[j * b + i] = self.complement[i * b + j]
+                self.schur[j * b + i] = self.schur[i * b + j]
         return 0
 
     def __dealloc__(self):
         free(self.L)
-        free(self.complement)
+        free(self.schur)
         free(self.u)
 
     cdef int reserve(self, Py_ssize_t border) except -1:
@@ -512,7 +512,7 @@ cdef class BorderedFactor(LinearMap):
         The row with the fewest entries is eliminated first (minimum degree), those of
         the border last.
 
-        border : (n,) mask
+        border : (b,) rows
 
         Raises
         ------
@@ -521,26 +521,29 @@ cdef class BorderedFactor(LinearMap):
 
         """
         cdef BorderedFactor new = BorderedFactor.__new__(BorderedFactor)
-        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, last, inner = 0, count = 0
+        cdef const long long[::1] last = np.ascontiguousarray(border, dtype=np.int64)
+        cdef Py_ssize_t n = len(A), i, j, l, m, p, step, count = 0
+        cdef Py_ssize_t inner = n - last.shape[0]
         cdef double[:, ::1] M = np.array(A, dtype=np.float64, order="C")
-        cdef const unsigned char[::1] is_last = np.asarray(border, bool).view(np.uint8)
         cdef double root, share
         cdef int size, info = 0
-        for i in range(n):
-            inner += not is_last[i]
         order, begin = np.empty(n, dtype=np.int32), np.zeros(inner + 1, dtype=np.int32)
         indices, data = np.empty(inner * n, dtype=np.int32), np.empty(inner * n)
         corner = np.empty((n - inner, n - inner), order="F")
-        cdef int[:, ::1] work = np.zeros((4, n), dtype=np.int32)
+        cdef int[:, ::1] work = np.zeros((5, n), dtype=np.int32)
         cdef int[::1] degree = work[0]
         cdef int[::1] neighbour = work[1]
         cdef int[::1] is_done = work[2]
         cdef int[::1] place = work[3]
+        cdef int[::1] is_last = work[4]
         cdef int[::1] row = order
         cdef int[::1] indptr = begin
         cdef int[::1] index = indices
         cdef double[::1] value = data
         cdef double[::1, :] L_bb = corner
+        for i in range(n - inner):
+            is_last[last[i]] = 1
+            row[inner + i] = <int> last[i]
         for i in range(n):
             for j in range(n):
                 degree[i] += M[i, j] != 0
@@ -570,11 +573,6 @@ cdef class BorderedFactor(LinearMap):
                     M[neighbour[j], i] -= share * value[count + 1 + l]
             count += m + 1
             indptr[step + 1] = <int> count
-        last = inner
-        for i in range(n):
-            if is_last[i]:
-                row[last] = <int> i
-                last += 1
         for i in range(n):
             place[row[i]] = <int> i
         for j in range(count):
@@ -686,13 +684,50 @@ cdef class BorderedFactor(LinearMap):
             self.backward_to(&a[0], &y[0])
         return result
 
+    def reduced(self, const double[::1] t):
+        """Return (L_aa⁻¹t_a, t_b − L_baL_aa⁻¹t_a), in the order of L."""
+        self.expect(t.shape[0], self.n)
+        result = np.empty(self.n)
+        cdef double[::1] u = result
+        if self.n:
+            self.reduce(&t[0], &u[0])
+        return result
+
+    def extended(self, const double[::1] u):
+        """Return the x with L_aaᵀx_a + L_baᵀx_b = u_a and x_b = u_b, u as of `reduced`.
+        """
+        self.expect(u.shape[0], self.n)
+        result = np.empty(self.n)
+        cdef double[::1] x = result
+        if self.n:
+            memcpy(self.u, &u[0], self.n * sizeof(double))
+            self.extend(self.u, &x[0])
+        return result
+
     @property
-    def least_pivot(self):
-        """Smallest diagonal entry of L; inf for n = 0."""
+    def complement(self):
+        """L_bbL_bbᵀ (b, b), the Schur complement of A on the border."""
+        cdef Py_ssize_t b = self.border
+        block = np.empty((b, b))
+        cdef double[:, ::1] at = block
+        if b:
+            memcpy(&at[0, 0], self.schur, b * b * sizeof(double))
+        return block
+
+    @property
+    def least_inner_pivot(self):
+        """Smallest diagonal entry of L_aa; inf without rows outside of the border."""
         cdef Py_ssize_t i
         cdef double least = float("inf")
         for i in range(self.inner):
             least = min(least, sqrt(self.scale) * self.data[self.indptr[i]])
+        return least
+
+    @property
+    def least_pivot(self):
+        """Smallest diagonal entry of L; inf for n = 0."""
+        cdef Py_ssize_t i
+        cdef double least = self.least_inner_pivot
         for i in range(self.border):
             least = min(least, self.L[i * self.border + i])
         return least
@@ -703,9 +738,14 @@ cdef class BorderedFactor(LinearMap):
         return self.indptr[self.inner] + self.border * (self.border + 1) // 2
 
     @property
+    def rows(self):
+        """Rows (n,) of A in the order of L."""
+        return np.asarray(self.arrays[0]).astype(np.int64)
+
+    @property
     def border_rows(self):
         """Rows (b,) of the border."""
-        return np.asarray(self.arrays[0])[self.inner:].astype(np.int64)
+        return self.rows[self.inner:]
 
     # changes of the border
 
@@ -720,10 +760,10 @@ cdef class BorderedFactor(LinearMap):
         new.whole = self
         new.reserve(b)
         for i in range(b * b):
-            new.L[i] = (1 + shift) * self.complement[i] - block[i]
+            new.L[i] = (1 + shift) * self.schur[i] - block[i]
         if b and not factorised_above(new.L, b, shift, self.L):
             for i in range(b * b):
-                new.L[i] = (1 + shift) * self.complement[i] - block[i]
+                new.L[i] = (1 + shift) * self.schur[i] - block[i]
             new.raise_border(shift)
         return new
 

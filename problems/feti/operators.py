@@ -381,8 +381,7 @@ def gram_inverses(gram: csr_array, equalities: int) -> tuple[csr_array, LinearMa
     inverse = block_pseudoinverse(gram[:equalities, :equalities])
     contact = csc_array(gram[equalities:, equalities:])
     contact += diags_array(CONTACT_SHIFT * contact.diagonal(), format="csc")
-    none = np.zeros(contact.shape[0], dtype=bool)
-    return inverse, bordered_factor(contact, none)
+    return inverse, bordered_factor(contact, np.zeros(0, dtype=np.int64))
 
 
 def block_pseudoinverse(M: csr_array) -> csr_array:

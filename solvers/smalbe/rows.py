@@ -209,7 +209,7 @@ class WholeGram:
         return self.factor.shifted(shift, changed)
 
     def _factorised(self, free: Mask, shift: float) -> BorderedFactor:
-        none = np.zeros(self.matrix.shape[0], dtype=bool)
+        none = np.zeros(0, dtype=np.int64)
         of_free = _gram(self.unit, free)
         while True:
             try:
@@ -252,7 +252,7 @@ class _OverRanks:
     @cached_property
     def _place(self) -> NDArray[np.int32]:
         """Positions (k,) of the local rows in the border; −1 for all others."""
-        place = np.full(self.local.order.size, -1, dtype=np.int32)
+        place = np.full(self.matrix.shape[0], -1, dtype=np.int32)
         place[self.local.border] = np.arange(self.local.border.size)
         return place
 
@@ -419,7 +419,7 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
         return None
     gram, has_border = _gram(unit), int(changing.sum()) <= MAX_BORDER
     try:
-        factor = bordered_factor(gram, changing & has_border)
+        factor = bordered_factor(gram, np.flatnonzero(changing & has_border))
     except DependentRowsError:
         return None
     if factor.least_pivot**2 <= RANK:

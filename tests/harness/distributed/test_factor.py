@@ -174,7 +174,7 @@ def test_the_factor_of_a_chain_of_springs_is_that_of_the_whole(changing):
         change = np.zeros(own.size, dtype=bool)
         change[np.flatnonzero(~at.is_shared)[:changing]] = True
         local = local_factor(csc_array(A), at, change)
-        assert sorted(local.order.tolist()) == list(range(own.size))
+        assert sorted(local.factor.rows.tolist()) == list(range(own.size))
         assert local.border.size == changing + at.is_shared.sum()
         inner = np.setdiff1d(np.arange(own.size), local.border)
         schur = A - A[:, inner] @ np.linalg.solve(A[np.ix_(inner, inner)], A[inner])
