@@ -135,6 +135,30 @@ def test_the_bound_is_almost_independent_of_the_size_of_the_grid():
     assert bounds == pytest.approx([1.55066] * 3, rel=1e-4)
 
 
+@pytest.mark.parametrize("n", [1, 2, 9, 20])
+def test_the_preconditioner_is_positive_and_close_to_the_inverse(n):
+    F = influence_operator(np.argwhere(np.ones((n, n), dtype=bool)), 0.1).build()
+    matrix, M = F(np.eye(n * n)), F.preconditioner("dirichlet", "stiffness")
+    approximate = M(np.eye(n * n))
+
+    assert approximate == pytest.approx(approximate.T, abs=1e-12)
+    assert np.linalg.eigvalsh(approximate)[0] > 0
+    ratios = np.linalg.eigvals(approximate @ matrix).real
+    assert ratios.max() / ratios.min() < 4
+    with pytest.raises(ValueError, match="known: 'dirichlet'"):
+        F.preconditioner("lumped", "stiffness")
+
+
+@pytest.mark.parametrize("law", ["hertz", "rough"])
+def test_the_preconditioner_saves_half_of_the_products(law):
+    qp = built(n=128, law=law).qp
+    with_it, without = (
+        SMALBE(preconditioner=kind).prepare(qp, TOL)() for kind in ("auto", "model")
+    )
+    assert with_it.counts["P_products"] < 0.7 * without.counts["P_products"]
+    assert with_it.x == pytest.approx(without.x, abs=1e-6 * without.x.max())
+
+
 def test_a_solver_s_process_builds_the_same_operator_from_a_file(tmp_path):
     for keys in (dict(n=6), dict(n=6, law="mindlin")):
         qp = built(**keys).qp
