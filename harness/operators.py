@@ -116,6 +116,15 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
         product = self.build()
         return product.diagonal() if isinstance(product, WithDiagonal) else None
 
+    @property
+    def least_eigenvalue(self) -> float | None:
+        """Proven lower bound of the eigenvalues of P that the product offers, or None.
+
+        With a positive one, errors of answers over convex sets are bounded
+        (`harness.verify.certificate.certify_by_eigenvalue`).
+        """
+        return getattr(self.build(), "least_eigenvalue", None)
+
     def forget(self) -> None:
         """Drop the product, so that the next solver is charged for building it."""
         self._product = None

@@ -212,7 +212,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
     if not blocks:
         return None
     Px, rows = qp.P @ s.x, qp.A.T @ s.y + qp.G.T @ s.z
-    g, L = Px + qp.q + rows, _largest_eigenvalue(qp)
+    g, L = Px + qp.q + rows, largest_eigenvalue(qp)
     moved = s.x - g / L if L > 0 else s.x - g
     for one in qp.sets:
         moved = one.project(moved)
@@ -226,7 +226,7 @@ def normality(qp: QP, s: Solution, tol: float) -> Normality | None:
     )
 
 
-def _largest_eigenvalue(qp: QP) -> float:
+def largest_eigenvalue(qp: QP) -> float:
     """Estimate the largest eigenvalue of P from below, by power iteration."""
     v = np.random.default_rng(0).standard_normal(qp.q.size)
     for _ in range(POWER_STEPS):

@@ -174,7 +174,8 @@ class _Bearing:
         for j, along in enumerate(forces.T):
             size = np.abs(along[self.block]).max(initial=0.0)
             if size > 0:
-                h = STEP * float(np.abs(at[self.block]).max()) / size
+                # at the common apex of all cones there is no length
+                h = STEP * (float(np.abs(at[self.block]).max()) or 1.0) / size
                 for one in self.sets:
                     ends = one.project(at + h * along), one.project(at - h * along)
                     left[one.block, j] = ((ends[0] - ends[1]) / (2 * h))[one.block]

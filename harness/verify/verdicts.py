@@ -27,8 +27,10 @@ from mortarbench.harness.registry import COPIES, SolverSpec
 from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.certificate import (
     Certificate,
+    EigenvalueCertificate,
     UncertifiableError,
     certify,
+    certify_by_eigenvalue,
 )
 from mortarbench.harness.verify.infeasibility import infeasibility_margin
 from mortarbench.harness.verify.kkt import Residuals, kkt_residuals, verdict
@@ -163,10 +165,18 @@ def certified(case: Case, s: Solution) -> tuple[dict[str, Any], str]:
     √(2λ̂ᵀ(c − Bû)), `answer` (the bound of the answer alone), `moved` = ‖u − û‖, and
     `friction`, the frictional part of `work`; `seminorm` is 1 if bodies can move
     rigidly, which is not bounded.
+
+    Without mechanics, a positive `least_eigenvalue` of an operator P bounds the error
+    of x in the norm of P instead (`certify_by_eigenvalue`).
     """
-    if case.mechanics is None or not has_point(s):
+    if not has_point(s):
         return {}, ""
     mechanics, was_loaded = case.mechanics, LATE_IMPORT in sys.modules
+    if mechanics is None:
+        least = getattr(case.qp.P, "least_eigenvalue", None)
+        if least is None or not least > 0 or case.qp.b.size + case.qp.h.size:
+            return {}, ""
+        return _certified(lambda: certify_by_eigenvalue(case.qp, s, least))
 
     def certificate() -> Certificate:
         return certify(mechanics, mechanics.to_primal(s))
@@ -245,7 +255,9 @@ def _values_by_ranks(
 LATE_IMPORT = "scipy.optimize"  #: slow import of `certify` for some bodies
 
 
-def _certified(certificate: Callable[[], Certificate]) -> tuple[dict[str, Any], str]:
+def _certified(
+    certificate: Callable[[], Certificate | EigenvalueCertificate],
+) -> tuple[dict[str, Any], str]:
     start = perf_counter()
     try:
         bound = certificate()

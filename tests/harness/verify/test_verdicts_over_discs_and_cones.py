@@ -411,3 +411,13 @@ def test_verify_and_solve_report_the_further_measures(tmp_path, capsys):
     assert 0 <= record["natural_map"] <= 1e-6
     assert 0 <= record["normal_distance"] <= 1e-6
     assert record["sizes"]["discs"] == 1
+
+
+def test_multipliers_are_computed_at_the_apex_of_all_cones():
+    """Neither x nor a force has a length there; q acts on the row alone."""
+    qp = mb.QP.from_arrays(
+        np.eye(4), [0, 0, 0, -1], A=[[1, 0, 0, 1]], b=1, sets=[Cones([[0, 1, 2]], [1])]
+    )
+    found = mb.verify(qp, [0, 0, 0, 1])
+    assert found.verdict is mb.Verdict.VERIFIED
+    assert found.multipliers.y == pytest.approx([0], abs=1e-12)

@@ -1,0 +1,165 @@
+"""Errors over convex sets are below the bound by the least eigenvalue of P.
+
+The solutions are exact (integers times powers of two). P = MᵀM + I with integers M has
+no eigenvalue below one.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.sparse.linalg import LinearOperator
+
+import mortarbench as mb
+from mortarbench.harness import Case, Solution, Status
+from mortarbench.harness.operators import SerialisableOperator
+from mortarbench.harness.verify.certificate import (
+    UncertifiableError,
+    certify_by_eigenvalue,
+)
+from mortarbench.harness.verify.verdicts import certified
+from tests.harness.verify.test_verdicts_over_discs_and_cones import (
+    TRAPS,
+    AttackOnBlocks,
+    ExactProblem,
+)
+
+#: these keep the eigenvalues above one; rows are removed
+KEPT = [t for t in TRAPS if t not in ("singular", "weak", "touching", "units")]
+
+
+class WithoutRows:
+    """A QP over sets without rows, its solution, and the least eigenvalue of P."""
+
+    def __init__(self, traps, seed, ill=False):
+        planted = ExactProblem(traps, seed)
+        qp, s = planted.qp, planted.solution
+        P = qp.P
+        if ill:  # condition numbers up to 1e9, with the same least eigenvalue
+            M = (P - np.eye(len(P))) * 2.0**20
+            P = M + np.eye(len(P))
+        self.least = 1.0
+        rows, none = np.zeros((0, qp.q.size)), np.zeros(0)
+        self.qp = replace(
+            qp, P=P, q=-(P @ s.x + s.z_box), A=rows, b=none, G=rows, h=none
+        )
+        self.solution = replace(s, y=none, z=none)
+        self.value = float(self.qp.objective(s.x))
+
+    def error(self, x):
+        """‖x − x*‖_P relative to ‖x*‖_P, in extended precision."""
+        e, at = (
+            v.astype(np.longdouble) for v in (x - self.solution.x, self.solution.x)
+        )
+        norm = np.sqrt(at @ (self.qp.P @ at))
+        return float(np.sqrt(e @ (self.qp.P @ e)) / norm) if norm else np.inf
+
+
+def exceeded(seed, tries, each=100):
+    """Attack bounds by points of all kinds; return failures and the sharpness."""
+    rng = np.random.default_rng(seed)
+    failures, ratios, count = [], [], 0
+    with np.errstate(all="ignore"):
+        for _ in range(tries // each):
+            traps = {str(t) for t in rng.choice(KEPT, rng.integers(0, 3))}
+            number, ill = int(rng.integers(2**30)), bool(rng.random() < 0.3)
+            planted = WithoutRows(traps, number, ill)
+            attack = AttackOnBlocks(planted, rng)
+            for k, s in enumerate(attack.points(each)):
+                if k % 10 == 0:
+                    s = replace(s, x=0 * s.x)
+                try:
+                    bound = certify_by_eigenvalue(planted.qp, s, planted.least).bound
+                except UncertifiableError:
+                    continue
+                count += 1
+                error = planted.error(s.x)
+                if error > bound:
+                    failures.append((sorted(traps), number, ill, error, bound))
+                if error > 0 and np.isfinite(bound):
+                    ratios.append(bound / error)
+    return failures, count, float(np.median(ratios))
+
+
+def test_no_bound_of_a_short_search_is_exceeded():
+    failures, count, ratio = exceeded(2718, 500)
+    assert failures == []
+    assert count > 450
+    assert ratio < 100
+
+
+@pytest.mark.slow
+def test_of_ten_thousand_attacked_bounds_none_is_exceeded():
+    failures, count, ratio = exceeded(3141, 12_000)
+    assert failures == []
+    assert count >= 10_000
+    assert ratio < 100
+
+
+@pytest.mark.parametrize("trap", ["", *KEPT])
+def test_the_bound_of_a_solution_is_rounding(trap):
+    for seed in range(10):
+        planted = WithoutRows({trap}, seed)
+        found = certify_by_eigenvalue(planted.qp, planted.solution, planted.least)
+        assert found.bound <= 1e-9
+        assert found.parts["answer"] == found.bound
+        for one in planted.qp.sets:
+            assert all((l.slack >= -1e-13 * (l.size + l.terms + 1)).all()
+                       for l in one.limits(found.x))  # fmt: skip
+
+
+def test_an_interior_point_is_bounded_without_its_multipliers():
+    """min ½‖x‖² − 5x₁ over the unit disc, at (1 − δ, 0): the error is δ."""
+    qp = mb.QP.from_arrays(np.eye(2), [-5, 0], sets=[mb.Discs([[0, 1]], [1])])
+    for delta in (1e-3, 1e-6):
+        x, none = np.array([1 - delta, 0]), np.zeros(0)
+        s = Solution(status=Status.SOLVED, x=x, y=none, z=none, z_box=np.full(2, 7.0))
+        found = certify_by_eigenvalue(qp, s, 1.0)
+        assert delta <= found.bound <= 1.01 * delta
+
+
+class Scaled:
+    """x ↦ 2x, with a proven bound of its eigenvalues."""
+
+    least_eigenvalue = 1.5
+
+    def __call__(self, x):
+        return 2 * x
+
+
+@pytest.mark.parametrize("offers", [True, False])
+def test_a_case_without_mechanics_is_certified_by_its_operator(offers):
+    maker = (lambda arrays: Scaled()) if offers else (lambda arrays: lambda x: 2 * x)
+    P = SerialisableOperator(3, "scaled", {}, {"scaled": maker})
+    row, none = np.zeros((0, 3)), np.zeros(0)
+    qp = mb.QP(
+        P=P, q=np.array([-6.0, 0, 2]), A=row, b=none, G=row, h=none,
+        lb=np.array([-np.inf, -np.inf, 0]), ub=np.full(3, np.inf),
+        sets=(mb.Discs([[0, 1]], [1]),),
+    )  # fmt: skip
+    assert P.least_eigenvalue == (1.5 if offers else None)
+    case = Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {})
+    s = Solution(
+        status=Status.SOLVED, x=np.array([1, 1e-5, 0]), y=none, z=none,
+        z_box=np.array([4, 0, -2.0]),
+    )  # fmt: skip
+    fields, note = certified(case, s)
+    assert note == ""
+    if offers:
+        assert 1e-5 <= fields["energy_bound"] <= 1e-4
+        assert fields["certificate"]["answer"] == fields["energy_bound"]
+        broken = replace(s, x=np.full(3, 1e300))
+        assert "too large" in certified(case, broken)[1]
+    else:
+        assert fields == {}
+    assert isinstance(P, LinearOperator)
+
+
+def test_rows_are_refused():
+    planted = ExactProblem({"touching"}, 1)
+    with pytest.raises(UncertifiableError, match="the QP has rows; expected bounds"):
+        certify_by_eigenvalue(planted.qp, planted.solution, 1.0)
+    bad = WithoutRows(set(), 1)
+    nan = replace(bad.solution, x=bad.solution.x * np.nan)
+    with pytest.raises(UncertifiableError, match="NaN or inf"):
+        certify_by_eigenvalue(bad.qp, nan, 1.0)
