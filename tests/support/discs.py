@@ -1,49 +1,22 @@
 """QPs on discs and cones: friction of half-spaces, and planted KKT points."""
 
-from functools import cache
+from dataclasses import replace
 
 import numpy as np
 
+import mortarbench as mb
 from mortarbench.harness import QP, Cones, Discs
+from mortarbench.harness.operators import assembled
 
-MU = 0.3  #: coefficient of friction
 SIZES = {88: 12, 376: 24, 820: 36, 1468: 48}  #: cells per side of that many discs
 
 
-@cache
-def compliance(n, nu):
-    """Return F_t (2k, 2k) of n² cells of two half-spaces, R = a = E = 1 (Cerruti)."""
-    h, x, y = _cells(n)
-    X, Y = x[:, None] - x, y[:, None] - y
-    I0, Ixx, Iyy, Ixy = (np.zeros_like(X) for _ in range(4))
-    for sx in (1, -1):
-        for sy in (1, -1):
-            a, b = X + sx * h / 2, Y + sy * h / 2
-            r = np.hypot(a, b)
-            log_x, log_y = _log(a, b, r), _log(b, a, r)
-            I0 += sx * sy * (a * log_y + b * log_x)
-            Ixx += sx * sy * b * log_x
-            Iyy += sx * sy * a * log_y
-            Ixy -= sx * sy * r
-    F = np.empty((x.size, 2, x.size, 2))
-    F[:, 0, :, 0], F[:, 1, :, 1] = (1 - nu) * I0 + nu * Ixx, (1 - nu) * I0 + nu * Iyy
-    F[:, 0, :, 1] = F[:, 1, :, 0] = nu * Ixy
-    F = F.reshape(2 * x.size, -1) * (2 * (1 + nu)) / (np.pi * h * h)
-    F.flags.writeable = False
-    return (F + F.T) / 2
-
-
 def mindlin(discs, nu, Q):
-    """Return the problem of Cattaneo and Mindlin, Q relative to μP."""
-    F, (h, x, y) = compliance(SIZES[discs], nu), _cells(SIZES[discs])
-    load = 2 / (3 * (1 - nu**2))  # 4E*/3, E* = E/2(1 − ν²)
-    pressure = 1.5 * load / np.pi * np.sqrt(1 - x**2 - y**2)
-    stuck = 1 - (1 - Q) ** (2 / 3)
-    shift = 0.75 * MU * load * (2 - nu) * (1 + nu) * stuck  # δ
-    q = np.zeros(2 * x.size)
-    q[::2] = -shift
-    index = np.arange(2 * x.size).reshape(-1, 2)
-    return QP.from_arrays(F, q, sets=(Discs(index, MU * h * h * pressure),))
+    """Return the problem of Cattaneo and Mindlin with an explicit P."""
+    case = f"half-space/n={SIZES[discs]}/law=mindlin/nu={nu}/Q={Q}/dual"
+    qp = mb.build(case).qp
+    assert qp.sets[1].radius.size == discs
+    return replace(qp, P=assembled(qp.P))
 
 
 def natural_map(qp, s):
@@ -114,18 +87,3 @@ def _with_solution(rng, x, z, rows):
     A = rng.standard_normal((rows, x.size))
     arrays = {"P": P, "q": -P @ x - z - A.T @ rng.standard_normal(rows)}
     return arrays | ({"A": A, "b": A @ x} if rows else {})
-
-
-def _cells(n):
-    """Return the side, and the centres of cells in contact."""
-    h = 2 / 0.9 / n
-    at = (np.arange(n) + 0.5 - n / 2) * h
-    x, y = (c.ravel() for c in np.meshgrid(at, at, indexing="ij"))
-    inside = x**2 + y**2 < 1
-    return h, x[inside], y[inside]
-
-
-def _log(a, b, r):
-    """Return ln(a + r) without cancellation, r² = a² + b²."""
-    flat = np.where(a < 0, b**2 / np.where(a < 0, r - a, 1), a + r)
-    return np.log(flat)

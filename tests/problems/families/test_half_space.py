@@ -31,7 +31,6 @@ from mortarbench.solvers.adapters.clarabel_ import Clarabel
 from mortarbench.solvers.baselines.projected_gradient import ProjectedGradient
 from mortarbench.solvers.reference.solve import reference_solution
 from mortarbench.solvers.smalbe.solver import SMALBE
-from tests.support.discs import mindlin
 
 FAMILY = HalfSpace()
 TOL = 1e-9
@@ -135,6 +134,30 @@ def test_the_bound_is_almost_independent_of_the_size_of_the_grid():
     assert bounds == pytest.approx([1.55066] * 3, rel=1e-4)
 
 
+@pytest.mark.parametrize("n", [1, 2, 9, 20])
+def test_the_preconditioner_is_positive_and_close_to_the_inverse(n):
+    F = influence_operator(np.argwhere(np.ones((n, n), dtype=bool)), 0.1).build()
+    matrix, M = F(np.eye(n * n)), F.preconditioner("dirichlet", "stiffness")
+    approximate = M(np.eye(n * n))
+
+    assert approximate == pytest.approx(approximate.T, abs=1e-12)
+    assert np.linalg.eigvalsh(approximate)[0] > 0
+    ratios = np.linalg.eigvals(approximate @ matrix).real
+    assert ratios.max() / ratios.min() < 4
+    with pytest.raises(ValueError, match="known: 'dirichlet'"):
+        F.preconditioner("lumped", "stiffness")
+
+
+@pytest.mark.parametrize("law", ["hertz", "rough"])
+def test_the_preconditioner_saves_half_of_the_products(law):
+    qp = built(n=128, law=law).qp
+    with_it, without = (
+        SMALBE(preconditioner=kind).prepare(qp, TOL)() for kind in ("auto", "model")
+    )
+    assert with_it.counts["P_products"] < 0.7 * without.counts["P_products"]
+    assert with_it.x == pytest.approx(without.x, abs=1e-6 * without.x.max())
+
+
 def test_a_solver_s_process_builds_the_same_operator_from_a_file(tmp_path):
     for keys in (dict(n=6), dict(n=6, law="mindlin")):
         qp = built(**keys).qp
@@ -200,17 +223,52 @@ def test_mindlin_s_problem_has_one_disc_for_each_cell_in_contact():
     assert counts == [88, 2608, 41684, 166740]
 
 
+def prototype(n, nu, Q):
+    """Return F, δ and bounds of Mindlin's problem, entry by entry: R = a = E = 1.
+
+    Written from the published formulas before the family existed.
+    """
+    h, mu = 2 / 0.9 / n, 0.3
+    at = (np.arange(n) + 0.5 - n / 2) * h
+    x, y = (c.ravel() for c in np.meshgrid(at, at, indexing="ij"))
+    inside = x**2 + y**2 < 1
+    x, y = x[inside], y[inside]
+    X, Y = x[:, None] - x, y[:, None] - y
+    I0, Ixx, Iyy, Ixy = (np.zeros_like(X) for _ in range(4))
+    for i in (1, -1):
+        for j in (1, -1):
+            a, b = X + i * h / 2, Y + j * h / 2
+            r = np.hypot(a, b)
+            log_x, log_y = (
+                np.log(np.where(c < 0, d**2 / np.where(c < 0, r - c, 1), c + r))
+                for c, d in ((a, b), (b, a))
+            )
+            I0 += i * j * (a * log_y + b * log_x)
+            Ixx += i * j * b * log_x
+            Iyy += i * j * a * log_y
+            Ixy -= i * j * r
+    F = np.empty((x.size, 2, x.size, 2))
+    F[:, 0, :, 0], F[:, 1, :, 1] = (1 - nu) * I0 + nu * Ixx, (1 - nu) * I0 + nu * Iyy
+    F[:, 0, :, 1] = F[:, 1, :, 0] = nu * Ixy
+    F = F.reshape(2 * x.size, -1) * (2 * (1 + nu)) / (np.pi * h * h)
+    load = 2 / (3 * (1 - nu**2))  # 4E*/3, E* = E/2(1 − ν²)
+    pressure = 1.5 * load / np.pi * np.sqrt(1 - x**2 - y**2)
+    shift = 0.75 * mu * load * (2 - nu) * (1 + nu) * (1 - (1 - Q) ** (2 / 3))
+    return F, shift, mu * h * h * pressure, mu * load
+
+
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.45])
 def test_mindlin_s_problem_is_that_of_an_independent_prototype(nu):
-    """With forces over μP, displacements over μP/(πGa), and R = a = E = 1 there."""
-    there, here = mindlin(88, nu, 0.7), built(n=12, law="mindlin", nu=nu, Q=0.7).qp
-    unit = 0.3 * 2 / (3 * (1 - nu**2))  # μP
-    length = unit * 2 * (1 + nu) / np.pi
+    """With forces over μP and displacements over μP/(πGa)."""
+    F, shift, bound, limit = prototype(12, nu, 0.7)
+    qp = built(n=12, law="mindlin", nu=nu, Q=0.7).qp
+    length = limit * 2 * (1 + nu) / np.pi
 
-    assert here.q == pytest.approx(there.q / length, rel=1e-12)
-    assert here.sets[1].radius == pytest.approx(there.sets[1].radius / unit, rel=1e-12)
-    P = here.P @ np.eye(here.q.size)
-    assert P == pytest.approx(there.P * (unit / length), rel=1e-11, abs=1e-9)
+    assert -qp.q[::2] == pytest.approx(shift / length, rel=1e-12)
+    assert not qp.q[1::2].any()
+    assert qp.sets[1].radius == pytest.approx(bound / limit, rel=1e-12)
+    P = qp.P @ np.eye(qp.q.size)
+    assert pytest.approx(F * (limit / length), rel=1e-11, abs=1e-9) == P
 
 
 @pytest.mark.parametrize(
