@@ -539,7 +539,9 @@ def _reach(
     soft, pressed = np.append(phi[up], phi[down]), 0.5 / np.append(above, below)
     cost = opened + np.sqrt(square) * soft + square * pressed + tiny
     columns = (np.vstack([-motions[up], motions[down]]) / cost[:, None]).T
-    size = np.abs(columns).max()
+    size = np.abs(columns).max(initial=0.0)
+    if not size > 0:  # costs overflow, or are NaN: the answer is too far off
+        return _Reach(*np.full((3, supported.shape[1]), np.inf))
     bounds = np.zeros((3, supported.shape[1]))
     for k, motion in enumerate(supported.T):
         for target in (motion, -motion):

@@ -24,6 +24,9 @@ _UNITS = {
     "max_von_mises": "Pa",
     "p_max": "Pa",
     "half_width": "m",
+    "corner": "m",
+    "contact_radius": "m",
+    "approach": "m",
     _CONTACTS: "Pa",  # tables show the largest pressure of each pair
 }
 _STRESS = "max_von_mises"  #: only elastic bodies have it
