@@ -101,7 +101,7 @@ def parse(text: str, families: Mapping[str, Family]) -> CaseId:
     if (suffix := family.path_suffix) is None:
         parts, given = text.split("/")[1:], {}
     else:
-        path, parts = _split_path(text, head, suffix)
+        path, parts = _split_path(text, family, suffix)
         given = {"path": path}
         if not suffix:
             return assemble(family, given, family.forms[0], texts=True)
@@ -227,8 +227,12 @@ def _path_key(family: Family) -> str:
     return "" if family.path_suffix is None else "path"
 
 
-def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
-    """Split the text after ``FAMILY:`` into the path and the other parts."""
+def _split_path(text: str, family: Family, suffix: str) -> tuple[str, list[str]]:
+    """Split the text after ``FAMILY:`` into the path and the other parts.
+
+    The form of a family with a single form may be missing, and is added.
+    """
+    head = family.name
     path = text[len(head) + 1 :]
     if text[len(head) : len(head) + 1] != ":" or not path:
         raise InputError(f"{shortened(text)}: no file; expected {head}:PATH{suffix}")
@@ -240,7 +244,10 @@ def _split_path(text: str, head: str, suffix: str) -> tuple[str, list[str]]:
         raise InputError(
             f"{shortened(text)}: no file; expected {head}:PATH{suffix}/…/FORM"
         )
-    return "/".join(parts[: ends[0]]), parts[ends[0] :]
+    path, parts = "/".join(parts[: ends[0]]), parts[ends[0] :]
+    if len(family.forms) == 1 and (not parts or "=" in parts[-1]):
+        parts.append(family.forms[0])
+    return path, parts
 
 
 def _number(text: str, kind: type) -> object:

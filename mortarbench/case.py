@@ -141,7 +141,7 @@ class Case(plugin.Case):
         return self.family_case.fields(solution)
 
     def save(self, path: str | Path) -> Path:
-        """Write the QP to a file for other programs: .npz, .mat, .parquet or .qps.
+        """Write the QP to a file for other programs, see `export`.
 
         Raises
         ------
@@ -175,6 +175,12 @@ class Case(plugin.Case):
                 from mortarbench.problems.files.qps import save_qps
 
                 save_qps(path, self.qp, meta)
+            case ".hdf5":
+                from mortarbench.problems.files.fclib import save_fclib
+
+                is_stored = self.id.family.name == "fclib"
+                source = str(self.params["path"]) if is_stored else ""
+                save_fclib(path, self.qp, meta, source)
             case _:
                 from mortarbench.harness.files.qpfile import save_qp
 
@@ -258,7 +264,10 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
 
 
 def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
-    """Write a QP to a file for other programs: .npz, .mat, .parquet or .qps.
+    """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
+
+    FCLIB holds problems over friction cones (`Cones`). For a case ``fclib:PATH`` it is
+    the problem of the file, with all arrays unchanged, not one of its convex steps.
 
     Parameters
     ----------

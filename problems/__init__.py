@@ -34,6 +34,7 @@ PROBLEMS: Registry[Family] = Registry(
         "plate": entry("mortarbench.problems.families.plate", "Plate"),
         "bodies": entry("mortarbench.problems.families.gmsh_bodies", "GmshBodies"),
         "file": entry("mortarbench.problems.families.from_file", "FromFile"),
+        "fclib": entry("mortarbench.problems.families.fclib", "Fclib"),
     }
 )
 

@@ -208,7 +208,7 @@ def _folder(text: str) -> Path:
 
 #: types of arguments by their metavar; the others are strings
 _KINDS: Mapping[str, Callable[[str], Any]] = {
-    "DIR": Path, "DIR2": Path, "FILE.npz|mat|parquet|qps": Path,
+    "DIR": Path, "DIR2": Path, "FILE.npz|mat|parquet|qps|hdf5": Path,
     "FILE.png|pdf|svg": Path, "FILE.vtu": Path, "[LABEL=]FILE.py": PluginFile.of,
     "T": float, "S": float, "F": float, "SECONDS": float, "MIB": float, "N": int,
 }  # fmt: skip
@@ -319,7 +319,7 @@ _COMMANDS = {
         "write the QP of a case to a file for other programs",
         [
             _CASE,
-            _Option("file", "FILE.npz|mat|parquet|qps", "file for NumPy, for MATLAB "
+            _Option("file", "FILE.npz|mat|parquet|qps|hdf5", "for NumPy, for MATLAB "
                     "and Octave, for qpbenchmark, or for programs that read QPS"),
             _PLUGIN,
         ],

@@ -48,7 +48,10 @@ class FromFile(Family):
     def check(self, params: Mapping[str, Value]) -> None:
         """Raise InputError unless the file exists and has a known format."""
         if not params["path"]:
-            raise InputError("file: path is missing; expected file:PATH")
+            raise InputError(
+                f"{self.name}: path is missing; expected {self.name}:PATH"
+                f"{self.path_suffix}"
+            )
         self._located(params)
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile:
@@ -61,7 +64,7 @@ class FromFile(Family):
 
     def with_copies(self, folder: Path) -> FromFile:
         """Return the family that reads the copies of a result folder."""
-        return FromFile(Copies(folder))
+        return type(self)(Copies(folder))
 
     def copied_paths(self) -> list[str]:
         """Return the original paths of the files with copies in the result folder."""

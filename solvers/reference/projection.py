@@ -8,7 +8,8 @@ conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
     Px + q + MᵀR(t − Π(t)) = 0,      Mx = Π(t).                                    (1)
 
 1. ADMM (Stellato et al. 2020, Math. Prog. Comp. 12), with penalty R, comes near this
-   zero from any start.
+   zero from any start. Anderson's acceleration with a safeguard (Zhang, O'Donoghue and
+   Boyd 2020, SIAM J. Optim. 30) is needed for a singular P.
 2. Newton's method converges to it, with Π' by difference quotients and residuals in
    extended precision. The error of the quotients, √ε, only limits the rate: it is the
    factor by which each step reduces the residual.
@@ -16,7 +17,7 @@ conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,11 @@ from scipy.linalg import lu_factor, lu_solve
 from mortarbench.harness import QP, Solution, Status, Vector
 
 ROUNDS = 12  #: rounds of ADMM and Newton's method, each with another penalty
-ADMM_STEPS = 400  #: per round
+ADMM_STEPS = 400  #: in the first round; as many more in each further round
 NEWTON_STEPS = 30  #: at most, per round
+MEMORY = 10  #: iterates that an acceleration combines, and between two of them
+#: shift of the normal equations of an acceleration, relative to their trace
+GRAM_SHIFT = 1e-10
 RELAXATION = 1.6  #: over-relaxation of ADMM, the default of OSQP
 EQUALITY_PENALTY = 1e3  #: penalty of rows of A relative to the others, as in OSQP
 MAX_PENALTY_CHANGE = 10.0  #: largest factor between the penalties of two rounds
@@ -54,15 +58,21 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
 
     rho = float(np.abs(P).max(initial=0)) or 1.0
     x, t, multipliers = np.zeros(n), np.zeros(m + p + n), np.zeros(m + p + n)
-    for _ in range(ROUNDS):
+    for number in range(1, ROUNDS + 1):
         R = rho * relative_penalty
         t = project(t) + multipliers / R
         K = lu_factor(P + M.T @ (R[:, None] * M))
-        for _ in range(ADMM_STEPS):
-            w = project(t)
-            x = lu_solve(K, M.T @ (R * (2 * w - t)) - qp.q)
-            t = t + RELAXATION * (M @ x - w)
-        w = project(t)
+
+        def primal_point(t: Vector, R: Vector = R, K: Any = K) -> Vector:
+            x: Vector = lu_solve(K, M.T @ (R * (2 * project(t) - t)) - qp.q)
+            return x
+
+        t = _fixed_point(
+            lambda t: t + RELAXATION * (M @ primal_point(t) - project(t)),
+            t,
+            ADMM_STEPS * number,
+        )
+        x, w = primal_point(t), project(t)
         multipliers = R * (t - w)
         end = _newton(P, qp.q, M, R, project, x, t)
         force = R * (end - project(end))
@@ -78,6 +88,35 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
         dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
         change = float(np.sqrt(primal / dual))
         rho *= min(max(change, 1 / MAX_PENALTY_CHANGE), MAX_PENALTY_CHANGE)
+
+
+def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vector:
+    """Iterate t ← step(t), accelerated every `MEMORY` of `count` iterations.
+
+    An accelerated point is used if its residual is not larger: ‖step(t) − t‖ decreases
+    along the iterates without acceleration, since the step is averaged.
+    """
+    images, changes = list[Vector](), list[Vector]()
+    for _ in range(count // MEMORY):
+        images.clear()
+        changes.clear()
+        for _ in range(MEMORY):
+            image = step(t)
+            images.append(image)
+            changes.append(image - t)
+            t = image
+        F, G = (np.diff(np.array(rows), axis=0).T for rows in (changes, images))
+        gram = F.T @ F
+        gram[np.diag_indices_from(gram)] += GRAM_SHIFT * np.trace(gram)
+        try:
+            weights = np.linalg.solve(gram, F.T @ changes[-1])
+        except np.linalg.LinAlgError:  # the changes are zero
+            return t
+        candidate = t - G @ weights
+        image = step(candidate)
+        if np.linalg.norm(image - candidate) <= np.linalg.norm(changes[-1]):
+            t = image
+    return t
 
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop

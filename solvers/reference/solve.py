@@ -36,6 +36,7 @@ from mortarbench.solvers.reference.projection import projection_iterates
 #: with many solutions ended at one of size 1e10, whose rounding hid errors of the
 #: optimal value; so other starts are tried too
 MAX_START_RESIDUAL = 1e-3
+MAX_IDLE_ROUNDS = 1  #: of projections, without a smaller residual, before they end
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 #: data of a scaled QP larger than this times their median are first left out
 OUTLIER_FACTOR = 1e4
@@ -118,9 +119,13 @@ def _candidates(qp: QP) -> Iterator[Solution]:
 
 def _projection_candidates(qp: QP) -> Iterator[Solution]:
     """Yield points of a QP over arbitrary sets, until the residual is rounding."""
+    residuals = list[float]()
     for point in projection_iterates(qp):
         yield point
-        if _residual(qp, point) <= MAX_RESIDUAL:
+        residuals.append(_residual(qp, point))
+        best = int(np.argmin(residuals))
+        is_settled = best < len(residuals) - MAX_IDLE_ROUNDS
+        if residuals[best] <= (MAX_REFERENCE_RESIDUAL if is_settled else MAX_RESIDUAL):
             return
 
 

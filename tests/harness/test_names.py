@@ -217,3 +217,9 @@ def test_a_bare_path_is_told_how_its_case_is_called(tmp_path, monkeypatch, text,
 def test_what_looks_like_no_path_is_an_unknown_family(text):
     with pytest.raises(InputError, match="; known: file"):
         parse(text, {"file": stored("file", "")})
+
+
+@pytest.mark.parametrize("text", ["meshed:a/b.toml", "meshed:a/b.toml/qp"])
+def test_a_file_with_a_single_form_needs_no_form(text):
+    family = stored("meshed", ".toml")
+    assert str(parse(text, {"meshed": family})) == "meshed:a/b.toml/qp"

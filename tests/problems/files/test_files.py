@@ -598,7 +598,7 @@ def test_unknown_formats_of_an_export_are_refused_with_those_there_are(
     assert code == 2
     assert err == (
         "mortarbench: a.csv: unknown format '.csv'; expected .npz or .mat or .parquet "
-        "or .qps\n"
+        "or .qps or .hdf5\n"
     )
 
 

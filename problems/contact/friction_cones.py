@@ -1,0 +1,265 @@
+"""Coulomb's law between many bodies in the forces of its contacts, by convex problems.
+
+Contacts have forces r, blocks (N, T₁[, T₂]) in friction cones K, ‖r_T‖ ≤ μ r_N, and
+velocities u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
+
+    û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
+
+It has no potential, but two sequences of convex problems, each with the data of its
+predecessor's solution, lead to it:
+
+* ``cones``: min ½rᵀWr + (q + s)ᵀr over K with s = (μ‖u_T‖, 0), first 0 (Acary, Cadoux,
+  Lemaréchal and Malick 2011, Z. Angew. Math. Mech. 91);
+* ``tresca``: the same with s = 0 over r_N ≥ 0, ‖r_T‖ ≤ g, with the bound g = μ r_N
+  (Haslinger 1983, Math. Methods Appl. Sci. 5); first that of ``cones`` with s = 0.
+
+Rigid bodies have more contacts than equations of motion, W is singular, and the forces
+of a problem are not unique; the bounds of ``tresca`` then wander in the null space, and
+the loop does not settle on a stack of three boxes. It therefore takes proximal steps:
+it adds ½δ‖r − r'‖² with the forces r' of the predecessor, which vanishes at its end.
+The other loop does so where a problem has no solution otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array, csr_array, eye_array
+from scipy.sparse.linalg import eigsh
+
+from mortarbench.harness import QP, InputError, Solution, Vector, no_rows
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.discs import Discs
+from mortarbench.problems.contact.friction import MAX_ITERATES, MAX_STAGNATION
+
+LOOPS = ("cones", "tresca")
+#: largest asymmetry of W, relative to its largest entry, that counts as rounding: it
+#: changes the scaled natural map by about as much, and 1e-6 is asked for
+MAX_ASYMMETRY = 1e-9
+#: scaled natural map at which Coulomb's law counts as solved
+FIXED_POINT_TOLERANCE = 1e-9
+MAX_DENSE_ROWS = 3000  #: of W whose eigenvalues are all computed: 20 s
+#: eigenvalues of W below this fraction of the largest count as zero
+RANK_TOLERANCE = 1e-10
+#: δ of the proximal step relative to the largest eigenvalue of W. Three boxes by
+#: ``tresca`` take 56 problems with 1e-2, 15 with 1e-3, 9 with 1e-4; 1e-5 diverges
+PROXIMITY = 1e-4
+ACTIVE = 1e-6  #: forces below this fraction of the largest count as zero
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionalContact:
+    """Contacts with Coulomb friction: W, q, μ, and equations A r = b of the forces.
+
+    Raises
+    ------
+    InputError
+        If W is unsymmetric, so that the steps are not convex problems.
+
+    """
+
+    W: Any  #: (n, n) sparse, stored as its symmetric part
+    q: Vector  #: (n,) velocity without forces
+    mu: Vector  #: (k,) coefficient of friction; n/k components per contact
+    A: Any = None  #: (p, n) = Vᵀ
+    b: Vector = field(default_factory=lambda: np.zeros(0))  #: (p,)
+
+    def __post_init__(self) -> None:
+        """Symmetrise W up to rounding."""
+        largest = abs(self.W).max() if self.W.nnz else 0.0
+        asymmetry = abs(self.W - self.W.T).max() / (largest or 1.0)
+        if asymmetry > MAX_ASYMMETRY:
+            raise InputError(
+                f"W is unsymmetric by {asymmetry:.2g} of its largest entry, so that no "
+                "step is a convex problem; expected a symmetric W"
+            )
+        object.__setattr__(self, "W", csc_array((self.W + self.W.T) / 2))
+        if self.A is None:
+            object.__setattr__(self, "A", no_rows(self.q.size))
+
+    def check_convex(self) -> None:
+        """Raise InputError if W has a negative eigenvalue that is not rounding."""
+        least = self._eigenvalues[0]
+        if least < -RANK_TOLERANCE * self.stiffness:
+            raise InputError(
+                f"W has the negative eigenvalue {least:.2g}, relative to its largest "
+                f"{least / self.stiffness:.1g}, so that no step is a convex problem; "
+                "expected a positive semidefinite W"
+            )
+
+    @cached_property
+    def _eigenvalues(self) -> Vector:
+        """All eigenvalues of W in ascending order; of a large W the largest one."""
+        if self.q.size <= MAX_DENSE_ROWS:
+            return np.asarray(np.linalg.eigvalsh(self.W.toarray()))
+        return np.asarray(eigsh(self.W, 1, return_eigenvectors=False))
+
+    @property
+    def stiffness(self) -> float:
+        """The largest eigenvalue of W, or 1 if W is zero."""
+        return float(self._eigenvalues[-1]) or 1.0
+
+    @property
+    def rank(self) -> int | None:
+        """Rank of W; None if W is large."""
+        if self._eigenvalues.size < self.q.size:
+            return None
+        return int((self._eigenvalues > RANK_TOLERANCE * self.stiffness).sum())
+
+    @property
+    def cones(self) -> Cones:
+        """The friction cones of all contacts."""
+        n, k = self.q.size, self.mu.size
+        return Cones(np.arange(n).reshape(k, n // k), self.mu)
+
+    def velocity(self, r: Vector, multipliers: Vector) -> Vector:
+        """Return u (n,) for forces r (n,) and multipliers λ (p,)."""
+        u: Vector = self.W @ r + self.q + self.A.T @ multipliers
+        return u
+
+    def tangential(self, v: Vector) -> Vector:
+        """Return the norm (k,) of the tangential part of v (n,)."""
+        norms: Vector = np.linalg.norm(v[self.cones.index[:, 1:]], axis=1)
+        return norms
+
+    def natural_map(
+        self, r: Vector, multipliers: Vector, omega: float | None = None
+    ) -> float:
+        """Evaluate  ‖r − Π(r − û/ω)‖·ω/‖q‖ + ‖A r − b‖/‖b‖,  zero at solutions.
+
+        Parameters
+        ----------
+        r, multipliers : (n,) forces and λ (p,)
+        omega : velocity per force, to compare them; default: the largest eigenvalue of
+            W, with which the result does not depend on units. FCLIB's error has 1 in
+            the units of the file
+
+        """
+        omega = self.stiffness if omega is None else omega
+        u = self.velocity(r, multipliers)
+        u[self.cones.index[:, 0]] += self.mu * self.tangential(u)
+        change = r - self.cones.project(r - u / omega)
+        off = self.A @ r - self.b
+        return sum(
+            float(np.linalg.norm(error)) / (float(np.linalg.norm(size)) or 1.0)
+            for error, size in ((change * omega, self.q), (off, self.b))
+        )
+
+    def scaled(self, force: float, velocity: float) -> FrictionalContact:
+        """Return the problem in units of force and velocity."""
+        return replace(
+            self, W=self.W * (force / velocity), q=self.q / velocity, b=self.b / force
+        )
+
+    def cone_step(self, slip: Vector) -> QP:
+        """Return the problem over friction cones with s = (slip (k,), 0)."""
+        q = self.q.copy()
+        q[self.cones.index[:, 0]] += slip
+        return self._qp(q, np.full(q.size, -np.inf), self.cones)
+
+    def tresca_step(self, bound: Vector) -> QP:
+        """Return Tresca's problem, ‖r_T‖ ≤ bound (k,)."""
+        lower, index = np.full(self.q.size, -np.inf), self.cones.index
+        lower[index[:, 0]] = 0.0
+        return self._qp(self.q, lower, Discs(index[:, 1:], bound))
+
+    def _qp(self, q: Vector, lower: Vector, one: Cones | Discs) -> QP:
+        return QP(
+            P=self.W, q=q, A=csr_array(self.A), b=self.b, G=no_rows(q.size),
+            h=np.zeros(0), lb=lower, ub=np.full(q.size, np.inf), sets=(one,),
+        )  # fmt: skip
+
+
+class ConvexStep(NamedTuple):
+    """A convex problem of a sequence that leads to Coulomb's law."""
+
+    qp: QP
+    error: float  #: scaled natural map, in Coulomb's law, of its solution
+
+
+def coulomb_steps(
+    contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
+) -> list[ConvexStep]:
+    """Return the convex problems up to Coulomb's law, or the first `count` of them.
+
+    Parameters
+    ----------
+    loop : one of `LOOPS`
+    solve : solves convex problems; raises ArithmeticError if one has no solution
+    count : number of problems, or 0 for all
+
+    Raises
+    ------
+    InputError
+        When a problem has no solution, or the sequence does not converge.
+
+    """
+    steps, errors, method = (
+        list[ConvexStep](),
+        list[float](),
+        _ProximalMethod(contact, solve),
+    )
+
+    r, qp = np.zeros(contact.q.size), contact.cone_step(np.zeros(contact.mu.size))
+    if loop == "tresca":
+        s = method.solve(qp, r)
+        r, qp, method.is_proximal = s.x, _successor(contact, loop, s), True
+    while len(steps) < MAX_ITERATES:
+        s = method.solve(qp, r)
+        errors.append(contact.natural_map(s.x, s.y))
+        steps.append(ConvexStep(qp, errors[-1]))
+        if errors[-1] <= FIXED_POINT_TOLERANCE or len(steps) == count:
+            return steps
+        if len(steps) - 1 - int(np.argmin(errors)) > MAX_STAGNATION:
+            break
+        r, qp = s.x, _successor(contact, loop, s)
+    raise InputError(
+        f"Coulomb's law does not converge by loop={loop}: after {len(steps)} convex "
+        f"problems the scaled natural map is {errors[-1]:.1e}, and was at best "
+        f"{min(errors):.1e}; expected another loop, or a smaller mu"
+    )
+
+
+class _ProximalMethod:
+    """Solves convex problems, by proximal steps from the first one without solution."""
+
+    def __init__(
+        self, contact: FrictionalContact, solve: Callable[[QP], Solution]
+    ) -> None:
+        self.is_proximal = False
+        self._solve, self._delta = solve, PROXIMITY * contact.stiffness
+
+    def solve(self, qp: QP, r: Vector) -> Solution:
+        """Solve `qp`, or with proximal steps  qp + ½δ‖x − r‖²."""
+        if not self.is_proximal:
+            try:
+                return self._solve(qp)
+            except ArithmeticError:  # W is singular, and no force is large enough
+                self.is_proximal = True
+        P = csc_array(qp.P + self._delta * eye_array(r.size))
+        try:
+            return self._solve(replace(qp, P=P, q=qp.q - self._delta * r))
+        except ArithmeticError as e:
+            raise InputError(f"a convex problem has no solution: {e}") from None
+
+
+def _successor(contact: FrictionalContact, loop: str, s: Solution) -> QP:
+    """Return the problem with the data of its predecessor's solution."""
+    if loop == "tresca":
+        normal = np.maximum(s.x[contact.cones.index[:, 0]], 0.0)
+        return contact.tresca_step(contact.mu * normal)
+    slip = contact.tangential(contact.velocity(s.x, s.y))
+    return contact.cone_step(contact.mu * slip)
+
+
+def states(contact: FrictionalContact, r: Vector) -> NDArray[Any]:
+    """Return "open", "stick" or "slip" (k,) of each contact with forces r (n,)."""
+    normal = r[contact.cones.index[:, 0]]
+    least = ACTIVE * float(np.abs(r).max(initial=0.0))
+    slips = contact.tangential(r) >= (1 - ACTIVE) * contact.mu * normal
+    return np.where(normal <= least, "open", np.where(slips, "slip", "stick"))

@@ -1,0 +1,122 @@
+"""The family of FCLIB's problems; see `problems.files.fclib`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from mortarbench.harness.errors import unknown
+from mortarbench.harness.plugin import SourceFile
+from mortarbench.problems.families.from_file import FromFile
+from mortarbench.problems.ranges import at_least
+
+if TYPE_CHECKING:
+    from mortarbench.harness import Case, Reference, Solution, Value
+
+
+class Fclib(FromFile):
+    """Contacts with Coulomb friction from FCLIB files, ``fclib:PATH.hdf5``.
+
+    The QP is the last of the convex problems of `loop`, whose solution fulfils
+    Coulomb's law, or the one with the number `iterate`. The digest of the file's
+    content is a parameter of the case.
+    """
+
+    name = "fclib"
+    path_suffix = ".hdf5"
+    defaults: Mapping[str, Value] = MappingProxyType(
+        {"path": "", "loop": "cones", "iterate": 0, "sha256": ""}
+    )
+    forms = ("dual",)
+
+    def check(self, params: Mapping[str, Value]) -> None:
+        """Raise InputError unless keys are in range and the file exists."""
+        loops = ("cones", "tresca")
+        if params["loop"] not in loops:
+            raise unknown("loop", str(params["loop"]), loops, where=self.name)
+        at_least(0, self.name, params, ["iterate"])
+        super().check(params)
+
+    def source_file(self, params: Mapping[str, Value]) -> SourceFile:
+        """Return the file with the digest of its content."""
+        return SourceFile(
+            path=str(params["path"]), sha256=str(params["sha256"]), suffix=".hdf5"
+        )
+
+    def build(
+        self, form: str, params: Mapping[str, Value], reference: Reference
+    ) -> Case:
+        """Return a convex problem in units of the largest entries of W and q.
+
+        Raises
+        ------
+        InputError
+            If the file is damaged or not a convex problem, or the loop does not
+            converge.
+        PastEndError
+            If the loop has fewer problems than `iterate`.
+
+        """
+        import numpy as np
+
+        from mortarbench.harness import Case
+        from mortarbench.harness.checked import located
+        from mortarbench.harness.errors import PastEndError
+        from mortarbench.problems.contact.friction_cones import coulomb_steps, states
+        from mortarbench.problems.files.fclib import read_fclib
+
+        p: Any = params
+        path = self._located(params)
+        file = read_fclib(path)
+        speed = float(np.abs(file.contact.q).max(initial=0.0)) or 1.0
+        largest = float(file.contact.W.diagonal().max(initial=0.0)) or 1.0
+        force = speed / largest
+        contact = file.contact.scaled(force, speed)
+        with located(str(path)):
+            contact.check_convex()
+            steps = coulomb_steps(contact, p["loop"], reference, p["iterate"])
+        if p["iterate"] > len(steps):
+            raise PastEndError(
+                f"iterate={p['iterate']}: loop={p['loop']} has {len(steps)} problems; "
+                "expected at most that, or 0 for the last"
+            )
+        remarks = []
+        if (rank := contact.rank) is not None and rank < contact.q.size:
+            remarks.append(
+                f"W has rank {rank} of {contact.q.size}: the forces may not be unique"
+            )
+        stored = file.stored
+        quantities: dict[str, Any] = {
+            "contacts": contact.mu.size,
+            "problems": len(steps),
+            "loop_natural_map": steps[-1].error,
+        }
+        if stored is not None:
+            error = contact.natural_map(stored / force, file.multipliers / speed)
+            quantities |= {"stored_natural_map": error}
+            if error > DUMMY:
+                remarks.append(
+                    "the solution that the file stores has a scaled natural map of "
+                    f"{error:.2g}: a dummy"
+                )
+
+        def evaluate(s: Solution) -> dict[str, Any]:
+            state = states(contact, s.x)
+            counts = {k: int((state == k).sum()) for k in ("stick", "slip", "open")}
+            return {
+                **quantities,
+                **counts,
+                "natural_map": contact.natural_map(s.x, s.y, force / speed),
+                "scaled_natural_map": contact.natural_map(s.x, s.y),
+            }
+
+        return Case(
+            qp=steps[-1].qp, recover=lambda s: force * s.x, quantities=evaluate,
+            scale=force * speed, remarks=tuple(remarks),
+            unsettled=0.0 if p["iterate"] == 0 else steps[-1].error,
+        )  # fmt: skip
+
+
+#: scaled natural map of a stored solution that counts as a dummy: zeros have about 1
+DUMMY = 0.1

@@ -1,0 +1,331 @@
+"""FCLIB files: problems of contact with Coulomb friction in HDF5.
+
+A local problem is stated in the forces r of the contacts, blocks (N, T₁[, T₂]), and
+multipliers l; a global one has the velocities v of the bodies besides::
+
+    u = W r + V l + q,   Vᵀr + R l + s = 0                        (local)
+    M v = H r + G l + f,   Gᵀv + b = 0,   u = Hᵀv + w             (global)
+
+with û = u + (μ‖u_T‖, 0) in the dual of the friction cones K, and r ∈ K orthogonal to û.
+A matrix is a group  nzmax, m, n, nz, p, i, x:  nz = −1 by columns, −2 by rows, and the
+number of triplets otherwise. The documentation of FCLIB says that p holds the rows of
+triplets, but files that Siconos wrote have CSparse's order, p for columns. Both are
+read; where both fit, the second.
+
+Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
+https://frictionalcontactlibrary.github.io.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_array, coo_array, csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from mortarbench.harness import QP, InputError, Vector
+from mortarbench.harness.checked import located
+from mortarbench.harness.files.datafile import check_size, opened
+from mortarbench.harness.files.durable import replacing
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.problems.contact.friction_cones import FrictionalContact
+
+SUFFIX = ".hdf5"
+_EXPECTED = "an FCLIB file (HDF5)"
+_KINDS = ("fclib_local", "fclib_global")
+_COLUMNS, _ROWS = -1, -2  #: values of nz for compressed matrices
+
+Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by their path in it
+
+
+@dataclass(frozen=True, eq=False)
+class FclibFile:
+    """A problem of contact and what its file stores beside it."""
+
+    contact: FrictionalContact
+    is_local: bool
+    stored: Vector | None  #: (n,) forces of /solution; None without one
+    multipliers: Vector  #: (p,) of /solution; zeros without
+
+
+def read_datasets(path: Path) -> Datasets:
+    """Return all arrays of an HDF5 file by their path, such as fclib_local/W/x.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is not HDF5, or is too large.
+
+    """
+    import h5py  # late: workers of solvers need no HDF5
+
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def read(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset):
+            check_size(f"{path}: {name}", node.size * node.dtype.itemsize)
+            arrays[name] = np.asarray(node[()])
+
+    with opened(path, _EXPECTED) as stream:
+        try:
+            with h5py.File(stream, "r") as file:
+                file.visititems(read)
+        except InputError:
+            raise
+        except (OSError, RuntimeError, ValueError, KeyError, TypeError):
+            raise InputError(
+                f"{path}: damaged, or not HDF5; expected {_EXPECTED}"
+            ) from None
+    return arrays
+
+
+def write_datasets(path: Path, arrays: Datasets) -> None:
+    """Write arrays to an HDF5 file, with their types and shapes.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+
+    """
+    import h5py
+
+    try:
+        with replacing(path) as stream, h5py.File(stream, "w") as file:
+            for name, array in arrays.items():
+                file.create_dataset(name, data=array)
+    except OSError as e:
+        raise InputError(f"{path}: cannot be written: {e.strerror or e}") from None
+
+
+def read_fclib(path: Path) -> FclibFile:
+    """Read an FCLIB file; the global form is reduced to the local one.
+
+    Raises
+    ------
+    InputError
+        If it is damaged, has rolling friction, or is not a convex problem.
+
+    """
+    arrays = read_datasets(path)
+    with located(str(path)):
+        return to_contact(arrays)
+
+
+def to_contact(arrays: Datasets) -> FclibFile:
+    """Return the problem of the arrays of a file.
+
+    Raises
+    ------
+    InputError
+        If an array is missing or does not fit the others, and for problems that are
+        not built.
+
+    """
+    kinds = [
+        kind for kind in _KINDS if any(name.startswith(f"{kind}/") for name in arrays)
+    ]
+    if any("rolling" in name or name.endswith("/mu_r") for name in arrays):
+        raise InputError(
+            "rolling friction is not built; expected fclib_local or fclib_global "
+            "without mu_r"
+        )
+    if len(kinds) != 1:
+        raise InputError(
+            "no FCLIB problem; expected one group fclib_local or fclib_global"
+        )
+    part = _Group(kinds[0], arrays)
+    dim, mu = part.integer("spacedim"), part.vector("vectors/mu")
+    if dim not in (2, 3):
+        raise InputError(f"spacedim is {dim}; expected 2 or 3")
+    if (mu < 0).any():
+        raise InputError(f"vectors/mu holds {mu.min():g}; expected no negative numbers")
+    is_local = kinds[0] == "fclib_local"
+    contact = (_local if is_local else _global)(part, dim * mu.size, mu)
+    solution = _Group("solution", arrays)
+    stored = solution.vector("r", contact.q.size) if solution.has("r") else None
+    p = contact.b.size
+    has_multipliers = stored is not None and solution.has("l") and p > 0
+    multipliers = solution.vector("l", p) if has_multipliers else np.zeros(p)
+    return FclibFile(contact, is_local, stored, multipliers)
+
+
+def _local(part: _Group, n: int, mu: Vector) -> FrictionalContact:
+    W, q = part.matrix("W", n, n), part.vector("vectors/q", n)
+    if not part.has("V/x"):
+        return FrictionalContact(W=W, q=q, mu=mu)
+    s = part.vector("vectors/s")
+    V, R = part.matrix("V", n, s.size), part.matrix("R", s.size, s.size)
+    if not R.nnz or not np.abs(R.data).max():
+        return FrictionalContact(W=W, q=q, mu=mu, A=csr_array(V.T), b=-s)
+    eliminated = _factor("R", R).solve(np.column_stack([V.T.toarray(), s]))
+    W = csc_array(W - V @ csc_array(eliminated[:, :-1]))
+    return FrictionalContact(W=W, q=q - V @ eliminated[:, -1], mu=mu)
+
+
+def _global(part: _Group, n: int, mu: Vector) -> FrictionalContact:
+    """Eliminate the velocities, and the multipliers of Gᵀv + b = 0."""
+    f, w = part.vector("vectors/f"), part.vector("vectors/w", n)
+    M, H = part.matrix("M", f.size, f.size), part.matrix("H", f.size, n)
+    check_size("W, a dense matrix", 8 * (n + f.size) * n)
+    rows, rhs, K = H.toarray(), f, M
+    if part.has("G/x"):
+        b = part.vector("vectors/b")
+        G = part.matrix("G", f.size, b.size)
+        K = csc_array(block_array([[M, -G], [-G.T, None]]))
+        rows, rhs = np.vstack([rows, np.zeros((b.size, n))]), np.append(f, b)
+    solved = _factor("M", K).solve(np.column_stack([rows, rhs]))[: f.size]
+    W = csc_array(H.T @ solved[:, :-1])
+    return FrictionalContact(W=W, q=H.T @ solved[:, -1] + w, mu=mu)
+
+
+def _factor(name: str, K: Any) -> Any:
+    try:
+        return splu(csc_array(K))
+    except RuntimeError:
+        raise InputError(f"{name} is singular; expected a regular matrix") from None
+
+
+class _Group:
+    """Arrays of a group of a file, read with checks."""
+
+    def __init__(self, name: str, arrays: Datasets) -> None:
+        self.name, self._arrays = name, arrays
+
+    def has(self, name: str) -> bool:
+        return f"{self.name}/{name}" in self._arrays
+
+    def _array(self, name: str) -> NDArray[Any]:
+        if not self.has(name):
+            raise InputError(f"{self.name}/{name} is missing; expected an FCLIB file")
+        array = self._arrays[f"{self.name}/{name}"]
+        if array.dtype.kind not in "iuf":
+            raise InputError(f"{self.name}/{name} holds no numbers")
+        return array.ravel()
+
+    def integer(self, name: str) -> int:
+        array = self._array(name)
+        if array.size != 1 or array[0] != int(array[0]):
+            raise InputError(f"{self.name}/{name} is not an integer")
+        return int(array[0])
+
+    def vector(self, name: str, size: int | None = None) -> Vector:
+        vector: Vector = self._array(name).astype(float)
+        if size is not None and vector.size != size:
+            raise InputError(
+                f"{self.name}/{name} has {vector.size} entries; expected {size}"
+            )
+        if not np.isfinite(vector).all():
+            raise InputError(f"{self.name}/{name} holds NaN or inf")
+        return vector
+
+    def matrix(self, name: str, m: int, n: int) -> csc_array:
+        """Return a matrix of the expected shape (m, n)."""
+        nz, *shape = (self.integer(f"{name}/{key}") for key in ("nz", "m", "n"))
+        if shape != [m, n]:
+            raise InputError(
+                f"{self.name}/{name} has shape {tuple(shape)}; expected {(m, n)}"
+            )
+        x = self.vector(f"{name}/x")
+        p, i = (self._array(f"{name}/{key}").astype(np.int64) for key in "pi")
+        try:
+            if nz in (_COLUMNS, _ROWS):
+                kind = csc_array if nz == _COLUMNS else csr_array
+                matrix = kind((x[: p[-1]], i[: p[-1]], p), shape=(m, n))
+                matrix.check_format()
+                return csc_array(matrix)
+            places = (i[:nz], p[:nz])
+            if max(places[0], default=0) >= m or max(places[1], default=0) >= n:
+                places = (p[:nz], i[:nz])
+            return csc_array(coo_array((x[:nz], places), shape=(m, n)))
+        except (ValueError, IndexError):
+            raise InputError(
+                f"{self.name}/{name} is not a matrix: its p, i and x do not fit "
+                f"{m} rows and {n} columns"
+            ) from None
+
+
+def save_fclib(path: Path, qp: QP, meta: Mapping[str, Any], source: str = "") -> None:
+    """Write a QP over friction cones, or the arrays of the FCLIB file `source`.
+
+    meta : plain data; stored as the description, in JSON
+
+    Raises
+    ------
+    InputError
+        When the format cannot hold the QP, or a file cannot be read or written.
+
+    """
+    if source:
+        arrays = read_datasets(Path(source))
+    else:
+        with located(str(path)):
+            title = str(meta.get("name", "QP"))
+            arrays = fclib_datasets(qp, title, json.dumps(dict(meta)))
+    write_datasets(path, arrays)
+
+
+def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
+    """Return a QP over friction cones as the arrays of a local problem.
+
+    Equality rows A r = b become V = Aᵀ, s = −b, R = 0.
+
+    Raises
+    ------
+    InputError
+        If a variable is in no cone, the cones differ in dimension, there are other
+        constraints, or P is an operator.
+
+    """
+    cones = [one for one in qp.sets[1:] if isinstance(one, Cones)]
+    dims = {one.index.shape[1] for one in cones}
+    order = np.concatenate(
+        [np.zeros(0, np.int64), *(one.index.ravel() for one in cones)]
+    )
+    if (
+        len(dims) != 1
+        or dims - {2, 3}
+        or len(cones) < len(qp.sets) - 1
+        or order.size < qp.q.size
+        or qp.h.size
+    ):
+        raise InputError(
+            "FCLIB holds friction cones of all variables and equality rows; expected a "
+            "QP whose sets are Cones of 2 or 3 variables each, without inequality rows"
+        )
+    if not qp.is_explicit:
+        raise InputError("P is an operator; expected a matrix, which FCLIB holds")
+    kind, names = "fclib_local", {"mu": np.concatenate([one.slope for one in cones])}
+    arrays = {f"{kind}/spacedim": np.array([dims.pop()], dtype=np.int32)}
+    matrices = {"W": csc_array(qp.P)[order][:, order]}
+    if qp.b.size:
+        matrices["V"] = csc_array(qp.A)[:, order].T
+        matrices["R"] = csc_array((qp.b.size, qp.b.size))
+        names["s"] = -qp.b
+    names["q"] = qp.q[order]
+    for name, M in matrices.items():
+        arrays |= {f"{kind}/{name}/{key}": part for key, part in _compressed(M).items()}
+    arrays |= {f"{kind}/vectors/{name}": vector for name, vector in names.items()}
+    texts = {"title": title, "description": description, "math_info": ""}
+    for name, text in texts.items():
+        arrays[f"{kind}/info/{name}"] = np.array(f"{text}\0".encode())
+    return arrays
+
+
+def _compressed(M: Any) -> Datasets:
+    """Return the arrays of a matrix stored by columns."""
+    M = csc_array(M)
+    M.sum_duplicates()
+    sizes = {"nzmax": M.nnz, "m": M.shape[0], "n": M.shape[1], "nz": _COLUMNS}
+    return {
+        **{key: np.array([size], dtype=np.int32) for key, size in sizes.items()},
+        "p": M.indptr.astype(np.int32),
+        "i": M.indices.astype(np.int32),
+        "x": M.data,
+    }

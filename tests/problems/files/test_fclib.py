@@ -1,0 +1,405 @@
+"""FCLIB files: both loops, both forms, refusals, the writer, independent readers."""
+
+import ctypes
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mortarbench as mb
+from mortarbench.harness import QP, InputError
+from mortarbench.harness.files.datafile import VARIABLE
+from mortarbench.problems.contact.friction_cones import FrictionalContact
+from mortarbench.problems.files.fclib import (
+    read_datasets,
+    read_fclib,
+    to_contact,
+    write_datasets,
+)
+from tests.support.box_stack import (
+    box_stack,
+    global_arrays,
+    local_arrays,
+    write_boxes,
+)
+
+LOOPS = ("cones", "tresca")
+
+
+def case_of(path, *parts):
+    return mb.build("/".join([f"fclib:{path}", *parts]))
+
+
+def one_contact(mu=0.5, push=1.0):
+    """W = I, q = (−1, push, 0): the force (1, −min(push, μ), 0)."""
+    return local_arrays(np.eye(3), np.array([-1.0, push, 0.0]), np.array([mu]))
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+@pytest.mark.parametrize(("push", "force"), [(0.3, -0.3), (2.0, -0.5)])
+def test_one_contact_has_the_force_of_coulombs_law(tmp_path, loop, push, force):
+    """Sticking if push ≤ μ, else slipping with the force μ·1, and no dilatancy."""
+    write_datasets(tmp_path / "one.hdf5", one_contact(push=push))
+    case = case_of(tmp_path / "one.hdf5", f"loop={loop}")
+    answer = mb.solve(case, "ecos", 1e-9)
+    quantities = case.quantities(answer.solution)
+
+    assert case.recover(answer.solution) == pytest.approx([1, force, 0], abs=1e-6)
+    assert quantities["scaled_natural_map"] <= 1e-6
+    assert quantities["slip" if push > 0.5 else "stick"] == 1
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_a_stack_of_boxes_is_solved_by_both_loops(tmp_path, loop):
+    """W has half of full rank, and the forces are not unique."""
+    write_boxes(tmp_path / "boxes.hdf5", 2)
+    case = case_of(tmp_path / "boxes.hdf5", f"loop={loop}")
+    answer = mb.solve(case, "scs", 1e-8)
+    quantities = case.quantities(answer.solution)
+
+    assert answer.verdict is mb.Verdict.VERIFIED
+    assert quantities["loop_natural_map"] <= 1e-9
+    assert quantities["contacts"] == 8
+    assert quantities["slip"] + quantities["stick"] > 0
+    assert any("W has rank 12 of 24" in remark for remark in case.remarks)
+    if loop == "cones":
+        assert quantities["scaled_natural_map"] <= 1e-6
+
+
+def write_regular(path, contacts=3, mu=0.2, seed=0):
+    """Write a problem with a positive definite W and a small μ; return W and q."""
+    rng = np.random.default_rng(seed)
+    n = 3 * contacts
+    M = rng.standard_normal((n, n))
+    W, q = M @ M.T / n + np.eye(n), rng.standard_normal(n)
+    q[::3] = -np.abs(q[::3])
+    write_datasets(path, local_arrays(W, q, np.full(contacts, mu)))
+    return W, q
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_both_loops_have_the_same_forces_if_these_are_unique(tmp_path, seed):
+    write_regular(tmp_path / "regular.hdf5", seed=seed)
+    forces = []
+    for loop in LOOPS:
+        case = case_of(tmp_path / "regular.hdf5", f"loop={loop}")
+        forces.append(case.recover(case.registries.reference(case.qp)))
+    assert forces[0] == pytest.approx(forces[1], abs=1e-7)
+
+
+def test_the_global_form_is_the_same_problem(tmp_path):
+    M, H, f, mu = box_stack()
+    local = to_contact(local_arrays(H.T @ (H / M[:, None]), H.T @ (f / M), mu)).contact
+    for rows_first in (False, True):
+        arrays = global_arrays(M, H, f, mu, rows_first=rows_first)
+        contact = to_contact(arrays).contact
+        assert contact.W.toarray() == pytest.approx(local.W.toarray(), abs=1e-12)
+        assert contact.q == pytest.approx(local.q, abs=1e-14)
+
+
+def test_multipliers_of_equations_are_those_of_the_eliminated_problem():
+    """Gᵀv + b = 0 as a local problem with V and R, which Schur's complement removes."""
+    M, H, f, mu = box_stack(2)
+    rng = np.random.default_rng(1)
+    G, b = rng.standard_normal((12, 2)), np.array([1e-3, 0.0])
+    arrays = global_arrays(M, H, f, mu)
+    i, j = np.nonzero(G)
+    sizes = dict(nzmax=i.size, m=12, n=2, nz=i.size)
+    arrays |= {f"fclib_global/G/{k}": np.array([n]) for k, n in sizes.items()}
+    arrays |= {
+        "fclib_global/G/p": j,
+        "fclib_global/G/i": i,
+        "fclib_global/G/x": G[i, j],
+    }
+    arrays["fclib_global/vectors/b"] = b
+    inverse = np.diag(1 / M)
+    local = local_arrays(H.T @ inverse @ H, H.T @ inverse @ f, mu)
+    for name, matrix in (("V", H.T @ inverse @ G), ("R", G.T @ inverse @ G)):
+        i, j = np.nonzero(matrix)
+        sizes = dict(nzmax=i.size, m=len(matrix), n=2, nz=i.size)
+        local |= {f"fclib_local/{name}/{k}": np.array([n]) for k, n in sizes.items()}
+        local |= {
+            f"fclib_local/{name}/{k}": v
+            for k, v in zip("pix", (j, i, matrix[i, j]), strict=True)
+        }
+    local["fclib_local/vectors/s"] = G.T @ inverse @ f + b
+    one, two = to_contact(arrays).contact, to_contact(local).contact
+
+    assert one.W.toarray() == pytest.approx(two.W.toarray(), abs=1e-12)
+    assert one.q == pytest.approx(two.q, abs=1e-14)
+
+
+def test_iterates_are_counted_from_one(tmp_path):
+    write_regular(tmp_path / "boxes.hdf5")
+    first = case_of(tmp_path / "boxes.hdf5", "iterate=1", "dual")
+    last = case_of(tmp_path / "boxes.hdf5")
+    count = last.quantities(mb.solve(last, "scs").solution)["problems"]
+
+    assert first.unsettled > 1e-3
+    assert last.unsettled == 0
+    again = case_of(tmp_path / "boxes.hdf5", f"iterate={count}", "dual")
+    assert again.qp.q == pytest.approx(last.qp.q, abs=1e-12)
+    with pytest.raises(
+        InputError, match=f"has {count} problems; expected at most that"
+    ):
+        case_of(tmp_path / "boxes.hdf5", f"iterate={count + 1}", "dual")
+
+
+def test_the_scaled_error_has_no_units_and_that_of_fclib_has():
+    M, H, f, mu = box_stack()
+    contact = to_contact(
+        local_arrays(H.T @ (H / M[:, None]), H.T @ (f / M), mu)
+    ).contact
+    r = 1e-3 * np.random.default_rng(2).standard_normal(contact.q.size)
+    other = contact.scaled(force=1e-3, velocity=10.0)
+    none = np.zeros(0)
+
+    scaled = [c.natural_map(x, none) for c, x in ((contact, r), (other, 1e3 * r))]
+    assert scaled[0] == pytest.approx(scaled[1])
+    units = [c.natural_map(x, none, 1.0) for c, x in ((contact, r), (other, 1e3 * r))]
+    assert not 0.5 < units[0] / units[1] < 2
+
+
+def changed(**arrays):
+    return one_contact() | {
+        f"fclib_local/{name.replace('__', '/')}": array
+        for name, array in arrays.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        (
+            local_arrays(np.eye(3) + np.diag([0, 1e-3], 1), np.ones(3), np.ones(1)),
+            "W is unsymmetric by 0.001 of its largest entry",
+        ),
+        (
+            local_arrays(np.diag([1.0, -0.1, 1]), np.ones(3), np.ones(1)),
+            "W has the negative eigenvalue -0.1",
+        ),
+        (changed(vectors__mu_r=np.ones(1)), "rolling friction is not built; expected"),
+        ({"fclib_rolling/spacedim": np.array([5])}, "rolling friction is not built"),
+        ({"solution/r": np.ones(3)}, "no FCLIB problem; expected one group"),
+        (changed(spacedim=np.array([4])), "spacedim is 4; expected 2 or 3"),
+        (changed(vectors__mu=-np.ones(1)), "vectors/mu holds -1; expected no negative"),
+        (changed(vectors__q=np.ones(4)), "vectors/q has 4 entries; expected 3"),
+        (changed(vectors__q=np.array([np.nan, 0, 0])), "vectors/q holds NaN or inf"),
+        (changed(W__m=np.array([4])), r"W has shape \(4, 3\); expected \(3, 3\)"),
+        (changed(W__i=np.array([0, 1, 7])), "W is not a matrix: its p, i and x do not"),
+        (changed(vectors__q=np.array(b"text")), "vectors/q holds no numbers"),
+    ],
+)
+def test_what_is_no_convex_problem_of_contact_is_refused(tmp_path, arrays, message):
+    path = tmp_path / "wrong.hdf5"
+    write_datasets(path, arrays)
+    with pytest.raises(InputError, match=message) as raised:
+        case_of(path)
+    assert "\n" not in str(raised.value)
+    assert str(path) in str(raised.value)
+
+
+def test_a_file_that_is_not_hdf5_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "text.hdf5").write_text("text")
+    with pytest.raises(InputError, match="damaged, or not HDF5"):
+        case_of(tmp_path / "text.hdf5")
+    whole = tmp_path / "whole.hdf5"
+    write_boxes(whole)
+    data = whole.read_bytes()
+    (tmp_path / "half.hdf5").write_bytes(data[: len(data) // 2])
+    with pytest.raises(InputError, match="damaged, or not HDF5"):
+        case_of(tmp_path / "half.hdf5")
+    large = one_contact() | {"fclib_local/vectors/q": np.zeros(2**18)}
+    write_datasets(tmp_path / "large.hdf5", large)
+    monkeypatch.setenv(VARIABLE, "1")
+    with pytest.raises(InputError, match=r"expected at most 1 \(set"):
+        case_of(tmp_path / "large.hdf5")
+
+
+def test_a_loop_that_is_none_is_refused(tmp_path):
+    write_boxes(tmp_path / "boxes.hdf5")
+    with pytest.raises(InputError, match="unknown loop 'newton'"):
+        case_of(tmp_path / "boxes.hdf5", "loop=newton")
+
+
+def test_a_stored_solution_that_is_a_dummy_is_named(tmp_path):
+    arrays = one_contact()
+    path = tmp_path / "a.hdf5"
+    write_datasets(path, arrays | {"solution/r": np.zeros(3), "solution/u": np.ones(3)})
+    assert any("a dummy" in remark for remark in case_of(path).remarks)
+    write_datasets(path, arrays | {"solution/r": np.array([1.0, -0.5, 0])})
+    assert case_of(path).remarks == ()
+
+
+def test_arrays_survive_the_round_trip_byte_by_byte(tmp_path):
+    write_regular(tmp_path / "boxes.hdf5")
+    M, H, f, mu = box_stack(1)
+    write_datasets(
+        tmp_path / "global.hdf5",
+        global_arrays(M, H, f, mu) | {"guesses/1/r": np.zeros(3)},
+    )
+    for name in ("boxes", "global"):
+        source, copy = tmp_path / f"{name}.hdf5", tmp_path / "copy.hdf5"
+        mb.export(f"fclib:{source}", copy)
+        arrays, again = read_datasets(source), read_datasets(copy)
+        assert arrays.keys() == again.keys()
+        for key, array in arrays.items():
+            assert array.dtype == again[key].dtype
+            assert array.shape == again[key].shape
+            assert array.tobytes() == again[key].tobytes()
+
+
+def test_a_qp_over_cones_becomes_a_file(tmp_path):
+    """Cones in another order of variables, and equations as V and s."""
+    rng = np.random.default_rng(3)
+    M = rng.standard_normal((6, 6))
+    P, q, A = M @ M.T + np.eye(6), rng.standard_normal(6), rng.standard_normal((1, 6))
+    index = np.array([[5, 0, 2], [1, 4, 3]])
+    qp = QP.from_arrays(P, q, A=A, b=[0.3], sets=(mb.Cones(index, [0.4, 0.2]),))
+    mb.export(qp, tmp_path / "qp.hdf5")
+    contact = read_fclib(tmp_path / "qp.hdf5").contact
+    order = index.ravel()
+
+    assert contact.W.toarray() == pytest.approx(P[np.ix_(order, order)], abs=1e-15)
+    assert contact.q.tolist() == q[order].tolist()
+    assert contact.mu.tolist() == [0.4, 0.2]
+    assert contact.A.toarray().tolist() == A[:, order].tolist()
+    assert contact.b.tolist() == [0.3]
+    case = case_of(tmp_path / "qp.hdf5", "iterate=1", "dual")
+    x = np.zeros(6)
+    x[order] = case.recover(mb.solve(case, "scs", 1e-10).solution)
+    assert x == pytest.approx(mb.solve(qp, "scs", 1e-10).solution.x, abs=1e-7)
+
+
+def test_a_qp_without_cones_is_not_written(tmp_path):
+    with pytest.raises(InputError, match="FCLIB holds friction cones of all variables"):
+        mb.export("contact-patch/dual", tmp_path / "patch.hdf5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_contacts_without_friction_have_no_tangential_force(tmp_path):
+    write_datasets(tmp_path / "smooth.hdf5", one_contact(mu=0.0))
+    for loop in LOOPS:
+        case = case_of(tmp_path / "smooth.hdf5", f"loop={loop}")
+        solution = mb.solve(case, "clarabel", 1e-10).solution
+        assert case.recover(solution) == pytest.approx([1, 0, 0], abs=1e-8)
+
+
+def test_contacts_in_the_plane_have_two_components(tmp_path):
+    arrays = local_arrays(np.eye(2), np.array([-1.0, 2.0]), np.array([0.5]), dim=2)
+    write_datasets(tmp_path / "plane.hdf5", arrays)
+    for loop in LOOPS:
+        case = case_of(tmp_path / "plane.hdf5", f"loop={loop}")
+        solution = mb.solve(case, "scs", 1e-10).solution
+        assert case.recover(solution) == pytest.approx([1, -0.5], abs=1e-7)
+
+
+def test_an_asymmetry_of_rounding_is_removed():
+    W = np.eye(3) + np.diag([0, 1e-12], 1)
+    contact = to_contact(local_arrays(W, np.ones(3), np.ones(1))).contact
+    assert isinstance(contact, FrictionalContact)
+    assert abs(contact.W - contact.W.T).max() == 0
+
+
+# independent programs
+
+LIBFCLIB = """
+import ctypes, json, sys
+class Matrix(ctypes.Structure):
+    _fields_ = [(k, ctypes.c_int) for k in ("nzmax", "m", "n")] + [
+        ("p", ctypes.POINTER(ctypes.c_int)), ("i", ctypes.POINTER(ctypes.c_int)),
+        ("x", ctypes.POINTER(ctypes.c_double)), ("nz", ctypes.c_int)]
+numbers = ctypes.POINTER(ctypes.c_double)
+class Local(ctypes.Structure):
+    _fields_ = [(k, ctypes.POINTER(Matrix)) for k in "WVR"] + [
+        (k, numbers) for k in ("mu", "q", "s")] + [("spacedim", ctypes.c_int)]
+class Solution(ctypes.Structure):
+    _fields_ = [(k, numbers) for k in "vurl"]
+lib = ctypes.CDLL("libfclib.so.0")
+lib.fclib_read_local.restype = ctypes.POINTER(Local)
+lib.fclib_merit_local.restype = ctypes.c_double
+problem = lib.fclib_read_local(sys.argv[1].encode())
+p, W = problem.contents, problem.contents.W.contents
+r = (ctypes.c_double * W.n)(*json.loads(sys.stdin.read()))
+error = lib.fclib_merit_local(problem, 0, ctypes.byref(Solution(None, None, r, None)))
+print(json.dumps(dict(p=W.p[:W.n + 1], i=W.i[:W.p[W.n]], x=W.x[:W.p[W.n]], nz=W.nz,
+    q=p.q[:W.n], mu=p.mu[:W.n // 3], spacedim=p.spacedim, error=error)))
+"""
+
+
+@pytest.mark.slow
+def test_libfclib_reads_our_files_and_finds_the_same_error(tmp_path):
+    """Its error divides by 1 + √‖q‖ and, with W by rows, leaves out W r (issue 4)."""
+    try:
+        ctypes.CDLL("libfclib.so.0")
+    except OSError:
+        pytest.skip("libfclib is not installed: apt install libfclib0")
+    W, q, mu = write_boxes(tmp_path / "rows.hdf5")
+    n = q.size
+    qp = QP.from_arrays(W, q, sets=(mb.Cones(np.arange(n).reshape(-1, 3), mu),))
+    mb.export(qp, tmp_path / "columns.hdf5")
+    contact = read_fclib(tmp_path / "columns.hdf5").contact
+    r = 1e-2 * np.abs(np.random.default_rng(4).standard_normal(n))
+    output = subprocess.run(
+        [sys.executable, "-c", LIBFCLIB, tmp_path / "columns.hdf5"],
+        input=json.dumps(r.tolist()), capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    seen = json.loads(output.splitlines()[-1])
+
+    arrays = read_datasets(tmp_path / "columns.hdf5")
+    for key in "pix":
+        assert seen[key] == arrays[f"fclib_local/W/{key}"].tolist()
+    assert (seen["q"], seen["mu"]) == (q.tolist(), mu.tolist())
+    size = np.linalg.norm(q)
+    ours = contact.natural_map(r, np.zeros(0), 1.0) * size / (1 + np.sqrt(size))
+    assert seen["error"] == pytest.approx(ours, rel=1e-12)
+
+
+SICONOS = """
+import sys
+import numpy as np
+import siconos.numerics as sn
+data = np.load(sys.argv[1])
+problem = sn.FrictionContactProblem(3, data["W"], data["q"], data["mu"])
+options = sn.SolverOptions(sn.SICONOS_FRICTION_3D_NSGS)
+options.iparam[sn.SICONOS_IPARAM_MAX_ITER] = 100000
+options.dparam[sn.SICONOS_DPARAM_TOL] = 1e-12
+r, u = np.zeros(data["q"].size), np.zeros(data["q"].size)
+info = sn.fc3d_driver(problem, r, u, options)
+ours = np.array(data["ours"])
+size = np.linalg.norm(data["q"])
+code, error = sn.fc3d_compute_error(problem, ours, u * 0, 1e-9, options, size)
+np.savez(sys.argv[2], r=r, u=u, info=info, error=error)
+"""
+SYSTEM_PYTHON = os.environ.get("SICONOS_PYTHON", "/usr/bin/python3")
+
+
+@pytest.mark.slow
+def test_siconos_has_the_same_forces(tmp_path):
+    """Its NSGS on W, q and μ of our file; each side's error at the other's forces."""
+    imports = [SYSTEM_PYTHON, "-c", "import siconos.numerics"]
+    if (
+        not Path(SYSTEM_PYTHON).exists()
+        or subprocess.run(imports, capture_output=True, check=False).returncode
+    ):
+        pytest.skip("python3-siconos is not installed: apt install python3-siconos")
+    W, q = write_regular(tmp_path / "regular.hdf5", contacts=20)
+    contact = read_fclib(tmp_path / "regular.hdf5").contact
+    case = case_of(tmp_path / "regular.hdf5")
+    ours = case.recover(case.registries.reference(case.qp))
+    given = dict(W=W, q=q, mu=contact.mu, ours=ours)
+    np.savez(tmp_path / "problem.npz", **given)
+    subprocess.run(
+        [SYSTEM_PYTHON, "-c", SICONOS, tmp_path / "problem.npz", tmp_path / "out.npz"],
+        check=True, capture_output=True,
+    )  # fmt: skip
+    theirs = np.load(tmp_path / "out.npz")
+
+    assert theirs["info"] == 0
+    assert contact.natural_map(theirs["r"], np.zeros(0)) <= 1e-9
+    assert theirs["error"] <= 1e-9
+    assert ours == pytest.approx(theirs["r"], abs=1e-8)

@@ -1,0 +1,82 @@
+"""Stacks of boxes on the ground as FCLIB problems: an impact step of rigid bodies."""
+
+import numpy as np
+
+from mortarbench.problems.files.fclib import write_datasets
+
+SIDE, MASS, GRAVITY_STEP = 0.2, 3.0, 9.81e-3
+
+
+def box_stack(boxes=3, mu=0.4, seed=5):
+    """Return M (6b,), H (6b, 12b), f (6b,) and μ (4b,): four contacts below each box.
+
+    Boxes have random tangential velocities and spins besides that of gravity; W has
+    half of full rank.
+    """
+    rng = np.random.default_rng(seed)
+    inertia = MASS * SIDE**2 / 6
+    M = np.tile([MASS] * 3 + [inertia] * 3, boxes)
+    H = np.zeros((6 * boxes, 12 * boxes))
+    axes = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])  # N, T₁, T₂
+    corners = SIDE / 2 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+    for box in range(boxes):
+        for c, (x, y) in enumerate(corners):
+            columns = 12 * box + 3 * c + np.arange(3)
+            for body, z, sign in ((box, -SIDE / 2, 1), (box - 1, SIDE / 2, -1)):
+                if body >= 0:
+                    arm = np.array([x, y, z])
+                    rows = 6 * body + np.arange(6)
+                    H[np.ix_(rows, columns)] = sign * np.vstack(
+                        [axes.T, np.cross(arm, axes).T]
+                    )
+    v = np.zeros((boxes, 6))
+    v[:, 2] = -GRAVITY_STEP
+    v[:, :2] = GRAVITY_STEP * rng.uniform(-1, 1, (boxes, 2))
+    v[:, 5] = 3 * GRAVITY_STEP * rng.uniform(-1, 1, boxes)
+    return M, H, M * v.ravel(), np.full(4 * boxes, mu)
+
+
+def local_arrays(W, q, mu, dim=3):
+    """Return the arrays of a local problem, W stored by rows, as in many files."""
+    i, j = np.nonzero(W)
+    counts = np.bincount(i, minlength=len(W))
+    sizes = dict(nzmax=i.size, m=len(W), n=len(W), nz=-2)
+    arrays = {f"W/{key}": np.array([size], np.int32) for key, size in sizes.items()}
+    arrays |= {
+        "W/p": np.append(0, np.cumsum(counts)).astype(np.int32),
+        "W/i": j.astype(np.int32), "W/x": W[i, j],
+        "spacedim": np.array([dim], np.int32), "vectors/q": q, "vectors/mu": mu,
+        "info/title": np.array(b"boxes"), "info/description": np.array(b"stack"),
+        "info/math_info": np.array(b"unknown"),
+    }  # fmt: skip
+    return {f"fclib_local/{name}": array for name, array in arrays.items()}
+
+
+def global_arrays(M, H, f, mu, *, rows_first=False):
+    """Return the arrays of a global problem, matrices as triplets.
+
+    rows_first : the order of FCLIB's documentation, p for rows; else that of CSparse
+    """
+    arrays = {"spacedim": np.array([3], np.int32), "vectors/f": f, "vectors/mu": mu}
+    arrays["vectors/w"] = np.zeros(H.shape[1])
+    for name, matrix in (("M", np.diag(M)), ("H", H)):
+        i, j = np.nonzero(matrix)
+        p, i_ = (i, j) if rows_first else (j, i)
+        sizes = dict(nzmax=i.size, m=len(matrix), n=matrix.shape[1], nz=i.size)
+        arrays |= {
+            f"{name}/{key}": np.array([size], np.int32) for key, size in sizes.items()
+        }
+        arrays |= {
+            f"{name}/p": p.astype(np.int32), f"{name}/i": i_.astype(np.int32),
+            f"{name}/x": matrix[i, j],
+        }  # fmt: skip
+    return {f"fclib_global/{name}": array for name, array in arrays.items()}
+
+
+def write_boxes(path, boxes=3, mu=0.4, seed=5):
+    """Write the local problem of a stack; return W, q and μ."""
+    M, H, f, mu = box_stack(boxes, mu, seed)
+    W, q = H.T @ (H / M[:, None]), H.T @ (f / M)
+    W = (W + W.T) / 2
+    write_datasets(path, local_arrays(W, q, mu))
+    return W, q, mu
