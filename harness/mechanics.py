@@ -320,7 +320,8 @@ class Grid(NamedTuple):
     """The mesh of the unknowns, which are numbered node by node."""
 
     points: NDArray[np.float64]  #: (N, d)
-    #: (E, 2) segments, or (E, 4) corners in order; a triangle repeats its last corner
+    #: (E, 2) segments, or (E, 4) corners in order, of which a triangle repeats the
+    #: last one; in space (E, 8) hexahedra
     cells: NDArray[np.int64]
     bodies: NDArray[np.int64]  #: (E,) body number of each cell
     lift: Vector  #: (n,) physical unknown − u, from nonzero boundary values

@@ -18,15 +18,23 @@ Nodes = NDArray[np.int64]
 
 #: Largest distance between shared nodes, relative to the extent of the body.
 MAX_NODE_DISTANCE = 1e-9
+#: Corners of the edges of a hexahedron. The midpoints of two opposite edges of a face
+#: have its centre as common neighbour, those of two opposite faces that of the cell.
+EDGES = (
+    (0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5),
+    (2, 6), (3, 7),
+)  # fmt: skip
+#: two opposite edges of each face; the first two faces are opposite
+FACES = ((0, 2), (4, 6), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
 def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     """Return the interpolation (M, N) from the nodes of `coarse` to those of `fine`.
 
-    It is linear on the edges and bilinear in the cells of `coarse`, which are segments
-    or quadrilaterals. A quadrilateral whose last two corners coincide is a triangle. It
-    is refined into four triangles, or like a quadrilateral, around the midpoint between
-    that corner and the opposite side.
+    It is linear on the edges and multilinear in the cells of `coarse`, which are
+    segments, quadrilaterals or hexahedra. A quadrilateral whose last two corners
+    coincide is a triangle. It is refined into four triangles, or like a quadrilateral,
+    around the midpoint between that corner and the opposite side.
 
     Raises
     ------
@@ -37,14 +45,15 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     to, near = _shared(coarse, fine), _neighbours(fine)
     unit = eye_array(len(coarse.points), format="csr")
     corners = list(coarse.cells.T)
-    middles = [
-        _between(near, to[a], to[b])
-        for a, b in zip(corners, _turned(corners), strict=True)
-    ]
-    rows = [
-        (unit[a] + unit[b]) / 2 for a, b in zip(corners, _turned(corners), strict=True)
-    ]
+    ends = _edges(corners)
+    middles = [_between(near, to[a], to[b]) for a, b in ends]
+    rows = [csr_array((unit[a] + unit[b]) / 2) for a, b in ends]
     places = [to, *middles]
+    if len(corners) == 8:
+        centres = [_between(near, middles[a], middles[b]) for a, b in FACES]
+        of_faces = [csr_array((rows[a] + rows[b]) / 2) for a, b in FACES]
+        places += [*centres, _between(near, *centres[:2])]
+        rows += [*of_faces, csr_array((of_faces[0] + of_faces[1]) / 2)]
     if len(corners) == 4:
         # four triangles: an edge joins the midpoints of the sides at the double corner
         joined = np.asarray(near[middles[1], middles[3]]).ravel() > 0
@@ -57,8 +66,11 @@ def prolongation(coarse: Grid, fine: Grid) -> csr_array:
     return csr_array(csr_array(vstack([unit, *rows]))[first])
 
 
-def _turned(corners: list[Nodes]) -> list[Nodes]:
-    return [*corners[1:], corners[0]]
+def _edges(corners: list[Nodes]) -> list[tuple[Nodes, Nodes]]:
+    """Return the ends of each edge of all cells."""
+    if len(corners) == 8:
+        return [(corners[a], corners[b]) for a, b in EDGES]
+    return list(zip(corners, [*corners[1:], corners[0]], strict=True))
 
 
 def _shared(coarse: Grid, fine: Grid) -> Nodes:
@@ -81,8 +93,7 @@ def _shared(coarse: Grid, fine: Grid) -> Nodes:
 
 def _neighbours(grid: Grid) -> csr_array:
     """Return the adjacency matrix (M, M) of the edges, with a zero diagonal."""
-    corners = list(grid.cells.T)
-    a, b = np.concatenate(corners), np.concatenate(_turned(corners))
+    a, b = map(np.concatenate, zip(*_edges(list(grid.cells.T)), strict=True))
     # a triangle repeats its last corner, which is not an edge
     differs, n = a != b, len(grid.points)
     ends = a[differs], b[differs]

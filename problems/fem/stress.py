@@ -29,7 +29,14 @@ from mortarbench.problems.fem.mesh import Mesh
 
 def centre_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:
     """Return σ = DBu (E, v) at the cell centres, Pa; u in m, D (v, v) or (E, v, v)."""
-    return _stress_at(mesh.element.centre, mesh, D, u)
+    if mesh.dim == 2:
+        return _stress_at(mesh.element.centre, mesh, D, u)
+    stress = np.empty((len(mesh.cells), D.shape[-1]))
+    for block in mesh.blocks:  # the centre of a hexahedron is not that of a wedge
+        part = Mesh(mesh.points, block.nodes, {})
+        of_cells = D if D.ndim == 2 else D[block.cells]
+        stress[block.cells] = _stress_at(part.element.centre, part, of_cells, u)
+    return stress
 
 
 def gauss_stress(mesh: Mesh, D: NDArray[np.float64], u: Vector) -> NDArray[np.float64]:

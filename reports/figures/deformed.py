@@ -199,7 +199,7 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     """Show the surface of bodies in space, and the pressure on each contact side."""
-    faces = np.concatenate([boundary_facets(block.nodes, 3) for block in fields.blocks])
+    faces = boundary_facets(fields.cells, 3)
     sides = [
         (side, faces[np.isin(faces, side.nodes).all(axis=1)])
         for side in fields.contacts if side.pressure.max(initial=0.0) > 0

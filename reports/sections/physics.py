@@ -28,6 +28,7 @@ from mortarbench.reports.figures.deformed import (
     automatic_scale,
     clipped_at,
     deformed_figure,
+    prefixed,
 )
 from mortarbench.reports.figures.maps import traction_maps
 from mortarbench.reports.figures.tractions import traction_figure
@@ -146,7 +147,8 @@ def deformed(a: Analysis) -> Iterator[Part]:
         if len(fields.cells):  # rigid half planes alone have no cells
             figure = deformed_figure(fields)
             scale, limits = automatic_scale(fields), clipped_at(fields)
-            caption = TEXT("deformed", chosen, scale, limits)
+            unit = prefixed(limits[0]) if limits else None
+            caption = TEXT("deformed", chosen, scale, limits, unit)
             yield Picture(name="deformed", caption=caption, figure=figure)
     except InputError as e:  # vectors/ may be missing: the journal suffices
         missing = str(e).removeprefix(f"{directory}{os.sep}")

