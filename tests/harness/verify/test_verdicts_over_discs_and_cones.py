@@ -203,7 +203,11 @@ class AttackOnBlocks(AttackOverSets):
     def moved(self, s):
         rng, qp = self.rng, self.qp
         if rng.random() < 0.6:
-            s = super().moved(s)
+            s = super(AttackOverSets, self).moved(s)
+        if rng.random() < 0.5:
+            s = replace(s, x=self.project(s.x))
+        if rng.random() < 0.02:  # expensive
+            s = with_multipliers(qp, s.x)
         if rng.random() < 0.5:
             s = replace(s, x=self.turned(s.x, 10 ** rng.uniform(-9, 0.5)))
         choice = rng.random()
@@ -274,7 +278,7 @@ def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
 
     assert (wrong, refuted) == ([], [])
     assert verified > 10_000
-    assert proven > 0.9
+    assert proven > 0.8
 
 
 @pytest.mark.slow
