@@ -14,9 +14,16 @@ import pytest
 import mortarbench as mb
 from mortarbench.cli.main import main
 from mortarbench.harness import QP, Cones, Discs, Solution, Status, kkt_residuals
+from mortarbench.harness.conformance.metamorphic import (
+    change_units,
+    mirror,
+    permute_unknowns,
+    shift_unknowns,
+)
 from mortarbench.harness.verify.kkt import ROUNDING, normality, own_sizes
 from mortarbench.harness.verify.multipliers import with_multipliers
 from mortarbench.registries import Registries
+from mortarbench.solvers.reference.solve import reference_solution
 from tests.harness.verify.test_optimum_over_sets import (
     PAIRS,
     AttackOverSets,
@@ -196,7 +203,11 @@ class AttackOnBlocks(AttackOverSets):
     def moved(self, s):
         rng, qp = self.rng, self.qp
         if rng.random() < 0.6:
-            s = super().moved(s)
+            s = super(AttackOverSets, self).moved(s)
+        if rng.random() < 0.5:
+            s = replace(s, x=self.project(s.x))
+        if rng.random() < 0.02:  # expensive
+            s = with_multipliers(qp, s.x)
         if rng.random() < 0.5:
             s = replace(s, x=self.turned(s.x, 10 ** rng.uniform(-9, 0.5)))
         choice = rng.random()
@@ -267,7 +278,7 @@ def test_of_a_hundred_thousand_points_none_is_wrongly_verified():
 
     assert (wrong, refuted) == ([], [])
     assert verified > 10_000
-    assert proven > 0.9
+    assert proven > 0.8
 
 
 @pytest.mark.slow
@@ -421,3 +432,57 @@ def test_multipliers_are_computed_at_the_apex_of_all_cones():
     found = mb.verify(qp, [0, 0, 0, 1])
     assert found.verdict is mb.Verdict.VERIFIED
     assert found.multipliers.y == pytest.approx([0], abs=1e-12)
+
+
+@pytest.mark.parametrize("trap", ["", "steep", "point", "apex"])
+def test_equivalent_formulations_have_the_same_residuals(trap):
+    """Units, order and the signs of tangents change, exactly, by powers of two."""
+    for seed in range(5):
+        planted = ExactProblem({trap}, seed)
+        qp, s = planted.qp, planted.solution
+        rng = np.random.default_rng(seed)
+        tangents = np.concatenate([one.index[:, -2:].ravel() for one in qp.sets[1:]])
+        order, flipped = rng.permutation(qp.q.size), rng.choice(tangents, 3)
+        new = (
+            change_units(qp, unknown=2.0**7, objective=2.0**-9)
+            .followed_by(lambda other, flipped=flipped: mirror(other, flipped))
+            .followed_by(lambda other, order=order: permute_unknowns(other, order))
+        )
+        there = reference_solution(new.qp)
+        here = new.recover(there)
+
+        assert kkt_residuals(qp, here).worst <= 1e-12
+        assert here.x == pytest.approx(s.x, abs=1e-9 * np.abs(s.x).max())
+        before, after = kkt_residuals(qp, here), kkt_residuals(new.qp, there)
+        assert after == pytest.approx(before, rel=1e-6, abs=1e-14)
+        assert normality(qp, here, 1e-8).normal_distance == pytest.approx(
+            normality(new.qp, there, 1e-8).normal_distance, rel=1e-3, abs=1e-12
+        )
+
+
+def test_a_reversed_or_shifted_cone_is_no_cone():
+    qp = mb.QP.from_arrays(np.eye(3), [1, 1, 1], sets=[Cones([[0, 1, 2]], [1])])
+    with pytest.raises(ValueError, match="Cones cannot be scaled unevenly, nor reve"):
+        mirror(qp, [0])
+    with pytest.raises(ValueError, match="Cones cannot be shifted"):
+        shift_unknowns(qp, np.ones(3))
+
+
+def test_a_plugin_with_bad_sets_gets_one_line(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "import numpy as np\n"
+        "from mortarbench import QP, Case, Discs\n"
+        "class Mine:\n"
+        "    name, defaults, forms = 'mine', {'radius': 1.0}, ('qp',)\n"
+        "    def build(self, form, params, reference):\n"
+        "        discs = Discs([[0, 1]], [params['radius']])\n"
+        "        qp = QP.from_arrays(np.eye(2), [-3, -4], sets=[discs])\n"
+        "        return Case(qp=qp, recover=lambda s: s.x, quantities=lambda s: {})\n"
+        "PROBLEMS = {'mine': Mine()}\n"
+    )
+    plugin = tmp_path / "mine.py"
+    good = mb.solve("mine/qp", "clarabel", plugins=[plugin])
+    assert good.verdict is mb.Verdict.VERIFIED
+    assert good.solution.x == pytest.approx([0.6, 0.8], abs=1e-4)
+    with pytest.raises(mb.InputError, match=r"Discs: radius\[0\] = -1.0; expected fin"):
+        mb.build("mine/radius=-1/qp", plugins=[plugin])
