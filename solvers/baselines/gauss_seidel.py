@@ -164,6 +164,7 @@ def _sweep(
         if any(change):
             x[block.variables] = [a + d for a, d in zip(at, change, strict=True)]
             add_columns(block.variables, np.array(change), g)
+    problem.counts["sweeps"] += 1
     d = x - s.x
     square = float(d @ d)
     curvature = float(d @ (g - s.g)) / square if square else 0.0
