@@ -43,6 +43,8 @@ from scipy.linalg.cython_lapack cimport (
 
 from mortarbench.harness.verify cimport scales
 
+from sys import getrefcount
+
 import numpy as np
 from scipy.sparse import csr_array, issparse
 
@@ -188,6 +190,7 @@ cdef extern from "incomplete.h" nogil:
 cdef extern from "discs.h" nogil:
     ctypedef struct discs:
         Py_ssize_t count, ranges
+        int dim
         const int *start
         const int *index
         const double *radius
@@ -202,8 +205,8 @@ cdef extern from "discs.h" nogil:
                        const double *p, const double *Hp, double tau, double *phi,
                        double *free, double *result)
     void chop_discs(const discs *D, const double *x, const double *g, double *beta)
-    void step_on_discs(const discs *D, const double *x, const double *g, double tau,
-                       bint free_only, double *s)
+    void step_on_discs(const discs *D, const double *x, const double *g, double length,
+                       bint free_only, double *s, double *result)
     double inward_energy_of_discs(const discs *D, const double *x, const double *g,
                                   const double *diagonal, double norm, double noise)
 

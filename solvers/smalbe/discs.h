@@ -3,10 +3,15 @@
    A disc is active if x is within `slack` of its boundary. Active discs are no part of
    the face, the free gradient φ is zero there. With the outward normal n, the chopped
    gradient β is the gradient, without its normal component if that points inwards
-   (nᵀg < 0 holds x on the boundary). A disc of radius zero has φ = β = 0. */
+   (nᵀg < 0 holds x on the boundary). A disc of radius zero has φ = β = 0.
+
+   Each loop is compiled for discs of 2, of 3 and of any number d of variables: with a
+   constant d, those of a disc stay in registers. Square roots are taken on the boundary
+   alone. */
 
 typedef struct {
     Py_ssize_t count, ranges;
+    int dim; /* variables of every disc; 0 if these differ */
     const int *start; /* (count + 1,) of each disc in `index` */
     const int *index; /* its variables */
     const double *radius;
@@ -15,73 +20,131 @@ typedef struct {
     const Py_ssize_t *range; /* (2 ranges,) first and last variable without a disc */
 } discs;
 
-INLINE double about_centre(const discs *D, const double *x, int j)
+#define FIRST(D, i, d) ((d) ? (d) * (i) : (D)->start[i])
+#define LAST(D, i, d) ((d) ? (d) * ((i) + 1) : (D)->start[(i) + 1])
+#define FOR_VARIABLES(D, i, d, j)                                                       \
+    for (Py_ssize_t k_ = FIRST(D, i, d), to_ = LAST(D, i, d), j; k_ < to_               \
+         && ((j = (D)->index[k_]), 1); k_++)
+#define WITH_DIMENSION(D, loop, ...)                                                    \
+    ((D)->dim == 2 ? loop(D, 2, __VA_ARGS__)                                            \
+     : (D)->dim == 3 ? loop(D, 3, __VA_ARGS__) : loop(D, 0, __VA_ARGS__))
+
+INLINE double about_centre(const discs *D, const double *x, Py_ssize_t j)
 {
     return D->centre ? x[j] + D->centre[j] : x[j];
 }
 
-INLINE double size_of_disc(const discs *D, Py_ssize_t i, const double *x)
+INLINE double square_of_disc(const discs *D, int d, Py_ssize_t i, const double *x)
 {
     double square = 0;
-    for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-        double u = about_centre(D, x, D->index[k]);
+    FOR_VARIABLES(D, i, d, j) {
+        double u = about_centre(D, x, j);
         square += u * u;
     }
-    return sqrt(square);
+    return square;
+}
+
+INLINE int is_inside(const discs *D, Py_ssize_t i, double square)
+{
+    double r = D->radius[i] - D->slack[i];
+    return r > 0 && square < r * r;
 }
 
 /* Scale a disc of x by `factor` about its centre. */
-INLINE void scale_disc(const discs *D, Py_ssize_t i, double factor, double *x)
+INLINE void scale_disc(const discs *D, int d, Py_ssize_t i, double factor, double *x)
 {
-    for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-        int j = D->index[k];
+    FOR_VARIABLES(D, i, d, j) {
         double c = D->centre ? D->centre[j] : 0;
         x[j] = factor * (x[j] + c) - c;
     }
 }
 
-/* Factor about the centre that projects x − v on the disc, v = length·g. */
-INLINE double projected_factor(const discs *D, Py_ssize_t i, const double *x,
+/* Factor about the centre that projects x − g·length on the disc; 1 inside. */
+INLINE double projected_factor(const discs *D, int d, Py_ssize_t i, const double *x,
                                const double *g, double length)
 {
     double square = 0, r = D->radius[i];
-    for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-        int j = D->index[k];
+    FOR_VARIABLES(D, i, d, j) {
         double u = about_centre(D, x, j) - length * g[j];
         square += u * u;
     }
     return square > r * r ? r / sqrt(square) : 1;
 }
 
-/* y = Π(y). */
-static void project_discs(const discs *D, double *y)
+/* nᵀg/‖x + c‖ where it holds x on the boundary, else 0; `square` = ‖x + c‖². */
+INLINE double held_share(const discs *D, int d, Py_ssize_t i, const double *x,
+                         const double *g, double square)
 {
-    for (Py_ssize_t i = 0; i < D->count; i++) {
-        double size = size_of_disc(D, i, y), r = D->radius[i];
-        if (size > r)
-            scale_disc(D, i, r / size, y);
+    double push = 0;
+    FOR_VARIABLES(D, i, d, j)
+        push += about_centre(D, x, j) * g[j];
+    return push < 0 ? push / square : 0;
+}
+
+/* Write φ and `free` of a disc, if not NULL, and add ‖φ‖², ‖β‖² and φ̃ᵀφ to result, and
+   φᵀHp to result[3] unless Hp is NULL. */
+INLINE void face_of_disc(const discs *D, int d, Py_ssize_t i, const double *x,
+                         const double *g, const double *Hp, double tau, double square,
+                         double *phi, double *free, double *result)
+{
+    if (is_inside(D, i, square)) {
+        double factor = projected_factor(D, d, i, x, g, 1 / tau);
+        FOR_VARIABLES(D, i, d, j) {
+            double u = about_centre(D, x, j);
+            double cut = factor < 1 ? tau * u - factor * (tau * u - g[j]) : g[j];
+            result[0] += g[j] * g[j];
+            result[2] += cut * g[j];
+            if (Hp)
+                result[3] += g[j] * Hp[j];
+            if (phi)
+                phi[j] = g[j], free[j] = 1;
+        }
+        return;
+    }
+    int is_point = D->radius[i] == 0; /* ‖x + c‖ is rounding there */
+    double inward = is_point ? 0 : held_share(D, d, i, x, g, square);
+    FOR_VARIABLES(D, i, d, j) {
+        double b = is_point ? 0 : g[j] - inward * about_centre(D, x, j);
+        result[1] += b * b; /* the difference of squares would cancel */
+        if (phi)
+            phi[j] = 0, free[j] = 0;
     }
 }
 
-/* Return the α at which x − αp leaves the first disc, `least` if none is left before. */
-static double first_disc(const discs *D, const double *x, const double *p, double least)
+INLINE void project_each(const discs *D, int d, double *y)
+{
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double square = square_of_disc(D, d, i, y), r = D->radius[i];
+        if (square > r * r)
+            scale_disc(D, d, i, r / sqrt(square), y);
+    }
+}
+
+/* y = Π(y). */
+static void project_discs(const discs *D, double *y)
+{
+    WITH_DIMENSION(D, project_each, y);
+}
+
+INLINE double first_of_each(const discs *D, int d, const double *x, const double *p,
+                            double least)
 {
     for (Py_ssize_t i = 0; i < D->count; i++) {
         double a = 0, b = 0, c = 0, r = D->radius[i];
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k];
-            double u = about_centre(D, x, j);
+        FOR_VARIABLES(D, i, d, j)
             a += p[j] * p[j];
+        if (a == 0)
+            continue;
+        FOR_VARIABLES(D, i, d, j) {
+            double u = about_centre(D, x, j);
             b += u * p[j];
             c += u * u;
         }
-        if (a == 0)
+        /* a α² − 2bα + c − r² ≤ 0 in the disc: convex, and it holds at α = 0 */
+        if (least < INFINITY && (a * least - 2 * b) * least + c < r * r)
             continue;
         c = (sqrt(c) - r) * (sqrt(c) + r); /* without cancellation */
         c = c < 0 ? c : 0;
-        /* a α² − 2bα + c ≤ 0 in the disc: convex, and it holds at α = 0 */
-        if (least < INFINITY && (a * least - 2 * b) * least + c <= 0)
-            continue;
         double root = sqrt(b * b - a * c);
         double to = b >= 0 ? (b + root) / a : -c / (root - b);
         least = to < least ? to : least;
@@ -89,101 +152,106 @@ static double first_disc(const discs *D, const double *x, const double *p, doubl
     return least;
 }
 
-/* Add ‖φ‖², ‖β‖² and φ̃ᵀφ of one disc to result, and φᵀHp to result[3] if Hp is given;
-   returns 1 where it is free. */
-INLINE double face_of_disc(const discs *D, Py_ssize_t i, const double *x,
-                           const double *g, const double *Hp, double tau, double *phi,
-                           double *free, double *result)
+/* Return the α at which x − αp leaves the first disc, `least` if none is left before. */
+static double first_disc(const discs *D, const double *x, const double *p, double least)
 {
-    double size = size_of_disc(D, i, x), r = D->radius[i], push = 0, square = 0;
-    int is_free = size < r - D->slack[i];
-    for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-        int j = D->index[k];
-        push += about_centre(D, x, j) * g[j];
-        square += g[j] * g[j];
-        phi[j] = is_free ? g[j] : 0;
-        free[j] = is_free;
-    }
-    if (is_free) {
-        double factor = projected_factor(D, i, x, g, 1 / tau), cut = 0, along = 0;
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k];
-            double u = about_centre(D, x, j);
-            cut += (factor < 1 ? tau * u - factor * (tau * u - g[j]) : g[j]) * g[j];
-            along += Hp ? g[j] * Hp[j] : 0;
-        }
-        result[0] += square;
-        result[2] += cut;
-        if (Hp)
-            result[3] += along;
-    } else if (r > 0) {
-        double inward = push < 0 ? push / size : 0;
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k]; /* the difference of squares would cancel */
-            double b = g[j] - inward * about_centre(D, x, j) / size;
-            result[1] += b * b;
-        }
-    }
-    return is_free;
+    return WITH_DIMENSION(D, first_of_each, x, p, least);
+}
+
+INLINE void split_each(const discs *D, int d, const double *x, const double *g,
+                       double tau, double *phi, double *free, double *result)
+{
+    double sums[4] = {0};
+    for (Py_ssize_t i = 0; i < D->count; i++)
+        face_of_disc(D, d, i, x, g, NULL, tau, square_of_disc(D, d, i, x), phi, free,
+                     sums);
+    for (int k = 0; k < 3; k++)
+        result[k] += sums[k];
 }
 
 /* φ and `free` on discs; adds ‖φ‖², ‖β‖² and φ̃ᵀφ to result. */
 static void split_discs(const discs *D, const double *x, const double *g, double tau,
                         double *phi, double *free, double *result)
 {
-    for (Py_ssize_t i = 0; i < D->count; i++)
-        face_of_disc(D, i, x, g, NULL, tau, phi, free, result);
+    WITH_DIMENSION(D, split_each, x, g, tau, phi, free, result);
+}
+
+INLINE void advance_each(const discs *D, int d, double alpha, double *x, double *g,
+                         const double *p, const double *Hp, double tau, double *phi,
+                         double *free, double *result)
+{
+    double sums[4] = {0};
+    for (Py_ssize_t i = 0; i < D->count; i++) {
+        double r = D->radius[i], near = r - 4 * D->slack[i], square = 0;
+        FOR_VARIABLES(D, i, d, j) {
+            x[j] -= alpha * p[j];
+            g[j] -= alpha * Hp[j];
+        }
+        square = square_of_disc(D, d, i, x);
+        if ((near < 0 || square > near * near) && square > 0) {
+            scale_disc(D, d, i, r / sqrt(square), x);
+            square = r * r;
+        }
+        face_of_disc(D, d, i, x, g, Hp, tau, square, phi, free, sums);
+    }
+    for (int k = 0; k < 4; k++)
+        result[k] += sums[k];
 }
 
 /* x = x − αp, set to the boundary within rounding of it, g = g − αHp and the sums of
-   `advance`, on discs. */
+   `advance`, on discs.
+
+   phi, free : NULL if not needed */
 static void advance_discs(const discs *D, double alpha, double *x, double *g,
                           const double *p, const double *Hp, double tau, double *phi,
                           double *free, double *result)
 {
-    for (Py_ssize_t i = 0; i < D->count; i++) {
-        double r = D->radius[i];
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k];
-            x[j] -= alpha * p[j];
-            g[j] -= alpha * Hp[j];
-        }
-        double size = size_of_disc(D, i, x);
-        if (size > r - 4 * D->slack[i] && size != r && size > 0)
-            scale_disc(D, i, r / size, x);
-        face_of_disc(D, i, x, g, Hp, tau, phi, free, result);
-    }
+    if (phi)
+        WITH_DIMENSION(D, advance_each, alpha, x, g, p, Hp, tau, phi, free, result);
+    else
+        WITH_DIMENSION(D, advance_each, alpha, x, g, p, Hp, tau, NULL, NULL, result);
 }
 
 /* beta = β on discs. */
 static void chop_discs(const discs *D, const double *x, const double *g, double *beta)
 {
     for (Py_ssize_t i = 0; i < D->count; i++) {
-        double size = size_of_disc(D, i, x), r = D->radius[i], push = 0;
-        int is_chopped = size >= r - D->slack[i] && r > 0;
-        for (int k = D->start[i]; k < D->start[i + 1]; k++)
-            push += about_centre(D, x, D->index[k]) * g[D->index[k]];
-        double inward = push < 0 ? push / size : 0;
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k];
-            beta[j] = is_chopped ? g[j] - inward * about_centre(D, x, j) / size : 0;
-        }
+        double square = square_of_disc(D, 0, i, x);
+        int is_chopped = !is_inside(D, i, square) && D->radius[i] > 0;
+        double inward = is_chopped ? held_share(D, 0, i, x, g, square) : 0;
+        FOR_VARIABLES(D, i, 0, j)
+            beta[j] = is_chopped ? g[j] - inward * about_centre(D, x, j) : 0;
     }
 }
 
-/* s = Π(x − g/τ) − x on discs; zero on active ones if `free_only`. */
-static void step_on_discs(const discs *D, const double *x, const double *g, double tau,
-                          int free_only, double *s)
+INLINE void step_on_each(const discs *D, int d, const double *x, const double *g,
+                         double length, int free_only, double *s, double *result)
 {
+    double slope = 0, square = 0;
     for (Py_ssize_t i = 0; i < D->count; i++) {
-        double factor = projected_factor(D, i, x, g, 1 / tau);
-        int moves = !free_only || size_of_disc(D, i, x) < D->radius[i] - D->slack[i];
-        for (int k = D->start[i]; k < D->start[i + 1]; k++) {
-            int j = D->index[k];
-            double u = about_centre(D, x, j), v = u - g[j] / tau;
-            s[j] = moves ? (factor < 1 ? factor * v - u : -g[j] / tau) : 0;
+        double factor = projected_factor(D, d, i, x, g, length);
+        int moves = !free_only || is_inside(D, i, square_of_disc(D, d, i, x));
+        FOR_VARIABLES(D, i, d, j) {
+            double u = about_centre(D, x, j), v = length * g[j];
+            double t = factor < 1 ? u - factor * (u - v) : v;
+            s[j] = moves ? t : 0;
+            slope += g[j] * s[j];
+            square += s[j] * s[j];
         }
     }
+    result[0] += slope;
+    result[1] += square;
+}
+
+/* s = x − Π(x − g·length) on discs, zero on active ones if `free_only`; adds gᵀs and
+   ‖s‖² to result. */
+static void step_on_discs(const discs *D, const double *x, const double *g,
+                          double length, int free_only, double *s, double *result)
+{
+    if (free_only)
+        WITH_DIMENSION(D, step_on_each, x, g, length, 1, s, result);
+    else
+        WITH_DIMENSION(D, step_on_each, x, g, length, 0, s, result);
 }
 
 /* Return Σ (norm gᵢ)²/Dᵢᵢ over the projected gradient on discs, see `inward_energy`. */
@@ -192,18 +260,13 @@ static double inward_energy_of_discs(const discs *D, const double *x, const doub
 {
     double total = 0;
     for (Py_ssize_t i = 0; i < D->count; i++) {
-        double size = size_of_disc(D, i, x), r = D->radius[i], push = 0;
-        int is_free = size < r - D->slack[i];
-        for (int k = D->start[i]; k < D->start[i + 1]; k++)
-            push += about_centre(D, x, D->index[k]) * g[D->index[k]];
-        double inward = !is_free && push < 0 ? push / size : 0;
-        for (int k = D->start[i]; k < D->start[i + 1] && r > 0; k++) {
-            int j = D->index[k];
-            double b = g[j];
-            if (inward < 0)
-                b -= inward * about_centre(D, x, j) / size;
-            if (diagonal[j] > 0 && fabs(norm * b) > noise)
-                total += norm * b * norm * b / diagonal[j];
+        double square = square_of_disc(D, 0, i, x);
+        double inward = is_inside(D, i, square) || D->radius[i] == 0
+                            ? 0 : held_share(D, 0, i, x, g, square);
+        FOR_VARIABLES(D, i, 0, j) {
+            double b = norm * (g[j] - inward * about_centre(D, x, j));
+            if (D->radius[i] > 0 && diagonal[j] > 0 && fabs(b) > noise)
+                total += b * b / diagonal[j];
         }
     }
     return total;

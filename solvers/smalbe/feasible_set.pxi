@@ -76,6 +76,7 @@ cdef class FeasibleSet:
         self.D.count, self.D.ranges = len(sizes), ranges.size // 2
         self.D.start, self.D.index, self.D.radius = &start[0], &index[0], &radius[0]
         self.D.slack, self.D.centre = &slack[0], shift
+        self.D.dim = sizes[0] if len(set(sizes)) == 1 else 0
         if ranges.size:
             self.D.range = &ranges[0]
         for i in range(self.D.count):
@@ -102,28 +103,26 @@ cdef class FeasibleSet:
     cdef int lengths(self, const double *x, const double *g, const double *p,
                      const double *Hp, Line *line) except -1:
         """Compute the step lengths along x − αp."""
-        if self.over.ranks is None:
+        if self.over.ranks is None and not self.D.count:
             lengths(x, g, p, Hp, self.lower, self.upper_if_any, self.n, &line.cg)
-            if self.D.count:
-                self.limit_by_discs(x, p, line)
             return 0
         line.slope, line.curvature = dot(g, p, self.n), dot(p, Hp, self.n)
-        line.feasible = first_bound(x, p, self.lower, self.upper_if_any, self.n)
+        line.feasible = self.feasible_length(x, p)
         self.over.add(&line.slope, 2, &line.feasible)
         line.cg = line.slope / line.curvature if line.curvature > 0 else INFINITY
         return 0
 
-    cdef void limit_by_discs(self, const double *x, const double *p, Line *line) noexcept:
-        """Reduce the feasible length to that at which the first disc is left."""
-        cdef double least = fmin(line.feasible, line.cg)
-        cdef double first = first_disc(&self.D, x, p, least)
-        if first < least:
-            line.feasible = first
-
     cdef double feasible_length(self, const double *x, const double *p) noexcept:
-        """Return the largest α for which x − αp is in the set; one process only."""
-        cdef double first = first_bound(x, p, self.lower, self.upper_if_any, self.n)
-        return first_disc(&self.D, x, p, first) if self.D.count else first
+        """Return the largest α for which x − αp is in the set; of this process."""
+        cdef double least = INFINITY
+        cdef Py_ssize_t i, o, size
+        if not self.D.count:
+            return first_bound(x, p, self.lower, self.upper_if_any, self.n)
+        for i in range(self.D.ranges):
+            o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
+            least = fmin(least, first_bound(x + o, p + o, self.lower + o,
+                                            self.upper + o, size))
+        return first_disc(&self.D, x, p, least)
 
     cdef void product_and_lengths(
         self, const sparse *F, double s, const double *x, const double *g, double *p,
@@ -132,7 +131,7 @@ cdef class FeasibleSet:
         """Hp ← s F p, and the `lengths` along p, in one pass over memory."""
         sparse_lengths(F, s, x, g, p, Hp, self.lower, self.upper_if_any, &line.cg)
         if self.D.count:
-            self.limit_by_discs(x, p, line)
+            line.feasible = fmin(line.feasible, first_disc(&self.D, x, p, line.feasible))
 
     cdef void next_product_and_lengths(
         self, const sparse *F, double s, double gamma, const double *x, const double *g,
@@ -171,7 +170,7 @@ cdef class FeasibleSet:
         Components within rounding of their bound are set to it: otherwise a step of
         the largest feasible length could stop just short of the face.
 
-        phi, free : NULL if they are not stored; not for sets with discs
+        phi, free : NULL if they are not stored
         """
         cdef Py_ssize_t i, o, size
         cdef double sums[4]
@@ -181,7 +180,8 @@ cdef class FeasibleSet:
             for i in range(self.D.ranges):
                 o, size = self.D.range[2 * i], self.D.range[2 * i + 1] - self.D.range[2 * i]
                 advance(alpha, x + o, g + o, p + o, Hp + o, self.lower + o,
-                        self.upper + o, tau, phi + o, free + o, size, sums)
+                        self.upper + o, tau, phi + o if phi else NULL,
+                        free + o if free else NULL, size, sums)
                 parts.phi_square += sums[0]
                 parts.beta_square += sums[1]
                 parts.reduced_square += sums[2]
@@ -209,16 +209,41 @@ cdef class FeasibleSet:
         self, const double *x, const double *g, double tau, double *y
     ) noexcept:
         """y ← P(x − φ/τ), which is x − φ̃/τ."""
+        cdef Py_ssize_t i
         projected(x, g, tau, self.lower, self.upper, y, self.n)
         if self.D.count:
-            step_on_discs(&self.D, x, g, tau, True, y)
-            self.add_on_discs(x, y)
+            self.step_on_discs(x, g, tau, True, y)
+            for i in range(self.D.start[self.D.count]):
+                y[self.D.index[i]] += x[self.D.index[i]]
 
-    cdef void add_on_discs(self, const double *x, double *y) noexcept:
-        """y ← x + y on discs."""
-        cdef int k
-        for k in range(self.D.start[self.D.count]):
-            y[self.D.index[k]] += x[self.D.index[k]]
+    cdef void step_on_discs(
+        self, const double *x, const double *g, double tau, bint free_only, double *s
+    ) noexcept:
+        """s ← P(x − g/τ) − x on discs."""
+        cdef double sums[2]
+        cdef Py_ssize_t i
+        step_on_discs(&self.D, x, g, 1 / tau, free_only, s, sums)
+        for i in range(self.D.start[self.D.count]):
+            s[self.D.index[i]] *= -1
+
+    cdef double step_back(self, const double *x, const double *g, double tau, double *s,
+                          double *square) noexcept:
+        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs. On one process."""
+        cdef double sums[2]
+        cdef Py_ssize_t i, j, first, last
+        sums[:] = [0.0, 0.0]
+        for i in range(max(self.D.ranges, not self.D.count)):
+            first, last = 0, self.n
+            if self.D.count:
+                first, last = self.D.range[2 * i], self.D.range[2 * i + 1]
+            for j in range(first, last):
+                s[j] = x[j] - fmin(fmax(x[j] - g[j] / tau, self.lower[j]), self.upper[j])
+                sums[0] += g[j] * s[j]
+                sums[1] += s[j] * s[j]
+        if self.D.count:
+            step_on_discs(&self.D, x, g, 1 / tau, False, s, sums)
+        square[0] = sums[1]
+        return sums[0]
 
     cdef void minimise(self, const double *x, const double *g, double tau, double *s,
                        double *piece) noexcept:
@@ -228,7 +253,7 @@ cdef class FeasibleSet:
         """
         model_minimiser(x, g, tau, self.lower, self.upper, s, piece, self.n)
         if self.D.count:
-            step_on_discs(&self.D, x, g, tau, False, s)
+            self.step_on_discs(x, g, tau, False, s)
 
     cdef void minimise_part(
         self, Py_ssize_t first, Py_ssize_t size, const double *x, const double *g_part,

@@ -269,7 +269,7 @@ cdef class MPRGP:
         cdef long check = FIRST_CHECK
         cdef double least = INFINITY, before = INFINITY, cost = INFINITY  # at the last check
         cdef int letter
-        cdef bint has_expanded = False
+        cdef bint has_expanded = False, begun = True
         cdef double chopped = INFINITY  # ‖β‖² at the last proportioning
         cdef double weight, began, gamma = 0.0  # of the deferred update p ← φ − γp
         self.in_two = self.F.rows.data != NULL and not self.rows.exist and (
@@ -308,7 +308,7 @@ cdef class MPRGP:
                     self.proportions_by_model
                     and (idle < MAX_IDLE or self.B.basis is None)
                 )
-            elif not inside and self.spectral_step_leaves():
+            elif not inside and self.spectral_step_leaves(begun):
                 letter = b"e" if self.step_spectrally() else 0
             else:
                 # 4. The trial step of conjugate gradients: α_cg, and α_f, the largest
@@ -336,11 +336,14 @@ cdef class MPRGP:
                 has_expanded = True
             if not letter:
                 return 0
-            # 7. Restart CG on the new face with the preconditioned free gradient.
-            self.directions.begin(self.free)
+            # 7. Restart CG on the new face with the preconditioned free gradient; after
+            #    a spectral step only where CG begins there.
             inside, began, gamma = 0, self.parts.phi_square, 0.0
             self.phi_square_at_drift = INFINITY
-            self.first_direction()
+            begun = self.expansion != SPECTRAL
+            if begun:
+                self.directions.begin(self.free)
+                self.first_direction()
             self.record_step(letter, trace, note)
 
     cdef int settle(self) except -1:
@@ -494,8 +497,15 @@ cdef class MPRGP:
         self.n_costs += 1
         return 0
 
-    cdef bint spectral_step_leaves(self) noexcept:
-        """Return True if x − αp is not in the set; False without an α."""
+    cdef bint spectral_step_leaves(self, bint begun) except -1:
+        """Return True if x − αφ is not in the set; False without an α.
+
+        begun : false if CG has no first direction yet on this face
+        """
+        if not begun:
+            self.split()
+            self.directions.begin(self.free)
+            self.first_direction()
         return self.expansion == SPECTRAL and self.spectral_length > 0 and (
             self.set.feasible_length(self.x, self.p) < self.spectral_length
         )
@@ -515,28 +525,29 @@ cdef class MPRGP:
         if not length:
             return 0
         self.record_cost(change_along(&self.line, length))
-        self.to(length, self.s, self.Hs)
+        self.to(length, self.s, self.Hs, False)
         return 1
 
     cdef double searched_projection(self, double tau, double rise) except? -1:
         """Return the length of the step −s = P(x − g/τ) − x; 0 for s = 0. One product.
 
         It is 1 if the cost then falls enough below `rise` above its value, else that of
-        least cost. Stores s, Hs and `line`, and 1/τ of the next spectral step.
+        least cost. Stores s, Hs, slope and curvature, and 1/τ of the next spectral step.
         """
         cdef double square
-        self.set.minimise(self.x, self.g, tau, self.s, NULL)
-        if not negate(self.s, self.n):
+        cdef Line *line = &self.line
+        line.slope = self.set.step_back(self.x, self.g, tau, self.s, &square)
+        if not square:
             return 0
-        self.lengths_along(self.s, self.Hs)
-        square = dot(self.s, self.s, self.n)
+        self.H(self.s, self.Hs)
+        line.curvature = dot(self.s, self.Hs, self.n)
         # gᵀs ≥ τ‖s‖² for projections. At the end of a run rounding of the large normal
         # components of g hides it, and the step would be refused.
-        self.line.slope = fmax(self.line.slope, tau * square)
-        if self.line.curvature > NOISE * self.line.slope:
-            self.spectral_length = square / self.line.curvature
-        if change_along(&self.line, 1.0) > rise - SUFFICIENT_DECREASE * self.line.slope:
-            return self.line.slope / self.line.curvature
+        line.slope = fmax(line.slope, tau * square)
+        if line.curvature > NOISE * line.slope:
+            self.spectral_length = square / line.curvature
+        if change_along(line, 1.0) > rise - SUFFICIENT_DECREASE * line.slope:
+            return line.slope / line.curvature
         return 1.0
 
     # 4. The trial step
@@ -630,9 +641,14 @@ cdef class MPRGP:
         update_direction(z, z_Hp / curvature, self.p, self.n)
         return 0
 
-    cdef int to(self, double alpha, const double *p, const double *Hp) except -1:
-        """x ← x − αp; updates gradient and face without a product."""
-        cdef bint stored = not self.in_two
+    cdef int to(
+        self, double alpha, const double *p, const double *Hp, bint stored=True
+    ) except -1:
+        """x ← x − αp; updates gradient, `parts` and face without a product.
+
+        stored : false if φ and `free` are not needed
+        """
+        stored = stored and not self.in_two
         self.set.advance(alpha, self.x, self.g, p, Hp, self.B.tau,
                          self.phi if stored else NULL, self.free if stored else NULL,
                          &self.parts)
@@ -687,7 +703,7 @@ cdef class MPRGP:
         if self.line.curvature > NOISE * self.line.slope:
             self.spectral_length = dot(self.p, self.p, self.n) / self.line.curvature
         self.record_cost(change_along(&self.line, feasible))
-        self.to(feasible, self.p, self.Hp)
+        self.to(feasible, self.p, self.Hp, False)
         return feasible > LONG_STEP * cg or self.step_spectrally()
 
     cdef int trial_of_rule(self, double *y) except -1:

@@ -68,12 +68,17 @@ cdef view(const double *v, Py_ssize_t n):
     return np.asarray(<double[:n]> <double *> v) if n else np.empty(0)
 
 
-cdef int copy_result(result, Py_ssize_t n, double *y, str what) except -1:
-    """Copy an array returned by Python to y; raises ValueError unless its size is n."""
+cdef int copy_result(
+    result, Py_ssize_t n, double *y, str what, double s=1.0
+) except -1:
+    """y ← s times an array returned by Python; raises ValueError unless its size is n."""
     array = _whole(result)
     if array.size != n:
         raise ValueError(f"{what} has {array.size} components; expected {n}")
-    memcpy(y, address(array), n * sizeof(double))
+    if s == 1:
+        memcpy(y, address(array), n * sizeof(double))
+    else:
+        copy_scaled(s, address(array), y, n)
     return 0
 
 
@@ -159,7 +164,7 @@ cdef class Product:
     cdef object matrix
     cdef const double *dense
     cdef sparse rows  # data is NULL unless P is sparse
-    cdef object owners
+    cdef object owners, argument
 
     def __cinit__(self, P, Py_ssize_t n, Reduction over=None):
         self.n, self.matrix = n, P
@@ -211,10 +216,13 @@ cdef class Product:
                   y, &one)
         elif self.rows.data:
             sparse_product(&self.rows, s, v, y)
-        else:  # of a copy: an operator may keep a reference to its argument
-            copy_result(self.matrix @ self.over.vector(copied(v, self.n)), self.n, y, "P @ v")
-            if s != 1:
-                scale(s, y, self.n)
+        else:  # of a copy: an operator may change its argument or keep a reference
+            # kept, unless an operator still holds it: new memory costs page faults
+            if self.argument is None or getrefcount(self.argument) > 2:
+                self.argument = np.empty(self.n)
+            memcpy(address(self.argument), v, self.n * sizeof(double))
+            product = self.matrix @ self.over.vector(self.argument)
+            copy_result(product, self.n, y, "P @ v", s)
         return 0
 
 
