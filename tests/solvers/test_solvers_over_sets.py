@@ -27,37 +27,36 @@ PAIRS = [
 
 
 #: Interior-point methods end off the central path: z and x differ in direction by the
-#: square root of the gap. At their smallest tolerance, this is the largest error in x.
-ENDS_OFF_PATH = {"clarabel": 1e-5, "qoco": 1e-4, "ecos": 1e-5}
-
-
-def error_in_x(name, qp, s, expected):
-    """Return max|x − x*|, at the smallest tolerance if that is not small."""
-    off = np.abs(s.x - expected.x).max()
-    if off > 1e-6:
-        s = measure(SOLVERS[name], qp, TIGHT).solution
-        off = min(off, np.abs(s.x - expected.x).max())
-    return off
+#: square root of the gap. These are the largest errors in x at their smallest
+#: tolerance, about twice the largest of 1250 QPs.
+ENDS_OFF_PATH = {"clarabel": 1e-4, "qoco": 3e-4, "cvxopt": 5e-6, "ecos": 1e-4}
 
 
 def faults(name, shape, seeds):
-    """List the seeds where f is off by more than 1e-8, or x by more than 1e-6."""
+    """List the seeds where f is off by more than 1e-8, or x by more than 1e-6.
+
+    If so at `TOL`, the better error at `TIGHT` counts, whatever is claimed there.
+    """
     wrong, declined = [], []
+    limits = np.array([1e-8, ENDS_OFF_PATH.get(name, 1e-6)])
     for seed in seeds:
         qp, expected = manufactured_over_sets(shape, seed=seed)
-        s = measure(SOLVERS[name], qp, TOL).solution
+        best = qp.objective(expected.x)
+
+        def solved(tol, qp=qp, expected=expected, best=best):
+            s = measure(SOLVERS[name], qp, tol).solution
+            off = abs(qp.objective(s.x) / best - 1), np.abs(s.x - expected.x).max()
+            return s, np.array(off)
+
+        s, errors = solved(TOL)
         if s.status is Status.DECLINED:
             declined.append((seed, s.message))
             continue
-        f, best = qp.objective(s.x), qp.objective(expected.x)
         verdict = judged(s.status, kkt_residuals(qp, s), TOL)
-        off = error_in_x(name, qp, s, expected)
-        if not (
-            verdict is Verdict.VERIFIED
-            and abs(f - best) <= 1e-8 * abs(best)
-            and off <= ENDS_OFF_PATH.get(name, 1e-6)
-        ):
-            wrong.append((seed, str(verdict), abs(f / best - 1), off, s.message))
+        if not (errors <= [1e-8, 1e-6]).all():
+            errors = np.fmin(errors, solved(TIGHT)[1])
+        if verdict is not Verdict.VERIFIED or not (errors <= limits).all():
+            wrong.append((seed, str(verdict), *errors, s.message))
     return wrong, declined
 
 
