@@ -8,6 +8,7 @@ import json
 from collections import Counter
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.support import ROOT
@@ -183,3 +184,18 @@ def test_your_own_bodies(execute):
     assert l2["mortar", 30] < l2["mortar", 10] / 3
     assert off["nts", 30] > 0.02
     assert shown["image/png"] == 2
+
+
+@pytest.mark.slow
+def test_the_code_of_stick_and_slip(run_code):
+    """Stick radii are too large by a fraction of a cell; slip fans out for ν > 0."""
+    found = run_code("stick-and-slip")
+    errors, angles = found["errors"], found["angles"]
+
+    assert str(found["answer"].verdict) == "verified"
+    assert (errors[128] > 0).all()
+    assert (errors[128] < 0.004).all()
+    assert np.abs(errors[32]).max() > 2 * errors[128].max()
+    assert np.abs(angles[0.0]).max() < 1e-4
+    assert np.abs(angles[0.3]).max() < np.abs(angles[0.45]).max()
+    found["plt"].close("all")
