@@ -18,7 +18,7 @@ RENDERED = frozenset({"html", "md", "tex"})  #: formats that contain a page
 
 
 def write_page(page: Page, target: Path, formats: Collection[str]) -> list[Path]:
-    """Write a page in the `RENDERED` ones of the formats, and its figures.
+    """Write a page in those formats that `RENDERED` contains, and its figures.
 
     html: index.html. md: report.md. tex: tables/SECTION.tex. Figures go to figures/.
     """
