@@ -193,18 +193,22 @@ cdef class CompressedRows(LinearMap):
 
     cdef void times(self, const double *x, double *y) noexcept:
         """y ← Mx."""
-        cdef Py_ssize_t i
-        cdef int j, last
+        cdef Py_ssize_t i, j, last
         cdef double y_i, z_i
+        cdef const double *data = self.data
+        cdef const int *indices = self.indices
+        cdef const int *indptr = self.indptr
+        j = indptr[0]
         for i in range(self.n):
             y_i = z_i = 0  # two sums, as each addition waits for the one before
-            j, last = self.indptr[i], self.indptr[i + 1]
+            last = indptr[i + 1]
             while j + 1 < last:
-                y_i += self.data[j] * x[self.indices[j]]
-                z_i += self.data[j + 1] * x[self.indices[j + 1]]
+                y_i += data[j] * x[indices[j]]
+                z_i += data[j + 1] * x[indices[j + 1]]
                 j += 2
             if j < last:
-                y_i += self.data[j] * x[self.indices[j]]
+                y_i += data[j] * x[indices[j]]
+                j += 1
             y[i] = y_i + z_i
 
     cdef void add_transposed(self, const double *x, double *y) noexcept:
@@ -219,29 +223,34 @@ cdef class CompressedRows(LinearMap):
         self, double s, const double *v, double t, const double *x, double *y
     ) noexcept:
         """y ← sv + tMx; y may be v."""
-        cdef Py_ssize_t i
-        cdef int j
+        cdef Py_ssize_t i, j
         cdef double y_i
+        cdef const double *data = self.data
+        cdef const int *indices = self.indices
+        cdef const int *indptr = self.indptr
+        j = indptr[0]
         for i in range(self.n):
             y_i = 0
-            for j in range(self.indptr[i], self.indptr[i + 1]):
-                y_i += self.data[j] * x[self.indices[j]]
+            while j < indptr[i + 1]:
+                y_i += data[j] * x[indices[j]]
+                j += 1
             y[i] = s * v[i] + t * y_i
 
     cdef void weigh_difference(
         self, const double *v, const double *x, const double *weights, double *y
     ) noexcept:
         """y ← diag(weights)(v − Mx)."""
-        cdef Py_ssize_t i
-        cdef int j
+        cdef Py_ssize_t i, j
         cdef double y_i
+        cdef const double *data = self.data
+        cdef const int *indices = self.indices
+        cdef const int *indptr = self.indptr
+        j = indptr[0]
         for i in range(self.n):
-            if weights[i] == 0:
-                y[i] = 0
-                continue
             y_i = 0
-            for j in range(self.indptr[i], self.indptr[i + 1]):
-                y_i += self.data[j] * x[self.indices[j]]
+            while j < indptr[i + 1]:
+                y_i += data[j] * x[indices[j]]
+                j += 1
             y[i] = weights[i] * (v[i] - y_i)
 
     def combined(self, double s, const double[::1] v, double t, const double[::1] x):
