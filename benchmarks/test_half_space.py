@@ -1,0 +1,52 @@
+"""Half-spaces: time of a product, and of a solve relative to its products."""
+
+from time import process_time
+
+import numpy as np
+import pytest
+
+from mortarbench.harness import kkt_residuals
+from mortarbench.problems import PROBLEMS
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+
+TOL = 1e-8
+
+
+def built(**keys):
+    family = PROBLEMS["half-space"]
+    return family.build("dual", family.complete(keys), reference_solution)
+
+
+@pytest.mark.parametrize("n", [64, 256, 512])
+@pytest.mark.parametrize("law", ["hertz", "mindlin"])
+def test_product(benchmark, law, n):
+    qp = built(n=n, law=law).qp
+    x = np.random.default_rng(1).standard_normal(qp.q.size)
+    assert np.isfinite(benchmark(lambda: qp.P @ x)).all()
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3])
+@pytest.mark.parametrize("n", [256, 512])
+def test_the_time_of_a_solve_is_that_of_its_products(note, n, nu):
+    """And the stick radius, with ν = 0, is exact to 0.3 % and 0.1 %."""
+    case = built(n=n, law="mindlin", nu=nu)
+    x = np.random.default_rng(1).standard_normal(case.qp.q.size)
+    case.qp.P @ x  # builds the operator
+    start = process_time()
+    for _ in range(20):
+        case.qp.P @ x
+    product = (process_time() - start) / 20
+    start = process_time()
+    s = SOLVERS["smalbe"].prepare(case.qp, TOL)()
+    seconds, products = process_time() - start, s.counts["P_products"]
+    got = case.quantities(s)
+    note(
+        f"half-space n={n} nu={nu}: {1e3 * product:.2f} ms per product, {products} "
+        f"products, {seconds:.2f} s, ratio {seconds / products / product:.2f}, "
+        f"c/a {got['c_over_a']:.5f}, error {100 * got['c_over_a_error']:+.3f} %"
+    )
+    assert kkt_residuals(case.qp, s).worst <= 10 * TOL
+    if nu == 0:
+        assert abs(got["c_over_a_error"]) < (0.003 if n == 256 else 0.001)
+        assert abs(got["force_error"]) < 1e-4
