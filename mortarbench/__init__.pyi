@@ -28,6 +28,8 @@ from .results import Results as Results
 from .results import load as load
 from .results import merge as merge
 from .results import run as run
+from .solvers.common.polygons import PolygonalQP as PolygonalQP
+from .solvers.common.polygons import polygonal as polygonal
 from .validation import Conformance as Conformance
 from .validation import Validation as Validation
 from .validation import test_solver as test_solver

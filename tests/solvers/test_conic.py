@@ -1,5 +1,6 @@
 """Conic solvers on discs and cones: planted solutions, degenerate sets, sequences."""
 
+import re
 from dataclasses import replace
 from time import process_time
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, eye_array
 
+import mortarbench as mb
 from mortarbench.harness import QP, Cones, Discs, Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals
 from mortarbench.solvers import SOLVERS
@@ -200,3 +202,54 @@ def test_the_degenerate_cone_costs_half_of_the_digits(name):
         s = solver_of(name).prepare(degenerate(), tol)()
         assert s.status is Status.SOLVED
         assert np.abs(s.x - [4, 4, 0]).max() <= error
+
+
+def turned(angle):
+    """min ½‖x − c‖² over ‖(x₁, x₂)‖ ≤ 1 and ‖(x₄, x₅)‖ ≤ ½x₃, c far along `angle`."""
+    none = csr_array((0, 5))
+    direction = np.array([np.cos(angle), np.sin(angle)])
+    q = -np.concatenate([3 * direction, [1.0], 3 * direction])
+    sets = (Discs([[0, 1]], [1.0]), Cones([[2, 3, 4]], [0.5]))
+    return QP(
+        P=eye_array(5, format="csr"), q=q, A=none, b=np.zeros(0), G=none,
+        h=np.zeros(0), sets=sets,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("sides", [3, 4, 16, 100])
+def test_polygons_are_inside_circles_by_the_error_that_they_state(sides):
+    least = 1.0
+    for angle in np.linspace(0, 2 * np.pi / sides, 5):
+        qp = turned(angle)
+        other = mb.polygonal(qp, sides)
+        assert SOLVERS["piqp"].declines(other.qp) is None
+        s = other.recover(SOLVERS["piqp"].prepare(other.qp, 1e-10)())
+        disc, cone = np.linalg.norm(s.x[:2]), np.linalg.norm(s.x[3:]) / (0.5 * s.x[2])
+        for reached in (disc, cone):
+            assert 1 - other.error - 1e-8 <= reached <= 1 + 1e-8
+            least = min(least, reached)
+        assert qp.P @ s.x + qp.q + s.z_box == pytest.approx(0, abs=1e-8)
+    assert other.error == 1 - np.cos(np.pi / sides)
+    assert least <= 1 - 0.99 * other.error
+
+
+def test_an_answer_over_polygons_is_not_verified_on_circles():
+    qp = turned(0.1)
+    other = mb.polygonal(qp, 16)
+    s = other.recover(mb.solve(other.qp, "clarabel", 1e-8).solution)
+    verdict = mb.verify(qp, s.x, s.y, s.z, s.z_box, tol=1e-6).verdict
+    assert verdict is not mb.Verdict.VERIFIED
+
+
+@pytest.mark.parametrize(
+    ("index", "sides", "message"),
+    [
+        ([[0, 1, 2]], 8, "Discs of 3 tangential variables; expected 2"),
+        ([[0, 1]], 2, "sides = 2; expected an integer from 3 to 10000"),
+        ([[0, 1]], 8.0, "sides = 8.0; expected an integer"),
+    ],
+)
+def test_sets_without_polygons_are_refused(index, sides, message):
+    qp = QP.from_arrays(np.eye(4), np.ones(4), sets=(Discs(index, [1.0]),))
+    with pytest.raises(mb.InputError, match=re.escape(message)):
+        mb.polygonal(qp, sides)

@@ -1,0 +1,115 @@
+"""Polygons in place of discs and friction cones, for solvers that take rows only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, vstack
+
+from mortarbench.harness import QP, Box, Solution, Vector
+from mortarbench.harness.errors import InputError, shown
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.convex import ConvexSet
+from mortarbench.harness.sets.discs import Discs
+
+LEAST_SIDES, MOST_SIDES = 3, 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class PolygonalQP:
+    """A QP with polygons in place of circles; another problem than the original."""
+
+    qp: QP  #: with rows of G for the sides of polygons, and without discs and cones
+    #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius
+    error: float
+    #: map a point of `qp` to the original; `z_box` there is normal to the polygons, not
+    #: to the circles, and residuals show the error
+    recover: Callable[[Solution], Solution]
+
+
+def polygonal(qp: QP, sides: int) -> PolygonalQP:
+    """Replace discs and friction cones by inscribed regular polygons and pyramids.
+
+    Points of the new QP are feasible in the original. With the normals n_j of the k
+    sides, a disc becomes  n_jᵀx ≤ radius·cos(π/k),  and a cone  n_jᵀx_T ≤
+    slope·cos(π/k)·x_N  with x_N ≥ 0.
+
+    sides : k, the number of sides of each polygon
+
+    Raises
+    ------
+    InputError
+        If `sides` is not an integer from 3 to 10 000, or a set is not of two
+        (tangential) variables.
+
+    Examples
+    --------
+    >>> import mortarbench as mb
+    >>> disc = mb.Discs([[0, 1]], [1.0])
+    >>> qp = mb.QP.from_arrays([[1, 0], [0, 1]], [-2, 0], sets=(disc,))
+    >>> other = mb.polygonal(qp, 8)
+    >>> other.qp.sizes["inequalities"], round(other.error, 3)
+    (8, 0.076)
+
+    """
+    if not isinstance(sides, int) or not LEAST_SIDES <= sides <= MOST_SIDES:
+        raise InputError(
+            f"sides = {shown(sides)}; expected an integer from {LEAST_SIDES} to "
+            f"{MOST_SIDES}"
+        )
+    p, n, lower = qp.h.size, qp.q.size, qp.lb.copy()
+    parts = [_sides(one, sides, n) for one in qp.sets[1:]]
+    for one in qp.sets[1:]:
+        if isinstance(one, Cones):
+            lower[one.index[:, 0]] = 0.0
+    rows = vstack([csr_array((0, n)), *(rows for rows, _ in parts)]).tocsr()
+    flat = replace(
+        qp,
+        sets=(Box(lower, qp.ub),),
+        G=vstack([csr_array(qp.G), rows]).tocsr(),
+        h=np.concatenate([qp.h, *(h for _, h in parts)]),
+    )
+
+    def recover(s: Solution) -> Solution:
+        return replace(s, z=s.z[:p], z_box=s.z_box + rows.T @ s.z[p:])
+
+    return PolygonalQP(flat, float(1 - np.cos(np.pi / sides)), recover)
+
+
+def _sides(one: ConvexSet, sides: int, n: int) -> tuple[csr_array, Vector]:
+    """Return R, r of the sides Rx ≤ r of all polygons of a set."""
+    if isinstance(one, Discs):
+        tangents, radius, slope = one.index, one.radius, 0 * one.radius
+    elif isinstance(one, Cones):
+        tangents, radius, slope = one.index[:, 1:], 0 * one.slope, one.slope
+    else:
+        raise InputError(
+            f"{type(one).__name__} has no polygon; expected Discs and Cones"
+        )
+    k, d = tangents.shape
+    if d != 2:
+        raise InputError(
+            f"{type(one).__name__} of {d} tangential variables; expected 2"
+        )
+    angle = (2 * np.arange(sides) + 1) * np.pi / sides
+    row = np.arange(k * sides).reshape(k, sides)
+    shrink, column = np.cos(np.pi / sides), np.broadcast_to
+    entries = [
+        (column(tangents[:, :1], row.shape), column(np.cos(angle), row.shape)),
+        (column(tangents[:, 1:], row.shape), column(np.sin(angle), row.shape)),
+        (
+            column(one.index[:, :1], row.shape),
+            column(-shrink * slope[:, None], row.shape),
+        ),
+    ]
+    R = coo_array(
+        (
+            np.concatenate([values.ravel() for _, values in entries]),
+            (np.tile(row.ravel(), 3), np.concatenate([c.ravel() for c, _ in entries])),
+        ),
+        shape=(row.size, n),
+    ).tocsr()
+    R.eliminate_zeros()
+    return R, np.repeat(shrink * radius, sides)
