@@ -34,6 +34,7 @@ from mortarbench.problems.fem.mesh import (
     boundary_facets,
     box,
     dofs_of,
+    join,
     nodal_areas,
 )
 from mortarbench.problems.fem.multifrontal import multifrontal
@@ -269,3 +270,27 @@ def test_the_fill_of_a_box_does_not_depend_on_its_orientation():
 
     assert max(sizes) <= 1.05 * min(sizes), sizes
     assert max(sizes) <= 2 * metis.L().nnz
+
+
+@pytest.mark.parametrize("across", [1, 2, 3])
+def test_fixing_nodes_of_bars_feel_every_rotation(across):
+    """The central nodes of 3 × 3 × 11 cells alone are on an axis of rotation."""
+    for length in range(1, 30):
+        divisions = across, across, length
+        mesh = box((0.0, 0.0, 0.0), tuple(map(float, divisions)), divisions)
+        fixed = dofs_of(fixing_nodes(mesh.points), 3)
+        sizes = np.linalg.svd(rigid_modes(mesh.points)[fixed], compute_uv=False)
+        assert sizes[-1] > 0.25 * sizes[0]
+
+
+def test_stresses_of_mixed_cells_use_the_material_of_each():
+    wedges = degenerate(
+        divided(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1)), WEDGES)
+    )
+    mesh, body = join((box((2.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1)), wedges))
+    of_cells = np.stack([D, 2 * D])[body]
+    u = (mesh.points * [0, 0, 1e-3]).ravel()
+    stress = centre_stress(mesh, of_cells, u)
+
+    assert body.tolist() == [0, 1, 1]
+    assert stress == pytest.approx(np.outer([1, 2, 2], 1e-3 * D[2]), rel=1e-12)
