@@ -56,7 +56,11 @@ class WithoutRows:
 
 
 def exceeded(seed, tries, each=100):
-    """Attack bounds by points of all kinds; return failures and the sharpness."""
+    """Attack bounds by points of all kinds; return failures and the sharpness.
+
+    The sharpness, bound over error, is that of well-conditioned P: otherwise bounds may
+    be too large by the root of the condition number.
+    """
     rng = np.random.default_rng(seed)
     failures, ratios, count = [], [], 0
     with np.errstate(all="ignore"):
@@ -76,7 +80,7 @@ def exceeded(seed, tries, each=100):
                 error = planted.error(s.x)
                 if error > bound:
                     failures.append((sorted(traps), number, ill, error, bound))
-                if error > 0 and np.isfinite(bound):
+                if error > 0 and np.isfinite(bound) and not ill:
                     ratios.append(bound / error)
     return failures, count, float(np.median(ratios))
 
@@ -85,7 +89,7 @@ def test_no_bound_of_a_short_search_is_exceeded():
     failures, count, ratio = exceeded(2718, 500)
     assert failures == []
     assert count > 450
-    assert ratio < 100
+    assert ratio < 20
 
 
 @pytest.mark.slow
@@ -93,7 +97,7 @@ def test_of_ten_thousand_attacked_bounds_none_is_exceeded():
     failures, count, ratio = exceeded(3141, 12_000)
     assert failures == []
     assert count >= 10_000
-    assert ratio < 100
+    assert ratio < 20
 
 
 @pytest.mark.parametrize("trap", ["", *KEPT])

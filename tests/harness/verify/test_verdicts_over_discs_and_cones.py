@@ -397,7 +397,7 @@ def test_distances_to_normal_cones_are_euclidean():
 @pytest.mark.parametrize("trap", ["", *(t for t in TRAPS if t != "tiny")])
 def test_multipliers_are_found_for_points_alone(trap):
     worst = []
-    for seed in range(10):
+    for seed in range(5):
         planted = ExactProblem({trap}, seed)
         s = with_multipliers(planted.qp, planted.solution.x)
         worst.append(kkt_residuals(planted.qp, s).worst)
@@ -437,7 +437,7 @@ def test_multipliers_are_computed_at_the_apex_of_all_cones():
 @pytest.mark.parametrize("trap", ["", "steep", "point", "apex"])
 def test_equivalent_formulations_have_the_same_residuals(trap):
     """Units, order and the signs of tangents change, exactly, by powers of two."""
-    for seed in range(5):
+    for seed in range(2):
         planted = ExactProblem({trap}, seed)
         qp, s = planted.qp, planted.solution
         rng = np.random.default_rng(seed)
