@@ -240,6 +240,8 @@ class _Group:
                 matrix = kind((x[: p[-1]], i[: p[-1]], p), shape=(m, n))
                 matrix.check_format()
                 return csc_array(matrix)
+            if not nz <= min(p.size, i.size, x.size) or nz < 0:
+                raise ValueError("fewer entries than nz")
             places = (i[:nz], p[:nz])
             if max(places[0], default=0) >= m or max(places[1], default=0) >= n:
                 places = (p[:nz], i[:nz])

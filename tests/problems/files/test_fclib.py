@@ -191,6 +191,11 @@ def changed(**arrays):
         (changed(vectors__q=np.array([np.nan, 0, 0])), "vectors/q holds NaN or inf"),
         (changed(W__m=np.array([4])), r"W has shape \(4, 3\); expected \(3, 3\)"),
         (changed(W__i=np.array([0, 1, 7])), "W is not a matrix: its p, i and x do not"),
+        (
+            changed(W__nz=np.array([9])),
+            "W is not a matrix: its p, i and x do not fit 3",
+        ),
+        (changed(W__nz=np.array([-7])), "W is not a matrix"),
         (changed(vectors__q=np.array(b"text")), "vectors/q holds no numbers"),
     ],
 )
@@ -403,3 +408,22 @@ def test_siconos_has_the_same_forces(tmp_path):
     assert contact.natural_map(theirs["r"], np.zeros(0)) <= 1e-9
     assert theirs["error"] <= 1e-9
     assert ours == pytest.approx(theirs["r"], abs=1e-8)
+
+
+def test_a_suite_takes_a_pattern_and_keeps_copies(tmp_path):
+    """A run of all files, judged again after the files are gone."""
+    for seed in range(2):
+        write_regular(tmp_path / f"{seed}.hdf5", seed=seed)
+    suite = {
+        "name": "cones", "tolerances": [1e-6], "repeats": 1, "solvers": ["scs"],
+        "problems": [
+            {"family": "fclib", "forms": ["dual"],
+             "params": {"path": str(tmp_path / "*.hdf5")}},
+        ],
+    }  # fmt: skip
+    results = mb.run(suite, out=tmp_path / "out")
+    assert results.df["status"].tolist() == ["verified"] * 2
+    run_id = results.df["run_id"].iloc[0]
+    for seed in range(2):
+        (tmp_path / f"{seed}.hdf5").unlink()
+    assert mb.replay(tmp_path / "out", run_id).now.verdict is mb.Verdict.VERIFIED
