@@ -48,6 +48,9 @@ CLAIM_FACTOR = 5.0
 #: ‖g^P‖, though not in proportion.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
+#: rounding of ‖x_I‖, relative to the radius and x̃; twice that of feasible_set.pxi.
+#: With 16 EPS times the radius, `test_small_discs_beside_large_shifts` fails
+DISC_ROUNDING = 32 * EPS
 MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
 #: for a single dense P with bounds alone, whose CG takes about ten steps: on duals of
 #: beam-ring and greco with 32 to 722 unknowns, seven or eight take the fewest products
@@ -454,7 +457,9 @@ def recovered(
         at_lower, qp.lb, np.where(at_upper, qp.ub, problem.rows.x_tilde + at.nu)
     )
     x = np.clip(x, qp.lb, qp.ub)  # l − x̃ + x̃ may differ from l in the last bit
-    boundaries = [(one, _on_boundary(one, x)) for one in problem.discs]
+    boundaries = [
+        (one, _on_boundary(one, x, problem.rows.x_tilde)) for one in problem.discs
+    ]
     for one, active in boundaries:
         x = one.project(x)
         free[one.index[active]] = False
@@ -473,10 +478,14 @@ def recovered(
     return x, a, z_box, Fx
 
 
-def _on_boundary(discs: Discs, x: Vector) -> NDArray[np.bool_]:
-    """Return which discs (k,) have x (n,) on their boundary."""
-    sizes = np.linalg.norm(x[discs.index], axis=1)
-    on_boundary: NDArray[np.bool_] = sizes >= discs.radius * (1 - 16 * EPS)
+def _on_boundary(discs: Discs, x: Vector, shift: Vector) -> NDArray[np.bool_]:
+    """Return which discs (k,) have x (n,) on their boundary.
+
+    shift : x̃ (n,), whose rounding is part of x
+    """
+    sizes, shifts = (np.linalg.norm(v[discs.index], axis=1) for v in (x, shift))
+    rounding = DISC_ROUNDING * (discs.radius + shifts)
+    on_boundary: NDArray[np.bool_] = sizes >= discs.radius - rounding
     return on_boundary
 
 

@@ -113,6 +113,12 @@ def test_equality_rows_beside_discs(name, seed, sparse):
     assert_solved(name, qp, x)
 
 
+def test_small_discs_beside_large_shifts():
+    """The rounding of x̃ exceeds that of the radius."""
+    qp, _ = qp_on_discs(5249, dim=3, rows=3, spread=4.0)
+    assert_solved("smalbe", qp)
+
+
 def test_rows_that_no_point_of_the_discs_meets_are_reported():
     rows = [[1.0, 0, 0, 0], [0, 0, 1, 0]]
     qp = QP.from_arrays(
