@@ -2,9 +2,10 @@
 # cython: initializedcheck=False
 """SMALBE, compiled: preparation, MPRGP, outer loop and recovery of the solution.
 
-One loop serves all problems. It is written in a few operations. On one process with an
-explicit P they run without Python; sums over ranks, products with operators, sparse
-factors and preconditioners call back into Python.
+One loop serves all problems. It is written in a few operations. On one process they run
+without Python, with an explicit P and with one that is a linear map
+(`mortarbench.harness.distributed.sparse`); sums over ranks, their rows, and other
+operators and preconditioners call back into Python.
 
 * operations.pxi: sums over processes, products with F, orthonormal rows
 * coarse.pxi: sparse rows and the factor of GGᵀ

@@ -10,7 +10,8 @@ are applied by products with G and solves with L (`SparseRows`); the rows must b
 independent. A model of the penalty ρCᵀC (model.pxi) needs solves with G_F G_Fᵀ + κGGᵀ
 on a face F. These matrices differ from (1 + κ)GGᵀ only in rows with entries in bounded
 components, and in contact problems few subdomains have any: with those rows c ordered
-last, each face only needs a factorisation of the Schur complement on c (`_Bordered`).
+last, each face only needs a factorisation of the Schur complement on c
+(`harness.distributed.sparse.BorderedFactor`).
 
 On several ranks this is the *coarse problem*, with a row for each rigid mode of every
 subdomain. Each rank eliminates its local rows (`_OverRanks`). If it shares many of them
