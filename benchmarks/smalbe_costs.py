@@ -196,16 +196,16 @@ def incomplete(tol: float = 1e-6) -> None:
     print("case | products, factors, ms | without: products, ms | ratio of times")
     for name, several in INCOMPLETE.items():
         for params in several:
-            given = {key: value for key, value in params.items() if key != "half"}
-            family = PROBLEMS[name]
-            qp = family.build("primal", family.complete(given), reference_solution).qp
-            if "half" in params:
-                qp = _on_half(qp)
-            _incomplete(f"{name} {params}", qp, tol)
+            _incomplete(f"{name} {params}", sparse_qp(name, params), tol)
 
 
-def _on_half(qp: QP) -> QP:
-    """Leave out the lower bounds of the second half of the variables."""
+def sparse_qp(name: str, params: dict[str, object]) -> QP:
+    """Return a primal QP; with "half" without bounds on the second half."""
+    given = {key: value for key, value in params.items() if key != "half"}
+    family = PROBLEMS[name]
+    qp = family.build("primal", family.complete(given), reference_solution).qp
+    if "half" not in params:
+        return qp
     lb = qp.lb.copy()
     lb[qp.q.size // 2 :] = -np.inf
     return QP(P=qp.P, q=qp.q, A=qp.A, b=qp.b, G=qp.G, h=qp.h, lb=lb, ub=qp.ub)
@@ -226,7 +226,8 @@ def _incomplete(name: str, qp: QP, tol: float) -> None:
     (ms, _), (before, _) = times["factors"], times["without"]
     with_factors, without = counts["factors"], counts["without"]
     print(
-        f"{name} | {with_factors['P_products']}, {with_factors['factorisations']}, "
+        f"{name} | {with_factors['P_products']}, "
+        f"{with_factors.get('factorisations', 0)}, "
         f"{1e3 * ms:.3g} | {without['P_products']}, {1e3 * before:.3g} | "
         f"{ms / before:.2f}",
         flush=True,

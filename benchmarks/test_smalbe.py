@@ -9,7 +9,7 @@ import pytest
 from scipy.linalg.blas import dsymv
 
 import mortarbench as mb
-from benchmarks.smalbe_costs import SUBDOMAINS
+from benchmarks.smalbe_costs import INCOMPLETE, SUBDOMAINS, in_turn, sparse_qp, timed
 from mortarbench.harness import Status, kkt_residuals
 from mortarbench.problems import PROBLEMS
 from mortarbench.solvers import SOLVERS
@@ -258,3 +258,46 @@ def test_large_sparse_problems(race, note, name):
         for f in fleet
     )
     note(f"{name} n={n}: {times}; a product with its step × {step:.2f}")
+
+
+@pytest.mark.parametrize(
+    ("name", "params"),
+    [(name, params) for name, several in INCOMPLETE.items() for params in several],
+    ids=lambda value: value if isinstance(value, str) else repr(value),
+)
+def test_sparse_problems_with_bounds(note, name, params):
+    """Processor time of prepare and solve at 1e-6, by default and without a factor."""
+    qp, tol = sparse_qp(name, params), 1e-6
+    plain = replace(SOLVERS["smalbe"], preconditioner="model")
+    solvers = {"smalbe": SOLVERS["smalbe"], "plain": plain}
+    spent = {f: products(s.prepare(qp, tol)()) for f, s in solvers.items()}
+    times = in_turn(
+        5 if qp.q.size > 20_000 else 30,
+        **{f: timed(lambda s=s: s.prepare(qp, tol)()) for f, s in solvers.items()},
+    )
+    ms = {f: 1e3 * typical for f, (typical, _) in times.items()}
+    note(
+        f"{name} {params}: {spent['smalbe']} products, {ms['smalbe']:.3g} ms; without "
+        f"a factor {spent['plain']}, {ms['plain']:.3g} ms; × "
+        f"{ms['smalbe'] / ms['plain']:.2f}"
+    )
+
+
+@pytest.mark.parametrize(("Nr", "Nh"), [(6, 3), (12, 6), (12, 7), (24, 12)])
+def test_the_smallest_duals_with_bounds_alone(note, Nr, Nh):
+    """Processor times at 1e-6, and that of preparing relative to that of solving."""
+    qp, tol, solver = dual(Nr, Nh, 5, "dual-bounds"), 1e-6, SOLVERS["smalbe"]
+    ready = []
+    spent = products(solver.prepare(qp, tol)())
+    times = in_turn(
+        600,
+        prepare=timed(lambda: ready.append(solver.prepare(qp, tol))),
+        solve=timed(lambda: ready.pop()()),
+        whole=timed(lambda: solver.prepare(qp, tol)()),
+    )
+    us = {f: 1e6 * fast for f, (_, fast) in times.items()}
+    note(
+        f"dual-bounds m={qp.q.size}: {spent} products, fastest tenth {us['whole']:.1f} "
+        f"µs; prepare {us['prepare']:.1f} µs, solve {us['solve']:.1f} µs, "
+        f"prepare/solve {us['prepare'] / us['solve']:.2f}"
+    )
