@@ -129,7 +129,7 @@ PROMISED = {
         "beam.png": "",
         "out/mine/report/report.md": r"osqp-polish",
         "out/mine/report/records.parquet": "",
-        "out/again/report/against-mine/index.html": r"what changed from mine to again",
+        "out/again/report/against-mine/index.html": r"changes from mine to again",
     },
     "own-geometry": {
         "press.png": "",
