@@ -35,7 +35,7 @@ PRIMAL = 1  #: the exit flag that has a certificate
 RANK_TOLERANCE = 1e-14
 #: Sizes of the unknowns of corrections, relative to ‖x‖∞. Which of them helps depends
 #: on the QP: the first is needed at tol 1e-6, the last reaches 1e-8.
-CORRECTION_SIZES = (1e-2, 1e-3, 1e-4)
+CORRECTION_SIZES = (3e-2, 1e-2, 3e-3, 1e-3, 1e-4)
 #: largest KKT residual, relative to tol, of a point that is claimed solved
 CLAIM_FACTOR = 10.0
 
