@@ -80,9 +80,9 @@ def conic_qp(seed):
 
 #: largest error in x at tol 1e-8: interior-point methods stop at a gap of tol, which
 #: permits an angle of √tol between x and z of a disc
-ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 3e-5}
+ERROR = {"scs": 1e-6, "cvxpy:SCS": 1e-6, "ecos": 1e-6}
 OTHER_ERROR = 5e-4
-RESIDUAL = {"ecos": 1e-5}  #: at tol 1e-8; more than 1e-7 for 35 of 500 QPs
+RESIDUAL = {"ecos": 3e-7}  #: more than 1e-7 for 7 of 500 QPs, which it does not claim
 
 
 def check_solution(name, seed, tol=1e-8):
@@ -90,8 +90,9 @@ def check_solution(name, seed, tol=1e-8):
     s = solver_of(name).prepare(qp, tol)()
 
     value = qp.objective(best.x)
-    assert s.status is Status.SOLVED
-    assert kkt_residuals(qp, s).worst <= RESIDUAL.get(name, 10 * tol)
+    worst = kkt_residuals(qp, s).worst
+    assert worst <= RESIDUAL.get(name, 10 * tol)
+    assert s.status is (Status.SOLVED if worst <= 10 * tol else Status.FAILED)
     assert qp.objective(s.x) == pytest.approx(value, rel=1e-8)
     assert np.abs(s.x - best.x).max() <= ERROR.get(name, OTHER_ERROR)
 
