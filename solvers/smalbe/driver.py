@@ -52,10 +52,6 @@ EPS = float(np.finfo(float).eps)
 #: With 16 EPS times the radius, `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
 MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
-#: for a single dense P with bounds alone, whose CG takes about ten steps: on duals of
-#: beam-ring and greco with 32 to 722 unknowns, seven or eight take the fewest products
-#: on average, five or twelve up to a half more
-BOUNDS_LANCZOS_STEPS = 7
 #: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
 #: with 1e4 two or three outer iterations suffice
 RHO = 1e4
@@ -237,16 +233,17 @@ def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
 
     Few steps suffice for few unknowns, where more would cost as much as the CG steps;
     and if P offers a preconditioner, since the spectrum of decomposed bodies is flat
-    and only its norm is used. With a dense P and bounds alone, BOUNDS_LANCZOS_STEPS are
-    enough. A sequence reuses the spectrum, so that further steps pay there: with fewer,
-    the 24 problems of greco/n=32/dual-bounds take 170 products instead of 152.
+    and only its norm is used. With bounds alone fewer are enough: seven or eight for 73
+    to 85 unknowns save as many products as they cost, of which CG takes about ten.
+    Seven for all would save up to a fifth on dense duals with bounds alone, but cost up
+    to 1.9 times as many on dense matrices whose spectrum falls slowly. A sequence
+    reuses the spectrum, so that further steps pay there: with fewer, the 24 problems of
+    greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
         few = 0
     elif qp.b.size or in_sequence:
         few = qp.q.size // 6
-    elif isinstance(qp.P, np.ndarray):
-        few = min(qp.q.size // 12, BOUNDS_LANCZOS_STEPS)
     else:
         few = qp.q.size // 10
     return min(options.lanczos_steps, max(MIN_LANCZOS_STEPS, few))

@@ -55,7 +55,7 @@ class Options:
     reduced: bool = True  #: proportioning compares β with φ̃ᵀφ, not with φᵀφ
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
-    # n/10 where there are bounds alone; n/12 and seven for a single QP with a dense P
+    # n/10 where there are bounds alone
     lanczos_steps: int = 12  #: its products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
