@@ -47,8 +47,8 @@ MIN_CORRECTION_SIZE = 0.01
 class ECOS:
     """https://github.com/embotech/ecos.
 
-    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, L by eigenvalues. Its gap of tol
-    permits errors in x of √tol, so ECOS solves again for a correction.
+    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L by eigenvalues. A gap of tol
+    permits errors of √tol in x, so ECOS solves again for a correction.
     """
 
     max_iter: int = 200
