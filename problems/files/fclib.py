@@ -125,8 +125,8 @@ def to_contact(arrays: Datasets) -> FclibFile:
     Raises
     ------
     InputError
-        If an array is missing or does not fit the others, and for problems that are
-        not built.
+        If an array is missing or does not fit the others, or the problem is
+        of a kind that is not supported.
 
     """
     kinds = [
