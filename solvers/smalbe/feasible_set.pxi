@@ -9,7 +9,7 @@ cdef double DISC_ROUNDING = 16 * 2.0 ** -52
 
 cdef struct Line:
     double cg  # α that minimises the cost at x − αp; inf if pᵀHp ≤ 0
-    double feasible  # the largest feasible α, or inf if it is not below cg
+    double feasible  # the largest feasible α; may be inf if it is not below cg
     double slope  # gᵀp
     double curvature  # pᵀHp
 
