@@ -459,7 +459,7 @@ def _imported(path: Path) -> ModuleType:
         submodule_search_locations=[_BESIDE + str(whole.parent)],
     )
     if spec is None or spec.loader is None:
-        raise InputError(f"{path}: no Python file; its name must end in .py")
+        raise InputError(f"{path}: not a Python file; its name must end in .py")
     _forget(name)
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look there

@@ -269,7 +269,7 @@ def _ratio(
 
 
 def _pools_by_library(environment: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the environment with thread pools by the names of their libraries.
+    """Return the environment with its thread pools in a mapping from library names.
 
     Differences are then reported by library, not by the position in a list.
     """

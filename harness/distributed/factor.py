@@ -204,7 +204,7 @@ class SummedFactor:
             return distributed(np.concatenate([u / self.root, z_c, z_s]), ranks)
 
     def backward(self, a: Dense) -> DistributedVector:
-        """Map an orthonormal a (k - s_p + s,) to the consistent L⁻ᵀa (k,)."""
+        """Map an orthonormal vector a (k - s_p + s,) to the consistent L⁻ᵀa (k,)."""
         ranks, a = self.local.at.ranks, np.asarray(a)
         with ranks.clocked("coarse"):
             c, s = len(self.L_cc), len(self.L_ss)

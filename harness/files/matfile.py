@@ -142,7 +142,9 @@ def _decompressed(element: _Element) -> _Element:
     kind, size = struct.unpack(f"{element.order}II", head)
     body = inflate.decompress(inflate.unconsumed_tail, size) if size else b""
     if len(body) < size or inflate.decompress(inflate.unconsumed_tail, 1):
-        raise ValueError("a compressed variable has not the size that it declares")
+        raise ValueError(
+            "the size of a compressed variable differs from its declared size"
+        )
     return _Element(element.order, kind, body)
 
 

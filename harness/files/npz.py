@@ -109,7 +109,7 @@ def _members(archive: zipfile.ZipFile) -> dict[str, zipfile.ZipInfo]:
     for member in archive.infolist():
         name = member.filename.removesuffix(".npy")
         if name == member.filename or name in members:
-            raise ValueError(f"{shortened(name)!r} is no array, or there twice")
+            raise ValueError(f"{shortened(name)!r} is not an array, or occurs twice")
         if member.flag_bits & _ENCRYPTED or member.compress_type not in _METHODS:
             raise ValueError(f"{shortened(name)!r} is encrypted, or oddly compressed")
         members[name] = member
@@ -129,7 +129,7 @@ def _array(memory: mmap.mmap, member: zipfile.ZipInfo) -> NDArray[Any]:
     start = BytesIO(memory[begin : min(begin + 4096, begin + member.file_size)])
     shape, fortran, dtype = _header(start)
     if fortran:
-        raise ValueError(f"{member.filename} is no array in C order")
+        raise ValueError(f"{member.filename} is not an array in C order")
     count = _count(shape, dtype, member.file_size - start.tell())
     if count == 0:
         return np.empty(shape, dtype)

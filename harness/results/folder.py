@@ -429,7 +429,7 @@ def _environment(path: Path) -> dict[str, Any]:
         environment.get("digest"), str
     ):
         raise InputError(
-            f"{path}: no JSON object with a digest; expected the file that the run "
+            f"{path}: not a JSON object with a digest; expected the file that the run "
             "wrote; restore it, or run with --fresh"
         )
     return environment

@@ -81,7 +81,7 @@ class Schedule:
         return self._parts[block, part]
 
     def give_up(self, block: WorkUnit) -> bool:
-        """Exclude the cases of a block, not built; return False if they already are."""
+        """Exclude all cases of a block as unbuilt; return False if they already are."""
         new = [case for case in block.cases if case not in self.unbuilt]
         self.unbuilt += new
         return bool(new)

@@ -1,4 +1,4 @@
-"""Sets other than bounds as named arrays, as files hold them.
+"""Sets other than bounds as the named arrays that files store.
 
 The first set of a kind has `disc_index, disc_radius` or `cone_index, cone_slope`. A
 further one of the same kind, such as discs of another dimension, has a number after the
@@ -33,7 +33,7 @@ def set_arrays(sets: Sequence[ConvexSet]) -> dict[str, NDArray[Any]]:
     Raises
     ------
     InputError
-        When a set is of another kind than discs and cones.
+        When a set is neither of discs nor of cones.
 
     """
     arrays: dict[str, NDArray[Any]] = {}
@@ -60,8 +60,8 @@ def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
     Raises
     ------
     InputError
-        When an array is missing beside another, has a name of no set, or they are not
-        such sets.
+        When an array of a set is missing, a name belongs to no set, or arrays do not
+        define a valid set.
 
     """
     sets: list[ConvexSet] = []
@@ -71,7 +71,7 @@ def further_sets(arrays: Mapping[str, Any]) -> tuple[ConvexSet, ...]:
         while parts := _parts(kind, _prefix(kind, count), arrays, names):
             sets.append(kind(**parts))
             count += 1
-    if names:  # to leave out a set would be another problem
+    if names:  # without this set the QP would be a different problem
         raise InputError(
             f"{min(names)} belongs to no set; expected disc_index and disc_radius, "
             "cone_index and cone_slope, then disc2_index, …"
@@ -86,9 +86,9 @@ def _prefix(kind: type[Discs] | type[Cones], count: int) -> str:
 def _parts(
     kind: Any, prefix: str, arrays: Mapping[str, Any], names: set[str]
 ) -> dict[str, Any]:
-    """Return the arguments of a set, none if `arrays` has no such set.
+    """Return the arguments of a set, or an empty dict if `arrays` has no such set.
 
-    names : of arrays that belong to no set yet; those of this set are removed
+    names : of the arrays not yet assigned to a set; those of this set are removed
     """
     both = {f"{prefix}_{field.name}": field.name for field in fields(kind)}
     here = names.intersection(both)

@@ -1,4 +1,4 @@
-"""Sets of one kind on disjoint blocks of variables: what discs and cones share."""
+"""Sets of one kind on disjoint blocks of variables: the base of discs and cones."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mortarbench.harness.sets.convex import Vector
 class Blocks:
     """Base of dataclasses with a field `index` (k, d) and one number for each block.
 
-    Both are copied. Kinds of sets derive from it and add their geometry.
+    Both arrays are copied. Subclasses add the geometry of a kind of sets.
     """
 
     prefix: ClassVar[str]  #: of the names of arrays in files

@@ -43,7 +43,7 @@ class Box:
         return np.flatnonzero(np.isfinite(self.lower) | np.isfinite(self.upper))
 
     def check(self, n: int) -> None:
-        """Raise ValueError for other shapes, NaN, or bounds that cross."""
+        """Raise ValueError for other shapes, NaN, or a lower bound above an upper."""
         for name, bound in (("lb", self.lower), ("ub", self.upper)):
             if bound.shape != (n,):
                 raise ValueError(f"QP.{name} has shape {bound.shape}, expected {(n,)}")

@@ -1,4 +1,4 @@
-"""Second-order cones ‖x_T‖ ≤ μ x_N, which Coulomb's law of friction has in space."""
+"""Second-order cones ‖x_T‖ ≤ μ x_N: Coulomb's law of friction in space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mortarbench.harness.sets.convex import Limits, Sum, Vector
 class Cones(Blocks):
     """Cones ‖x_T‖ ≤ slope[i]·x_N and x_N ≥ 0, with N = index[i, 0], T = index[i, 1:].
 
-    Slope 0 is a contact without friction: x_T = 0 and x_N ≥ 0. The normal vector
+    Slope 0 means contact without friction: x_T = 0 and x_N ≥ 0. The normal vector
     `z_box` is in the polar cone, slope·‖z_T‖ ≤ −z_N, and orthogonal to x.
 
     Parameters
@@ -98,7 +98,7 @@ class Cones(Blocks):
     def normal_distances(self, x: Vector, z: Vector, tol: float) -> Vector:
         """Return the distances of z to polar cones at apices, to rays elsewhere.
 
-        As the apex count points that are `tol` times shorter than the longest block.
+        A block shorter than `tol` times the longest block counts as the apex.
         """
         at, force = x[self.index], z[self.index]
         sizes, tangents = norms(at), norms(at[:, 1:])

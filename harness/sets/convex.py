@@ -1,4 +1,4 @@
-"""Convex sets of the variables of a QP, used only through their operations.
+"""Convex sets of the variables of a QP, and the operations on them.
 
 A QP constrains x ∈ S₀ × S₁ × …: S₀ is a `Box` of all variables, and each further set
 constrains a block of variables that are free in S₀ and in all other sets. KKT

@@ -1,4 +1,4 @@
-"""Discs ‖x_I‖ ≤ r, which bound friction in space."""
+"""Discs ‖x_I‖ ≤ r: bounds of friction forces in space."""
 
 from __future__ import annotations
 

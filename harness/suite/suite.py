@@ -322,8 +322,8 @@ def _solvers(entries: object, registry: Mapping[str, Solver]) -> tuple[SolverSpe
             spec = _spec(entry)
             if spec.label in specs:
                 raise InputError(
-                    f"label {shown(spec.label)} is used twice; expected a label of its "
-                    "own"
+                    f"label {shown(spec.label)} is used twice; expected different "
+                    "labels"
                 )
             resolve(spec, registry)
         specs[spec.label] = spec

@@ -336,7 +336,7 @@ class Reduction(Protocol):
         """Gather the coefficients of the rigid motions of all subdomains: (r,)."""
 
     def local_part(self, alpha: Vector) -> Vector:
-        """Return the coefficients of the local rigid motions among all (r,)."""
+        """Extract the coefficients of the local rigid motions from alpha (r,)."""
 
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
         """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.

@@ -157,7 +157,7 @@ def select_iterate(problems: Sequence[T], iterate: int, step: int) -> T:
     if iterate > len(problems):
         raise PastEndError(
             f"iterate={iterate}: the fixed point of step {step} has {len(problems)} "
-            "problems; expected at most that, or 0 for the last"
+            f"problems; expected at most {len(problems)}, or 0 for the last"
         )
     return problems[iterate - 1]
 

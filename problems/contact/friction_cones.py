@@ -5,19 +5,20 @@ velocities u = W r + Vλ + q with Vᵀr = b. Coulomb's law is
 
     û = u + (μ‖u_T‖, 0),   K* ∋ û ⊥ r ∈ K.
 
-It has no potential, but two sequences of convex problems, each with the data of its
-predecessor's solution, lead to it:
+It has no potential, but its solutions are limits of two sequences of convex problems,
+in which the data of each problem are computed from the solution of its predecessor:
 
-* ``cones``: min ½rᵀWr + (q + s)ᵀr over K with s = (μ‖u_T‖, 0), first 0 (Acary, Cadoux,
-  Lemaréchal and Malick 2011, Z. Angew. Math. Mech. 91);
+* ``cones``: min ½rᵀWr + (q + s)ᵀr over K with s = (μ‖u_T‖, 0), initially 0 (Acary,
+  Cadoux, Lemaréchal and Malick 2011, Z. Angew. Math. Mech. 91);
 * ``tresca``: the same with s = 0 over r_N ≥ 0, ‖r_T‖ ≤ g, with the bound g = μ r_N
-  (Haslinger 1983, Math. Methods Appl. Sci. 5); first that of ``cones`` with s = 0.
+  (Haslinger 1983, Math. Methods Appl. Sci. 5); its first problem is that of ``cones``.
 
-Rigid bodies have more contacts than equations of motion, W is singular, and the forces
-of a problem are not unique; the bounds of ``tresca`` then wander in the null space, and
-the loop does not settle on a stack of three boxes. It therefore takes proximal steps:
-it adds ½δ‖r − r'‖² with the forces r' of the predecessor, which vanishes at its end.
-The other loop does so where a problem has no solution otherwise.
+If rigid bodies have more contacts than equations of motion, W is singular, and the
+forces of a problem are not unique. The bounds of ``tresca`` then drift in the null
+space, and the loop does not converge for three stacked boxes. It therefore takes
+proximal steps: it adds ½δ‖r − r'‖² with the forces r' of the predecessor; the term
+vanishes as the loop converges. ``cones`` does so from the first problem that has no
+solution.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ LOOPS = ("cones", "tresca")
 MAX_ASYMMETRY = 1e-9
 #: scaled natural map at which Coulomb's law counts as solved
 FIXED_POINT_TOLERANCE = 1e-9
-MAX_DENSE_ROWS = 3000  #: of W whose eigenvalues are all computed: 20 s
+MAX_DENSE_ROWS = 3000  #: of a W whose eigenvalues are all computed, in 20 s
 #: eigenvalues of W below this fraction of the largest count as zero
 RANK_TOLERANCE = 1e-10
 #: δ of the proximal step relative to the largest eigenvalue of W. Three boxes by
@@ -185,7 +186,7 @@ class ConvexStep(NamedTuple):
 def coulomb_steps(
     contact: FrictionalContact, loop: str, solve: Callable[[QP], Solution], count: int
 ) -> list[ConvexStep]:
-    """Return the convex problems up to Coulomb's law, or the first `count` of them.
+    """Return the sequence of convex problems until it converges, or its first `count`.
 
     Parameters
     ----------

@@ -7,7 +7,7 @@ x = X + u^k and n fixed there,
     g(x) + n·(u − u^k) ≥ 0    ⟺    B u ≤ c,    B = −n at the node,  c = g(x) − n·u^k
 
 which is exact for planes. Each row has the entries of one node only, so that rows are
-orthonormal. Friction acts along the tangents of n: T = −t at the node.
+orthonormal. Tangential rows for friction are T = −t at the node, with the tangents t.
 """
 
 from __future__ import annotations

@@ -174,7 +174,7 @@ class NewtonPath:
         if newton > len(iterations):
             raise PastEndError(
                 f"newton={newton}: step {k} has {len(iterations)} Newton iterations; "
-                "expected at most that, or 0 for the last"
+                f"expected at most {len(iterations)}, or 0 for the last"
             )
         return iterations[newton - 1]
 

@@ -1,4 +1,4 @@
-"""The family of FCLIB's problems; see `problems.files.fclib`."""
+"""The family of FCLIB problems; see `problems.files.fclib`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 class Fclib(FromFile):
     """Contacts with Coulomb friction from FCLIB files, ``fclib:PATH.hdf5``.
 
-    The QP is the last of the convex problems of `loop`, whose solution fulfils
-    Coulomb's law, or the one with the number `iterate`. The digest of the file's
+    The QP is the last of the convex problems of `loop`, whose solution satisfies
+    Coulomb's law, or problem number `iterate`. The digest of the file's
     content is a parameter of the case.
     """
 
@@ -79,7 +79,7 @@ class Fclib(FromFile):
         if p["iterate"] > len(steps):
             raise PastEndError(
                 f"iterate={p['iterate']}: loop={p['loop']} has {len(steps)} problems; "
-                "expected at most that, or 0 for the last"
+                f"expected at most {len(steps)}, or 0 for the last"
             )
         remarks = []
         if (rank := contact.rank) is not None and rank < contact.q.size:

@@ -55,7 +55,7 @@ class Layout:
     ) -> Layout:
         """Cut grids into blocks of at most `most` cells per side.
 
-        most : cells along both sides of a block, or along each side
+        most : one limit for both directions, or the limit for each direction
         """
         sides = np.broadcast_to(most, 2)
 

@@ -184,7 +184,7 @@ class Subdomains:
 
     @cached_property
     def start(self) -> NDArray[np.int64]:
-        """First torn unknown of each subdomain, and N: (S + 1,)."""
+        """Number of the first unknown of each subdomain, and their total: (S + 1,)."""
         sizes = np.array([kind.R.shape[0] for kind in self.classes])[self.class_of]
         return np.concatenate([[0], np.cumsum(sizes)])
 
@@ -257,7 +257,7 @@ class DecomposedBodies:
 
     @property
     def start(self) -> NDArray[np.int64]:
-        """First torn unknown of each subdomain, and N: (S + 1,)."""
+        """Number of the first unknown of each subdomain, and their total: (S + 1,)."""
         return self.domains.start
 
     @cached_property

@@ -1,7 +1,7 @@
 """FCLIB files: problems of contact with Coulomb friction in HDF5.
 
-A local problem is stated in the forces r of the contacts, blocks (N, T₁[, T₂]), and
-multipliers l; a global one has the velocities v of the bodies besides::
+The unknowns of a local problem are the forces r of the contacts, blocks (N, T₁[, T₂]),
+and multipliers l; a global one also contains the velocities v of the bodies::
 
     u = W r + V l + q,   Vᵀr + R l + s = 0                        (local)
     M v = H r + G l + f,   Gᵀv + b = 0,   u = Hᵀv + w             (global)
@@ -46,7 +46,7 @@ Datasets = Mapping[str, NDArray[Any]]  #: arrays of a file by their path in it
 
 @dataclass(frozen=True, eq=False)
 class FclibFile:
-    """A problem of contact and what its file stores beside it."""
+    """A contact problem, with the solution and description stored in its file."""
 
     contact: FrictionalContact
     is_local: bool
@@ -60,7 +60,7 @@ def read_datasets(path: Path) -> Datasets:
     Raises
     ------
     InputError
-        If the file cannot be read or is not HDF5, or is too large.
+        If the file cannot be read, is not HDF5, or is too large.
 
     """
     import h5py  # late: workers of solvers need no HDF5
@@ -110,7 +110,8 @@ def read_fclib(path: Path) -> FclibFile:
     Raises
     ------
     InputError
-        If it is damaged, has rolling friction, or is not a convex problem.
+        If the file is damaged or contains rolling friction, or the problem is not
+        convex.
 
     """
     arrays = read_datasets(path)
@@ -119,13 +120,13 @@ def read_fclib(path: Path) -> FclibFile:
 
 
 def to_contact(arrays: Datasets) -> FclibFile:
-    """Return the problem of the arrays of a file.
+    """Return the contact problem that the arrays of a file define.
 
     Raises
     ------
     InputError
-        If an array is missing or does not fit the others, and for problems that are
-        not built.
+        If an array is missing or does not fit the others, or the problem is
+        of a kind that is not supported.
 
     """
     kinds = [
@@ -302,7 +303,9 @@ def fclib_datasets(qp: QP, title: str, description: str) -> Datasets:
             "QP whose sets are Cones of 2 or 3 variables each, without inequality rows"
         )
     if not qp.is_explicit:
-        raise InputError("P is an operator; expected a matrix, which FCLIB holds")
+        raise InputError(
+            "P is an operator; expected a matrix, since FCLIB files hold nothing else"
+        )
     kind, names = "fclib_local", {"mu": np.concatenate([one.slope for one in cones])}
     arrays = {f"{kind}/spacedim": np.array([dims.pop()], dtype=np.int32)}
     matrices = {"W": csc_array(qp.P)[order][:, order]}

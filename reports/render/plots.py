@@ -204,7 +204,7 @@ def _legend(legends: Sequence[Legend], solvers: Mapping[str, int]) -> Data:
 
 
 def look_of(look: Look) -> Data:
-    """Describe the look of a line and of its marks, lengths in px or points."""
+    """Return the style of a line and its marks; lengths are in px or points."""
     dash = look.dash
     return {
         "colour": colour(look.colour),

@@ -44,8 +44,8 @@ CLAIM_FACTOR = 10.0
 class ECOS:
     """https://github.com/embotech/ecos.
 
-    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, L by eigenvalues. Its gap of tol
-    permits errors in x of √tol, so ECOS solves again for corrections.
+    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L by eigenvalues. A gap of tol
+    permits errors of √tol in x, so ECOS solves again for corrections.
     """
 
     max_iter: int = 200

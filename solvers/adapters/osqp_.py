@@ -44,8 +44,9 @@ class OSQP:
     test, so eps_rel = tol and eps_abs is negligible. The test is evaluated every 25
     iterations. Bounds become rows of the identity, one per bounded variable.
 
-    If the dual residual before polishing was below 1e-10 in absolute terms, polishing
-    accepts any larger one. So with polishing the objective is scaled to ‖q‖∞ = 1e4.
+    If the dual residual is below 1e-10 (absolute) before polishing, OSQP accepts any
+    dual residual after it. With polishing, the objective is therefore scaled to
+    ‖q‖∞ = 1e4.
     """
 
     max_iter: int = 1_000_000

@@ -4,11 +4,11 @@ With the projection Π on the product of sets and a curvature L,
 
     x⁺ = Π(y − (Py + q)/L),   y⁺ = x⁺ + β(x⁺ − x)
 
-with Nesterov's weights β, which start anew where the objective would rise. L grows
+with Nesterov's weights β, which are restarted when the objective would rise. L grows
 until it bounds the curvature along the step, and shrinks after each step (Mazhar, Heyn,
 Negrut and Tasora, Using Nesterov's method to accelerate multibody dynamics with
-friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Products with y follow
-from those with x: a step takes one, and one for each time that L grows.
+friction and contact, ACM Trans. Graph. 34, 2015, Algorithm 1). Products with y are
+combined from those with x: a step takes one product, and another for each growth of L.
 """
 
 from __future__ import annotations

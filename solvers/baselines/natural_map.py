@@ -1,4 +1,4 @@
-"""The natural map of a QP on convex sets, and solves to a tolerance of it.
+"""The natural map of a QP on convex sets, and a loop until it meets a tolerance.
 
 With the projection Π on the product of sets and a curvature L, the natural map
 L(x − Π(x − g/L)) is zero exactly at solutions. With v = x − g/L, the vector L(v − Π(v))
@@ -73,8 +73,8 @@ class Problem:
     ) -> Solution:
         """Take steps until the KKT residuals are within 5·tol.
 
-        They are evaluated where the natural map falls below tol‖q‖; if they are larger,
-        this bound is lowered. No other point is claimed solved.
+        The residuals are evaluated when the natural map falls below tol‖q‖; if they
+        are too large, this bound is lowered. No other point is claimed solved.
 
         step : iterate ↦ the next one, or a solution that ends the solve
         restarted : iterate, x and its gradient ↦ an iterate at x
@@ -104,7 +104,7 @@ class Problem:
 
     def _point(self, x: Vector, v: Vector, most: float) -> Solution:
         """Return x with the multipliers L(v − Π(v))."""
-        self.counts["P_products"] += 1  # of the residuals that follow
+        self.counts["P_products"] += 1  # for the residuals that follow
         return Solution(
             status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0),
             z_box=most * (v - self.project(v)), iterations=self.counts["steps"],

@@ -1,14 +1,14 @@
-"""Spectral projected gradients on convex sets, by products with P only.
+"""Spectral projected gradients on convex sets; P is used only through products.
 
 With the projection Π on the product of sets,
 
     d = Π(x − αg) − x,   x ← x + td
 
-with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988), s the last step. The
-line search is nonmonotone: the objective may exceed its last value but not the largest
-of the last M (Birgin, Martínez and Raydan, Nonmonotone spectral projected gradient
-methods on convex sets, SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective is
-quadratic along d, so one product Pd per iteration suffices for line search and α.
+with the step length α = sᵀs/sᵀPs of Barzilai and Borwein (1988) for the last step s.
+The line search is nonmonotone: the objective may exceed its last value but not the
+largest of the last M (Birgin, Martínez and Raydan, Nonmonotone spectral projected
+gradient methods on convex sets, SIAM J. Optim. 10, 2000, Algorithm 2.2). The objective
+is quadratic along d, so one product Pd per iteration suffices for line search and α.
 
 Alternating with sᵀPs/‖Ps‖² (ABBmin) halves the steps for a string on an obstacle, but
 takes five to twenty times as many on the duals of contact problems.
@@ -133,7 +133,7 @@ def _solve(problem: Problem, tol: float, options: ProjectedGradient) -> Solution
 
 
 def _proves_unbounded(qp: QP, d: Vector) -> bool:
-    """Return True if the objective falls along d for ever, which stays in all sets."""
+    """Return True if x + td is in all sets and the objective falls for all t > 0."""
     size = float(np.abs(d).max(initial=0.0))
     return all(
         np.abs(one.project(d) - d).max() <= ROUNDING * size for one in qp.sets[1:]

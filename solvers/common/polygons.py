@@ -19,7 +19,7 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonalQP:
-    """A QP with polygons in place of circles; another problem than the original."""
+    """A QP with polygons in place of circles, which differs from the original."""
 
     qp: QP  #: with rows of G for the sides of polygons, and without discs and cones
     #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius
@@ -41,8 +41,8 @@ def polygonal(qp: QP, sides: int) -> PolygonalQP:
     Raises
     ------
     InputError
-        If `sides` is not an integer from 3 to 10 000, or a set is not of two
-        (tangential) variables.
+        If `sides` is not an integer from 3 to 10 000, or a disc or the
+        tangential part of a cone does not have two variables.
 
     Examples
     --------

@@ -52,7 +52,7 @@ class _Point(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """QP, with its matrices in extended precision beside it."""
+    """A QP, and its matrices in extended precision."""
 
     qp: QP
     P: Matrix

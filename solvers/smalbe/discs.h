@@ -1,13 +1,13 @@
 /* Loops over discs ‖x_I + c_I‖ ≤ r of the set of MPRGP, beside those of vectors.h.
 
-   A disc is active if x is within `slack` of its boundary. Active discs are no part of
-   the face, the free gradient φ is zero there. With the outward normal n, the chopped
-   gradient β is the gradient, without its normal component if that points inwards
-   (nᵀg < 0 holds x on the boundary). A disc of radius zero has φ = β = 0.
+   A disc is active if x is within `slack` of its boundary. Active discs are not
+   part of the face: the free gradient φ is zero there. With the outward normal n, the
+   chopped gradient β is the gradient, without its normal component if nᵀg < 0, which
+   holds x on the boundary. On a disc of radius zero φ = β = 0.
 
    Each loop is compiled for discs of 2, of 3 and of any number d of variables: with a
-   constant d, those of a disc stay in registers. Square roots are taken on the boundary
-   alone. */
+   constant d, the variables of a disc stay in registers. Square roots are taken only on
+   the boundary. */
 
 typedef struct {
     Py_ssize_t count, ranges;
@@ -59,7 +59,7 @@ INLINE void scale_disc(const discs *D, int d, Py_ssize_t i, double factor, doubl
     }
 }
 
-/* Factor about the centre that projects x − g·length on the disc; 1 inside. */
+/* Return the factor about the centre that projects x − g·length on the disc, 1 inside. */
 INLINE double projected_factor(const discs *D, int d, Py_ssize_t i, const double *x,
                                const double *g, double length)
 {
@@ -71,7 +71,7 @@ INLINE double projected_factor(const discs *D, int d, Py_ssize_t i, const double
     return square > r * r ? r / sqrt(square) : 1;
 }
 
-/* nᵀg/‖x + c‖ where it holds x on the boundary, else 0; `square` = ‖x + c‖². */
+/* Return nᵀg/‖x + c‖ if nᵀg < 0 on the boundary, else 0; `square` = ‖x + c‖². */
 INLINE double held_share(const discs *D, int d, Py_ssize_t i, const double *x,
                          const double *g, double square)
 {
@@ -140,7 +140,7 @@ INLINE double first_of_each(const discs *D, int d, const double *x, const double
             b += u * p[j];
             c += u * u;
         }
-        /* a α² − 2bα + c − r² ≤ 0 in the disc: convex, and it holds at α = 0 */
+        /* a α² − 2bα + c − r² ≤ 0 in the disc: convex, and true at α = 0 */
         if (least < INFINITY && (a * least - 2 * b) * least + c < r * r)
             continue;
         c = (sqrt(c) - r) * (sqrt(c) + r); /* without cancellation */
@@ -152,7 +152,7 @@ INLINE double first_of_each(const discs *D, int d, const double *x, const double
     return least;
 }
 
-/* Return the α at which x − αp leaves the first disc, `least` if none is left before. */
+/* Return the smallest α at which x − αp leaves a disc, at most `least`. */
 static double first_disc(const discs *D, const double *x, const double *p, double least)
 {
     return WITH_DIMENSION(D, first_of_each, x, p, least);
@@ -169,7 +169,7 @@ INLINE void split_each(const discs *D, int d, const double *x, const double *g,
         result[k] += sums[k];
 }
 
-/* φ and `free` on discs; adds ‖φ‖², ‖β‖² and φ̃ᵀφ to result. */
+/* Write φ and `free` on discs; add ‖φ‖², ‖β‖² and φ̃ᵀφ to result. */
 static void split_discs(const discs *D, const double *x, const double *g, double tau,
                         double *phi, double *free, double *result)
 {

@@ -56,8 +56,8 @@ def checked(M: Operator) -> Operator:
     Raises
     ------
     ValueError
-        By the function that is returned: where Mv has not the shape of v, or vᵀMv is
-        not a positive number.
+        By the returned function: if the shapes of Mv and v differ, or vᵀMv is not a
+        positive number.
 
     """
 

@@ -1,5 +1,5 @@
-# The feasible set and every operation on it that MPRGP uses. The loop itself contains no
-# bounds and no discs.
+# The feasible set and every operation on it that MPRGP uses. The loop itself refers neither
+# to bounds nor to discs.
 
 
 # Relative rounding of the norm of a disc about its centre: sixteen operations. With zero,
@@ -8,8 +8,8 @@ cdef double DISC_ROUNDING = 16 * 2.0 ** -52
 
 
 cdef struct Line:
-    double cg  # α that minimises the cost at x − αp; inf without curvature
-    double feasible  # the largest feasible α; may be inf where it is not below
+    double cg  # α that minimises the cost at x − αp; inf if pᵀHp ≤ 0
+    double feasible  # the largest feasible α; may be inf if it is not below cg
     double slope  # gᵀp
     double curvature  # pᵀHp
 
@@ -36,8 +36,8 @@ cdef class FeasibleSet:
     cdef const double *upper
     cdef const double *upper_if_any  # NULL where all are inf
     cdef Reduction over
-    cdef discs D  # count is zero without any
-    cdef object arrays  # that D points to
+    cdef discs D  # its count is zero without discs
+    cdef object arrays  # keeps the memory that D points to
 
     @staticmethod
     cdef FeasibleSet of(const double *lower, const double *upper, Py_ssize_t n, Reduction over):
@@ -113,7 +113,7 @@ cdef class FeasibleSet:
         return 0
 
     cdef double feasible_length(self, const double *x, const double *p) noexcept:
-        """Return the largest α for which x − αp is in the set; of this process."""
+        """Return the largest α for which the components of this process stay in the set."""
         cdef double least = INFINITY
         cdef Py_ssize_t i, o, size
         if not self.D.count:
@@ -193,7 +193,7 @@ cdef class FeasibleSet:
         return self.over.add(&parts.phi_square, 4)
 
     cdef void chop(self, const double *x, const double *g, double *beta) noexcept:
-        """beta ← β, the part of g on the boundary that points into the box."""
+        """beta ← β, the part of g on the boundary that points into the set."""
         cdef Py_ssize_t i
         for i in range(self.n):
             beta[i] = 0.0
@@ -228,7 +228,7 @@ cdef class FeasibleSet:
 
     cdef double step_back(self, const double *x, const double *g, double tau, double *s,
                           double *square) noexcept:
-        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs. On one process."""
+        """s ← x − P(x − g/τ), square ← ‖s‖²; returns gᵀs. Only for one process."""
         cdef double sums[2]
         cdef Py_ssize_t i, j, first, last
         sums[:] = [0.0, 0.0]

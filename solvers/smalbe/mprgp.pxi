@@ -52,7 +52,7 @@ cdef double LONG_STEP = 0.5
 
 
 # Factor of Γ² for spectral steps, which decrease φ as well as β. Over Mindlin's problem
-# with 60 to 1468 discs 0.01 and 1 take 5 % more products in the mean.
+# with 60 to 1468 discs 0.01 and 1 take 5 % more products on average.
 cdef double SPECTRAL_GAMMA = 0.1
 
 EXPANSIONS = {
@@ -352,7 +352,7 @@ cdef class MPRGP:
             self.record_step(letter, trace, note)
 
     cdef int settle(self) except -1:
-        """Begin CG anew on this face if the factor has components besides."""
+        """Restart CG on this face if the factor also covers other components."""
         if self.factor.idle:
             self.factor.enter(self.free)
             memcpy(self.p, self.preconditioned_gradient(), self.n * sizeof(double))

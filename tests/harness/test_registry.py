@@ -253,7 +253,9 @@ def test_a_plugin_that_is_missing_or_no_python_file_is_refused(tmp_path):
 
     with pytest.raises(InputError, match=r"gone\.py: no such file; expected a Python"):
         load_plugin(tmp_path / "gone.py")
-    with pytest.raises(InputError, match=r"plug\.txt: no Python file; its name must"):
+    with pytest.raises(
+        InputError, match=r"plug\.txt: not a Python file; its name must"
+    ):
         load_plugin(text)
 
 

@@ -1,1 +1,1 @@
-"""Contact of faces with nodes and faces in space."""
+"""Contact in space between faces and nodes, and between faces."""

@@ -4,7 +4,7 @@ As in the plane (`problems.contact.node_to_segment`), each slave node stays on t
 side of the master: with its closest point x_c = Σ N_a x_a on the master faces and the
 outward normal n there, B u ≤ c with B = [−n at s, +N_a n at a] and c = g + B u^k.
 
-The closest point is that of the triangles of the faces
+The closest point is sought on the triangles of the faces
 (`problems.contact.space.triangles`). n is the normal of the face; at an edge or a
 corner where several faces meet, it is their averaged normal.
 """
@@ -116,8 +116,8 @@ def closest_points(x: Points, faces: FaceTriangles) -> ClosestPoints:
 def closest_in_triangles(x: Points, triangle: Points) -> NDArray[np.float64]:
     """Return barycentric coordinates (p, 3) of the closest points of x (p, 3).
 
-    Either the foot of the perpendicular, if it is inside, or the closest point of the
-    nearest edge.
+    The closest point is the foot of the perpendicular if this is inside the triangle,
+    and otherwise the closest point of the nearest edge.
 
     triangle : (p, 3, 3) vertices
     """

@@ -1,9 +1,9 @@
 """Faces of contact sides in space, divided into triangles.
 
 A quadrilateral face is four triangles about the mean of its corners. Its shape
-functions are linear on each of them, with the value ¼ at the centre. So the surface is
-continuous, and integrals over overlaps of two sides are exact. The integrals ∫N_j over
-plane faces are those of the bilinear functions.
+functions are linear on each of them, with the value ¼ at the centre. Thus the surface
+is continuous, and integrals over overlaps of two sides are exact. On plane faces, the
+integrals ∫N_j equal those of the bilinear functions.
 """
 
 from __future__ import annotations

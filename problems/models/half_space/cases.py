@@ -9,14 +9,14 @@ forces on cells, and F their influence (`influence`).
 * law=mindlin: min ½λᵀFλ − δᵀλ over ‖λ_i‖ ≤ μp_i h² with Hertz's exact pressure p_i at
   the centres of the cells in contact, r < a, and the displacement δ along x of
   Cattaneo and Mindlin's solution. Normal and tangential problem are decoupled, so that
-  Coulomb's fixed point is reached in one step
+  one fixed-point step solves Coulomb's law
 * law=hertz with friction=coulomb: the same with the solution λ_n of the normal problem,
   ‖λ_i‖ ≤ μλ_n,i; with friction=tresca, ‖λ_i‖ ≤ bound·h² in r < a
 
 Lengths are in units of a, forces of F₀: P in the normal direction, μP or bound·πa² in
 the tangential one; displacements are in units of F₀/(πE*a) and F₀/(πGa). Hertz's gap is
 then 3π/4·(r²/2 − 1), and δ = 3π/8·(2 − ν)(1 − (c/a)²). A rigid disc that sticks under Q
-moves by π/4·(2 − ν)Q, which is δ for Tresca's law.
+moves by π/4·(2 − ν)Q; this is the prescribed δ for Tresca's law.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ from mortarbench.problems.models.half_space.point_contact import (
 from mortarbench.problems.models.half_space.rough_surface import rough_surface
 
 CONTACT_SHARE = 0.9  #: contact radius over half the side of the grid
-#: the same for rough spheres, which also touch beyond that radius; with 0.9 and the
-#: default roughness, contact reached the border for 6 of 8 seeds, with 0.6 for none
+#: the same for rough spheres, which also touch beyond this radius; with 0.9 and the
+#: default roughness, contact reached the border for 6 of 8 seeds, with 0.6 for none of
+#: them
 ROUGH_SHARE = 0.6
 SIDE = "sphere on sphere"
 YOUNG = 200e9  #: modulus of both spheres, Pa
@@ -137,7 +138,8 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
         """Evaluate radius, force and pressure; compare smooth spheres with Hertz.
 
         contact_radius: of a disc with the area of the cells in contact. energy: elastic
-        energy, J; exactly 2/5·P·approach. Errors are relative, that of p in l².
+        energy, J; exactly 2/5·P·approach. Errors are relative, that of p in the l²
+        norm.
         """
         p, hertz = s.x * exact.P / area, exact.pressure(exact.a * cells.r)
         active = int((s.x > ACTIVE_THRESHOLD * s.x.max(initial=0.0)).sum())
@@ -236,8 +238,8 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
 
         Radii are those of discs with the area of the cells; c_over_a is the stick
         radius over the exact contact radius. energy: elastic energy, J. dissipation:
-        Σ bound·|slip|, J. Errors are relative, that of q in l² of the centres; the
-        exact solution is one for nu = 0 only.
+        Σ bound·|slip|, J. Errors are relative, that of q in the l² norm over
+        the centres. The reference is exact only for nu = 0.
         """
         force, slip = s.x.reshape(k, 2), slipping(s)
         stick_radius = cells.radius_of(int((~slip).sum()))
@@ -309,5 +311,5 @@ def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
 
 
 def _distance(got: NDArray[np.float64], exact: NDArray[np.float64]) -> float:
-    """Return the relative l² distance."""
+    """Return the relative distance in the l² norm."""
     return float(np.linalg.norm(got - exact) / np.linalg.norm(exact))

@@ -16,9 +16,10 @@ Since both are of one material, normal forces cause no relative tangential displ
 and tangential forces no normal one. The antiderivatives are Y ln(X + r) for I_xx,
 X ln(Y + r) for I_yy and −r for I_xy (Love 1929).
 
-The entries depend on the distance of two cells only. So F is a principal submatrix of
-the circulant C of a periodic grid of more than twice the size, which FFTs diagonalise:
-Fx = RᵀCRx, where R extends x by zeros. Hence λ_min(F) ≥ λ_min(C); docs/mathematics.md.
+Entries depend only on the distance of two cells. Therefore F is a principal submatrix
+of the circulant C of a periodic grid of more than twice the size, which FFTs
+diagonalise: Fx = RᵀCRx, where R extends x by zeros. Hence λ_min(F) ≥ λ_min(C); see
+docs/mathematics.md.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
     r = np.hypot(X, Y)
 
     def log_sum(a: Array, b: Array) -> Array:
-        # a + r cancels for a < 0, where it is b²/(r − a)
+        # for a < 0, a + r = b²/(r − a) avoids cancellation
         safe = 2 * np.log(np.abs(b)) - np.log(r + np.abs(a))
         return np.asarray(np.where(a < 0, safe, np.log(r + np.abs(a))))
 
@@ -91,8 +92,8 @@ class Influence:
         m0, m1 = int(i.max()) + 1, int(j.max()) + 1
         M0 = scipy.fft.next_fast_len(2 * m0 - 1, real=True)
         M1 = scipy.fft.next_fast_len(2 * m1 - 1)
-        # an odd length of rows, as transforms along columns whose distance is a power
-        # of two take half as long again: they compete for places in the cache
+        # odd row length: at a distance that is a power of two, entries of a column
+        # compete for cache lines, and transforms along columns take 1.5 times as long
         m1 |= 1
         self._period = M0, M1
         kernels = _kernels(cell_integrals(M0 // 2 + 1, M1 // 2 + 1), self._period, nu)
@@ -113,8 +114,8 @@ class Influence:
         for c in range(components):
             grid[c].reshape(-1)[self._places] = force[:, c]
         U = scipy.fft.rfft(grid, n=M0, axis=1)
-        # along y in strips that stay in cache; half of each row is zero before, and
-        # half is not needed afterwards
+        # along y in strips that stay in cache; half of each row is zero on input, and
+        # half of the output is not needed
         height = min(max(_STRIP_BYTES // (16 * components * M1), 1), U.shape[1])
         strip = np.empty((components, height, M1), dtype=complex)
         for start in range(0, U.shape[1], height):
@@ -161,7 +162,7 @@ class Influence:
 class NormalInfluence(Influence):
     """The product for normal forces, with a preconditioner.
 
-    Shear is left out: on discs, where CG steps are few, M saves no products.
+    Shear has no preconditioner: with discs, CG steps are few and M saves no products.
     """
 
     def __init__(self, cells: NDArray[Any], h: float) -> None:
@@ -211,7 +212,7 @@ def _kernels(
 
 
 def _extended(quadrant: Array, period: tuple[int, int], *, odd: bool = False) -> Array:
-    """Extend a function that is even, or odd in x and in y, from one quadrant."""
+    """Extend a function from one quadrant; it is even, or odd in both x and y."""
     lag_0, lag_1 = (np.arange(M) - M * (np.arange(M) > M // 2) for M in period)
     function: Array = quadrant[np.abs(lag_0)[:, None], np.abs(lag_1)]
     if odd:

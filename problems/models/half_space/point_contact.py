@@ -14,8 +14,8 @@ c ≤ r ≤ a slip while r < c sticks (Cattaneo 1938; Mindlin 1949; Johnson, 7.2
 
 where square roots of negative numbers count as zero, q acts along Q, and δ is the
 tangential displacement of distant points. This is exact for ν = 0. For ν > 0 slip is
-not quite parallel to q, and small transverse tractions, which the theory omits, correct
-it.
+not quite parallel to q; the theory omits the small transverse tractions that would
+restore this.
 """
 
 from __future__ import annotations

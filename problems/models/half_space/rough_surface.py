@@ -1,7 +1,7 @@
 """Heights of a self-affine surface, reproducible from a seed.
 
-The surface is a sum of waves in a square of side L, with all wave vectors 2πk/L of
-integers k = (i, j) between two lengths,
+The surface is a sum of waves in a square of side L, with all wave vectors 2πk/L for
+integers k = (i, j) whose length is between two limits,
 
     z(x) = Σ A_k cos(2πk·x/L + φ_k),    A_k ∝ |k|^−(1 + H),    LONGEST ≤ |k| ≤ SHORTEST
 
@@ -9,11 +9,11 @@ so that the power spectral density falls like |k|^−2(1 + H) with the Hurst exp
 (Persson et al. 2005, J. Phys.: Condens. Matter 17, R1). The amplitudes are exact, the
 phases φ_k random; the surface does not depend on the grid at which it is evaluated.
 
-Digits for a seed are the same on every machine and with every version of NumPy, but for
-very rare exceptions. Phases are from `random.Random.random`, whose sequence for a seed
-Python guarantees. Sums of cosines may differ in their last bits, so heights are rounded
-to 2⁻²⁰ of their root mean square: of 10⁹ heights, few are close enough to the middle
-between two such values.
+For a given seed, heights are identical on every machine and with every version of
+NumPy, with very rare exceptions. Phases are from `random.Random.random`, whose sequence
+for a seed Python guarantees. Sums of cosines may differ in their last bits, so heights
+are rounded to 2⁻²⁰ of their root mean square: of 10⁹ heights, about one is so close to
+the middle between two such values that it may be rounded the other way.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from mortarbench.harness import Vector
 
-#: Waves in L of the longest and the shortest component. A grid of 64 × 64 cells has two
-#: cells in the shortest.
+#: Number of waves along L of the longest and the shortest component. On 64 × 64 cells
+#: the shortest wave spans two cells.
 LONGEST, SHORTEST = 2, 32
 _DIGITS = 2.0**20  #: heights are multiples of rms/_DIGITS
 
@@ -34,7 +34,7 @@ _DIGITS = 2.0**20  #: heights are multiples of rms/_DIGITS
 def rough_surface(x: Vector, hurst: float, seed: int) -> NDArray[np.float64]:
     """Return heights (n, n) at the points (xᵢ, xⱼ), with a root mean square of one.
 
-    That is the mean over the whole square.
+    The mean is over the whole square.
 
     x : (n,) coordinates in L
     """

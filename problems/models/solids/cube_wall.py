@@ -1,8 +1,8 @@
 """A cube of hexahedra beside a rigid wall: PERMON's example of contact in space.
 
-The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and pressed down by
-465 Pa on its top. It bulges, and on x = 1 the wall leaves it u_x ≤ 1 mm. Contact rows
-are simple bounds, so that nothing is linearised. The nodes that are clamped have none.
+The unit cube with E = 2e4 Pa and ν = 0.33 is clamped on z = 0 and pressed down by 465
+Pa on its top. It bulges towards the wall, which requires u_x ≤ 1 mm on x = 1. Contact
+rows are simple bounds and need no linearisation. Clamped nodes have no row.
 """
 
 from __future__ import annotations

@@ -2,14 +2,15 @@
 
 The body is the part of the sphere around the contact, a quarter of a block of half
 width and height EXTENT·a with the sphere as its lower side. The planes x = 0 and y = 0
-are planes of symmetry. On its other sides act the tractions of a point force P at the
-origin on a half space (Boussinesq; Johnson 1985, Section 3.2), to which those of
-Hertz's pressure decay like (a/ρ)². A finite sphere would not do: its own compression,
-which the theory neglects, is of order a/R, 6 % of the approach at a/R = 0.08.
+are planes of symmetry. The tractions on its other sides are those of a point force P at
+the origin of a half-space (Boussinesq; Johnson 1985, Section 3.2), from which those of
+Hertz's pressure differ by O((a/ρ)²), relatively. A whole sphere is not suitable: its
+overall compression, which the theory neglects, is of order a/R, 6 % of the approach at
+0.08.
 
-Contact alone supports the body, so that the form ``dual-bounds`` does not exist. The
-displacement far away is that of the half space minus the approach δ of distant points,
-which is measured at the top.
+The body is supported by contact alone, so that the form ``dual-bounds`` does not exist.
+The displacement far from the contact is that of the half-space minus the approach δ of
+distant points, which is measured at the top.
 
 Errors at R = 8, E = 200, ν = 0.3, P = 10: 0.1 % in a and p₀ and 0.3 % in δ with 8 cells
 per a.

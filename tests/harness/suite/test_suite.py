@@ -251,7 +251,7 @@ def test_mistakes_are_reported_with_file_place_and_remedy(
             "{ name = 'osqp', label = 'b', options = 3 }",
             "solvers[1]: options = 3; expe",
         ),
-        ("'osqp'", "solvers[1]: label 'osqp' is used twice; expected a label of its o"),
+        ("'osqp'", "solvers[1]: label 'osqp' is used twice; expected different labels"),
         (
             "{ name = 'clarabel', options = { max_itr = 9 } }",
             "solvers[1]: clarabel: unknown option 'max_itr'; did you mean 'max_iter'?",
