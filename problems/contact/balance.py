@@ -38,9 +38,9 @@ class _BodyMotion(NamedTuple):
     name: str
     centre: Floats  #: (dim,) of its nodes, m
     velocity: Floats  #: (dim,) of the centre
-    rotation: (
-        float  #: anticlockwise, as the velocity at distance `size` from the centre
-    )
+    #: (1,) in the plane, (3,) in space, as of `rigid_motions`: velocities at the
+    #: distance `size` from the centre
+    rotation: Floats
 
 
 def is_determined(bodies: UnassembledBodies, rows: Matrix) -> bool:
@@ -92,7 +92,7 @@ def check_balance(bodies: UnassembledBodies, B: Matrix) -> None:
         return
     parts = motion.reshape(-1, modes)
     moving = [
-        _BodyMotion(name, centre, part[:dim], float(part[dim]))
+        _BodyMotion(name, centre, part[:dim], part[dim:])
         for name, centre, part in zip(bodies.names, centres, parts, strict=True)
         if np.abs(part).max() > _MIN_MOTION * np.abs(parts).max()
     ]
@@ -191,10 +191,10 @@ def _unbalanced_load(load: Floats, closing: Floats) -> Floats:
 
 def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
     """Return the message about an unbalanced force or moment."""
-    turning = max(moving, key=lambda body: abs(body.rotation))
+    turning = max(moving, key=lambda body: float(np.abs(body.rotation).max()))
     sliding = max(moving, key=lambda body: float(np.abs(body.velocity).max()))
     most = float(np.abs(sliding.velocity).max())
-    if abs(turning.rotation) <= _MIN_MOTION * most:
+    if np.abs(turning.rotation).max() <= _MIN_MOTION * most:
         axes = [
             axis
             for axis, v in zip(_AXES, sliding.velocity, strict=False)
@@ -203,11 +203,23 @@ def _imbalance_message(moving: list[_BodyMotion], size: float) -> str:
         names = [body.name for body in moving]
         whose = "its" if len(names) == 1 else "their"
         return _message(names, f"{whose} load in {' and '.join(axes)}")
-    (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.rotation
-    return _message(  # the centre of rotation is the point without velocity
+    return _message(
         [turning.name],
-        f"the moment of its load: it can turn about ({x - vy:.4g}, {y + vx:.4g}) m",
+        f"the moment of its load: it can turn about {_pivot(turning, size)}",
     )
+
+
+def _pivot(turning: _BodyMotion, size: float) -> str:
+    """Return the points that a rotation leaves in place, or moves along its axis."""
+    if turning.rotation.size == 1:
+        (x, y), (vx, vy) = turning.centre, turning.velocity * size / turning.rotation
+        return f"({x - vy:.4g}, {y + vx:.4g}) m"
+    about_z, about_minus_y, about_x = turning.rotation
+    axis = np.array([about_x, -about_minus_y, about_z])
+    at = turning.centre + size * np.cross(axis, turning.velocity) / (axis @ axis)
+    along = np.round(axis / np.linalg.norm(axis), 3) + 0.0  # no negative zeros
+    point, direction = (", ".join(f"{x:.4g}" for x in v) for v in (at, along))
+    return f"the axis through ({point}) m along ({direction})"
 
 
 def _message(names: list[str], what: str) -> str:

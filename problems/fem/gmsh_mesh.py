@@ -36,7 +36,7 @@ _MIRRORED = {
     "hexahedron": [4, 5, 6, 7, 0, 1, 2, 3],
 }  # fmt: skip
 #: name of bodies by dimension, and of their boundaries
-_BODY, _BOUNDARY = {2: "surface", 3: "volume"}, {2: "curve", 3: "surface"}
+BODY, BOUNDARY = {2: "surface", 3: "volume"}, {2: "curve", 3: "surface"}
 _SAVED = "only physical groups: Mesh.SaveAll = 0"
 
 
@@ -50,6 +50,11 @@ class NamedMesh(NamedTuple):
     #: each physical surface, faces (k, 4), anticlockwise from outside
     curves: Mapping[str, Nodes]
     spots: Mapping[str, Nodes]  #: nodes of each physical point, in space also curve
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the bodies."""
+        return int(self.points.shape[1])
 
 
 def read_msh(path: Path) -> NamedMesh:
@@ -88,7 +93,7 @@ def read_msh(path: Path) -> NamedMesh:
     parts = _named(path, mesh, dim)
     if not parts:
         raise InputError(
-            f"{path}: no named {_BODY[dim]} with cells; expected {_group(dim)}"
+            f"{path}: no named {BODY[dim]} with cells; expected {_group(dim)}"
         )
     used = _unique_in_order([np.unique(part) for part in parts.values()])
     renumbered = np.full(len(points), -1)
@@ -324,14 +329,14 @@ def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
         more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
         raise InputError(
             f"{path}: {len(nameless)} cells without a name; expected each in a named "
-            f"{_BODY[dim]}: {_group(dim)}{more}"
+            f"{BODY[dim]}: {_group(dim)}{more}"
         )
     return {name: np.concatenate(parts) for name, parts in cells.items()}
 
 
 def _group(dim: int) -> str:
     """Return the line of a .geo file that names a body."""
-    return f'Physical {_BODY[dim].capitalize()}("NAME") in the .geo file'
+    return f'Physical {BODY[dim].capitalize()}("NAME") in the .geo file'
 
 
 def _unique_in_order(parts: list[Nodes]) -> Nodes:
@@ -408,7 +413,7 @@ def _check_apart(
         if (count := np.unique(part[owner == i]).size) > 1:
             raise InputError(
                 f"{path}: body {name!r} falls into {count} parts; expected a physical "
-                f"{_BODY[dim]} for each"
+                f"{BODY[dim]} for each"
             )
 
 
@@ -416,11 +421,11 @@ def _directed(
     path: Path, name: str, facets: Nodes, boundary: Mapping[Any, list[int]], dim: int
 ) -> Nodes:
     """Return the facets of a boundary, directed so that the body is on the left."""
-    where, facet = f"{_BOUNDARY[dim]} {name!r}", "an edge" if dim == 2 else "a face"
+    where, facet = f"{BOUNDARY[dim]} {name!r}", "an edge" if dim == 2 else "a face"
     if (facets < 0).any():
         raise InputError(
             f"{path}: {where} has {facet} that bounds no body in the file: gmsh leaves "
-            f"out {_BODY[dim]}s without a physical name; expected {_group(dim)}"
+            f"out {BODY[dim]}s without a physical name; expected {_group(dim)}"
         )
     names = [tuple(sorted(set(facet))) for facet in facets.tolist()]
     if not all(name in boundary for name in names):

@@ -37,6 +37,11 @@
 Whatever the length unit of the mesh is, this file and all results are in SI units: E
 and tractions in Pa, forces in N/m, units.length in m.
 
+If the mesh has physical volumes, these are the bodies, and boundaries are physical
+surfaces. Vectors then have three components, forces are in N, and a force on a boundary
+is spread evenly over its area; `point` is a physical point or curve, whose nodes share
+a force equally. Friction, finite strain and ``plane = "stress"`` are refused there.
+
 The keys between mesh and units are optional, with the values above as defaults. Bodies
 that contact alone supports have no form dual-bounds and need, with linear kinematics,
 ``steps = 1``. The default of units.length is the longer side of the bounding box of the
@@ -65,8 +70,14 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh, refine
-from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of
+from mortarbench.problems.fem.gmsh_mesh import (
+    BODY,
+    BOUNDARY,
+    NamedMesh,
+    read_msh,
+    refine,
+)
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
     LAW_PARAMETERS,
@@ -82,7 +93,7 @@ from mortarbench.problems.ranges import (
 _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
-_AXES = ("x", "y")
+_AXES = ("x", "y", "z")
 #: units of length by name, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -147,12 +158,13 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     table = read_description(path)
     mesh_path = path.parent / table["mesh"]
     named = read_msh(mesh_path)
-    if named.points.shape[1] > 2:
+    if named.dim == 3 and halvings:
         raise InputError(
-            f"{mesh_path}: volumes; bodies: in space is not built; expected plane "
-            "bodies, gmsh -2"
+            f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
+            "halvings=0, and a finer mesh from gmsh"
         )
-    check_memory(str(path), 2 * len(named.cells) * 4**halvings)  # before refining
+    refined = 2 * len(named.cells) * 4**halvings  # checked before refining
+    check_memory(str(path), refined if named.dim == 2 else named.points.size)
     for _ in range(halvings):
         named = refine(named)
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
@@ -172,9 +184,10 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     mesh = Mesh(named.points, named.cells, {})
     return UnassembledBodies(
         mesh=mesh, body=body, names=tuple(named.surfaces),
-        materials=tuple(materials[name] for name in named.surfaces), plane=plane,
-        length=length, force=force, f=load.ravel() / force,
-        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))), pairs=tuple(pairs),
+        materials=tuple(materials[name] for name in named.surfaces),
+        plane=plane if named.dim == 2 else None, length=length, force=force,
+        f=load.ravel() / force, pairs=tuple(pairs),
+        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))),
     )  # fmt: skip
 
 
@@ -218,7 +231,7 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
 
     def read(entry: dict[str, Any]) -> None:
         _keys(entry, ("name", "E", "nu"))
-        name = _one_of(named.surfaces, "physical surface", entry, "name")
+        name = _one_of(named.surfaces, f"physical {BODY[named.dim]}", entry, "name")
         if name in materials:
             raise InputError(f"body {name!r} is described twice; expected once")
         E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
@@ -228,7 +241,9 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
 
     _each({"bodies": entries}, "bodies", read)
     if missing := [name for name in named.surfaces if name not in materials]:
-        raise InputError(f"bodies: physical surface {missing[0]!r} has no entry")
+        raise InputError(
+            f"bodies: physical {BODY[named.dim]} {missing[0]!r} has no entry"
+        )
     return materials
 
 
@@ -237,27 +252,34 @@ def _support(entry: dict[str, Any], named: NamedMesh) -> Nodes:
     checked.only_keys(entry, (*_PLACES, "fix"))
     nodes, _ = _place(entry, named, ("fix",))
     fix = checked.filled_list("fix", entry["fix"])
+    axes = _AXES[: named.dim]
     for component in fix:
-        if component not in _AXES:
-            raise unknown("component", checked.text("fix", component), _AXES)
-    return np.concatenate([dofs_of(nodes, len(_AXES), _AXES.index(c)) for c in fix])
+        if component not in axes:
+            raise unknown("component", checked.text("fix", component), axes)
+    return np.concatenate([dofs_of(nodes, named.dim, axes.index(c)) for c in fix])
 
 
 def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
-    """Return the nodal forces (N, 2) of a load, N/m."""
+    """Return the nodal forces (N, dim) of a load: N/m in the plane, N in space."""
     checked.only_keys(entry, (*_PLACES, *_LOADS))
     kinds = [kind for kind in _LOADS if kind in entry]
+    form = f"[{', '.join(_AXES[: named.dim])}]"
     if len(kinds) != 1:
-        raise InputError("expected either force or traction, [x, y]")
+        raise InputError(f"expected either force or traction, {form}")
     vector = checked.filled_list(kinds[0], entry[kinds[0]])
-    if len(vector) != len(_AXES) or not all(map(checked.is_number, vector)):
-        raise InputError(f"{kinds[0]} = {shown(vector)}; expected two numbers, [x, y]")
+    if len(vector) != named.dim or not all(map(checked.is_number, vector)):
+        count = {2: "two", 3: "three"}[named.dim]
+        raise InputError(
+            f"{kinds[0]} = {shown(vector)}; expected {count} numbers, {form}"
+        )
     vector = [physical(kinds[0], component) for component in vector]
-    nodes, edges = _place(entry, named, tuple(kinds))
+    nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
-    if edges.size:  # ∫N over the boundary, m
-        lengths = np.linalg.norm(np.diff(named.points[edges], axis=1)[:, 0], axis=1)
-        np.add.at(weights, edges, lengths[:, None] / 2)
+    if facets.size and named.dim == 3:  # ∫N over the boundary, m²
+        nodes, weights[nodes] = nodal_areas(named.points, facets)
+    elif facets.size:  # in the plane, m
+        lengths = np.linalg.norm(np.diff(named.points[facets], axis=1)[:, 0], axis=1)
+        np.add.at(weights, facets, lengths[:, None] / 2)
     elif kinds == ["traction"]:
         raise InputError("traction acts on a point; expected a boundary, or force")
     else:
@@ -274,10 +296,10 @@ def _check_loads_act(
 ) -> None:
     """Raise InputError for loads that act on prescribed displacements only."""
     for i, (entry, load) in enumerate(zip(entries, loads, strict=True)):
-        without_effect = []
-        for axis, name in enumerate(_AXES):
+        without_effect, dim = [], load.shape[1]
+        for axis, name in enumerate(_AXES[:dim]):
             at = np.flatnonzero(load[:, axis])
-            if at.size and np.isin(dofs_of(at, len(_AXES), axis), fixed).all():
+            if at.size and np.isin(dofs_of(at, dim, axis), fixed).all():
                 without_effect.append(name)
         if without_effect:
             where = entry.get("boundary", entry.get("point"))
@@ -343,8 +365,9 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
     _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
     for side in _SIDES:
-        name = _one_of(named.curves, "physical curve", entry, side)
-        sides[side] = _chain(f"{side} {name!r}", named.curves[name])
+        name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, side)
+        facets = named.curves[name]
+        sides[side] = _chain(f"{side} {name!r}", facets) if named.dim == 2 else facets
     if np.intersect1d(sides["slave"], sides["master"]).size:
         raise InputError("slave and master share nodes; expected sides that are apart")
     return ContactPair(**sides)
@@ -398,17 +421,18 @@ def _units(
 def _place(
     entry: dict[str, Any], named: NamedMesh, others: tuple[str, ...]
 ) -> tuple[Nodes, Nodes]:
-    """Return the nodes of an entry's boundary or point, and the boundary's edges."""
+    """Return the nodes of an entry's boundary or point, and the boundary's facets."""
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
         raise InputError("expected either boundary or point, a physical name")
     _keys(entry, (*where, *others))
     if where == ["point"]:
-        name = _one_of(named.spots, "physical point", entry, "point")
+        what = "physical point" if named.dim == 2 else "physical point or curve"
+        name = _one_of(named.spots, what, entry, "point")
         return named.spots[name], np.zeros((0, 2), dtype=np.int64)
-    name = _one_of(named.curves, "physical curve", entry, "boundary")
-    edges = named.curves[name]
-    return np.unique(edges), edges
+    name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, "boundary")
+    facets = named.curves[name]
+    return np.unique(facets), facets
 
 
 def _one_of(

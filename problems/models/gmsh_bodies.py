@@ -34,6 +34,7 @@ from mortarbench.problems.models.description import (
     read_bodies,
     read_description,
 )
+from mortarbench.problems.ranges import check_plane_only
 
 #: largest angle between edges of a straight side, from rounded coordinates
 MAX_STRAIGHT_ANGLE = 1e-6
@@ -73,6 +74,7 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 def _problem(params: Mapping[str, Value]) -> ContactProblem:
     p: Any = params
     elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
+    check_dimension(elastic, p)
     laws = laws_of(p)
     stages = load_steps(
         p["steps"], p["relin"], elastic.forces, elastic.fixed, laws,
@@ -105,11 +107,25 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
                 "friction of a contact with kinematics=finite is not built; expected "
                 "no friction, or kinematics=linear"
             )
+        check_dimension(bodies(*source), p)
         path = _newton_path(
             source, (p["contact"], p["basis"]), p["steps"], p["material"],
             p["contact_stiffness"], reference,
         )  # fmt: skip
         return newton_case(path, form, p["step"], p["newton"])
+
+
+def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
+    """Raise InputError for bodies in space with keys that only plane bodies support."""
+    if elastic.shape.dim == 2:
+        return
+    check_plane_only("bodies", params, "volumes")
+    for i, law in enumerate(laws_of(params)):
+        if law.kind != "none":
+            raise InputError(
+                f"{params['path']}: contacts[{i}]: friction {law.kind!r} with volumes "
+                "is not built; expected no friction, or a plane problem"
+            )
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:

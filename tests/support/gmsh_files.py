@@ -17,12 +17,35 @@ def msh22(points, quads, curves, spots, quad_type=3):
             for cell in cells:
                 nodes = " ".join(str(n + 1) for n in cell)
                 rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
+    return text22(points, groups, rows)
+
+
+def text22(points, groups, rows):
+    """Return the text of a file with physical names, nodes (N, 3) and cells."""
     nodes = [f"{i} {x!r} {y!r} {z!r}" for i, (x, y, z) in enumerate(points.tolist(), 1)]
     blocks = {"PhysicalNames": groups, "Nodes": nodes, "Elements": rows}
     text = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n"
     for name, lines in blocks.items():
         text += "\n".join([f"${name}", str(len(lines)), *lines, f"$End{name}", ""])
     return text
+
+
+#: gmsh's types of cells and faces by their number of corners
+_SOLIDS, _FACES = {4: 4, 6: 6, 8: 5}, {3: 2, 4: 3}
+
+
+def solids22(points, bodies, faces):
+    """Write ASCII 2.2 with bodies of cells and boundaries of faces in space."""
+    groups, rows, tag = [], [], 0
+    for dimension, kinds, named in ((3, _SOLIDS, bodies), (2, _FACES, faces)):
+        for name, cells in named.items():
+            tag += 1
+            groups.append(f'{dimension} {tag} "{name}"')
+            for cell in cells:
+                nodes = " ".join(str(n + 1) for n in dict.fromkeys(cell))
+                kind = kinds[len(set(cell))]
+                rows.append(f"{len(rows) + 1} {kind} 2 {tag} {tag} {nodes}")
+    return text22(points, groups, rows)
 
 
 def square(n=2, at=(0.0, 0.0)):

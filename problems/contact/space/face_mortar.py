@@ -180,7 +180,7 @@ def _facing(
     near = slave.radius + master.radius.max()
     limit = _max_distance(slave, master, reach) + near
     e: list[Nodes] = []
-    m: list[Nodes] = []
+    m: list[Nodes] = [np.zeros(0, dtype=np.int64)]
     for sign in (1.0, -1.0):
         at, t = slave.centre.copy(), np.zeros(len(near))
         moves = np.ones(len(near), dtype=bool)
@@ -189,13 +189,13 @@ def _facing(
             step = np.where(d > CLOSE * near[moves], d - near[moves], 0.0)
             t[moves] += step
             at[moves] += (sign * step)[:, None] * slave.surface.normal[moves]
-            moves[moves] = (step > 0) & (t[moves] <= limit)
+            moves[moves] = (step > 0) & (t[moves] <= limit[moves])
             if not moves.any():
                 break
         # where the first way ended at its start, both ways find the same faces
         start = np.flatnonzero(~moves & (t <= limit) & ((sign > 0) | (t > 0)))
         found = tree.query_ball_point(at[start], MAX_SPREAD * near[start])
-        e.append(np.repeat(start, [len(k) for k in found]))
+        e.append(np.repeat(start, np.array([len(k) for k in found], dtype=int)))
         m.extend(np.asarray(k, dtype=np.int64) for k in found)
     pairs = np.unique(np.stack([np.concatenate(e), np.concatenate(m)]), axis=1)
     offset = master.centre[pairs[1]] - slave.centre[pairs[0]]
@@ -310,8 +310,8 @@ def clip(subject: Points, window: Points) -> tuple[Points, Nodes]:
         t = d / np.where(crosses, d - d_end, 1.0)
         crossing = polygon + t[..., None] * (end - polygon)
         # each corner is followed by the crossing of its edge
-        emitted = np.stack([inside, crosses], axis=2).reshape(p, -1)
-        corners = np.stack([polygon, crossing], axis=2).reshape(p, -1, 2)
+        emitted = np.stack([inside, crosses], axis=2).reshape(p, 2 * slot.size)
+        corners = np.stack([polygon, crossing], axis=2).reshape(*emitted.shape, 2)
         place = np.cumsum(emitted, axis=1) - 1
         count = emitted.sum(axis=1)
         i, j = np.nonzero(emitted)

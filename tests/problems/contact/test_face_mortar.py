@@ -244,6 +244,27 @@ def test_the_overlaps_cover_the_common_part_exactly_once():
     assert (at.area > -1e-12).all()
 
 
+def test_faces_of_a_side_are_searched_as_each_alone():
+    """The side is steep: some faces meet the other side after few steps, some later."""
+    points, slave, master = stacked(
+        grid((8, 8), 0.0, kind="quad", up=True),
+        grid((6, 6), 0.0, kind="triangle", up=False),
+        gap=0.02,
+    )
+    upper = np.unique(slave)
+    points[upper, 2] += 0.8 * points[upper, 0] ** 3
+    u = np.zeros(points.size)
+    other = triangulated(current_surface(points, u, master, "master"))
+
+    def found(faces):
+        own = triangulated(current_surface(points, u, faces, "slave"))
+        return overlaps(own, other, Reach()).area.sum()
+
+    alone = [found(slave[[k]]) for k in range(len(slave))]
+    assert found(slave) == pytest.approx(sum(alone), rel=1e-12)
+    assert np.count_nonzero(alone) > len(slave) / 2
+
+
 def test_a_face_without_area_is_refused():
     points = np.array(
         [[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]]

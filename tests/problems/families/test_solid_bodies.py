@@ -1,0 +1,181 @@
+"""Bodies in space from gmsh files, compared with exact solutions and cut bodies."""
+
+import meshio
+import numpy as np
+import pytest
+
+from mortarbench.cli.main import main
+from mortarbench.harness import InputError
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.models.description import read_bodies
+from mortarbench.registries import Registries
+from mortarbench.solvers import SOLVERS
+from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.hexahedra import TETRAHEDRA, WEDGES
+from tests.support.solid_blocks import NU, PRESSURE, TOML, E, solid_blocks
+
+KINDS = {"tetra": TETRAHEDRA, "wedge": WEDGES, "hexahedron": None}
+#: clamped at both ends, so that supports exclude all rigid motions
+HELD = """\
+mesh = "blocks.msh"
+steps = 1
+[[bodies]]
+name = "lower"
+E = 1e9
+nu = 0.3
+[[bodies]]
+name = "upper"
+E = 2e9
+nu = 0.2
+[[supports]]
+boundary = "base"
+fix = ["x", "y", "z"]
+[[supports]]
+boundary = "top"
+fix = ["z", "x", "y"]
+[[loads]]
+boundary = "left"
+traction = [2e5, 0, -1e6]
+[[contacts]]
+slave = "foot"
+master = "table"
+"""
+
+
+def build(text):
+    return parse(text, PROBLEMS).build(reference_solution)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("keys", ["primal", "dual", "basis=standard/dual"])
+def test_mortar_contact_transfers_a_uniform_pressure_exactly(tmp_path, kind, keys):
+    """u = p/E (ν x, ν y, −z) in both blocks, on interfaces that do not match."""
+    case = build(f"bodies:{solid_blocks(tmp_path, KINDS[kind])}/{keys}")
+    s = reference_solution(case.qp)
+    fields = case.fields(s)
+    exact = PRESSURE / E * fields.points * [NU, NU, -1]
+    values = case.quantities(s)
+    pair = values["contacts"]["upper on lower"]
+
+    assert abs(fields.displacement - exact).max() <= 1e-9 * abs(exact).max()
+    assert pair["force"]["upper"] == pytest.approx([0, 0, PRESSURE], abs=1e-9 * 1e6)
+    assert pair["largest_pressure"] == pytest.approx(PRESSURE, rel=1e-9)
+    # half the work of the load: area 1, the top moves by −2p/E
+    assert values["energy"] == pytest.approx(-(PRESSURE**2) / E, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["tetra", "hexahedron"])
+@pytest.mark.parametrize("contact", ["nts", "mortar"])
+def test_forms_and_subdomains_have_the_same_answer(tmp_path, kind, contact):
+    text = f"bodies:{solid_blocks(tmp_path, KINDS[kind], HELD)}/contact={contact}"
+    answers = []
+    for form in ("dual-bounds", "primal", "dual", "parts=4/dual"):
+        case = build(f"{text}/{form}")
+        if "parts" in form:  # P is an operator
+            s = SOLVERS["smalbe"].prepare(case.qp, 1e-11)()
+        else:
+            s = reference_solution(case.qp)
+        answers.append((case.fields(s), case.quantities(s)))
+    (whole, values), *others = answers
+    largest = abs(whole.displacement).max()
+
+    for fields, found in others:
+        assert found["energy"] == pytest.approx(values["energy"], rel=1e-8)
+        assert found["active"] == values["active"]
+        np.testing.assert_array_equal(fields.points, whole.points)
+        assert abs(fields.displacement - whole.displacement).max() <= 1e-7 * largest
+
+
+def test_loads_on_faces_are_spread_by_area(tmp_path):
+    """Both tetrahedra and a total force; the corners' shares differ by triangles."""
+    for load in ("traction = [3e5, -2e5, 1e6]", "force = [3e5, -2e5, 1e6]"):
+        toml = TOML.replace("traction = [0, 0, -1e6]", load)
+        whole = read_bodies(solid_blocks(tmp_path, TETRAHEDRA, toml), "strain")
+        f = whole.f.reshape(-1, 3) * whole.force
+        x = whole.mesh.points
+        loaded = np.flatnonzero(f.any(axis=1))
+
+        assert (x[loaded, 2] == 2).all()
+        assert loaded.size == 9
+        assert f.sum(axis=0) == pytest.approx([3e5, -2e5, 1e6], rel=1e-12)
+        # no moment about the centre of the face
+        arm = x - [0.5, 0.5, 2.0]
+        assert abs(np.cross(arm, f).sum(axis=0)).max() <= 1e-9 * 1e6
+        assert whole.plane is None
+
+
+def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
+    solid_blocks(tmp_path, TETRAHEDRA)
+    monkeypatch.chdir(tmp_path)
+    command = "solve bodies:blocks.toml/dual --solver smalbe --plot a.png --vtu a.vtu"
+    assert main(Registries(), command.split()) == 0
+    out = capsys.readouterr().out
+    grid = meshio.read("a.vtu")
+    pressure = grid.point_data["pressure"]
+    pressed = grid.point_data["in_contact"] == 1
+
+    assert "largest pressure 1e+06 Pa" in out
+    assert "contact force             (0, 0, -1000000) N" in out
+    assert {block.type for block in grid.cells} == {"tetra"}
+    assert pressure[pressed] == pytest.approx(PRESSURE, rel=1e-6)
+    assert (grid.points[pressed, 2] == 1).all()
+    assert (tmp_path / "a.png").stat().st_size > 10_000
+    assert "force_z_N" in (tmp_path / "a-upper-on-lower.csv").read_text()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "keys", "message"),
+    [
+        ("", "", "/friction=coulomb/mu=0.3", "friction=coulomb with volumes is not"),
+        ("", "", "/kinematics=finite", "kinematics=finite with volumes is not built"),
+        ("", "", "/plane=stress", "plane=stress with volumes is not built; expected"),
+        ("", "", "/halvings=1", "halvings=1 with volumes is not built; expected halvi"),
+        ('master = "table"', 'master = "table"\nfriction = "coulomb"\nmu = 0.3', "",
+         "contacts[0]: friction 'coulomb' with volumes is not built; expected no fric"),
+        ('name = "lower"', 'name = "lowr"', "",
+         "bodies[0]: name: unknown physical volume 'lowr'; did you mean 'lower'?"),
+        ('boundary = "base"', 'boundary = "bass"', "",
+         "supports[0]: boundary: unknown physical surface 'bass'; did you mean 'base"),
+        ('boundary = "base"', 'point = "base"', "",
+         "supports[0]: point: unknown physical point or curve 'base'"),
+        ('slave = "foot"', 'slave = "boot"', "",
+         "contacts[0]: slave: unknown physical surface 'boot'; did you mean 'foot'?"),
+        ('slave = "foot"', 'slave = "left"', "", "slave and master share nodes"),
+        ("[0, 0, -1e6]", "[0, -1e6]", "",
+         "traction = [0, -1000000.0]; expected three numbers, [x, y, z]"),
+        ('fix = ["z"]', 'fix = ["w"]', "", "unknown component 'w'; known: x, y, z"),
+        ('boundary = "top"', 'boundary = "base"', "", "acts on 'base' in z, which fix"),
+        ('fix = ["y"]', 'fix = ["x"]', "",
+         "body 'upper': nothing balances its load in y; expected a support"),
+    ],
+)  # fmt: skip
+def test_what_volumes_do_not_support_is_refused_in_one_line(
+    tmp_path, old, new, keys, message
+):
+    toml = TOML.replace(old, new) if old else TOML
+    if message.endswith("in y; expected a support"):
+        toml = toml.replace("[0, 0, -1e6]", "[0, 1e5, -1e6]")
+    with pytest.raises(InputError) as e:
+        build(f"bodies:{solid_blocks(tmp_path, TETRAHEDRA, toml)}{keys}/dual")
+
+    assert message in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_a_block_that_tips_over_an_edge_is_refused_with_its_axis(tmp_path):
+    """Its resultant acts at x = 1.25, beyond the edge x = 1 of its foot."""
+    toml = TOML.replace('boundary = "left"', 'boundary = "foot"')
+    toml = toml.replace('boundary = "front"', 'boundary = "foot"')
+    toml = toml.replace('fix = ["z"]', 'fix = ["x", "y", "z"]')
+    toml += '[[loads]]\nboundary = "left"\ntraction = [0, 0, 6e5]\n'
+    path = solid_blocks(tmp_path, toml=toml)
+    with pytest.raises(InputError) as e:
+        build(f"bodies:{path}/contact=nts/dual")
+
+    assert "body 'upper': nothing balances the moment of its load: it can turn" in (
+        str(e.value)
+    )
+    axis = str(e.value).split("it can turn about ")[1].split(";")[0]
+    assert axis.startswith("the axis through (1, ")
+    assert axis.endswith(("along (0, 1, 0)", "along (0, -1, 0)"))
