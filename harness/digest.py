@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 Digest: TypeAlias = "_Hash"  #: a SHA-256 in progress; ``update`` adds another part
 
-_PIECE_BYTES = 2**20  #: that are read at a time
+_PIECE_BYTES = 2**20  #: number of bytes that are read at a time
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:

@@ -121,9 +121,9 @@ class About:
     linear_solver: str  #: solver of its linear systems
     phases: str  #: work timed as preparing, and work timed as solving
     package: str = (
-        ""  #: to install; its module has the same name unless `module` is set
+        ""  #: package to install; its module has the same name unless `module` is set
     )
-    module: str = ""  #: to import, if its name differs
+    module: str = ""  #: name of the module to import, if it differs
     sequence: str = ""  #: work reused from one QP to the next; empty for none
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
@@ -144,7 +144,7 @@ SLIDING = "sliding without contact"
 class ContactSide:
     """Results of a contact along its slave side, node by node; SI units."""
 
-    name: str  #: of the pair of bodies, such as "disc on plate"
+    name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) along the side
     length: Vector  #: (s,) share of the undeformed side of each node, m
     force: NDArray[Any]  #: (s, dim) on each node from this contact, N/m; N in space
@@ -239,9 +239,10 @@ class Case:
 class SourceFile:
     """A file that a case is read from, identified by its content."""
 
-    path: str  #: in the name of the case
+    path: str  #: path in the name of the case
     sha256: str  #: first 12 hexadecimal digits
-    suffix: str  #: of its format, for the name of a copy; not taken from the path
+    #: suffix of the format, for the name of a copy; not taken from the path
+    suffix: str
 
 
 class Family(ABC):
@@ -274,8 +275,8 @@ class Family(ABC):
 
     name: str  #: first component of its case names
     defaults: Mapping[str, Value]  #: all keys, in the order of canonical names
-    forms: tuple[str, ...]  #: of its QPs
-    path_suffix: str | None = None  #: of its input files; see `harness.names`
+    forms: tuple[str, ...]  #: forms of the QPs
+    path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
     #: reason why refinement has no limit of finite energy; empty if it has one
     singular: str = ""
 

@@ -75,7 +75,7 @@ class Solution:
     z_box: Vector  #: (n,) of the bounds, ≤ 0 at an active lb, ≥ 0 at an active ub
     iterations: int | None = None  #: None if the solver does not report it
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
-    message: str = ""  #: of the solver, stored in the record
+    message: str = ""  #: message of the solver, stored in the record
     reported: Mapping[str, float | str] = field(
         default_factory=dict
     )  #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}

@@ -140,10 +140,11 @@ def _rows_scaled(qp: QP, form: str) -> Equivalent:
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: by form: about half of the largest deflection, or contact force
+#: shift for each form: about half of the largest deflection, or contact force
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
-Change = Callable[[QP, str], Equivalent]  #: from the strings in a form
+#: function of the strings and the form that returns an equivalent QP
+Change = Callable[[QP, str], Equivalent]
 
 UNCHANGED = "as it is"
 

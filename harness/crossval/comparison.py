@@ -57,17 +57,19 @@ class Answer:
     claimed: str
     stored: Verdict  #: verdict of the run
     verdict: Verdict  #: verdict on the stored point now, at 10·tol
-    residuals: Mapping[str, float]  #: the four of `harness.verify.kkt`
+    residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
     optimum_error: (
         float | None
     )  #: decides in place of the residuals, see `harness.verify.optimum`
     allowed: float  #: largest residual of a verified answer
-    energy_allowed: float  #: its largest relative error in the energy norm
+    energy_allowed: float  #: largest relative error in the energy norm that is allowed
     energy_bound: float | None  #: certificate stored by the run
     doubt: float | None  #: uncertainty ± of the errors in `assessment`
     assessment: Assessment | None
     refuted: tuple[str, ...] = ()  #: reasons why the claim is false
-    contradiction: str = ""  #: of the run's certificate by the reference: a bug here
+    #: contradiction between the run's certificate and the reference: an error of this
+    #: program
+    contradiction: str = ""
     remarks: tuple[str, ...] = ()
 
     @property
@@ -99,7 +101,7 @@ class Problem:
     doubt: float | None  #: bound of its relative error in the energy norm
     closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
-    pairs: tuple[Pair, ...]  #: of answers at one tolerance
+    pairs: tuple[Pair, ...]  #: pairs of answers at one tolerance
     unresolved: tuple[Pair, ...]  #: beyond `allowed`, with neither answer refuted
     note: str = ""  #: reason why there is no reference
 

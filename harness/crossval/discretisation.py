@@ -42,10 +42,12 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Family, Reference
 from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
-FILE = "discretisation.json"  #: in the result folder
+FILE = "discretisation.json"  #: name of the file in the result folder
 SCHEMA = 1  #: version of the file
-MAX_UNKNOWNS = 200_000  #: of a mesh that is solved
-GROWTH = 4.0  #: of the unknowns by the first halving; later ones use the observed ratio
+MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is solved
+#: factor by which the first halving multiplies the unknowns; later ones use the
+#: observed ratio
+GROWTH = 4.0
 TIME_EXPONENT = 1.5  #: p in the growth of the time of a reference solve, unknowns^p
 MAX_LEVELS = 3  #: fewest meshes that determine a rate
 MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
@@ -63,7 +65,8 @@ class Level:
     energy: float  #: J_h; J/m in the plane
     norm: float  #: ‖û‖, in √energy
     bound: float  #: certified relative error of the reference solution
-    distance: float | None = None  #: to the solution on the level before, in √energy
+    #: distance to the solution on the previous level, in √energy
+    distance: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

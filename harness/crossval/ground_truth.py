@@ -45,7 +45,7 @@ class StoredAnswer:
     """A stored answer, and the case as rebuilt for its judgement."""
 
     record: Record
-    label: str  #: of the solver; sequences have a label of their own
+    label: str  #: label of the solver; sequences have a label of their own
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution

@@ -28,8 +28,8 @@ PEER_TIMEOUT = 5.0  #: seconds that a rank which failed waits for the others
 #: Environment variable with the file descriptor on which `harness.processes.ranks`
 #: reads failures of ranks. The output of a solver is not searched for them.
 RECORD = "MORTARBENCH_RANK_RECORD"
-_POLL_SECONDS = 1e-3  #: between two tests whether the others have arrived
-_MESSAGE_BYTES = 500  #: of the description of a failure; longer ones are cut
+_POLL_SECONDS = 1e-3  #: time between two tests whether the other ranks have arrived
+_MESSAGE_BYTES = 500  #: length to which the description of a failure is cut
 
 
 class RankFailedError(Exception):

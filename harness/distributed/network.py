@@ -12,8 +12,8 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE_BYTES = 2**20  #: of a message whose time is determined by bandwidth
-_BATCHES = 5  #: of calls that are timed together; the first one warms up
+LARGE_BYTES = 2**20  #: size of a message whose time is determined by bandwidth
+_BATCHES = 5  #: number of batches of timed calls; the first one warms up
 
 
 def network(comm: Comm) -> dict[str, float]:

@@ -61,7 +61,8 @@ SETTLE_SECONDS = 0.5  #: idle threads of pools spin for less than that after an 
 MAX_IDLE_CPU_SHARE = 0.5
 MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is neglected
 LOG_BYTES = 2**20  #: size at which the log of a worker is truncated
-MAX_LAST_LINE_CHARACTERS = 300  #: of the last line of the log, quoted in a message
+#: length of the last line of the log that is quoted in a message
+MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: part of the log that is searched for its last line
 _MIN_FD = 3  #: a pipe must not take the place of a standard stream that is closed
 #: share of the memory limit above which a failure is attributed to lack of memory

@@ -45,7 +45,8 @@ if TYPE_CHECKING:  # it needs the package distributed
 
 LOCAL = "local"
 CONNECT_SECONDS = 10
-CLUSTER_POLL_SECONDS = 2.0  #: between two checks for workers that joined or were lost
+#: time between two checks for workers that joined or were lost
+CLUSTER_POLL_SECONDS = 2.0
 MAX_LOST_WORKERS = 4  #: a block is given up when it has lost so many workers
 #: exit code of a process whose main script starts a run at its import
 _UNGUARDED_SCRIPT_CODE = 75
@@ -199,7 +200,7 @@ class _Cluster:
     """
 
     client: Any
-    name: str  #: of the plug-in of this run
+    name: str  #: name of the plug-in of this run
     nodes: Nodes
     address: str
     warn: Callable[[str], None]

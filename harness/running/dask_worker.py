@@ -38,7 +38,7 @@ class Delivery:
 
     outcomes: list[Outcome]
     node: str  #: host name
-    digest: str  #: of the environment
+    digest: str  #: digest of the environment
     environment: dict[str, Any]
 
 

@@ -39,7 +39,7 @@ DEFAULTS: Mapping[str, Any] = {
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
-NULL_SUFFIX = " (A/A)"  #: of the label of a solver's second copy, see `null_arm`
+NULL_SUFFIX = " (A/A)"  #: end of the label of a solver's second copy, see `null_arm`
 
 
 def _between(key: str, value: Any) -> float | None:
@@ -71,7 +71,7 @@ class Group(NamedTuple):
     """Cases of one block: a single case, or the steps of a sequence."""
 
     cases: tuple[CaseId, ...]
-    mode: str  #: of the records
+    mode: str  #: mode of the records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,7 +83,7 @@ class Suite:
     repeats: int
     time_limit: float  #: s per measurement
     memory_limit: float  #: MiB per measurement
-    solvers: tuple[SolverSpec, ...]  #: with distinct labels
+    solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
     cases: tuple[CaseId, ...]  #: cases that are solved cold, all distinct
     text: str  #: TOML of the suite, with the limits that apply
     sequences: tuple[tuple[CaseId, ...], ...] = ()  #: steps of each, in order

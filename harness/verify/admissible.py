@@ -33,7 +33,7 @@ from mortarbench.harness.mechanics import (
 )
 from mortarbench.harness.qp import Vector
 
-MAX_ROUNDS = 20  #: of extending the set of rows that are closed
+MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
 MAX_DENSE_ROWS = 2000  #: rows for which F_VV is formed; beyond, it is applied
 #: Singular values of √W G below this part of the largest belong to floating motions.
 SUPPORT_THRESHOLD = 1e-5

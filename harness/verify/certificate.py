@@ -108,7 +108,8 @@ SHARP_BOUND = 1e-7  #: bound below which no other pair is tried.
 #: Largest bound for which the closed rows are those of the answer: beyond, a solution
 #: for these rows would describe another point.
 MAX_EXCHANGE_BOUND = 1e-3
-EXCHANGE_ROUNDS = 5  #: from the closed rows of the answer to a better pair
+#: rounds of exchanges that lead from the closed rows of the answer to a better pair
+EXCHANGE_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -47,8 +47,10 @@ MIN_MARGIN = 1e-12
 #: iterative solvers leave small ones in rows that do not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
-MAX_ENTRIES = 10**6  #: of A and G; nothing is proven for larger QPs
-MAX_PIVOTS = 40  #: of an elimination in rational arithmetic, which takes about 1 s
+#: largest number of entries of A and G; nothing is proven for larger QPs
+MAX_ENTRIES = 10**6
+#: largest number of pivots of an elimination in rational arithmetic (about 1 s)
+MAX_PIVOTS = 40
 MAX_TABLEAU = 1500  #: entries of a rational linear program, which takes seconds
 MAX_ENCLOSURE = 1500  #: rows and columns of an enclosure
 #: Bounds beyond this multiple of the largest right-hand side are left out of the first

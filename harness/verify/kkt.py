@@ -79,7 +79,8 @@ class Normality(NamedTuple):
     """
 
     natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖
-    normal_distance: float  #: of z_box to the normal cones at x, relative to forces
+    #: distance of z_box to the normal cones at x, relative to forces
+    normal_distance: float
 
 
 class Scales(NamedTuple):
@@ -94,7 +95,7 @@ class _Constraints(NamedTuple):
 
     equalities: Limits
     inequalities: Limits
-    sets: list[Sequence[Limits]]  #: of each set of the QP
+    sets: list[Sequence[Limits]]  #: limits of each set of the QP
 
     def inequalities_and_limits(self) -> Iterator[Limits]:
         """Yield inequality rows, if there are any, then the limits of the sets."""
@@ -111,7 +112,7 @@ class _Terms:
     x: Vector  #: |x|
     constraints: _Constraints
     Px: Vector
-    Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
+    Px_size: Vector  #: upper bound of Σ|Pᵢⱼ||xⱼ|
     curvature: Vector  #: Pᵢᵢ, zero for an operator without diagonal
     has_diagonal: bool  #: False for an operator without diagonal
     forces: Vector  #: Aᵀy + Gᵀz + z_box

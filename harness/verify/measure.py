@@ -31,7 +31,8 @@ from mortarbench.harness.solution import Solution, Status, usable_history
 T = TypeVar("T")
 SAMPLE_SECONDS = 0.005  #: least duration of a sample, nearly; see `measure`
 MAX_INNER_LOOPS = 100  #: repetitions within a sample
-MAX_ASSEMBLED_ROWS = 3000  #: of an operator P that is assembled for a solver
+#: rows of the largest operator P that is assembled for a solver
+MAX_ASSEMBLED_ROWS = 3000
 MAX_COUNT = 2**53  #: beyond, integers are not exact in other programs
 MAX_MESSAGE = 1900  #: characters of a solver's message
 _MAX_NAME = 60  #: characters of a file name in a message
@@ -44,7 +45,7 @@ class Timed(NamedTuple):
 
     solution: Solution  #: always with float vectors of the right shapes
     cost: Measurement
-    first_seconds: float | None = None  #: of the first solve, if it was repeated
+    first_seconds: float | None = None  #: time of the first solve, if it was repeated
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]

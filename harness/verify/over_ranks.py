@@ -86,7 +86,7 @@ class FloatingBodies:
     motions: csr_array  #: (n, k) of each body in turn, regardless of supports
     #: (k, r) combinations that do not move prescribed components
     combinations: NDArray[np.float64]
-    names: tuple[str, ...]  #: of these bodies
+    names: tuple[str, ...]  #: names of these bodies
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,7 +94,8 @@ class LocalBodies:
     """The part of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    parts: Substructures  #: its subdomains; T has a column for each of its components
+    #: subdomains of the body; T has a column for each of its components
+    parts: Substructures
     components: NDArray[np.int64]  #: (n,) their global numbers, ascending
     shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
     coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
@@ -333,7 +334,7 @@ class _RigidMotions:
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) felt motions at the components of the rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
-    balance: Balance  #: of the load along felt motions
+    balance: Balance  #: balance of the load along constrained motions
     driven: str = ""  #: the load along free motions that nothing balances, if any
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:

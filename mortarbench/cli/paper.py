@@ -54,7 +54,7 @@ def measure_and_write(
     Raises
     ------
     InputError
-        If the folder is in use, or contains other files than results of this command.
+        If the folder is in use, or contains files that are not results of this command.
 
     """
     from mortarbench.harness.files.experiment import save_experiment

@@ -35,8 +35,8 @@ class Analysis:
     """Result of one analysis."""
 
     bodies: Bodies
-    primal: QP  #: of the last step
-    solution: Solution  #: of the last step
+    primal: QP  #: primal QP of the last step
+    solution: Solution  #: solution of the last step
     dual: QP
     laps: Laps
 

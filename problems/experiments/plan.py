@@ -20,7 +20,7 @@ class Plan:
     dense: int  #: dofs up to which a dense pseudoinverse is computed
     scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last is that of Table 1
     scaling_rounds: Rounds
-    Nh: int = 15  #: of Figures 6, 7 and Table 1
+    Nh: int = 15  #: size of Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
     steps: int = 10  #: load steps
     stepped: tuple[int, int]  #: Nr, Nh of the study of the stepping

@@ -32,7 +32,7 @@ class Multifrontal:
     """Factor K_oo = LLᵀ, stored by fronts as U = Lᵀ, pivots × (pivots + border)."""
 
     order: Nodes  #: o, components in elimination order
-    fronts: Fronts  #: of positions in `order`
+    fronts: Fronts  #: fronts of positions in `order`
     offset: NDArray[np.int64]  #: (F + 1,) start of each front in `rows`
     rows: Floats  #: entries of U, front by front
 

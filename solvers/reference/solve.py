@@ -36,7 +36,8 @@ from mortarbench.solvers.reference.projection import projection_iterates
 #: with many solutions ended at one of size 1e10, whose rounding hid errors of the
 #: optimal value; so other starts are tried too
 MAX_START_RESIDUAL = 1e-3
-MAX_IDLE_ROUNDS = 1  #: of projections, without a smaller residual, before they end
+#: rounds of projections without a smaller residual, after which they end
+MAX_IDLE_ROUNDS = 1
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 #: data of a scaled QP larger than this times their median are first left out
 OUTLIER_FACTOR = 1e4

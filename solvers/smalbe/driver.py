@@ -51,7 +51,7 @@ EPS = float(np.finfo(float).eps)
 #: rounding of ‖x_I‖, relative to the radius and x̃; twice that of feasible_set.pxi.
 #: With 16 EPS times the radius, `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
+MIN_LANCZOS_STEPS = 5  #: number of Lanczos steps for problems of few unknowns
 #: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
 #: with 1e4 two or three outer iterations suffice
 RHO = 1e4

@@ -52,7 +52,7 @@ class Eliminated(NamedTuple):
     qp: QP  #: P is dense
     recover: Callable[[Solution], Solution]
     G: Array  #: (m, n) equality rows of the original QP
-    block: FreeBlock  #: for later QPs with the same P_EE
+    block: FreeBlock  #: factor for later QPs with the same P_EE
     columns: int  #: columns of P_EE factorised here; 0 if a stored factor was used
 
 

@@ -56,7 +56,7 @@ class Options:
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 where there are bounds alone
-    lanczos_steps: int = 12  #: its products; at most n/6 or n/10, but at least 5
+    lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
     energy: float = 50.0  #: limit of the estimated energy error, times tol; 0: no limit

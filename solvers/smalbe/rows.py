@@ -121,7 +121,7 @@ class SparseRows(Rows):
     """Sparse, independent equality rows with a Cholesky factor of GGᵀ."""
 
     unit: SparseColumns  #: (r, n) rows of G divided by their norms
-    gram: GramFactor  #: of `unit`
+    gram: GramFactor  #: Cholesky factor of the Gram matrix of `unit`
     bounded: NDArray[np.int64]  #: (b,) components with a bound
     of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
 

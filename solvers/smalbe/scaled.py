@@ -27,9 +27,9 @@ class Scaled:
     """A QP in scaled variables, factors of its matrix, and the way back."""
 
     given: QP
-    P: Matrix  #: of that, sorted, by rows or columns
-    diagonal: Vector  #: (n,) of that
-    qp: QP  #: in y = D¹ᐟ²x; the given one if its diagonal is nearly constant
+    P: Matrix  #: P of `given`, sorted, by rows or columns
+    diagonal: Vector  #: (n,) diagonal of this P
+    qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
     norm: float  #: an upper bound for the norm of its matrix, by sums Σⱼ|Hᵢⱼ| of rows
     weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
