@@ -351,7 +351,7 @@ class Mechanics:
     rigid: NDArray[np.float64]
     names: tuple[
         str, ...
-    ] = ()  #: of the bodies, in the order of the columns of `rigid`
+    ] = ()  #: names of the bodies, in the order of the columns of `rigid`
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
     #: needed to compare meshes, see `harness.crossval.discretisation`

@@ -145,7 +145,7 @@ class ContactSide:
     """Results of a contact along its slave side, node by node; SI units."""
 
     name: str  #: name of the pair of bodies, such as "disc on plate"
-    nodes: NDArray[Any]  #: (s,) along the side
+    nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
     length: Vector  #: (s,) share of the undeformed side of each node, m
     force: NDArray[Any]  #: (s, dim) on each node from this contact, N/m; N in space
     pressure: Vector  #: (s,) Pa, positive in compression
@@ -202,7 +202,7 @@ class Fields:
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
         """Cells by kind, with the names of meshio."""
-        from mortarbench.harness.mechanics import cell_blocks  # late: loads numpy
+        from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
 
         return cell_blocks(self.cells, self.dim)
 
@@ -230,8 +230,9 @@ class Case:
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: needed to certify errors
     remarks: tuple[str, ...] = ()  #: doubts about the input, a line each
-    #: relative distance of the QP from the fixed point that it is an iterate of, which
-    #: no solution of this QP can reduce; 0 at the fixed point, or without one
+    #: relative distance of the QP from the fixed point of the iteration to which it
+    #: belongs; no solution of this QP can reduce it. 0 at the fixed point, or without
+    #: an iteration
     unsettled: float = 0.0
 
 

@@ -158,7 +158,8 @@ class Record(Measurement):
     #: "residuals"; "reference": `optimum_error` decided the verdict; "certificate": a
     #: claim of infeasibility was proven
     decided_by: str = "residuals"
-    optimum_error: float | None = None  #: see `harness.verify.optimum`
+    #: error against a proven optimum, see `harness.verify.optimum`
+    optimum_error: float | None = None
     energy_bound: float | None = (
         None  #: certified bound of the relative error, energy norm
     )
@@ -240,7 +241,7 @@ class Record(Measurement):
             field with a wrong type or value.
 
         """
-        import msgspec  # late: processes that measure do not read journals
+        import msgspec  # measuring processes do not need it
 
         try:
             try:

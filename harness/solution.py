@@ -29,8 +29,9 @@ from mortarbench.harness.qp import QP, Vector
 
 History = Mapping[str, NDArray[Any]]
 
-_MAX_TEXT = 16  #: characters of an entry
-MAX_HISTORY_BYTES = 2**28  #: keeps a result folder from filling the disk
+_MAX_TEXT = 16  #: largest number of characters of an entry
+#: largest size, which keeps a result folder from filling the disk
+MAX_HISTORY_BYTES = 2**28
 _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 
 

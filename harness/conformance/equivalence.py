@@ -34,7 +34,8 @@ from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
 TOL = 1e-8
-#: relative to the energies; a factor of 10 for residuals that add up over rows
+#: largest difference relative to the energies; a factor of 10 for residuals that add up
+#: over rows
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
 #: load and length of beam-ring (10⁸ N/m and 2 m) in each system of units, as powers of

@@ -2,7 +2,7 @@
 
 The reference is a point with a proven error (`harness.verify.references`), computed by
 none of the solvers under test. An answer is refuted by its own residuals, or if its
-distance to the reference, less the error of the reference, exceeds what the claim
+distance to the reference, minus the error of the reference, exceeds what the claim
 allows (`harness.crossval.assessment`). Which answer is wrong therefore does not depend
 on a majority. Distances between answers need no reference: two answers that differ by
 more than both claims allow, neither of them refuted, are an unresolved disagreement.
@@ -102,7 +102,8 @@ class Problem:
     closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
     pairs: tuple[Pair, ...]  #: pairs of answers at one tolerance
-    unresolved: tuple[Pair, ...]  #: beyond `allowed`, with neither answer refuted
+    #: pairs whose distance exceeds `allowed` although neither answer is refuted
+    unresolved: tuple[Pair, ...]
     note: str = ""  #: reason why there is no reference
 
 

@@ -76,7 +76,7 @@ def ground_truth_of(
     mechanics = mechanics.whole
     try:
         truth = _elastic_truth(mechanics, answers, solve, references)
-    except Exception as e:  # the family's code, of the factorisation
+    except Exception as e:  # the factorisation is the family's code
         return note_of("reference", e)
     if isinstance(truth, str):
         return truth

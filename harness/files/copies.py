@@ -63,7 +63,7 @@ class _Entry(NamedTuple):
 
     path: str  #: path in the names of cases
     sha256: str
-    size: int  #: bytes
+    size: int  #: size of the content, bytes
 
 
 class Copies:

@@ -43,7 +43,7 @@ _TYPES = {
 _TEXT, _SPARSE = 4, 5  #: classes of variables
 _CLASSES = frozenset(
     (_TEXT, _SPARSE, *range(6, 16))
-)  #: and numeric arrays of every type
+)  #: texts, sparse matrices and numeric arrays of every type
 _COMPLEX = 0x800  #: flag of a variable
 _COPIES = 8  #: number of copies of the content that a parser may store
 

@@ -200,7 +200,7 @@ def this_rank() -> Ranks:
 
     The speed of communication is measured here, before any solve is timed.
     """
-    from mpi4py import MPI  # late: runs without ranks do not need it installed
+    from mpi4py import MPI  # only runs with ranks need it
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})

@@ -50,21 +50,21 @@ from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
 POLL_SECONDS = 0.02
-START_SECONDS = 120.0  #: limit of imports, and of loading a QP
-WARM_UP_SECONDS = 60.0  #: limit of the warm-up
-POINT_SECONDS = 120.0  #: limit of writing the point of an answer
+START_SECONDS = 120.0  #: time limit of imports, and of loading a QP
+WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
+POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 CLOSE_SECONDS = 1.0  #: time to end after the requests are closed, before SIGKILL
 END_SECONDS = 1.0  #: time for the sub-reaper to end when all below it are dead
-SETTLE_SECONDS = 0.5  #: idle threads of pools spin for less than that after an answer
+SETTLE_SECONDS = 0.5  #: time that idle threads of pools may spin after an answer
 #: CPU time between answer and request, relative to wall time, above which a worker
 #: counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is neglected
+MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is ignored
 LOG_BYTES = 2**20  #: size at which the log of a worker is truncated
 #: length of the last line of the log that is quoted in a message
 MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: part of the log that is searched for its last line
-_MIN_FD = 3  #: a pipe must not take the place of a standard stream that is closed
+_MIN_FD = 3  #: a pipe must not get the number of a standard stream that is closed
 #: share of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 

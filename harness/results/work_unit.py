@@ -36,8 +36,8 @@ class WorkUnit:
     #: one turn per solver, in the order of measurement: its records, to be completed,
     #: one for the case or one for each step of the sequence
     turns: tuple[tuple[Record, ...], ...]
-    time_limit: float  #: s per measurement
-    memory_limit: float  #: MiB per measurement
+    time_limit: float  #: time limit of a measurement, s
+    memory_limit: float  #: memory limit of a measurement, MiB
 
     @property
     def cases(self) -> tuple[str, ...]:

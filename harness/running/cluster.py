@@ -47,7 +47,7 @@ LOCAL = "local"
 CONNECT_SECONDS = 10
 #: time between two checks for workers that joined or were lost
 CLUSTER_POLL_SECONDS = 2.0
-MAX_LOST_WORKERS = 4  #: a block is given up when it has lost so many workers
+MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up
 #: exit code of a process whose main script starts a run at its import
 _UNGUARDED_SCRIPT_CODE = 75
 

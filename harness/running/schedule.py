@@ -33,7 +33,7 @@ class Schedule:
     suite: Suite
     #: options of each solver, defaults resolved
     options: Mapping[str, Mapping[str, Any]]
-    environment: str  #: digest
+    environment: str  #: digest of the environment
     session: str = ""  #: session of the run, see `harness.record.Record`
     progress: Progress
     unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built

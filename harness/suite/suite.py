@@ -81,19 +81,20 @@ class Suite:
     name: str
     tolerances: tuple[float, ...]
     repeats: int
-    time_limit: float  #: s per measurement
-    memory_limit: float  #: MiB per measurement
+    time_limit: float  #: time limit of a measurement, s
+    memory_limit: float  #: memory limit of a measurement, MiB
     solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
     cases: tuple[CaseId, ...]  #: cases that are solved cold, all distinct
     text: str  #: TOML of the suite, with the limits that apply
-    sequences: tuple[tuple[CaseId, ...], ...] = ()  #: steps of each, in order
+    #: sequences of cases, in the order of their steps
+    sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: values of θ (`harness.record.Record.tighten`); each sequence is solved with each
     tighten: tuple[float, ...] = (0.0,)
     #: relative half-width of every ratio to the fastest solver at which repeats end;
     #: None: `repeats` alone decides
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
-    budget: float = 600.0  #: s per case and tolerance, if a precision is set
+    budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
     #: tolerance of the verdicts; None: the one that the solver was asked for
     accuracy: float | None = None
     every: frozenset[str] = frozenset()  #: names of all cases, before ``--case``

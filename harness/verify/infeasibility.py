@@ -43,16 +43,18 @@ from mortarbench.harness.verify.rational import (
 #: Least margin of a proof. Redundant rows whose right-hand sides are rounded sums of
 #: thousands of terms contradict one another by less.
 MIN_MARGIN = 1e-12
-#: Multipliers below these parts of the largest, in scaled rows, are dropped in turn:
-#: iterative solvers leave small ones in rows that do not contribute to the proof.
+#: Fractions of the largest multiplier, in scaled rows, below which multipliers are
+#: dropped, tried in turn: iterative solvers return small multipliers for rows that do
+#: not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
 #: largest number of entries of A and G; nothing is proven for larger QPs
 MAX_ENTRIES = 10**6
 #: largest number of pivots of an elimination in rational arithmetic (about 1 s)
 MAX_PIVOTS = 40
-MAX_TABLEAU = 1500  #: entries of a rational linear program, which takes seconds
-MAX_ENCLOSURE = 1500  #: rows and columns of an enclosure
+#: largest number of entries of a rational linear program, which takes seconds
+MAX_TABLEAU = 1500
+MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
 #: Bounds beyond this multiple of the largest right-hand side are left out of the first
 #: search: costs of such different sizes hide one another.
 MAX_BOUND_RATIO = 1e6
@@ -265,7 +267,7 @@ def _solved(
     M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
     reach : largest bound that takes part
     """
-    from scipy.optimize import linprog  # late: it is slow to import
+    from scipy.optimize import linprog  # imported here because it loads slowly
 
     n, k = M.shape[1], M.shape[0]
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))

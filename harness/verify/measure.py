@@ -30,12 +30,12 @@ from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
 SAMPLE_SECONDS = 0.005  #: least duration of a sample, nearly; see `measure`
-MAX_INNER_LOOPS = 100  #: repetitions within a sample
+MAX_INNER_LOOPS = 100  #: largest number of repetitions within a sample
 #: rows of the largest operator P that is assembled for a solver
 MAX_ASSEMBLED_ROWS = 3000
 MAX_COUNT = 2**53  #: beyond, integers are not exact in other programs
-MAX_MESSAGE = 1900  #: characters of a solver's message
-_MAX_NAME = 60  #: characters of a file name in a message
+MAX_MESSAGE = 1900  #: largest length of a solver's message, in characters
+_MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
 _VECTORS = ("x", "y", "z", "z_box")
 

@@ -244,7 +244,7 @@ def _least_squares(
     y is eliminated by an orthonormal basis of the range of w·free, which may have
     dependent columns; these get no multiplier.
     """
-    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
+    from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)

@@ -72,7 +72,7 @@ class Contact:
 
     rows: csr_array  #: (m, n) with global components as columns
     c: Vector  #: (m,)
-    bound: Vector  #: (k,) of the last rows
+    bound: Vector  #: (k,) friction bounds of the last rows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -289,7 +289,7 @@ def _admissible_pair(
     at, softness, start = trace
     found = feasible_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
+        raise UncertifiableError("the penetration of the answer could not be removed")
     if rigid.driven:
         raise UncertifiableError(rigid.driven)
     places, here = local.reduction.places(at)

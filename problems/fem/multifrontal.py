@@ -44,7 +44,7 @@ class Multifrontal:
         return x.T.reshape(b.shape)
 
     def trailing(self) -> list[tuple[Nodes, Floats]]:
-        """Return the unknowns eliminated last, per connected part, and U on them."""
+        """Return the unknowns eliminated last in each connected part, and U on them."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
             positions = slice(f.start[s], f.start[s + 1])

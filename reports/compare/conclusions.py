@@ -64,8 +64,7 @@ def sentences(c: Comparison) -> tuple[str, ...]:
 
 
 def _named_sentences(c: Comparison) -> dict[str, str]:
-    """Return all sentences on a comparison by name; sentences that do not apply are
-    empty."""
+    """Return all sentences by name; a sentence that does not apply is empty."""
     keys = [key for key, *_ in environments(c.before, c.after)]
     schemas = [sorted({r.schema for r in e.records}) for e in (c.before, c.after)]
     loads = [
