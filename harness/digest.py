@@ -17,7 +17,7 @@ _PIECE_BYTES = 2**20  #: number of bytes that are read at a time
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
     """Return the first hexadecimal digits of the SHA-256 of concatenated parts.
 
-    digits : at most 64, with 4 bits each
+    digits : number of digits, at most 64, of 4 bits each
 
     >>> from mortarbench.harness.digest import hex_digest
     >>> hex_digest([b"a", b"b"]) == hex_digest([b"ab"])

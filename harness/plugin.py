@@ -147,7 +147,7 @@ class ContactSide:
     name: str  #: name of the pair of bodies, such as "disc on plate"
     nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
     length: Vector  #: (s,) share of the undeformed side of each node, m
-    force: NDArray[Any]  #: (s, dim) on each node from this contact, N/m; N in space
+    force: NDArray[Any]  #: (s, dim) force of this contact on each node, N/m; N in space
     pressure: Vector  #: (s,) Pa, positive in compression
     gap: Vector  #: (s,) m, positive if open; NaN without an opposite side
     #: (s,) compressive force along the normal of the contact row of each node, N/m
@@ -328,11 +328,11 @@ class Family(ABC):
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
         """Return a function that assembles the QP of `build` on ranks, or None.
 
-        It is called by all ranks, with a reference for distributed QPs. None means that
-        one process builds the QP. This method itself builds nothing and does not need
-        MPI.
+        All ranks call the returned function, with a reference solver for distributed
+        QPs. None means that one process builds the QP. The method itself builds nothing
+        and does not need MPI.
 
-        params : complete
+        params : values of all keys
         """
         return None
 

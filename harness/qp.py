@@ -176,10 +176,9 @@ class QP:
         ----------
         P : (n, n) symmetric, both triangles
         q : (n,)
-        G, h : (p, n) and (p,) of G x ≤ h
-        A, b : (m, n) and (m,) of A x = b
-        lb, ub : (n,) bounds, -inf and inf for absent ones
-        sets : convex sets of further blocks of variables
+        G, h : (p, n) and (p,), the rows G x ≤ h A, b : (m, n) and (m,), the rows A x =
+        b lb, ub : (n,) bounds, -inf and inf for absent ones sets : convex sets of
+        further blocks of variables
 
         Raises
         ------
@@ -459,8 +458,7 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, also from a matrix with one row or column.
 
-    name : of the vector in messages
-    n : expected number of entries; None for any
+    name : name of the vector in messages n : expected number of entries; None for any
 
     Raises
     ------

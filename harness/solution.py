@@ -71,9 +71,10 @@ class Solution:
 
     status: Status
     x: Vector  #: (n,)
-    y: Vector  #: (m,) of A x = b
-    z: Vector  #: (p,) of G x ≤ h, nonnegative
-    z_box: Vector  #: (n,) of the bounds, ≤ 0 at an active lb, ≥ 0 at an active ub
+    y: Vector  #: (m,) multipliers of A x = b
+    z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
+    #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
+    z_box: Vector
     iterations: int | None = None  #: None if the solver does not report it
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
     message: str = ""  #: message of the solver, stored in the record

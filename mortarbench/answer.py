@@ -470,9 +470,9 @@ def solver_session(
 class Multipliers(NamedTuple):
     """Multipliers with the signs of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
 
-    y: Vector  #: (m,) of A x = b
-    z: Vector  #: (p,) of G x ≤ h
-    z_box: Vector  #: (n,) of the bounds
+    y: Vector  #: (m,) multipliers of A x = b
+    z: Vector  #: (p,) multipliers of G x ≤ h
+    z_box: Vector  #: (n,) multipliers of the bounds
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)

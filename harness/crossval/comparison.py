@@ -115,9 +115,9 @@ def compare_answers(
 ) -> Problem:
     """Judge all answers to one problem.
 
-    answers : to one problem: equal ``mechanics.program``, or one QP without mechanics
-    solve : the reference solve
-    references : folder in which reference points are cached; None for no cache
+    answers : answers to one problem: equal ``mechanics.program``, or one QP without
+    mechanics solve : the reference solve references : folder in which reference points
+    are cached; None for no cache
     """
     prove = proves(solve)
     truth = ground_truth_of(answers, solve, references)

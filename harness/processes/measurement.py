@@ -43,7 +43,7 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-#: CPU time of the harness between "start" and "timed", beside the worker's clock
+#: CPU time of the harness between "start" and "timed" that the worker's clock excludes
 HARNESS_SECONDS = 0.005
 #: the same per repeat; 0.12 ms were seen on a busy machine, and no solver is to be
 #: suspected because of it

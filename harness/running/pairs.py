@@ -66,7 +66,7 @@ def unpaired_ratio(
     in the interval. Return None for fewer than two values in either sample.
 
     a, b : seconds
-    coverage : of the interval
+    coverage : coverage of the interval
 
     References
     ----------

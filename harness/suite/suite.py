@@ -189,14 +189,14 @@ def name_in(text: str) -> str:
 def read_stored(path: Path) -> dict[str, Any]:
     """Read the suite of a result folder, and check only the types of its values.
 
-    Names of solvers and families, and ranges, may be those of another version or of a
-    plug-in.
+    Names and ranges are not checked, since the suite may come from another version or
+    need a plug-in.
 
     Raises
     ------
     InputError
-        If a value has another type than in a suite that a run wrote; the message names
-        the file and the value.
+        If a value does not have the type that a run writes; the message names the file
+        and the value.
 
     """
     table = read_toml(path, "the suite of a result folder")

@@ -157,10 +157,9 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : with the components (w,) that the rows touch as the columns of B
-    R : (w, p) rigid motions that contact feels, which cost no energy
-    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
-    u : (w,)
+    exact : exact data whose columns of B are the components (w,) that the rows touch R
+    : (w, p) rigid motions that contact feels, which cost no energy softness : (w,)
+    1/Kᵢᵢ, zero at prescribed components u : (w,)
 
     Returns
     -------

@@ -65,7 +65,7 @@ EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
-    rows: NDArray[np.int64]  #: (k,) with a nonzero multiplier
+    rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
     centre: Any  #: (k,) fractions
     radius: Any  #: (k,) fractions: |ray − centre| is at most this
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
@@ -149,7 +149,7 @@ def _corrected(
     is small and of the wrong sign. The ray itself comes first, then one with cⱼ = 0
     wherever it is small, then one with cⱼ = 0 where required only.
 
-    M, w : of the rows that carry a multiplier
+    M, w : entries and multipliers of the rows with a nonzero multiplier
     """
     exact = rational(w)
     zero = 0 * exact

@@ -425,8 +425,9 @@ def _natural_energies(
     at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ with the feasible width wᵢ, if that is less.
 
     bounds : lower and upper (n,) each, tightened by rows or not
-    by_length : without curvature at most |qᵢ|lᵢ, and Pᵢᵢlᵢ² where q is rounding, with
-        the least length lᵢ from a row or bound (`_lengths`), 1 without any length
+    by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² where q is
+    rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 if there is
+    no length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)

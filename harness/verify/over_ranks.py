@@ -70,7 +70,7 @@ from mortarbench.harness.verify.substructured import (
 class Contact:
     """Rows of contact, then of friction with a positive bound; replicated."""
 
-    rows: csr_array  #: (m, n) with global components as columns
+    rows: csr_array  #: (m, n) rows, with global components as columns
     c: Vector  #: (m,)
     bound: Vector  #: (k,) friction bounds of the last rows
 
@@ -83,7 +83,9 @@ class FloatingBodies:
     components of all ranks.
     """
 
-    motions: csr_array  #: (n, k) of each body in turn, regardless of supports
+    motions: (
+        csr_array  #: (n, k) rigid motions of each body in turn, regardless of supports
+    )
     #: (k, r) combinations that do not move prescribed components
     combinations: NDArray[np.float64]
     names: tuple[str, ...]  #: names of these bodies
@@ -220,7 +222,7 @@ def certify_over_ranks(
     Parameters
     ----------
     claimed : (n,) displacement of the local components
-    multipliers : (m,) of all rows, replicated
+    multipliers : (m,) multipliers of all rows, replicated
 
     Returns
     -------

@@ -341,7 +341,7 @@ class Reduction(Protocol):
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
         """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.
 
-        S : (t, local) with rows for the components `at`
+        S : (t, local) matrix with a row for each of the components `at`
         """
 
 

@@ -86,6 +86,6 @@ def measure_and_write(
 
 
 def _answer(registries: Registries, name: str) -> Reference:
-    """Return the solve of one of our solvers at 1e-8; the paper states no accuracy."""
+    """Return a function that solves QPs by one of our solvers at tolerance 1e-8."""
     solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

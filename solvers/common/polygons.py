@@ -19,7 +19,7 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonalQP:
-    """A QP with polygons in place of circles, which differs from the original."""
+    """Approximation of a QP by another one, with polygons in place of circles."""
 
     qp: QP  #: QP with rows of G for the sides of polygons, and without discs and cones
     #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius

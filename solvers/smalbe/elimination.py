@@ -60,8 +60,8 @@ class Eliminated(NamedTuple):
 class _Saddle:
     """Solution operator of the saddle point system for x_E and y."""
 
-    factor: Array  #: (k, k) of P_EE, in the upper triangle
-    G_E: Array  #: (r, k) of full rank
+    factor: Array  #: (k, k) Cholesky factor of P_EE, in the upper triangle
+    G_E: Array  #: (r, k) rows of full rank
     PG: Array  #: P_EE⁻¹G_Eᵀ (k, r)
     schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, likewise
 

@@ -79,7 +79,7 @@ class Scaled:
 
 
 def _canonical(P: Matrix) -> Matrix:
-    """Return a symmetric P by rows or columns, sorted and without repetitions."""
+    """Return a symmetric sparse P with sorted indices and without duplicate entries."""
     if P.format not in ("csc", "csr"):
         P = csr_array(P)
     if not P.has_canonical_format:
