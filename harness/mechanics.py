@@ -246,7 +246,7 @@ FACETS = {
 class CellBlock(NamedTuple):
     """Cells of one kind."""
 
-    kind: str  #: its name in meshio
+    kind: str  #: name of the kind in meshio
     nodes: NDArray[np.int64]  #: (k, corners)
     cells: NDArray[np.int64]  #: (k,) their rows in the table
 
@@ -344,13 +344,14 @@ class Mechanics:
     #: contact and friction rows
     to_primal: Callable[[Solution], Solution]
     factorise: Callable[[], Inverse]  #: returns K⁺; called at most once
-    mesh_size: float  #: of the contact side, in the unit of length of `primal`
+    #: cell size of the contact side, in the unit of length of `primal`
+    mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, to measure the balance
     #: of forces
     rigid: NDArray[np.float64]
     names: tuple[
         str, ...
-    ] = ()  #: of the bodies, in the order of the columns of `rigid`
+    ] = ()  #: names of the bodies, in the order of the columns of `rigid`
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
     #: needed to compare meshes, see `harness.crossval.discretisation`

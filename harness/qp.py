@@ -22,13 +22,14 @@ NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: Largest entry of P − Pᵀ, relative to that of P, that counts as rounding.
 SYMMETRY_TOLERANCE = 1e-12
-_MAX_FACTORED_ROWS = 2000  #: of a P that is checked by a Cholesky factor: 0.25 s
+#: rows of the largest P that is checked by a Cholesky factor (0.25 s)
+_MAX_FACTORED_ROWS = 2000
 #: Least eigenvalue of the scaled P: text formats may store no more than six digits.
 _MIN_CURVATURE = -1e-6
 #: Least diagonal entry for scaling, relative to the largest entry of P: smaller ones
 #: may be mostly rounding.
 _MIN_DIAGONAL = 1e-4
-_STRIP_ROWS = 256  #: of a dense matrix that are compared at a time, to save memory
+_STRIP_ROWS = 256  #: rows of a dense matrix that are compared at a time, to save memory
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,7 +95,8 @@ class QP:
     G: Matrix  #: (p, n)
     h: Vector  #: (p,)
     sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then sets of other blocks
-    structure: Structure | None = None  #: that a solver may use, but must not require
+    #: data that a solver may use but must not require
+    structure: Structure | None = None
 
     def __init__(
         self,
@@ -174,10 +176,9 @@ class QP:
         ----------
         P : (n, n) symmetric, both triangles
         q : (n,)
-        G, h : (p, n) and (p,) of G x ≤ h
-        A, b : (m, n) and (m,) of A x = b
-        lb, ub : (n,) bounds, -inf and inf for absent ones
-        sets : convex sets of further blocks of variables
+        G, h : (p, n) and (p,), the rows G x ≤ h A, b : (m, n) and (m,), the rows A x =
+        b lb, ub : (n,) bounds, -inf and inf for absent ones sets : convex sets of
+        further blocks of variables
 
         Raises
         ------
@@ -457,8 +458,7 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, also from a matrix with one row or column.
 
-    name : of the vector in messages
-    n : expected number of entries; None for any
+    name : name of the vector in messages n : expected number of entries; None for any
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Cases by name, and QPs without mechanics, with the recovery of physical results."""
+"""Cases, defined by a name or a bare QP, with the recovery of physical results."""
 
 from __future__ import annotations
 
@@ -146,8 +146,8 @@ class Case(plugin.Case):
         Raises
         ------
         InputError
-            If the suffix is another one, the format cannot store the QP, or the file
-            cannot be written.
+            If the suffix is unknown, the format cannot store the QP, or the file cannot
+            be written.
 
         """
         path = check_output_file(path, EXPORTS)
@@ -278,8 +278,8 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
     Raises
     ------
     InputError
-        If there is no such case, it cannot be built, the suffix is another one, the
-        format cannot store the QP, or the file cannot be written.
+        If there is no such case, it cannot be built, the suffix is unknown, the format
+        cannot store the QP, or the file cannot be written.
 
     Examples
     --------

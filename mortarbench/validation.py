@@ -261,7 +261,7 @@ class Conformance:
     """Results of the conformance suite for one solver."""
 
     solver: str  #: name, or class of an object
-    results: Mapping[str, Result]  #: by the name of the check
+    results: Mapping[str, Result]  #: results by the name of the check
 
     @property
     def conforms(self) -> bool:

@@ -199,7 +199,7 @@ def membrane(k: int) -> QP:
     )  # fmt: skip
 
 
-FORMS = ("primal", "dual", "dual-bounds")  #: of `strings`
+FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 
 
 def strings(form: str) -> QP:

@@ -21,7 +21,7 @@ from mortarbench.harness.conformance.manufactured import FORMS
 
 MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
 
-Results = Mapping[str, Result]  #: of one solver, by the name of the check
+Results = Mapping[str, Result]  #: results of one solver, by the name of the check
 
 HEAD = f"""\
 # Effects of equivalent formulations

@@ -56,7 +56,7 @@ class Deviation(NamedTuple):
     """Difference of an answer from the reference, over ‖u*‖; see `distances`."""
 
     u: Vector  #: (n,)
-    equilibrium: Vector | None  #: (n,) of u_λ; None without mechanics
+    equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
 
 
 def energy_allowed(tol: float) -> float:

@@ -13,7 +13,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-_FORMULA = frozenset("=+-@＝＋－＠")  #: also full-width, for East Asian spreadsheets
+#: first characters of formulas; East Asian spreadsheets also use full-width ones
+_FORMULA = frozenset("=+-@＝＋－＠")
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})  #: categories that programs skip
 _CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})
 #: direction controls; other characters of Cf join letters and symbols

@@ -24,7 +24,7 @@ _OLD = ("suite.tmp", "environment.tmp")  #: names in older versions
 
 #: Codes of an OSError for a full disk, an exhausted quota or a file size limit.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: written to find out whether a disk is full
+_PROBE_BYTES = 2**16  #: data written to test whether a disk is full
 _MIB = 2**20
 
 
@@ -85,7 +85,7 @@ def remove_unfinished(
 def report_full_disk(folder: Path) -> Iterator[None]:
     """Convert an OSError for a full disk, raised in the block, to an InputError.
 
-    folder : that the block writes to
+    folder : folder that the block writes to
 
     Raises
     ------
@@ -104,8 +104,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 def refuse_full_disk(folder: Path, failure: str) -> None:
     """Raise if a failure was caused by a full disk.
 
-    folder : that was written to
-    failure : message of the failure
+    folder : folder that was written to failure : message of the failure
 
     Raises
     ------

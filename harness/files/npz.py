@@ -27,10 +27,11 @@ EXPECTED = "an npz file"
 ALIGNMENT = 64
 _LOCAL_HEADER = 30  #: bytes before name and extra field of a member
 _PADDING = b"\xfe\xca"  #: id of an extra field that readers skip
-_ENCRYPTED = 1  #: among the flags of a member
+_ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_KINDS = "biufcSU"  #: kinds of dtypes: no objects, which are pickles, and no structures
-_PIECE_BYTES = 2**20  #: decompressed at a time
+#: kinds of dtypes that are read: neither objects, which are pickles, nor structures
+_KINDS = "biufcSU"
+_PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
 
 class _PickledError(ValueError):

@@ -40,7 +40,8 @@ TYPE_CHECKING = False  # importing typing (or json) would cost each worker 10 ms
 if TYPE_CHECKING:
     from typing import NoReturn
 
-SEGMENTS = "/proc/sysvipc/shm"  #: see proc(5)
+#: list of the System V segments of shared memory, see proc(5)
+SEGMENTS = "/proc/sysvipc/shm"
 END_SECONDS = 5.0  #: longest wait for processes that were sent SIGKILL
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)

@@ -131,7 +131,7 @@ class _SolverHost:
         """Measure once, or run one check."""
         if "check" in request:
             from mortarbench.harness.conformance.conformance import (
-                run_check,  # late: few requests need it
+                run_check,  # few requests need it
             )
 
             events.start()

@@ -36,7 +36,8 @@ from mortarbench.harness.suite.suite import Suite, read_stored
 #: everything that a run and its evaluations write; `fresh` deletes these, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-_RESULT_FILES = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+#: files of `mortarbench validate` and of faults
+_RESULT_FILES = ("validation.json", FAULTS)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: levels accepted in a result folder; runs write three
 _LOCK = ".lock"
@@ -296,8 +297,8 @@ def claim(
 ) -> None:
     """Assign a locked folder to a suite and an environment.
 
-    environment : with its digest under the key ``digest``
-    fresh : delete the previous content first; without it, call `refuse_other` before
+    environment : environment, with its digest under the key ``digest`` fresh : delete
+    the previous content first; without it, call `refuse_other` before
     """
     if fresh:
         for name in _FOLDERS:

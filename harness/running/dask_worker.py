@@ -38,7 +38,7 @@ class Delivery:
 
     outcomes: list[Outcome]
     node: str  #: host name
-    digest: str  #: of the environment
+    digest: str  #: digest of the environment
     environment: dict[str, Any]
 
 
@@ -46,10 +46,10 @@ class Delivery:
 class ExecutorPlugin(WorkerPlugin):
     """Executor in every Dask worker, including workers that join later.
 
-    commands : of the parent; its Python is replaced by that of the node
-    plugins : files that must exist under the same paths on the node
-    operators : makers of operators P by name, except those of `plugins`
-    sharing : largest number of Dask workers on one machine. Several disturb each other,
+    commands : commands of the parent, in which its Python is replaced by that of the
+    node plugins : files that must exist under the same paths on the node operators :
+    makers of operators P by name, except those of `plugins` sharing : largest number of
+    Dask workers on one machine. Several disturb each other,
         so the number is a part of the environment
     packages : names of the packages whose versions an environment contains
     """

@@ -31,9 +31,10 @@ class Schedule:
     """Blocks of a suite that remain to be measured, given those in its journal."""
 
     suite: Suite
-    options: Mapping[str, Mapping[str, Any]]  #: of each solver, defaults resolved
-    environment: str  #: digest
-    session: str = ""  #: of the run, see `harness.record.Record`
+    #: options of each solver, defaults resolved
+    options: Mapping[str, Mapping[str, Any]]
+    environment: str  #: digest of the environment
+    session: str = ""  #: session of the run, see `harness.record.Record`
     progress: Progress
     unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
     #: records by cell; empty unless the suite sets a precision

@@ -18,7 +18,7 @@ class Blocks:
     Both arrays are copied. Subclasses add the geometry of a kind of sets.
     """
 
-    prefix: ClassVar[str]  #: of the names of arrays in files
+    prefix: ClassVar[str]  #: prefix of the names of arrays in files
     least: ClassVar[int]  #: smallest d
     columns: ClassVar[str]  #: meaning of the d columns, for messages
 

@@ -21,10 +21,11 @@ from numpy.typing import NDArray
 from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.verify.admissible import closing
 
-MAX_EXCHANGES = 60  #: of active sets
-REFINEMENTS = 6  #: of a solution, each with a residual in extended precision
+MAX_EXCHANGES = 60  #: largest number of exchanges of active sets
+#: refinements of a solution, each with a residual in extended precision
+REFINEMENTS = 6
 
-States = NDArray[np.int8]  #: (m,) of each row
+States = NDArray[np.int8]  #: (m,) state of each row
 LOWER, CLOSED, UPPER = -1, 0, 1  #: multiplier at its lower bound, free, at its upper
 
 _EPS = Real(np.finfo(Real).eps)

@@ -33,9 +33,11 @@ from mortarbench.harness.mechanics import (
 )
 from mortarbench.harness.qp import Vector
 
-MAX_ROUNDS = 20  #: of extending the set of rows that are closed
-MAX_DENSE_ROWS = 2000  #: rows for which F_VV is formed; beyond, it is applied
-#: Singular values of √W G below this part of the largest belong to floating motions.
+MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
+#: number of rows up to which F_VV is formed; for more rows it is only applied
+MAX_DENSE_ROWS = 2000
+#: Singular values of √W G below this fraction of the largest belong to floating
+#: motions.
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of its absolute terms.
@@ -50,7 +52,7 @@ class UncertifiableError(Exception):
 def admissible(
     mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
 ) -> Extended | None:
-    """Return û near u with Bû ≤ c, and equality on the rows `closed`; None if none.
+    """Return û near u with Bû ≤ c and equality on the rows `closed`, or None.
 
     û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα is the nearest point in the
     energy norm with equality on the rows V; V is extended until Bû ≤ c.
@@ -155,10 +157,9 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : with the components (w,) that the rows touch as the columns of B
-    R : (w, p) rigid motions that contact feels, which cost no energy
-    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
-    u : (w,)
+    exact : exact data whose columns of B are the components (w,) that the rows touch R
+    : (w, p) rigid motions that contact feels, which cost no energy softness : (w,)
+    1/Kᵢᵢ, zero at prescribed components u : (w,)
 
     Returns
     -------
@@ -317,7 +318,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
     return (
         f"nothing balances the load of {which} "
         f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
-        "contact does not feel that motion, and no support holds it"
+        "contact does not resist that motion, and no support holds it"
     )
 
 
@@ -352,8 +353,8 @@ class Balance(NamedTuple):
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of its absolute terms
     bent: Extended  #: (p,)  (KR)ᵀu
-    lower: Extended  #: (m,) of λ
-    upper: Extended  #: (m,)
+    lower: Extended  #: (m,) lower bounds of λ
+    upper: Extended  #: (m,) upper bounds of λ
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.

@@ -104,11 +104,12 @@ POWER_ITERATION_FACTOR = 2.0
 #: A pair with less work than this times the distance squared counts as sharp: without
 #: any work, the bound √(d² + 2·work) would be 5 % smaller.
 SHARP_WORK = 0.05
-SHARP_BOUND = 1e-7  #: bound below which no other pair is tried.
+SHARP_BOUND = 1e-7  #: bound below which no other pair is tried
 #: Largest bound for which the closed rows are those of the answer: beyond, a solution
 #: for these rows would describe another point.
 MAX_EXCHANGE_BOUND = 1e-3
-EXCHANGE_ROUNDS = 5  #: from the closed rows of the answer to a better pair
+#: rounds of exchanges that lead from the closed rows of the answer to a better pair
+EXCHANGE_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,7 +120,7 @@ class Certificate:
     """
 
     u: Extended  #: û (n,)
-    multipliers: Extended  #: λ̂ (m,), of contact, then of friction rows
+    multipliers: Extended  #: λ̂ (m,): multipliers of contact, then of friction rows
     off: Extended  #: û − u_λ (n,); with subdomains, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
@@ -252,7 +253,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
         moved=_root(float(moved)), norm=_root(float(norm)),
     )  # fmt: skip
     if not np.isfinite(certificate.error):
-        raise UncertifiableError("the answer is too large for arithmetic")
+        raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
 
 
@@ -387,7 +388,7 @@ def proof(
     mechanics = split.mechanics
     feasible = admissible(mechanics, u, closed)
     if feasible is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
+        raise UncertifiableError("the penetration of the answer could not be removed")
     lam = balanced(mechanics, multipliers, feasible)
     return proven(
         split, mechanics.exact, mechanics.motions.G, claimed=claimed, u=feasible,
@@ -410,7 +411,7 @@ def proven(
     Raises
     ------
     UncertifiableError
-        When the answer is too large for arithmetic.
+        When the answer is so large that its energy overflows.
 
     """
     lam, motion = multipliers, exact.motion(at_rows)
@@ -445,8 +446,8 @@ def proven(
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
-            "the answer is too far off: along rigid motions that large, rounding of "
-            "the stiffness outweighs all that contact holds"
+            "the answer is too far off: along such large rigid motions, the rounding "
+            "of the stiffness outweighs the contact forces"
         )
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
@@ -468,7 +469,7 @@ def proven(
         seminorm=near.unbalanced.size > 0,
     )  # fmt: skip
     if not np.isfinite(certificate.error):
-        raise UncertifiableError("the answer is too large for arithmetic")
+        raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
 
 
@@ -561,7 +562,7 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Return y ≥ 0 with  columns·y = target  (p,); inf if none is found."""
-    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
+    from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
     try:
         y, left = nnls(columns, target)

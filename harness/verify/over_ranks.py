@@ -70,9 +70,9 @@ from mortarbench.harness.verify.substructured import (
 class Contact:
     """Rows of contact, then of friction with a positive bound; replicated."""
 
-    rows: csr_array  #: (m, n) with global components as columns
+    rows: csr_array  #: (m, n) rows, with global components as columns
     c: Vector  #: (m,)
-    bound: Vector  #: (k,) of the last rows
+    bound: Vector  #: (k,) friction bounds of the last rows
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,10 +83,12 @@ class FloatingBodies:
     components of all ranks.
     """
 
-    motions: csr_array  #: (n, k) of each body in turn, regardless of supports
+    motions: (
+        csr_array  #: (n, k) rigid motions of each body in turn, regardless of supports
+    )
     #: (k, r) combinations that do not move prescribed components
     combinations: NDArray[np.float64]
-    names: tuple[str, ...]  #: of these bodies
+    names: tuple[str, ...]  #: names of these bodies
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,7 +96,8 @@ class LocalBodies:
     """The part of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    parts: Substructures  #: its subdomains; T has a column for each of its components
+    #: subdomains of the body; T has a column for each of its components
+    parts: Substructures
     components: NDArray[np.int64]  #: (n,) their global numbers, ascending
     shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
     coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
@@ -219,7 +222,7 @@ def certify_over_ranks(
     Parameters
     ----------
     claimed : (n,) displacement of the local components
-    multipliers : (m,) of all rows, replicated
+    multipliers : (m,) multipliers of all rows, replicated
 
     Returns
     -------
@@ -288,7 +291,7 @@ def _admissible_pair(
     at, softness, start = trace
     found = feasible_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
+        raise UncertifiableError("the penetration of the answer could not be removed")
     if rigid.driven:
         raise UncertifiableError(rigid.driven)
     places, here = local.reduction.places(at)
@@ -333,7 +336,7 @@ class _RigidMotions:
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) felt motions at the components of the rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
-    balance: Balance  #: of the load along felt motions
+    balance: Balance  #: balance of the load along constrained motions
     driven: str = ""  #: the load along free motions that nothing balances, if any
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:

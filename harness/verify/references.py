@@ -45,7 +45,7 @@ class ReferencePoint:
     """A solution of the elastic problem, and a certified bound of its error."""
 
     u: Extended  #: (n,) admissible
-    multipliers: Extended  #: (m,) of contact, then of friction rows
+    multipliers: Extended  #: (m,) multipliers of contact, then of friction rows
     equilibrium: Extended  #: u_λ (n,)
     states: States  #: (m,) closed, or at a bound of the multiplier
     norm: float  #: ‖u‖_K

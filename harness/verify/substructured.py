@@ -59,7 +59,7 @@ RANDOM_ULPS = 4.0
 #: The same with the sign of u. A slender body has few soft modes, which random signs
 #: may miss: with ¼, the error of a plate 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
-MAX_REFINEMENTS = 6  #: of d
+MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative size of a correction of d that ends the refinement. Bounds are reported to
 #: fewer digits.
 REFINEMENT_TOLERANCE = 1e-6
@@ -341,7 +341,7 @@ class Reduction(Protocol):
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
         """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.
 
-        S : (t, local) with rows for the components `at`
+        S : (t, local) matrix with a row for each of the components `at`
         """
 
 

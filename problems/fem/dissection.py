@@ -23,7 +23,7 @@ from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
 
-LEAF_SIZE = 8  #: most nodes of a set that is not bisected further
+LEAF_SIZE = 8  #: largest number of nodes of a set that is not bisected further
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]

@@ -129,8 +129,8 @@ class Pattern:
     cells: NDArray[np.int32]  #: (E, c)
     ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
     slot: NDArray[np.int32]  #: (E, c, c) index of node b among the neighbours of node a
-    indptr: NDArray[np.int32]  #: (n + 1,) of K in CSC
-    indices: NDArray[np.int32]  #: of K in CSC
+    indptr: NDArray[np.int32]  #: (n + 1,) column pointers of K in CSC
+    indices: NDArray[np.int32]  #: row indices of K in CSC
 
 
 def sparsity(mesh: Mesh) -> Pattern:

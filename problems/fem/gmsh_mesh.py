@@ -46,8 +46,8 @@ class NamedMesh(NamedTuple):
     points: NDArray[np.float64]  #: (N, dim)
     cells: Nodes  #: (E, c) as of a `problems.fem.mesh.Mesh`
     surfaces: Mapping[str, Nodes]  #: cell numbers of each body, in space a volume
-    #: of each physical curve, edges (k, 2) with the body on their left; in space of
-    #: each physical surface, faces (k, 4), anticlockwise from outside
+    #: edges (k, 2) of each physical curve, with the body on their left; in space, faces
+    #: (k, 4) of each physical surface, anticlockwise from outside
     curves: Mapping[str, Nodes]
     spots: Mapping[str, Nodes]  #: nodes of each physical point, in space also curve
 
@@ -151,8 +151,8 @@ def refine(mesh: NamedMesh) -> NamedMesh:
         np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
         for k in range(4)
     ], axis=-1)  # fmt: skip
-    # of the third corner, which a triangle repeats: one child cut off there, and the
-    # triangle of the midpoints in place of the other
+    # a triangle repeats its third corner: one of the two children there is the triangle
+    # at this corner, the other the triangle of the midpoints
     children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
     children[:, ~is_quad, 3] = m[[0, 1, 3, 3]][:, ~is_quad]
     fine = np.ascontiguousarray(children.transpose(1, 2, 0))  # (E, 4 children, 4)
@@ -298,8 +298,8 @@ def _numbers(data: bytes) -> NDArray[np.int64] | None:
 def _named(path: Path, mesh: Any, dim: int) -> dict[str, Nodes]:
     """Return the cells of one dimension by physical names, in the file's order.
 
-    Triangles have four columns, as quadrilaterals; so have all cells of a mixture in
-    space eight.
+    Triangles have four columns, as quadrilaterals, and all cells of a mixture in space
+    have eight.
     """
     is_mixed = len({b.type for b in mesh.cells if DIMENSION[b.type] == 3}) > 1
     names = {
@@ -348,7 +348,9 @@ def _unique_in_order(parts: list[Nodes]) -> Nodes:
 def _counter_clockwise(path: Path, points: NDArray[np.float64], cells: Nodes) -> Nodes:
     """Reorder clockwise cells; raise InputError for flat and non-convex ones."""
     x, triangle = points[cells], is_triangle(cells)[:, None]
-    twice_area = cross(x[:, 2] - x[:, 0], x[:, 3] - x[:, 1])  # of both diagonals
+    twice_area = cross(
+        x[:, 2] - x[:, 0], x[:, 3] - x[:, 1]
+    )  # cross product of both diagonals
     reversed_ = np.where(triangle, cells[:, [1, 0, 2, 3]], cells[:, [0, 3, 2, 1]])
     cells = np.where(twice_area[:, None] < 0, reversed_, cells)
     if (flat := twice_area == 0).any():

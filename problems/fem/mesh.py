@@ -311,7 +311,7 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
     """Move the nodes of a `box` at random; those of a side stay in its plane.
 
-    share : largest move along an axis, relative to the mean cell size along it
+    share : largest shift along an axis, relative to the mean cell size along this axis
     """
     points = mesh.points
     low, high = points.min(axis=0), points.max(axis=0)

@@ -158,7 +158,7 @@ def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _column_lines(A: csc_array, q: Vector, rows: list[str]) -> Iterator[str]:
-    """Write each column; one without entries is named all the same."""
+    """Write each column, also those without entries."""
     for j, cost in enumerate(q):
         part = slice(A.indptr[j], A.indptr[j + 1])
         if cost or part.start == part.stop:

@@ -62,13 +62,15 @@ class Competitor:
     """A solver of a comparison, and its times relative to those of the first."""
 
     solver: str
-    outcomes: Mapping[str, Outcome]  #: by case
+    outcomes: Mapping[str, Outcome]  #: outcomes by case
     compared: tuple[str, ...] = ()  #: cases solved by it and the first
     slower: bool = False  #: significantly slower than the first
-    ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
-    by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
-    form: str = ""  #: of the QPs, in comparisons of forms
-    apart: bool = False  #: on some case not measured in the blocks of the first
+    #: ratio over the cases, or within the blocks of a single case
+    ratio: Ratio | None = None
+    #: ratios within blocks, by case
+    by_case: Mapping[str, Ratio] = field(default_factory=dict)
+    form: str = ""  #: form of the QPs, in comparisons of forms
+    apart: bool = False  #: not measured in the blocks of the first on some case
 
     @property
     def verified(self) -> tuple[str, ...]:

@@ -146,7 +146,7 @@ class Sweep:
 
     title: str  #: family, other parameters, form, tolerance
     solver: str
-    answers: tuple[Sized, ...]  #: by the value of the key
+    answers: tuple[Sized, ...]  #: answers by the value of the key
 
 
 def sweeps(evidence: Evidence, key: str) -> list[Sweep]:

@@ -23,7 +23,8 @@ from mortarbench.harness.plugin import SLIDING
 #: a node is in contact if its force exceeds this times the largest force or, with
 #: friction, if it sticks or slips
 IN_CONTACT = 1e-6
-STATES = ("open", "stick", "slip", SLIDING)  #: of friction, numbered in VTU files
+#: states of friction, numbered in VTU files
+STATES = ("open", "stick", "slip", SLIDING)
 #: by increasing priority, for nodes on several contact sides
 _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 

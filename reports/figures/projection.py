@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 _STANDARD = np.array([0.62, -0.64, 0.45])
 #: tiles of the visible surface; fewer show steps of the colours
 _TILES = 12_000
-_MAX_TILES = 20  #: along an edge of a face
+_MAX_TILES = 20  #: largest number of tiles along an edge of a face
 
 
 class Camera(NamedTuple):
@@ -25,7 +25,7 @@ class Camera(NamedTuple):
 
     right: Vector
     up: Vector
-    towards: Vector  #: from the bodies to the camera
+    towards: Vector  #: direction from the bodies to the camera
 
     def project(self, points: Points) -> NDArray[np.float64]:
         """Return positions in the picture (…, 2)."""

@@ -61,13 +61,14 @@ def significantly_faster(logs: Array, cases: Sequence[str]) -> NDArray[np.bool_]
 
     If two solvers are equal, their times on a case are exchangeable: the sign of the
     difference d of logarithms is random. The signs of whole cases are flipped, and the
-    statistics of a pair are compared with their maximum over all pairs in every flip
-    [3]_. There are two statistics: Σd/√Σd², equivalent to Student's t, and the same of
-    signed ranks, which a few failures with a large penalty cannot mask; it counts only
-    if it agrees with the sign of the mean. The more significant one is used, in the
-    flips as well. So among any number of equal solvers, at most one set of cases in
-    twenty has a significant pair. Fewer than six cases have none: all signs of five
-    agree in 2 of 2⁵ flips.
+    statistics of each pair are compared with the maxima over all pairs in every flip
+    [3]_. There are two statistics: Σd/√Σd², which is equivalent to Student's t, and the
+    same expression for signed ranks, which a few failures with a large penalty do not
+    distort. The latter counts only if its sign agrees with that of the mean. The more
+    significant statistic is used, also for the flips. Therefore, among any number of
+    equal solvers, at most one set of cases in twenty has a significant pair. With fewer
+    than six cases no pair is significant: the signs of five cases agree in 2 of 2⁵
+    flips.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ class Active(NamedTuple):
     """Active set: the constraints that the Newton system takes as equations."""
 
     side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 free
-    rows: NDArray[np.bool_]  #: (p,) of G
+    rows: NDArray[np.bool_]  #: (p,) active rows of G
 
 
 class Point(NamedTuple):
@@ -54,8 +54,8 @@ class Problem:
     A: Matrix
     G: Matrix
     D: Vector  #: (n,) diag P, with a typical value in place of zeros
-    rho: Vector  #: (m,) of A
-    sigma: Vector  #: (p,) of G
+    rho: Vector  #: (m,) weights of the rows of A
+    sigma: Vector  #: (p,) weights of the rows of G
     faces: Faces
     counts: Counter[str]
 

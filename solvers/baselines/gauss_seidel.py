@@ -56,7 +56,7 @@ class GaussSeidel:
         method="minimises over one disc, cone or variable after the other (NSGS)",
         linear_solver="none (columns of P)",
         phases="everything happens in solving",
-        limits=("a loop in Python over the blocks: for comparisons of sweeps",),
+        limits=("its loop over blocks is in Python: compare sweeps, not times",),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
