@@ -124,6 +124,8 @@ class Record(Measurement):
     )
     #: the part of `build_seconds` for factor and dual; dual forms only
     dualise_seconds: float | None = None
+    #: peak resident memory of the process that built the case anew; see `growing`
+    build_peak_mib: float | None = None
     recover_seconds: float | None = None  #: time to compute quantities from the point
     certify_seconds: float | None = None  #: time to compute `energy_bound`
     canary_seconds: float | None = (
@@ -220,6 +222,8 @@ class Record(Measurement):
             del row["step_tol"]
         if self.ranks == 1:
             del row["ranks"]
+        if self.build_peak_mib is None:
+            del row["build_peak_mib"]
         for name in ("rank_seconds", "rank_counts", "rank_network"):
             if not row[name]:
                 del row[name]
@@ -290,8 +294,8 @@ def _journal() -> dict[str, Field[Any]]:
 JOURNAL: Mapping[str, Field[Any]] = _journal()
 _NOT_NEGATIVE = (
     "repeat", "block", *MEASURED, "build_seconds", "dualise_seconds",
-    "recover_seconds", "certify_seconds", "canary_seconds", "threads", "cpu", "primal",
-    "dual", "complementarity", "gap", "energy_bound", "optimum_error",
+    "build_peak_mib", "recover_seconds", "certify_seconds", "canary_seconds", "threads",
+    "cpu", "primal", "dual", "complementarity", "gap", "energy_bound", "optimum_error",
 )  # fmt: skip
 _SECONDS = tuple(name for name in _NOT_NEGATIVE if name.endswith("_seconds"))
 _texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)

@@ -3,7 +3,8 @@
 It speaks `harness.processes.protocol` and answers four kinds of requests:
 
 * ``{"build": NAME, "qp": PATH, "keep": N}`` builds the case and writes its QP to PATH.
-  Reply: ``{"event": "done", "meta": {…}}``, with the digest of the QP's numbers
+  Reply: ``{"event": "done", "meta": {…}}``, with the digest of the QP's numbers. With
+  the entry ``"first": NAME``, another case is built and dropped first
 * ``{"describe": NAME, "point": PATH, "fields": PATH or null, "keep": N}`` evaluates a
   point. Reply: ``{"event": "done", "quantities": {…}, "bounds": {…}, "notes": […]}``:
   its physical quantities and the bounds of its error. The deformed state is written to
@@ -49,6 +50,7 @@ from mortarbench.harness.plugin import Case, Family, Reference
 from mortarbench.harness.processes.protocol import Events, answer_requests
 from mortarbench.harness.record import finite
 from mortarbench.harness.solution import Solution, Status
+from mortarbench.harness.verify.measure import memory_mib, reset_peak
 from mortarbench.harness.verify.verdicts import certified, note_of, plain, quantities_of
 
 MAX_STORED_BOUNDS = 10_000  #: number of points whose error bounds are cached
@@ -69,6 +71,7 @@ class CaseWorker:
     #: cases in memory by canonical name, least recently used first
     _cases: dict[str, Case] = field(default_factory=dict)
     _build_seconds: float = 0.0  # duration of the last build
+    _build_peak_mib: float | None = None  # peak memory during that build
     _warm: bool = False  # True once a dual case has been built
     #: bounds and objection by case name and digest of the point
     _bounds: dict[tuple[str, str], tuple[dict[str, Any], str]] = field(
@@ -84,6 +87,11 @@ class CaseWorker:
         if "shared" in request:
             return {"shared": is_shared(name)}
         try:
+            if "first" in request:
+                first = request["first"]
+                family = self.families[first["family"]]
+                self._build(CaseId(**{**first, "family": family}))
+                self._warm = True
             case = self._case(name, request["keep"])
         except (Exception, SystemExit) as e:  # the family's code
             return {
@@ -158,9 +166,11 @@ class CaseWorker:
         return case
 
     def _build(self, name: CaseId) -> Case:
+        has_peak = reset_peak()
         start = perf_counter()
         case = name.build(self.reference)
         self._build_seconds = perf_counter() - start
+        self._build_peak_mib = memory_mib("VmHWM") if has_peak else None
         return case
 
     def _write(self, case: Case, name: CaseId, path: Path) -> dict[str, Any]:
@@ -173,6 +183,7 @@ class CaseWorker:
         seconds = {
             "build_seconds": self._build_seconds,
             "dualise_seconds": case.dualise_seconds,
+            "build_peak_mib": self._build_peak_mib,
             "unsettled": case.unsettled,
         }
         return {"meta": {**meta, **seconds, "qp": digest}}

@@ -10,7 +10,8 @@ requests:
   ``sample_seconds``, see `harness.verify.measure`. ``step`` 0, 1, … of a sequence.
   ``tightens``: true if each step of the sequence has its own tolerance
 * ``{"case": {…}, "source": …, "tol": TOL, "out": PATH}``: the same on ranks that emit
-  the QP of a case themselves (`harness.plugin.Family.emission`) and, if ``source`` is
+  the QP of a case themselves (`harness.plugin.Family.emission`), after that of
+  ``first``, another case, if the request has this entry; and, if ``source`` is
   "ranks", evaluate the answer together. The event ``emitted`` contains the ``sizes``
   and the ``digest`` of the QP; ``measured`` follows when the point is written
 * ``{"check": NAME}``: run one of `harness.conformance.conformance.CHECKS`
@@ -149,9 +150,10 @@ class _SolverHost:
         source = source_of(request)
         if source.is_shared:
             assert self.parallel is not None
-            qp, emission = self.parallel.emit(
-                request["case"], request.get("memory_limit")
-            )
+            limit = request.get("memory_limit")
+            if "first" in request:
+                self.parallel.emit(request["first"], limit)
+            qp, emission = self.parallel.emit(request["case"], limit)
             events.reached("emitted", emission)
         else:
             qp = self._load(request)

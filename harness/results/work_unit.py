@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from mortarbench.harness.files.store import Arrays
 from mortarbench.harness.record import Record
@@ -38,6 +38,9 @@ class WorkUnit:
     turns: tuple[tuple[Record, ...], ...]
     time_limit: float  #: time limit of a measurement, s
     memory_limit: float  #: memory limit of a measurement, MiB
+    #: Fields of a small case that a new process builds first, so that the time of its
+    #: next build excludes first calls. None: cases of earlier blocks may be reused
+    warm_up: Mapping[str, Any] | None = None
 
     @property
     def cases(self) -> tuple[str, ...]:

@@ -62,6 +62,8 @@ class Executor:
     _loaded: dict[str, QP] = field(default_factory=dict)  # their QPs, by digest
     # proven optima of small QPs, by digest
     _optima: dict[str, Optimum | None] = field(default_factory=dict)
+    # the limit that building the cases of that block exceeded
+    _limit_hit: _BuildLimitError | None = None
     # True if ranks emit the QP, by case
     _shared: dict[str, bool] = field(default_factory=dict)
 
@@ -89,6 +91,9 @@ class Executor:
                 # On a cluster, the turns of a block come one by one.
                 if block.number != self._number:
                     self._number, self._entries = block.number, ()
+                    self._limit_hit = None
+                    if block.warm_up is not None:
+                        self._case_worker.close()
                 for turn in block.turns:
                     yield from self._turn(block, turn)
             except _BuildError as e:
@@ -107,6 +112,13 @@ class Executor:
                     if result.record.run_id not in measured:
                         measured.add(result.record.run_id)
                         yield result
+                return
+            except _BuildLimitError as e:
+                self._limit_hit = e
+                message = f"building the case: {e.reason}"
+                for record in turn:
+                    ended = record.replace(verdict=e.verdict, message=message)
+                    yield Result(record=ended)
                 return
             except (FaultError, OSError) as e:
                 reason = " ".join(str(e).split())
@@ -186,12 +198,17 @@ class Executor:
         }
         if source.is_shared:
             request |= case_request(record)
+            if block.warm_up is not None:  # in new processes, as on a single one
+                self._worker(record.solver).close()
+                request["first"] = dict(block.warm_up)
         if source is Source.RANKS:
             return request, record
         entry = self._entries[step]
         if not source.is_shared:
             request |= {"qp": str(entry.qp), "digest": entry.digest}
-        keys = ("qp", "build_seconds", "dualise_seconds")
+        keys = ["qp", "build_seconds", "dualise_seconds"]
+        if block.warm_up is not None:  # else its process may hold earlier cases
+            keys.append("build_peak_mib")
         meta = {key: entry.meta.get(key) for key in keys}
         return request, record.replace(**meta, step_tol=_step_tol(record, entry))
 
@@ -211,6 +228,8 @@ class Executor:
 
     def _build(self, block: WorkUnit, turn: tuple[Record, ...]) -> None:
         """Build the cases of a block, once; a sequence may have fewer than steps."""
+        if self._limit_hit is not None:
+            raise self._limit_hit
         if self._entries:
             return
         entries: list[StoredCase] = []
@@ -259,25 +278,33 @@ class Executor:
     def _entry(self, record: Record, block: WorkUnit) -> StoredCase:
         def make(path: Path) -> Mapping[str, Any]:
             request = {"build": _case(record), "qp": str(path)}
+            if block.warm_up is not None:
+                request["first"] = dict(block.warm_up)
             meta: Mapping[str, Any] = self._ask_case_worker(request, block)["meta"]
             return meta
 
         r = record
-        return find_or_build(
-            self.cases, [r.family, r.params, r.form, r.environment], make
-        )
+        identity: list[Any] = [r.family, r.params, r.form, r.environment]
+        if block.warm_up is not None:
+            identity += [r.session, r.block]
+        return find_or_build(self.cases, identity, make)
 
     def _ask_case_worker(
         self, request: Mapping[str, Any], block: WorkUnit
     ) -> Mapping[str, Any]:
+        is_limited = block.warm_up is not None
         for _ in range(
             2
         ):  # it may have been killed from outside, or by an earlier case
             reply = self._case_worker.ask(
-                {**request, "keep": len(block.cases)}, time_limit=inf, memory_limit=inf
+                {**request, "keep": len(block.cases)},
+                time_limit=block.time_limit if is_limited else inf,
+                memory_limit=block.memory_limit if is_limited else inf,
             )
             if reply.answer is not None:
                 break
+            if reply.verdict in (Verdict.TIME_LIMIT, Verdict.MEMORY_LIMIT):
+                raise _BuildLimitError(reply.message, reply.verdict)
         else:
             refuse_full_disk(self.scratch, reply.message)
             if reply.fault:
@@ -376,6 +403,14 @@ class _BuildError(Exception):
         self.reason = reason
         self.trace = trace
         self.past_end = past_end
+
+
+class _BuildLimitError(_BuildError):
+    """A limit that ended the process which builds or evaluates a case."""
+
+    def __init__(self, reason: str, verdict: Verdict) -> None:
+        super().__init__(reason, "")
+        self.verdict = verdict
 
 
 def _case(r: Record) -> dict[str, Any]:

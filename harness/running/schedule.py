@@ -16,10 +16,12 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from mortarbench.harness.names import CaseId
 from mortarbench.harness.record import Record, Verdict
 from mortarbench.harness.results.work_unit import WorkUnit
 from mortarbench.harness.running.pairs import Block, largest_half_width
 from mortarbench.harness.running.progress import Progress
+from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Group, Suite
 from mortarbench.harness.verify.verdicts import new_record
 
@@ -40,6 +42,8 @@ class Schedule:
     #: records by cell; empty unless the suite sets a precision
     _records: dict[Cell, list[Record]] = field(default_factory=dict)
     _declined: set[tuple[str, Cell]] = field(default_factory=set)  # solver and cell
+    #: solver and cell, in series of growing sizes, without a verified answer
+    _ended: set[tuple[str, Cell]] = field(default_factory=set)
     _done: set[str] = field(default_factory=set)  # run ids
     _next: int = 0  # number of the next new block
     _parts: dict[tuple[int, int], int] = field(default_factory=dict)  # their numbers
@@ -56,16 +60,31 @@ class Schedule:
         self._next = max(self._next, record.block + 1)
         if record.verdict is Verdict.DECLINED:
             self._declined.add((record.solver, _cell(record)))
+        elif record.case in self.suite.growing and not record.verdict.is_verified:
+            self._ended.add((record.solver, _cell(record)))
         if self.suite.precision is not None:
             self._records.setdefault(_cell(record), []).append(record)
 
     def is_settled(self, record: Record) -> bool:
-        """Return True for a record that is in the journal, or that its solver declines.
+        """Return True for a record that is in the journal, or that is not needed.
 
-        A solver that declined a case once declines it in every repeat.
+        A solver that declined a case once declines it in every repeat. In a series of
+        growing sizes, one answer that is not verified ends the series of its solver.
         """
-        declined = (record.solver, _cell(record)) in self._declined
-        return declined or record.run_id in self._done
+        cell = record.solver, _cell(record)
+        if record.run_id in self._done or cell in self._declined | self._ended:
+            return True
+        growth = self.suite.growing.get(record.case)
+        return growth is not None and self._has_ended(record, growth)
+
+    def _has_ended(self, record: Record, growth: Growth) -> bool:
+        """Return True if the solver was not verified on a smaller case."""
+        while growth.smaller:
+            cell = record.mode, growth.smaller, record.tol
+            if (record.solver, cell) in self._ended:
+                return True
+            growth = self.suite.growing[growth.smaller]
+        return False
 
     def is_measured(self, run_id: str) -> bool:
         """Return True if the measurement is in the journal."""
@@ -168,11 +187,13 @@ class Schedule:
         if repeat % 2:
             turns.reverse()
         self._next += 1
+        growth = self.suite.growing.get(group.cases[0].name)
         return WorkUnit(
             number=turns[0][0].block,
             turns=tuple(turns),
             time_limit=self.suite.time_limit,
             memory_limit=self.suite.memory_limit,
+            warm_up=None if growth is None else _fields(growth.warm_up),
         )
 
     def _skip(self, cells: int) -> None:
@@ -196,6 +217,14 @@ def _by_block(records: Iterable[Record]) -> dict[Block, float]:
         )
         for repeat, steps in repeats.items()
     }
+
+
+def _fields(case: CaseId) -> dict[str, Any]:
+    """Return the name of a case for `harness.processes.case_worker`."""
+    return {
+        "family": case.family.name, "params": dict(case.params),
+        "form": case.form, "name": case.name,
+    }  # fmt: skip
 
 
 def _cell(record: Record) -> Cell:

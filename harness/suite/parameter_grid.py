@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from glob import escape, glob
-from itertools import product
+from itertools import cycle, product
 from math import prod
 from pathlib import Path, PurePath
 from typing import Any
@@ -16,17 +16,34 @@ from mortarbench.harness.errors import PLUGINS, InputError, shown, some, unknown
 from mortarbench.harness.names import CaseId, assemble
 from mortarbench.harness.plugin import Family
 
-_PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence")
+_PROBLEM_KEYS = ("family", "forms", "params", "zip", "sequence", "growing")
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Place of a case in a series of growing sizes."""
+
+    smaller: str  #: name of the next smaller case of the series; empty for the smallest
+    warm_up: CaseId  #: the same case at the default size of its family
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Problems:
+    """All cases of a suite."""
+
+    cold: tuple[CaseId, ...]
+    sequences: tuple[tuple[CaseId, ...], ...]
+    growing: Mapping[str, Growth]  #: by name of the case; only those of growing series
 
 
 def expand_problems(
     blocks: object, families: Mapping[str, Family], folder: Path, most: int
-) -> tuple[tuple[CaseId, ...], tuple[tuple[CaseId, ...], ...]]:
+) -> Problems:
     """Return all cold cases in the order of the suite, and all sequences of cases.
 
-    A case that occurs in two blocks is returned once. A sequence consists of the cases
-    that differ only in its key and in the keys zipped with that, in the order of their
-    values.
+    A case that occurs in two blocks is returned once. A sequence, like a series of
+    growing sizes, consists of the cases that differ only in its key and in the keys
+    zipped with that, in the order of their values.
 
     folder : folder of the suite; relative paths that do not exist are looked up there
     most : largest number of cases of all blocks
@@ -39,23 +56,36 @@ def expand_problems(
     """
     cold: dict[str, CaseId] = {}
     sequences: dict[str, tuple[CaseId, ...]] = {}
+    growing: dict[str, Growth] = {}
     for block in _blocks(blocks, families, folder, most):
-        if not block.along:
+        if block.kind != "sequence":
             for case in block.cases:
                 cold.setdefault(case.name, case)
-            continue
         steps: dict[str, list[CaseId]] = {}
-        for case in block.cases:
-            rest = {k: v for k, v in case.params.items() if k not in block.along}
+        for case, given in zip(block.cases, block.given, strict=True):
+            rest = {k: v for k, v in given.items() if k not in block.along}
             steps.setdefault(f"{case.form} {rest}", []).append(case)
-        sequences |= {repr(cases): tuple(cases) for cases in steps.values()}
-    return tuple(cold.values()), tuple(sequences.values())
+            if block.kind == "growing":
+                smaller = steps[f"{case.form} {rest}"][-2:-1]
+                growing[case.name] = Growth(
+                    smaller[0].name if smaller else "",
+                    assemble(case.family, rest, case.form),
+                )
+        if block.kind == "sequence":
+            sequences |= {repr(cases): tuple(cases) for cases in steps.values()}
+    return Problems(
+        cold=tuple(cold.values()),
+        sequences=tuple(sequences.values()),
+        growing=growing,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Block:
     cases: list[CaseId]
-    along: tuple[str, ...]  #: keys of a sequence; empty if the cases are cold
+    given: list[dict[str, object]]  #: keys of each case in the suite
+    kind: str  #: "sequence", "growing" or ""
+    along: tuple[str, ...]  #: keys of the sequence or series; empty without
 
 
 def _blocks(
@@ -77,30 +107,28 @@ def _blocks(
             for key in params:
                 if key not in family.defaults:
                     raise unknown("key", key, family.defaults, where=name)
-            sequence_key = _along(table.get("sequence"), params)
+            kind, along_key = _along(table, params)
             forms = checked.filled_list("forms", table.get("forms", list(family.forms)))
             if family.path_suffix is not None and "path" in params:
                 params = {**params, "path": _expanded(params["path"], folder, family)}
             axes = _axes(params, table.get("zip", []))
-            along = next(
-                (tuple(axis[0]) for axis in axes if sequence_key in axis[0]), ()
-            )
+            along = next((tuple(axis[0]) for axis in axes if along_key in axis[0]), ())
             count += prod(map(len, axes)) * len(forms)
             if count > most:
                 raise InputError(
                     f"the grid spans {count} cases; expected at most {most} in all; "
                     f"take fewer values, or set max_cases = {count} in the suite"
                 )
-            cases = [
-                assemble(
-                    family,
-                    _located(point, folder, family),
-                    checked.text("forms", form),
-                )
+            given = [
+                _located(point, folder, family)
                 for point in _points(axes)
-                for form in forms
+                for _ in forms
             ]
-            yield _Block(cases=cases, along=along)
+            cases = [
+                assemble(family, point, checked.text("forms", form))
+                for point, form in zip(given, cycle(forms), strict=False)
+            ]
+            yield _Block(cases=cases, given=given, kind=kind, along=along)
 
 
 def _expanded(paths: object, folder: Path, family: Family) -> object:
@@ -168,19 +196,24 @@ def _located(
     return point
 
 
-def _along(key: object, params: Mapping[str, Any]) -> str | None:
-    """Return the key of a sequence after checking that it has several values."""
-    if key is None:
-        return None
-    values = params.get(checked.text("sequence", key))
+def _along(table: Mapping[str, Any], params: Mapping[str, Any]) -> tuple[str, str]:
+    """Return the kind of a block and its key, which must have several values."""
+    kinds = [kind for kind in ("sequence", "growing") if kind in table]
+    if not kinds:
+        return "", ""
+    if len(kinds) > 1:
+        raise InputError("sequence and growing: expected one of the two")
+    (kind,) = kinds
+    key = table[kind]
+    values = params.get(checked.text(kind, key))
     if not isinstance(values, list) or len(values) < 2:
         lists = [k for k, v in params.items() if isinstance(v, list)]
         hint = f"; the lists are {some(lists)}" if lists else ""
         raise InputError(
-            f"sequence = {shown(key)} is not a list in params; expected the key whose "
-            f"values are the steps{hint}"
+            f"{kind} = {shown(key)} is not a list in params; expected the key whose "
+            f"values are the {'steps' if kind == 'sequence' else 'sizes'}{hint}"
         )
-    return str(key)
+    return kind, str(key)
 
 
 def _axes(table: Mapping[str, Any], groups: object) -> list[list[dict[str, object]]]:

@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from mortarbench.harness.names import CaseId
 from mortarbench.harness.plugin import Family, Solver
 from mortarbench.harness.record import TIGHTENING
 from mortarbench.harness.registry import SolverSpec, resolve
-from mortarbench.harness.suite.parameter_grid import expand_problems
+from mortarbench.harness.suite.parameter_grid import Growth, expand_problems
 
 DEFAULTS: Mapping[str, Any] = {
     "tolerances": [1e-6],
@@ -88,6 +88,8 @@ class Suite:
     text: str  #: TOML of the suite, with the limits that apply
     #: sequences of cases, in the order of their steps
     sequences: tuple[tuple[CaseId, ...], ...] = ()
+    #: place in a series of growing sizes, by name of the case
+    growing: Mapping[str, Growth] = field(default_factory=dict)
     #: values of θ (`harness.record.Record.tighten`); each sequence is solved with each
     tighten: tuple[float, ...] = (0.0,)
     #: relative half-width of every ratio to the fastest solver at which repeats end;
@@ -161,19 +163,21 @@ def parse_suite(
                 f"name = {shown(table['name'])} is not a valid folder name; "
                 "expected letters, digits, '.', '-' and '_'"
             )
-        cases, sequences = expand_problems(
+        problems = expand_problems(
             table["problems"], families, folder, _most_cases(table)
         )
         numbers: dict[str, Any] = {
             key: check(key, table[key]) for key, check in _NUMBERS.items()
         }
         specs = _solvers(table["solvers"], solvers)
+        cases, sequences = problems.cold, problems.sequences
         specs = _on_ranks(specs, table, solvers, sequences)
         every = frozenset(case.name for group in (cases, *sequences) for case in group)
         return Suite(
             name=table["name"], tolerances=_tolerances(table["tolerances"]), text=text,
             solvers=_with_null(specs, table["null_arm"]), cases=cases, every=every,
-            sequences=sequences, tighten=_tightening(table, sequences), **numbers,
+            sequences=sequences, growing=problems.growing,
+            tighten=_tightening(table, sequences), **numbers,
         )  # fmt: skip
 
 
@@ -298,10 +302,10 @@ def steps_up_to(
 
     """
     table = {**DEFAULTS, **toml(text)}
-    _, sequences = expand_problems(
+    problems = expand_problems(
         table.get("problems"), families, Path(), _most_cases(table)
     )
-    for steps in sequences:
+    for steps in problems.sequences:
         if name in steps:
             return steps[: steps.index(name) + 1]
     raise InputError("the suite has no sequence with that case")

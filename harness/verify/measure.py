@@ -189,12 +189,12 @@ def _timed(
     prepare: Prepare, qp: QP, *, peaks: bool = True
 ) -> tuple[object, tuple[float, ...], tuple[float | None, float | None]]:
     """Prepare and solve once; return the answer, seconds and peaks (MiB) of both."""
-    reset = peaks and _reset_peak()
+    reset = peaks and reset_peak()
     start = perf_counter()
     solve = prepare(qp)
     ready = perf_counter()
     prepare_peak = memory_mib("VmHWM") if reset else None
-    reset = peaks and _reset_peak()
+    reset = peaks and reset_peak()
     resumed = perf_counter()
     answer = solve()
     end = perf_counter()
@@ -249,7 +249,7 @@ def memory_mib(key: str, process: int | str = "self") -> float | None:
     return int(values[0]) / 1024 if values else None  # the kernel counts in KiB
 
 
-def _reset_peak() -> bool:
+def reset_peak() -> bool:
     """Reset VmHWM to the resident memory; return False if that fails."""
     try:
         Path("/proc/self/clear_refs").write_text("5")  # proc(5)

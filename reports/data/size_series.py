@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -99,14 +99,7 @@ def by_series(
     step, for example); the other parameters determine the size.
     """
     answers = list(answers)
-    seen: dict[tuple[str, str, int], set[Any]] = {}
-    for n, o in answers:
-        for key, value in o.first.params.items():
-            seen.setdefault((o.first.family, key, n), set()).add(value)
-    fixed: dict[str, dict[str, None]] = {}
-    for (family, key, _), values in seen.items():
-        if len(values) > 1:
-            fixed.setdefault(family, {})[key] = None
+    fixed = fixed_keys(answers)
     groups: dict[SeriesKey, list[Sized]] = {}
     for n, o in answers:
         r = o.first
@@ -114,6 +107,25 @@ def by_series(
         series = SeriesKey(r.family, shared, r.form, o.tol, solver(o))
         groups.setdefault(series, []).append((n, o))
     return groups
+
+
+def fixed_keys(
+    answers: Iterable[Sized], apart: Sequence[str] = ()
+) -> dict[str, dict[str, None]]:
+    """Return, by family, the keys in which cases of equal size differ, in their order.
+
+    apart : keys that are never fixed
+    """
+    seen: dict[tuple[str, str, int], set[Any]] = {}
+    for n, o in answers:
+        for key, value in o.first.params.items():
+            if key not in apart:
+                seen.setdefault((o.first.family, key, n), set()).add(value)
+    fixed: dict[str, dict[str, None]] = {}
+    for (family, key, _), values in seen.items():
+        if len(values) > 1:
+            fixed.setdefault(family, {})[key] = None
+    return fixed
 
 
 def size_series(evidence: Evidence) -> list[SizeSeries]:

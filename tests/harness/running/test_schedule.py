@@ -11,6 +11,7 @@ from mortarbench.harness.plugin import Family
 from mortarbench.harness.registry import SolverSpec
 from mortarbench.harness.running.pairs import largest_half_width, paired_ratio
 from mortarbench.harness.running.schedule import Schedule
+from mortarbench.harness.suite.parameter_grid import Growth
 from mortarbench.harness.suite.suite import Suite
 
 
@@ -235,3 +236,31 @@ def test_only_common_blocks_are_compared():
 
     assert (r.value, r.pairs) == (pytest.approx(2.0), 2)
     assert paired_ratio({0: 1.0}, {0: 1.0}) is None
+
+
+def test_the_first_answer_that_is_not_verified_ends_a_growing_series():
+    """Solver a ends at n = 2, in its first repeat; b declines n = 1 and goes on."""
+    small, middle, large = cases = cases_of(1, 2, 3)
+    growing = {
+        small.name: Growth("", small),
+        middle.name: Growth(small.name, small),
+        large.name: Growth(middle.name, small),
+    }
+    verdicts = {
+        ("a", middle.name): Verdict.TIME_LIMIT, ("b", small.name): Verdict.DECLINED
+    }  # fmt: skip
+    schedule = schedule_of(cases=cases, growing=growing)
+    made = []
+    for block in schedule.blocks():
+        assert block.warm_up["name"] == small.name
+        for (record,) in block.turns:
+            verdict = verdicts.get((record.solver, record.case), Verdict.VERIFIED)
+            made.append((record.solver, record.case, record.repeat))
+            schedule.add(record.replace(verdict=verdict))
+
+    count = {(s, c.name): sum(m[:2] == (s, c.name) for m in made)
+             for s in "ab" for c in cases}  # fmt: skip
+    assert count == {
+        ("a", small.name): 3, ("a", middle.name): 1, ("a", large.name): 0,
+        ("b", small.name): 1, ("b", middle.name): 3, ("b", large.name): 3,
+    }  # fmt: skip

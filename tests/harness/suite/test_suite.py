@@ -591,3 +591,45 @@ def test_a_sequence_along_no_list_is_refused(tmp_path, key):
     )
     with pytest.raises(InputError, match=r"problems\[0\]: sequence = "):
         load_suite(file, problems.PROBLEMS, solvers.SOLVERS)
+
+
+GROWING = "growing = 'n'\nparams = { n = [2, 4, 8], kind = ['soft', 'hard'] }"
+
+
+def test_a_growing_series_knows_its_next_smaller_case_and_a_case_to_warm_up(load):
+    suite = load(MINIMAL + GROWING)
+
+    growth = suite.growing["well/n=8/kind=hard/dual"]
+    assert growth.smaller == "well/n=4/kind=hard/dual"
+    assert growth.warm_up.name == "well/kind=hard/dual"  # n of the family's defaults
+    assert suite.growing["well/n=2/primal"].smaller == ""
+    assert set(suite.growing) == set(names(suite))
+    assert not load(MINIMAL).growing
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("growing = 'm'\nparams = { n = [1, 2] }", "growing = 'm' is not a list"),
+        (
+            "growing = 'n'\nsequence = 'n'\nparams = { n = [1, 2] }",
+            "sequence and growing: expected one of the two",
+        ),
+    ],
+)
+def test_a_wrong_growing_series_is_refused(load, keys, message):
+    with pytest.raises(InputError, match=message):
+        load(MINIMAL + keys)
+
+
+def test_the_suite_of_the_crossover_reaches_a_million_dofs_in_plane_and_space():
+    suite = load_suite(
+        ROOT / "suites/crossover.toml", problems.PROBLEMS, solvers.SOLVERS
+    )
+    largest = {case.family.name: case.params for case in suite.cases}
+
+    p = largest["beam-ring"]
+    nodes = (8 * p["Nr"] + 1) * (p["Nr"] + 1) + (12 * p["Nh"] + 1) * (p["radial"] + 1)
+    assert 0.9e6 < 2 * nodes < 1.1e6
+    assert 0.9e6 < 3 * (largest["cube-wall"]["n"] + 1) ** 3 < 1.1e6
+    assert set(suite.growing) == set(names(suite))

@@ -1,0 +1,128 @@
+"""Time and memory from the mesh to a verified answer against size, for every route."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.crossover import KINDS, Map, Route, charged, memory
+from mortarbench.reports.data.evidence import Outcome
+from mortarbench.reports.document.figure import (
+    INK,
+    Figure,
+    Key,
+    Look,
+    Mark,
+    Panel,
+    Row,
+    Rule,
+    Text,
+)
+from mortarbench.reports.figures.style import (
+    COLOURS,
+    DASHED,
+    DOTTED,
+    MARKERS,
+    curve,
+    legible,
+    log,
+    with_legend,
+)
+from mortarbench.reports.statistics.intervals import Interval
+
+#: letters at the end of a line, by the verdict that ended it; "?" where not measured
+LETTERS = {
+    Verdict.TIME_LIMIT: "t",
+    Verdict.MEMORY_LIMIT: "m",
+    Verdict.ITERATION_LIMIT: "i",
+    Verdict.DECLINED: "d",
+}
+FAILED = "f"  #: letter of all other verdicts
+UNMEASURED = "?"
+_HEIGHT = 2.75  #: of a row of panels, inches
+_LIMIT = Look(colour=INK, width=0.7, dash=DOTTED)
+_BARS = {"cap": 2.2, "width": 0.9}
+
+Quantity = Callable[[Outcome], Interval | None]
+
+
+def crossover_figure(
+    maps: Sequence[Map], time_limit: float | None, memory_limit: float | None
+) -> Figure:
+    """Plot times (left) and peak memory (right) of all routes, one row per map.
+
+    time_limit, memory_limit : s and MiB, drawn as dotted lines; None if unknown
+    """
+    rows = []
+    for one in maps:
+        title = legible(one.title, 44)
+        panels = (
+            _panel(one, charged, "time from mesh to answer in s", time_limit, title),
+            _panel(one, memory, "peak memory in MiB", memory_limit, title),
+        )
+        rows.append(Row(panels=panels))
+    routes = dict.fromkeys(r for one in maps for r in one.routes if one.routes[r])
+    ordered = sorted(routes, key=lambda r: (_index(r), r.layout, r.ranks))
+    keys = [
+        Key(label=legible(label, 40), look=_look(route), solver=label)
+        for route in ordered
+        if (label := _short(route))
+    ]
+    keys = list({key.label: key for key in keys}.values())
+    return with_legend(rows, keys, 3, _HEIGHT * len(rows))
+
+
+def _panel(
+    one: Map, quantity: Quantity, label: str, limit: float | None, title: str
+) -> Panel:
+    marks, texts = list[Mark](), list[Text]()
+    for route, answers in one.routes.items():
+        points = [(n, quantity(o), o) for n, o in answers.items()]
+        known = [(n, value) for n, value, _ in points if value is not None]
+        marks += curve(points, _look(route), _short(route), _BARS)
+        letter = end_letter(one, route)
+        if known and letter:
+            n, last = known[-1]
+            texts.append(Text(text=letter, place=(n, last.value), offset=(6, 0)))
+    rules = () if limit is None else (Rule(axis="y", at=float(limit), look=_LIMIT),)
+    return Panel(
+        x=log("degrees of freedom"), y=log(label), marks=tuple(marks),
+        texts=tuple(texts), rules=rules, title=title,
+    )  # fmt: skip
+
+
+def end_letter(one: Map, route: Route) -> str:
+    """Return the letter at the end of a route; empty if it reached the largest size."""
+    stop = one.stops[route]
+    if stop.dofs is None:
+        return ""
+    if stop.verdict is None:
+        return UNMEASURED
+    return LETTERS.get(stop.verdict, FAILED)
+
+
+def _index(route: Route) -> int:
+    return KINDS.index(route.kind) if route.kind in KINDS else len(KINDS)
+
+
+def _short(route: Route) -> str:
+    """Return the name of a route without the keys of its decomposition.
+
+    The same route has other keys in other families; tables show them.
+    """
+    return replace_layout(route).label
+
+
+def replace_layout(route: Route) -> Route:
+    """Return a route without the keys of its decomposition."""
+    return route._replace(layout="")
+
+
+def _look(route: Route) -> Look:
+    """Return colour and marker of the kind; several ranks are dashed and hollow."""
+    i = _index(route)
+    style = Look(colour=COLOURS[i], marker=MARKERS[i], width=1.3, size=4.2)
+    if route.ranks == 1:
+        return style
+    return replace(style, dash=DASHED, fill="none")

@@ -1,0 +1,131 @@
+"""Crossover maps: routes, charged times, crossover sizes and reasons to stop."""
+
+from functools import partial
+
+import pytest
+
+from mortarbench.harness import Verdict
+from mortarbench.reports.data.crossover import (
+    Route,
+    charged_seconds,
+    crossover_maps,
+    memory,
+)
+from mortarbench.reports.data.evidence import Evidence, arrange
+from mortarbench.reports.figures.crossover import crossover_figure, end_letter
+from mortarbench.reports.sections import Analysis
+from mortarbench.reports.sections.crossover import crossover
+from tests.support.box_records import box_record
+
+PRIMAL, DUAL = Route("primal", "", 1), Route("dual", "", 1)
+TFETI, RANKS = Route("TFETI", "feti=4", 1), Route("TFETI", "feti=4", 2)
+SIZES = (9, 19, 39, 79)  # of the box: 1000, 2000, 4000 and 8000 dofs
+
+
+def record(solver, n, build, total, repeat=0, form="dual", feti=0, **changes):
+    """Return a record of a fresh build; recovery takes 1 s."""
+    name = f"box/n={n}/feti={feti}/{form}"
+    changes = {"build_peak_mib": 50.0, "recover_seconds": 1.0, **changes}
+    made = box_record(solver, n, total, repeat, form=form, **changes)
+    return made.replace(
+        case=name, build_seconds=build, run_id=f"{solver} {name} {repeat}",
+        params={"n": n, "feti": feti}, peak_mib=20.0,
+    )  # fmt: skip
+
+
+def measured(repeats=3):
+    """Primal costs n², dual 20 s and n/10, TFETI stops; a is fast, b slow."""
+    for n in SIZES:
+        for i in range(repeats):
+            noise = 1 + 0.01 * i
+            one = partial(record, repeat=i)
+            if n < SIZES[-1]:
+                yield one("a", n, 1.0, noise * n**2 / 10, form="primal")
+            yield one("b", n, 1.0, noise * n**2, form="primal")
+            yield one("a", n, 20.0, noise * n / 10)
+            if n == SIZES[0]:
+                yield one("a", n, 1.0, 1.0, feti=4)
+                yield one("a ranks=2", n, 1.0, 1.0, feti=4, ranks=2)
+    stop = dict(verdict=Verdict.MEMORY_LIMIT, quantities={}, total_seconds=None)
+    yield record("a", SIZES[1], None, None, feti=4, **stop)
+
+
+@pytest.fixture
+def evidence(tmp_path):
+    return lambda records: Evidence(directory=tmp_path, records=arrange(records))
+
+
+def test_everything_from_the_mesh_to_the_recovered_answer_is_charged():
+    r = record("a", 9, 3.0, 4.0)
+    assert charged_seconds(r) == 8.0
+    assert charged_seconds(r.replace(recover_seconds=None)) is None
+
+
+def test_a_route_has_its_fastest_solver_at_each_size(evidence):
+    (one,) = crossover_maps(evidence(measured()))
+
+    assert one.sizes == (1000, 2000, 4000, 8000)
+    assert [o.solver for o in one.routes[PRIMAL].values()] == ["a", "a", "a", "b"]
+    assert set(one.routes) == {PRIMAL, DUAL, TFETI, RANKS}
+    assert one.missing == ("primal, multigrid", "dual-bounds", "hybrid TFETI")
+
+
+def test_memory_is_the_larger_peak_of_building_and_solving(evidence):
+    (one,) = crossover_maps(evidence(measured()))
+    assert memory(one.routes[DUAL][1000]).value == 50.0
+
+
+def test_the_crossover_is_the_size_from_which_on_the_dual_is_faster(evidence):
+    """n²/10 + 1 exceeds n/10 + 20 from n = 19 on: 37.1 s against 21.9 s."""
+    (one,) = crossover_maps(evidence(measured()))
+
+    at = one.crossover(DUAL, PRIMAL)
+    assert (at.pays, at.smallest, at.largest, at.beyond) == (2000, 1000, 8000, False)
+    assert at.ratio.value == pytest.approx((79**2 + 2) / (7.9 + 21), rel=0.02)
+
+
+def test_single_runs_are_never_called_faster(evidence):
+    (one,) = crossover_maps(evidence(measured(repeats=1)))
+    assert one.crossover(DUAL, PRIMAL).pays is None
+
+
+def test_every_end_has_its_reason(evidence):
+    (one,) = crossover_maps(evidence(measured()))
+
+    stops = {route: (stop.dofs, stop.verdict) for route, stop in one.stops.items()}
+    assert stops == {
+        PRIMAL: (None, None), DUAL: (None, None),
+        TFETI: (2000, Verdict.MEMORY_LIMIT), RANKS: (2000, None),
+    }  # fmt: skip
+    letters = {route: end_letter(one, route) for route in one.routes}
+    assert letters == {PRIMAL: "", DUAL: "", TFETI: "m", RANKS: "?"}
+
+
+def test_the_section_names_every_route_even_those_without_measurements(evidence):
+    whole = crossover(Analysis(evidence(measured())))
+
+    stops = whole.tables[-1]
+    assert [row[0].text for row in stops.rows] == [
+        "primal", "dual", "TFETI (feti=4)", "TFETI (feti=4), 2 ranks",
+        "primal, multigrid", "dual-bounds", "hybrid TFETI",
+    ]  # fmt: skip
+    assert [row[3].text for row in stops.rows][2:5] == [
+        "memory limit", "not measured", "not in this run"
+    ]  # fmt: skip
+    assert whole.pictures[0].name == "crossover"
+
+
+def test_a_folder_without_growing_series_has_no_section(evidence):
+    old = [r.replace(build_peak_mib=None) for r in measured()]
+    assert crossover(Analysis(evidence(old))) is None
+
+
+def test_the_figure_has_a_line_per_route_and_its_measurements(evidence):
+    maps = crossover_maps(evidence(measured()))
+    figure = crossover_figure(maps, 120, 8192)
+
+    time, peak = figure.panels
+    assert len(time.marks) == len(peak.marks) == 4
+    assert [text.text for text in time.texts] == ["m", "?"]
+    assert {rule.at for p in figure.panels for rule in p.rules} == {120.0, 8192.0}
+    assert all(len(series.runs) == len(series.x) for series in time.marks)
