@@ -1,4 +1,4 @@
-"""Reader of contact problems described by a TOML file next to a mesh from gmsh.
+"""Reader of contact problems described by a TOML file next to a mesh.
 
 ::
 
@@ -37,6 +37,9 @@
 Whatever the length unit of the mesh is, this file and all results are in SI units: E
 and tractions in Pa, forces in N/m, units.length in m.
 
+In .inp and .med files, bodies are sets of elements and groups of cells, boundaries are
+surfaces, sets or groups of facets or of nodes, and points are sets of nodes.
+
 If the mesh has physical volumes, these are the bodies, and boundaries are physical
 surfaces. Vectors then have three components, forces are in N, and a force on a boundary
 is spread evenly over its area; `point` is a physical point or curve, whose nodes share
@@ -52,7 +55,7 @@ top-level key ``loading = "static"`` measures slip from the undeformed state.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +73,14 @@ from mortarbench.problems.contact.bodies import (
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import (
-    BODY,
-    BOUNDARY,
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh_files.named import (
+    FileMesh,
     NamedMesh,
-    read_msh,
+    named_mesh,
     refine,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
     LAW_PARAMETERS,
@@ -157,11 +160,14 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     """
     table = read_description(path)
     mesh_path = path.parent / table["mesh"]
-    named = read_msh(mesh_path)
+    file = read_mesh_file(mesh_path)
+    with located(str(path)):
+        materials = _materials(table["bodies"], file)
+    named = named_mesh(file, materials)
     if named.dim == 3 and halvings:
         raise InputError(
             f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
-            "halvings=0, and a finer mesh from gmsh"
+            "halvings=0, and a finer mesh file"
         )
     refined = 2 * len(named.cells) * 4**halvings  # checked before refining
     check_memory(str(path), refined if named.dim == 2 else named.points.size)
@@ -170,7 +176,9 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
-        materials = _materials(table["bodies"], named)
+        for name in named.surfaces:
+            if name not in materials:
+                raise InputError(f"bodies: {named.words.body} {name!r} has no entry")
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
         _check_loads_act(table["loads"], loads, np.concatenate(fixed))
@@ -226,12 +234,12 @@ def _each(
     return values
 
 
-def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
+def _materials(entries: object, file: FileMesh) -> dict[str, Material]:
     materials: dict[str, Material] = {}
 
     def read(entry: dict[str, Any]) -> None:
         _keys(entry, ("name", "E", "nu"))
-        name = _one_of(named.surfaces, f"physical {BODY[named.dim]}", entry, "name")
+        name = _one_of(file.body_names, file.words.body, entry, "name")
         if name in materials:
             raise InputError(f"body {name!r} is described twice; expected once")
         E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
@@ -240,10 +248,6 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
         materials[name] = Material(E=E, nu=float(nu))
 
     _each({"bodies": entries}, "bodies", read)
-    if missing := [name for name in named.surfaces if name not in materials]:
-        raise InputError(
-            f"bodies: physical {BODY[named.dim]} {missing[0]!r} has no entry"
-        )
     return materials
 
 
@@ -365,7 +369,7 @@ def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
     _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
     sides = {}
     for side in _SIDES:
-        name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, side)
+        name = _one_of(named.curves, named.words.boundary, entry, side)
         facets = named.curves[name]
         sides[side] = _chain(f"{side} {name!r}", facets) if named.dim == 2 else facets
     if np.intersect1d(sides["slave"], sides["master"]).size:
@@ -424,19 +428,18 @@ def _place(
     """Return the nodes of an entry's boundary or point, and the boundary's facets."""
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
-        raise InputError("expected either boundary or point, a physical name")
+        raise InputError("expected either boundary or point, a name of the mesh")
     _keys(entry, (*where, *others))
     if where == ["point"]:
-        what = "physical point" if named.dim == 2 else "physical point or curve"
-        name = _one_of(named.spots, what, entry, "point")
+        name = _one_of(named.spots, named.words.point, entry, "point")
         return named.spots[name], np.zeros((0, 2), dtype=np.int64)
-    name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, "boundary")
+    name = _one_of(named.curves, named.words.boundary, entry, "boundary")
     facets = named.curves[name]
     return np.unique(facets), facets
 
 
 def _one_of(
-    names: Mapping[str, Any], what: str, entry: Mapping[str, Any], key: str
+    names: Collection[str], what: str, entry: Mapping[str, Any], key: str
 ) -> str:
     name = checked.text(key, entry[key])
     if name not in names:
