@@ -316,9 +316,7 @@ def _vector(key: str, value: object, dim: int) -> list[float]:
     vector = checked.filled_list(key, value)
     if len(vector) != dim or not all(map(checked.is_number, vector)):
         count, form = {2: "two", 3: "three"}[dim], ", ".join(_AXES[:dim])
-        raise InputError(
-            f"{key} = {shown(vector)}; expected {count} numbers, [{form}]"
-        )
+        raise InputError(f"{key} = {shown(vector)}; expected {count} numbers, [{form}]")
     return [physical(key, component) for component in vector]
 
 

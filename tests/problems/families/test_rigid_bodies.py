@@ -141,7 +141,7 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
     """A plane, and a sphere that is 0.5 mm above it at one node."""
     second = '[[contacts]]\nslave = "foot"\nrigid = {{ {} }}\n'
     toml = TOML + second.format(SPHERE.replace("[0, 0, -2]", "[0.5, 0.5, -1.9995]"))
-    fields, values = solve(block(tmp_path, toml))
+    _, values = solve(block(tmp_path, toml))
     on_plane, on_sphere = values["contacts"].values()
 
     assert list(values["contacts"]) == ["block on rigid", "block on rigid (2)"]
@@ -161,7 +161,7 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
         (TOML, f"rigid = {{ {PLANE} }}", "", "expected either master, a physical surf"),
         (TOML, f"{{ {PLANE} }}", '"plane"', "rigid = 'plane'; expected a table"),
         (TOML, 'shape = "plane"', 'shape = "plain"',
-         "rigid: unknown shape 'plain'; did you mean 'plane'? known: cylinder, plane, s"),
+         "rigid: unknown shape 'plain'; did you mean 'plane'? known: cylinder, plane"),
         (TOML, 'shape = "plane", ', "",
          "rigid: shape is missing; expected cylinder or plane or sphere"),
         (TOML, "point = [7, 7, 0], ", "", "rigid: point is missing"),
@@ -175,15 +175,15 @@ def test_one_side_may_press_on_two_rigid_bodies(tmp_path):
          "rigid: radius = 0; expected a positive number"),
         (TOML, PLANE, SPHERE.replace("-2", "2"), "no part of slave 'foot' faces the r"),
         (TOML, PLANE, SPHERE.replace("-2", "-2000"),
-         "the rigid body is 2e+03 m from slave 'foot', farther than the size 1.5 m of"),
+         "the rigid body is 2e+03 m from slave 'foot', farther than the size 1.5"),
         (TOML, PLANE, CYLINDER.replace("axis = [0, -3, 0], ", ""), "axis is missing"),
-        (TOML, PLANE, CYLINDER.replace("-3", "0"), "axis is zero; expected a direction"),
+        (TOML, PLANE, CYLINDER.replace("-3", "0"), "axis is zero; expected a"),
         (IN_PLANE, LINE, 'shape = "sphere", centre = [0, -2], radius = 2',
          "rigid: unknown shape 'sphere'; known: cylinder, plane"),
         (IN_PLANE, LINE, DISC.replace("radius", "axis = [0, 1], radius"),
          "rigid: unknown key 'axis'"),
         (IN_PLANE, "steps", 'kinematics = "finite"\nsteps',
-         "contact with a rigid body and kinematics=finite is not built; expected a mas"),
+         "a rigid body and kinematics=finite is not built; expected a master, or kin"),
     ],
 )  # fmt: skip
 def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, message):
