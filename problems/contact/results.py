@@ -106,7 +106,7 @@ def _contact_force(
         return {}
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
-    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
+    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
     # contact forces act on both bodies: sum those on one of them, or they cancel
     loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}

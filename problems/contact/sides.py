@@ -1,9 +1,10 @@
 """Contact results along the slave side of each pair: forces, pressures, gaps, states.
 
 The rows of the primal QP are ordered pair by pair, and along the slave side within a
-pair. A row is assigned to the first pair, from the pair of the preceding row on, whose
-two sides contain all nodes of the row. If two pairs share nodes on both sides, rows on
-these nodes therefore belong to the first of them.
+pair. A rigid master has one row per slave node that is not clamped. Any other row is
+assigned to the first pair, from the pair of the preceding row on, whose two sides
+contain all nodes of the row. If two pairs share nodes on both sides, rows on these
+nodes therefore belong to the first of them.
 """
 
 from __future__ import annotations
@@ -142,16 +143,19 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
     # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
-    outside = []
-    for pair in bodies.pairs:
-        other = np.ones(N)
-        other[pair.nodes] = 0.0
-        outside.append(touches @ other > 0)
     slices, first = [], 0
-    for k in range(len(bodies.pairs)):
-        # the rows of pair k end before the first row with a node beyond its two sides
-        beyond = np.flatnonzero(outside[k][first:])
-        end = first + int(beyond[0]) if beyond.size else m
+    for pair in bodies.pairs:
+        if pair.rigid is not None:
+            end = first + pair.slave_nodes.size - pair.clamped.size
+        else:
+            # the rows of the pair end before the first row with a node beyond its two
+            # sides, or that of a rigid master, which has nodes of the slave only
+            other, opposite = np.ones(N), np.zeros(N)
+            other[pair.nodes] = 0.0
+            opposite[pair.master if pair.master.size else pair.slave] = 1.0
+            outside = (touches @ other > 0) | (touches @ opposite == 0)
+            beyond = np.flatnonzero(outside[first:])
+            end = first + int(beyond[0]) if beyond.size else m
         slices.append(slice(first, end))
         first = end
     return slices
