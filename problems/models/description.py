@@ -399,9 +399,7 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
     """Return the pair of an entry; held : prescribed components."""
     checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
     if ("master" in entry) == ("rigid" in entry):
-        raise InputError(
-            f"expected either master, a {named.words.boundary}, or rigid"
-        )
+        raise InputError(f"expected either master, a {named.words.boundary}, or rigid")
     names = [side for side in _SIDES if side in entry]
     _keys({k: v for k, v in entry.items() if k in _SIDES}, tuple(names))
     sides = {}
