@@ -32,6 +32,8 @@ class HertzSphere(ContactFamily):
         E=size(200.0),
         nu=key(0.3),
         load=size(10.0),
+        Q=key(0.0),
+        mu=size(0.3),
         contact=METHODS["contact"].with_default("mortar"),
         basis=METHODS["basis"],
         **DECOMPOSITION,
@@ -50,6 +52,21 @@ class HertzSphere(ContactFamily):
                         f"{self.name}: {name}={params[name]} is not used by "
                         f"against=plane; expected against=sphere, or no {name}"
                     )
+        if not 0 <= float(params["Q"]) < 1:
+            raise InputError(
+                f"{self.name}: Q={params['Q']} must be at least 0 and below 1, a part "
+                "of μP"
+            )
+        if params["Q"] and params["against"] == "plane":
+            raise InputError(
+                f"{self.name}: Q={params['Q']} with against=plane; expected "
+                "against=sphere, where the exact solution is known"
+            )
+        if params["mu"] != self.defaults["mu"] and not params["Q"]:
+            raise InputError(
+                f"{self.name}: mu={params['mu']} is not used without a tangential "
+                "force; expected Q, or no mu"
+            )
         if not -1 < float(params["nu"]) < 0.5:
             raise InputError(
                 f"{self.name}: nu={params['nu']} must be between -1 and 0.5"
