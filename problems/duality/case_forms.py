@@ -66,7 +66,9 @@ def case_of(
         contact = Contact(*contact_rows(primal, friction), friction.bound)
         stage = problem.stages[path.last_of(choice.step)]
         layout = cached_layout(elastic, choice.size)
-        decomposed = decompose(elastic, layout, choice.glue, stage, contact)
+        decomposed = decompose(
+            elastic, layout, choice.glue, stage, contact, choice.cluster
+        )
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:

@@ -213,6 +213,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     none = np.zeros(0)
     return DecomposedProblem(
         layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
+        cluster=p["cluster"],
         material=_material(p, column, row),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(Forces(*_pull(grid, p["load"]))),
