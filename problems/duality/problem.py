@@ -112,7 +112,7 @@ class _Joined(Generic[B]):
 class StructuredGrids(_Joined[StructuredGrid]):
     """Structured grids; subdomains have at most size² cells."""
 
-    def layout(self, size: int) -> Layout:
+    def layout(self, size: int | tuple[int, ...]) -> Layout:
         """Cut each grid into blocks of at most `size` cells a side."""
         return Layout.of(self.parts, size)
 
@@ -156,7 +156,7 @@ class StructuredSolids:
         """Faces of the sides by name."""
         return self.mesh.boundaries
 
-    def layout(self, size: int) -> Subdivision:
+    def layout(self, size: int | tuple[int, ...]) -> Subdivision:
         """Cut each box into blocks of at most `size` cells a side."""
         labels = [blocks(divisions, size) for divisions in self.divisions]
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])

@@ -448,6 +448,11 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
     return nodes, areas
 
 
+def nodes_of_side(side: Nodes) -> Nodes:
+    """Return the nodes of a chain, in its order, or of faces, ascending."""
+    return side if side.ndim == 1 else np.unique(side)
+
+
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:
     """Return the displacement components of nodes: dim·i, dim·i + 1, … for node i.
 

@@ -51,7 +51,7 @@ class Layout:
 
     @classmethod
     def of(
-        cls, grids: tuple[StructuredGrid, ...], most: int | tuple[int, int]
+        cls, grids: tuple[StructuredGrid, ...], most: int | tuple[int, ...]
     ) -> Layout:
         """Cut grids into blocks of at most `most` cells per side.
 
