@@ -388,7 +388,8 @@ class RankOperator:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
         packed, ranks = self.local.packed, self.halo.ranks
         each, weights = self.local.weighted_blocks(kind, scaling)
-        blocks, BW = packed.block_diagonal(each), scaled_columns(packed.B, weights)
+        blocks = self.local.stiffness_map(each, weights)
+        BW = scaled_columns(packed.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ packed.BT))
 

@@ -237,7 +237,7 @@ class DualOperator:
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             solve = DirectSum(Identity(E), contact)
             self._preconditioners[kind, scaling] = Composition(
-                solve, CompressedRows(B_D), self.packed.block_diagonal(blocks),
+                solve, CompressedRows(B_D), self.stiffness_map(blocks, weights),
                 CompressedRows(csr_array(B_D.T)), solve,
             )  # fmt: skip
         return self._preconditioners[kind, scaling]
@@ -274,6 +274,16 @@ class DualOperator:
         if scaling == "multiplicity":
             weights = np.ones_like(weights)
         return blocks, weights
+
+    def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
+        """Return the map of packed components by D, or by (I − Π)D(I − Π)ᵀ.
+
+        blocks, weights : from `weighted_blocks`
+        """
+        separate = self.packed.block_diagonal(blocks)
+        if self.clusters is None:
+            return separate
+        return average_free(self.clusters, self.packed, separate, weights)
 
     @cached_property
     def packed(self) -> Packed:
@@ -373,13 +383,71 @@ class _Joints:
         return total
 
 
+def average_free(
+    clusters: Clusters, packed: Packed, D: LinearMap, weights: Vector
+) -> Composition:
+    """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
+
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding would let the iterates
+    of preconditioned conjugate gradients drift along these. B_DΠ maps to them, and
+    (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 since C = LᵀB for some L: the preconditioner is the same up
+    to such multipliers, and its images are free of them.
+
+    weights : (M,) W, equal for all subdomains of a class
+    """
+    members = [group.members.size for group in packed.groups]
+    modes, weighted, grams, end = [], [], [], 0
+    for group, faces in zip(packed.groups, clusters.faces, strict=True):
+        Phi = faces[group.touched].toarray()
+        w = weights[end : end + Phi.shape[0] * group.members.size : group.members.size]
+        end += Phi.shape[0] * group.members.size
+        modes.append(Phi)
+        weighted.append(w[:, None] * Phi)
+        grams.append(Phi.T @ weighted[-1])
+    place = _column_places(clusters, packed, [Phi.shape[1] for Phi in modes])
+    C = csr_array(
+        (clusters.joints.data, place[clusters.joints.indices], clusters.joints.indptr),
+        clusters.joints.shape,
+    )
+    q = [Phi.shape[1] for Phi in modes]
+    n = [Phi.shape[0] for Phi in modes]
+
+    def oblique(left: list[Dense], right: list[Dense]) -> Sum:
+        rows = [np.ascontiguousarray(block.T) for block in right]
+        sizes = np.diff(clusters.rows).tolist()
+        minus_joined = Composition(
+            BlockDiagonal(left, q, members), CompressedRows(csr_array(-C.T)),
+            BlockDiagonal(clusters.gram_inverses(grams), sizes, [1] * len(sizes)),
+            CompressedRows(C), BlockDiagonal(rows, n, members),
+        )  # fmt: skip
+        return Sum(Identity(D.shape[0]), minus_joined)
+
+    return Composition(oblique(modes, weighted), D, oblique(weighted, modes))
+
+
+def _column_places(
+    clusters: Clusters, packed: Packed, sizes: Sequence[int]
+) -> NDArray[np.int64]:
+    """Return the places of the coordinates (Σq,) of `Clusters`, packed by groups.
+
+    sizes : number of columns of each group; its first ones are the coordinates
+    """
+    first = clusters.coordinates
+    place, end = np.empty(first[-1], dtype=np.int64), 0
+    for group, faces, p in zip(packed.groups, clusters.faces, sizes, strict=True):
+        members, q = group.members, np.arange(faces.shape[1])[:, None]
+        number = end + q * members.size + np.arange(members.size)
+        place[first[members] + q] = number
+        end += p * members.size
+    return place
+
+
 def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
     """Return the joints of clusters, from the blocks (K⁺)_bb of the groups."""
-    modes = clusters.domains.modes
-    first, first_motion = clusters.coordinates, np.cumsum(modes) - modes
     columns, compliance, end = list[Dense](), list[Dense](), 0
-    coordinate = np.empty(first[-1], dtype=np.int64)  # places among packed columns
-    motion = np.empty(modes.sum(), dtype=np.int64)
+    modes = clusters.domains.modes
+    first_motion = np.cumsum(modes) - modes
+    motion = np.empty(modes.sum(), dtype=np.int64)  # places among packed columns
     for group, inverse, faces in zip(
         packed.groups, inverses, clusters.faces, strict=True
     ):
@@ -389,9 +457,9 @@ def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joi
         columns.append(np.hstack([image, group.template.R[group.touched]]))
         (q, p), members = (Phi.shape[1], columns[-1].shape[1]), group.members
         place = end + np.arange(p * members.size).reshape(p, members.size)
-        coordinate[first[members] + np.arange(q)[:, None]] = place[:q]
         motion[first_motion[members] + np.arange(p - q)[:, None]] = place[q:]
         end += place.size
+    coordinate = _column_places(clusters, packed, [M.shape[1] for M in columns])
     order, sizes = clusters.unknowns
     C = clusters.joints
     combine = vstack(

@@ -367,6 +367,13 @@ class Clusters:
         """
         return [upper_triangle(one.saddle_inverse(compliance)) for one in self._joined]
 
+    def gram_inverses(self, grams: Sequence[Dense]) -> list[Vector]:
+        """Return the upper triangle of (CWCᵀ)⁺ for each cluster, column by column.
+
+        grams : ΦᵀWΦ (q_k, q_k) of each class
+        """
+        return [upper_triangle(one.gram_inverse(grams)) for one in self._joined]
+
     @cached_property
     def _saddle_inverse(self) -> BlockDiagonal:
         """M⁺ in the order of `unknowns`."""
@@ -416,12 +423,21 @@ class _Joined(NamedTuple):
     independent: Dense  #: (c, c') orthonormal basis of range C
     dependent: Dense  #: (c, c − c') orthonormal basis of ker Cᵀ
 
+    def product(self, coordinates: Sequence[Dense]) -> Dense:
+        """Return CACᵀ (c, c), from ΦᵀAΦ of each class."""
+        total = np.zeros((self.CR.shape[0],) * 2)
+        for k, J in self.parts:
+            total += J @ coordinates[k] @ J.T
+        return total
+
+    def gram_inverse(self, grams: Sequence[Dense]) -> Dense:
+        """Return (CWCᵀ)⁺ on the range of C, from ΦᵀWΦ of each class."""
+        U = self.independent
+        return _symmetric(U @ np.linalg.inv(U.T @ self.product(grams) @ U) @ U.T)
+
     def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
         """Return M⁺ of this cluster, from ΦᵀK⁺Φ of each class."""
-        c, r = self.CR.shape
-        S = np.zeros((c, c))
-        for k, J in self.parts:
-            S += J @ compliance[k] @ J.T
+        S, (c, r) = self.product(compliance), self.CR.shape
         # in units in which CK⁺Cᵀ is of order one, as CR is
         unit = float(np.trace(S)) / c if c else 1.0
         M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
