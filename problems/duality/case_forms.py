@@ -67,7 +67,9 @@ def case_of(
         contact = Contact(rows, c, friction.bound, friction.tangents)
         stage = problem.stages[path.last_of(choice.step)]
         layout = cached_layout(elastic, choice.size)
-        decomposed = decompose(elastic, layout, choice.glue, stage, contact)
+        decomposed = decompose(
+            elastic, layout, choice.glue, stage, contact, choice.cluster
+        )
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:

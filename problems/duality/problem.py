@@ -47,7 +47,11 @@ from mortarbench.problems.feti.subdivision import (
     half_discs_in_blocks,
     mesh_in_subdomains,
 )
-from mortarbench.problems.feti.tearing import blocks, compact_blocks
+from mortarbench.problems.feti.tearing import (
+    block_positions,
+    blocks,
+    compact_blocks,
+)
 
 Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m → rows
 
@@ -158,7 +162,10 @@ class StructuredSolids:
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        return mesh_in_subdomains(self.mesh, label, self.body, named)
+        positions = [block_positions(divisions, size) for divisions in self.divisions]
+        return mesh_in_subdomains(
+            self.mesh, label, self.body, named, np.concatenate(positions)
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,10 +335,11 @@ class Choice(NamedTuple):
     iterate: int = 0  #: of the fixed point of Coulomb's law, from 1; 0: the last one
     size: int = 0  #: of subdomains, see `Shape.layout`; 0: undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
+    cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
 
 
 #: keys of a case that select one of the QPs of a problem
-CHOICES = ("step", "iterate", "feti", "parts", "glue")
+CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
@@ -351,8 +359,9 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
             f"{key} with form {form} is not built; expected form dual, or no {key}"
         )
     return Choice(
-        p.get("step", 1), p.get("iterate", 0), size, p.get("glue", "orthonormal")
-    )
+        p.get("step", 1), p.get("iterate", 0), size, p.get("glue", "orthonormal"),
+        p.get("cluster", 0),
+    )  # fmt: skip
 
 
 def cached_problem(

@@ -58,6 +58,17 @@ def blocks(
     return label
 
 
+def block_positions(
+    divisions: tuple[int, ...], most: int | tuple[int, ...]
+) -> NDArray[np.int64]:
+    """Return the positions (blocks, dim) of the blocks of `blocks` in their grid."""
+    sides = np.broadcast_to(most, len(divisions))
+    counts = [
+        -(-cells // int(side)) for cells, side in zip(divisions, sides, strict=True)
+    ]
+    return np.indices(counts[::-1]).reshape(len(counts), -1)[::-1].T
+
+
 Block = tuple[slice, slice]  #: rows and columns of cells
 #: sides of the cells of rows and columns, along columns and along rows: each as two
 #: factors, one of each row and one of each column

@@ -217,7 +217,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     none = np.zeros(0)
     return DecomposedProblem(
         layout=layout, components=shape.dim, E=moduli[:1], names=("plate",),
-        glue=p["glue"], material=_material(p),
+        glue=p["glue"], cluster=p["cluster"], material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
         fixed=_clamped(shape.sides, shape.dim),
