@@ -242,7 +242,7 @@ class LinearisedSides:
             (B.data, self.component[B.indices], B.indptr),
             shape=(B.shape[0], self.bodies.mesh.dim * self.nodes),
         )
-        return Contact(rows, c, friction.bound)
+        return Contact(rows, c, friction.bound, friction.tangents)
 
 
 def linearise_sides(
@@ -254,10 +254,7 @@ def linearise_sides(
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
         body_of_node=np.asarray(layout.body[layout.holder(node)]), names=elastic.names,
-        pairs=tuple(
-            ContactPair(*(np.searchsorted(node, side) for side in pair))
-            for pair in elastic.pairs
-        ),
+        pairs=tuple(pair.renumbered(node) for pair in elastic.pairs),
         length=elastic.length, force=elastic.force,
     )  # fmt: skip
     rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)

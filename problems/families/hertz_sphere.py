@@ -9,6 +9,7 @@ from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import ContactFamily
 from mortarbench.problems.ranges import (
     DECOMPOSITION,
+    METHODS,
     check_memory,
     choice,
     key,
@@ -21,16 +22,18 @@ if TYPE_CHECKING:
 
 
 class HertzSphere(ContactFamily):
-    """Hertz contact in space: an elastic sphere pressed onto a rigid plane."""
+    """Hertz contact in space: an elastic sphere on a rigid plane or an equal sphere."""
 
     name = "hertz-sphere"
     keys = schema(
         n=key(8, 1),
-        against=choice("plane"),
+        against=choice("plane", "sphere"),
         R=size(8.0),
         E=size(200.0),
         nu=key(0.3),
         load=size(10.0),
+        contact=METHODS["contact"].with_default("mortar"),
+        basis=METHODS["basis"],
         **DECOMPOSITION,
     )
     forms = ("primal", "dual")
@@ -40,6 +43,13 @@ class HertzSphere(ContactFamily):
         """Raise InputError unless every key is in its range."""
         super().check(params)
         check_memory(self.name, 3 * int(params["n"]) ** 3)
+        if params["against"] == "plane":
+            for name in ("contact", "basis"):
+                if params[name] != self.defaults[name]:
+                    raise InputError(
+                        f"{self.name}: {name}={params[name]} is not used by "
+                        f"against=plane; expected against=sphere, or no {name}"
+                    )
         if not -1 < float(params["nu"]) < 0.5:
             raise InputError(
                 f"{self.name}: nu={params['nu']} must be between -1 and 0.5"

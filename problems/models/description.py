@@ -33,9 +33,20 @@
     friction = "coulomb"       # or "tresca" with a bound in Pa; this pair's own law
     mu = 0.3
 
+    [[contacts]]
+    slave = "foot"             # its nodes must not enter a rigid body, in m:
+    rigid = { shape = "plane", point = [0, -1], normal = [0, 1] }
+    # or { shape = "cylinder", centre = [0, -1], radius = 0.5 }; in space also
+    # { shape = "cylinder", centre = [0, 0, -1], axis = [0, 1, 0], radius = 0.5 } or
+    # { shape = "sphere", centre = [0, 0, -1], radius = 0.5 }
 
 Whatever the length unit of the mesh is, this file and all results are in SI units: E
-and tractions in Pa, forces in N/m, units.length in m.
+and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
+
+A rigid body does not move. The normal of a plane points towards the slave; normals and
+axes may have any length. The centre of a cylinder is any point of its axis. Nodes whose
+components are all fixed have no row. Contact with a rigid body has nodal rows also with
+``contact = "mortar"``.
 
 In .inp and .med files, bodies are sets of elements and groups of cells, boundaries are
 surfaces, sets or groups of facets or of nodes, and points are sets of nodes.
@@ -72,6 +83,13 @@ from mortarbench.problems.contact.bodies import (
     support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.rigid import (
+    RigidBody,
+    RigidCylinder,
+    RigidPlane,
+    RigidSphere,
+)
+from mortarbench.problems.contact.surface import current_surface
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
 from mortarbench.problems.fem.mesh_files.named import (
@@ -97,6 +115,15 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
+#: keys of the shapes of rigid bodies, by dimension; those but radius are vectors
+_RIGID = {
+    2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
+    3: {
+        "plane": ("point", "normal"),
+        "cylinder": ("centre", "axis", "radius"),
+        "sphere": ("centre", "radius"),
+    },
+}
 #: units of length by name, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -181,8 +208,9 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
                 raise InputError(f"bodies: {named.words.body} {name!r} has no entry")
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
-        _check_loads_act(table["loads"], loads, np.concatenate(fixed))
-        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
+        held = np.unique(np.concatenate(fixed))
+        _check_loads_act(table["loads"], loads, held)
+        pairs = _each(table, "contacts", lambda entry: _pair(entry, named, held))
         _check_unique(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
         length, force = _units(table.get("units", {}), named, load)
@@ -195,7 +223,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         materials=tuple(materials[name] for name in named.surfaces),
         plane=plane if named.dim == 2 else None, length=length, force=force,
         f=load.ravel() / force, pairs=tuple(pairs),
-        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))),
+        B_D=support_rows(mesh, held),
     )  # fmt: skip
 
 
@@ -267,16 +295,10 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     """Return the nodal forces (N, dim) of a load: N/m in the plane, N in space."""
     checked.only_keys(entry, (*_PLACES, *_LOADS))
     kinds = [kind for kind in _LOADS if kind in entry]
-    form = f"[{', '.join(_AXES[: named.dim])}]"
     if len(kinds) != 1:
-        raise InputError(f"expected either force or traction, {form}")
-    vector = checked.filled_list(kinds[0], entry[kinds[0]])
-    if len(vector) != named.dim or not all(map(checked.is_number, vector)):
-        count = {2: "two", 3: "three"}[named.dim]
-        raise InputError(
-            f"{kinds[0]} = {shown(vector)}; expected {count} numbers, {form}"
-        )
-    vector = [physical(kinds[0], component) for component in vector]
+        form = ", ".join(_AXES[: named.dim])
+        raise InputError(f"expected either force or traction, [{form}]")
+    vector = _vector(kinds[0], entry[kinds[0]], named.dim)
     nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
     if facets.size and named.dim == 3:  # ∫N over the boundary, m²
@@ -291,6 +313,15 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     if kinds == ["force"]:
         weights /= weights.sum()
     return np.outer(weights, vector)
+
+
+def _vector(key: str, value: object, dim: int) -> list[float]:
+    """Return a vector of physical values."""
+    vector = checked.filled_list(key, value)
+    if len(vector) != dim or not all(map(checked.is_number, vector)):
+        count, form = {2: "two", 3: "three"}[dim], ", ".join(_AXES[:dim])
+        raise InputError(f"{key} = {shown(vector)}; expected {count} numbers, [{form}]")
+    return [physical(key, component) for component in vector]
 
 
 def _check_loads_act(
@@ -364,22 +395,82 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
     return law_of(keys)
 
 
-def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    checked.only_keys(entry, ("slave", "master", "friction", *LAW_PARAMETERS))
-    _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
+def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
+    """Return the pair of an entry; held : prescribed components."""
+    checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
+    if ("master" in entry) == ("rigid" in entry):
+        raise InputError(f"expected either master, a {named.words.boundary}, or rigid")
+    names = [side for side in _SIDES if side in entry]
+    _keys({k: v for k, v in entry.items() if k in _SIDES}, tuple(names))
     sides = {}
-    for side in _SIDES:
+    for side in names:
         name = _one_of(named.curves, named.words.boundary, entry, side)
         facets = named.curves[name]
         sides[side] = _chain(f"{side} {name!r}", facets) if named.dim == 2 else facets
-    if np.intersect1d(sides["slave"], sides["master"]).size:
+    slave = sides["slave"]
+    if "rigid" in entry:
+        with located("rigid"):
+            rigid = _rigid(checked.table("rigid", entry["rigid"]), named.dim)
+            _check_faces(named.points, slave, entry["slave"], rigid)
+        components = dofs_of(np.unique(slave), named.dim).reshape(-1, named.dim)
+        clamped = np.unique(slave)[np.isin(components, held).all(axis=1)]
+        return ContactPair(slave, slave[:0], rigid, clamped)
+    if np.intersect1d(slave, sides["master"]).size:
         raise InputError("slave and master share nodes; expected sides that are apart")
     return ContactPair(**sides)
 
 
-def _sides(entries: list[dict[str, str]]) -> list[tuple[str, str]]:
-    """Return the names of slave and master of each contact."""
-    return [(entry["slave"], entry["master"]) for entry in entries]
+def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
+    """Return the rigid body of an entry."""
+    shapes = _RIGID[dim]
+    if "shape" not in entry:
+        raise InputError(f"shape is missing; expected {' or '.join(sorted(shapes))}")
+    shape = checked.text("shape", entry["shape"])
+    if shape not in shapes:
+        raise unknown("shape", shape, shapes)
+    _keys(entry, ("shape", *shapes[shape]))
+    vectors = {
+        key: tuple(_vector(key, entry[key], dim))
+        for key in shapes[shape]
+        if key != "radius"
+    }
+    for key in ("normal", "axis"):
+        if key in vectors:
+            size = float(np.linalg.norm(vectors[key]))
+            if not size:
+                raise InputError(f"{key} is zero; expected a direction")
+            vectors[key] = tuple(x / size for x in vectors[key])
+    if shape == "plane":
+        return RigidPlane(vectors["point"], vectors["normal"])
+    radius = physical("radius", checked.positive("radius", entry["radius"]))
+    if "axis" in vectors:
+        return RigidCylinder(vectors["centre"], vectors["axis"], radius)
+    return RigidSphere(vectors["centre"], radius)  # in the plane a cylinder
+
+
+def _check_faces(
+    points: NDArray[np.float64], slave: Nodes, name: str, rigid: RigidBody
+) -> None:
+    """Raise InputError for a slave that looks away from a rigid body or is far away."""
+    side = current_surface(points, np.zeros(points.size), slave, "slave")
+    gap, normal = rigid.gap(side.x[side.facets].mean(axis=1))
+    if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
+        raise InputError(
+            f"no part of slave {name!r} faces the rigid body; expected a plane whose "
+            "normal points towards the slave, or a centre on its other side"
+        )
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if gap.min() > extent:
+        raise InputError(
+            f"the rigid body is {gap.min():.3g} m from slave {name!r}, farther than "
+            f"the size {extent:.3g} m of the mesh; expected lengths in m, whatever "
+            "length_unit is"
+        )
+
+
+def _sides(entries: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return the names of slave and master of each contact; a rigid one as text."""
+    return [(e["slave"], e.get("master") or f"{e['rigid']}") for e in entries]
 
 
 def _check_unique(entries: list[dict[str, str]]) -> None:
