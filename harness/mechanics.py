@@ -13,9 +13,19 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
+from scipy.sparse import (
+    block_array,
+    csc_array,
+    csr_array,
+    eye_array,
+    hstack,
+    vstack,
+)
 
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
+from mortarbench.harness.sets.blocks import norms
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution
 
 #: Extended precision if the machine has it (x86: 64-bit mantissa), so that residuals of
@@ -84,24 +94,44 @@ class Friction:
 
     ::
 
-        Σ gᵢ|Tᵢu − sᵢ|  is added to the energy;  its multipliers satisfy  |λᵢ| ≤ gᵢ
+        Σ gᵢ‖Tᵢu − sᵢ‖  is added to the energy;  its multipliers satisfy  ‖λᵢ‖ ≤ gᵢ
 
     T u is the tangential motion of the slave relative to the master, and s its initial
     value: zero for a single static load, and T u of the previous step for slip
-    increments. A contact row may have several friction rows, one for each tangential
-    direction in turn.
+    increments. A contact row i with friction has d consecutive rows Tᵢ, one for each
+    tangential direction, of equal bound: d = 1 in the plane, where ‖·‖ is |·|, and 2
+    in space.
 
     By the law of friction the bound should be g = cohesion + mu·λ_n, with the
     multiplier λ_n of the contact row: mu = 0 for Tresca, cohesion = 0 for Coulomb.
     """
 
-    T: csr_array  #: (k, n) tangential rows
+    T: csr_array  #: (k, n) tangential rows, d of each contact row in turn
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
     unsettled: float = 0.0  #: `residual` at the solution with this bound; 0 if unknown
+
+    @property
+    def tangents(self) -> int:
+        """Number d of tangential directions: of rows per contact row with friction."""
+        return int(np.bincount(self.row).max(initial=1))
+
+    @property
+    def vectors(self) -> NDArray[np.int64]:
+        """The friction rows (k/d, d) of each tangential vector."""
+        return np.arange(self.row.size).reshape(-1, self.tangents)
+
+    def slip(self, u: NDArray[Any]) -> NDArray[Any]:
+        """Return Tᵢu − sᵢ (k/d, d) for u (n,)."""
+        return np.asarray((self.T @ u - self.start)[self.vectors])
+
+    def work(self, u: NDArray[Any]) -> float:
+        """Return Σ gᵢ‖Tᵢu − sᵢ‖ for u (n,)."""
+        radius = self.bound[self.vectors[:, 0]]
+        return float(radius @ norms(self.slip(u)))
 
     def demanded(self, normal: Vector) -> Vector:
         """Return cohesion + mu·max(λ_n, 0) (k,) for normal forces (m,)."""
@@ -116,6 +146,20 @@ class Friction:
         """Return the selected rows (an index array or a mask)."""
         rows = {k: v[selected] for k, v in vars(self).items() if k != "unsettled"}
         return replace(self, **rows)
+
+
+def friction_discs(bound: Vector, tangents: int, first: int) -> Discs:
+    """Return the sets ‖λᵢ‖ ≤ gᵢ of multipliers of friction rows.
+
+    Parameters
+    ----------
+    bound : (k,) g of each row, equal for the d rows of a vector
+    tangents : d
+    first : number of the first of these multipliers
+
+    """
+    index = first + np.arange(bound.size).reshape(-1, tangents)
+    return Discs(index, bound[::tangents])
 
 
 _EMPTY = np.zeros(0)
@@ -134,21 +178,47 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 
 
 def with_friction(primal: QP, friction: Friction) -> QP:
-    """Return the problem with friction as a QP, with one more variable per |·|.
+    """Return the problem with friction as a QP, with further variables.
+
+    For the friction rows with g > 0, in the plane one t per |·|,
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    for the friction rows with g > 0. The unknown is (u, t), and the multiplier of a
-    friction row is the difference of those of its two rows. Without friction rows,
-    `primal` itself is returned.
+    and in space the slip w = Tu − s and one t per ‖·‖, over second-order cones,
+
+    ::
+
+        min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
+                                              Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
+
+    The unknown is (u, t) or (u, t, w). Without friction rows, `primal` itself is
+    returned. See `friction_multipliers` for those of the friction rows.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
     if not k:
         return primal
+    vectors = moving.vectors
+    if vectors.shape[1] > 1:
+        v = len(vectors)
+        t = n + np.arange(v)
+        return QP(
+            P=csc_array(
+                block_array([[primal.P, None], [None, csc_array((v + k, v + k))]])
+            ),
+            q=np.concatenate([primal.q, moving.bound[vectors[:, 0]], np.zeros(k)]),
+            A=csr_array(block_array([
+                [primal.A, csr_array((primal.b.size, v)), None],
+                [moving.T, None, -eye_array(k)],
+            ])),
+            b=np.append(primal.b, moving.start),
+            G=csr_array(hstack([primal.G, csr_array((primal.h.size, v + k))])),
+            h=primal.h,
+            sets=(Cones(np.column_stack([t, n + v + vectors]), np.ones(v)),),
+        )  # fmt: skip
     one = eye_array(k)
     return QP(
         P=csc_array(block_array([[primal.P, None], [None, csc_array((k, k))]])),
@@ -161,6 +231,24 @@ def with_friction(primal: QP, friction: Friction) -> QP:
         h=np.concatenate([primal.h, moving.start, -moving.start]),
         lb=np.full(n + k, -np.inf), ub=np.full(n + k, np.inf),
     )  # fmt: skip
+
+
+def friction_multipliers(
+    s: Solution, primal: QP, friction: Friction
+) -> tuple[Vector, Vector, Vector]:
+    """Split a solution of `with_friction`: y of supports, z of contact, λ_t.
+
+    λ_t (k,) is in the plane the difference of the multipliers of the two rows of each
+    |·|, and in space the multiplier of Tu − w = s; zero where g = 0.
+    """
+    e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
+    tangential = np.zeros(acts.size)
+    if friction.vectors.shape[1] > 1:
+        tangential[acts] = s.y[e:]
+    else:
+        forwards, backwards = s.z[m:].reshape(2, -1)
+        tangential[acts] = forwards - backwards
+    return s.y[:e], s.z[:m], tangential
 
 
 class Exact(NamedTuple):

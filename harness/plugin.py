@@ -152,9 +152,11 @@ class ContactSide:
     gap: Vector  #: (s,) m, positive if open; NaN without an opposite side
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
+    #: (s,) tangential traction on the side, Pa; in space its size
+    shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; old files have "open" for the last
     friction: NDArray[Any] | None = None
+    friction_force: NDArray[Any] | None = None  #: (s, dim) part of `force`, tangential
     #: (k, 3) exact solution, if known: distance along the side from its middle, m,
     #: pressure and shear, Pa
     exact: NDArray[Any] | None = None

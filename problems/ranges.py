@@ -96,9 +96,7 @@ GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
 DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
 DIMENSION = schema(dim=choice(2, 3))
 #: keys that families in space do not support yet, with the only value they allow
-PLANE_ONLY: Mapping[str, Value] = {
-    "friction": "none", "kinematics": "linear", "plane": "strain"
-}  # fmt: skip
+PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
 #: laws of friction, each with the key of its parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
 #: parameters of the laws of friction, with their allowed values

@@ -278,6 +278,8 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
+    if mechanics.friction.tangents > 1:
+        raise UncertifiableError("certificates of friction in space are not built")
     if mechanics.certify_by_subdomains is not None:
         certificate: Certificate = mechanics.certify_by_subdomains(
             s.x, mechanics.multipliers(s)

@@ -242,7 +242,7 @@ class LinearisedSides:
             (B.data, self.component[B.indices], B.indptr),
             shape=(B.shape[0], self.bodies.mesh.dim * self.nodes),
         )
-        return Contact(rows, c, friction.bound)
+        return Contact(rows, c, friction.bound, friction.tangents)
 
 
 def linearise_sides(

@@ -20,7 +20,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
-from mortarbench.problems.duality.dualisation import Transformed
+from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import block_bytes, touched_components
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
@@ -53,8 +53,7 @@ def feti_dual(
         P=dual_operator(B, domains, m_E), q=bodies.c - B @ free,
         A=csr_array((B @ R).T), b=R.T @ f,
         G=no_rows(bodies.c.size), h=np.zeros(0),
-        lb=np.concatenate([np.full(m_E, -np.inf), np.zeros(m_I), -bound]),
-        ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
+        sets=multiplier_sets(m_E, m_I, bound, friction.tangents),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
     copies[copies == 0] = 1  # eliminated components have no copy, and u = 0 there

@@ -90,6 +90,7 @@ class Contact(NamedTuple):
     rows: csr_array  #: (m_I, n) in components of the undivided bodies
     c: Vector  #: (m_I,)
     bound: Vector  #: (k,) friction bounds of the last rows
+    tangents: int = 1  #: number of friction rows of each tangential vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -117,7 +118,11 @@ class DecomposedProblem:
 
     @cached_property
     def contact_scale(self) -> Vector:
-        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches."""
+        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches.
+
+        That of the first row of a tangential vector applies to all of them: in exact
+        arithmetic they are equal.
+        """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
             return np.zeros(0)
@@ -126,7 +131,10 @@ class DecomposedProblem:
         # an entry b at a node of m copies becomes m entries b/m of B: m(b/m)² = b²/m
         norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
-        return np.asarray(np.sqrt(softest / norm2))
+        scale = np.sqrt(softest / norm2)
+        first, d = scale.size - self.contact.bound.size, self.contact.tangents
+        scale[first:] = np.repeat(scale[first::d], d)
+        return np.asarray(scale)
 
 
 class Entries(NamedTuple):

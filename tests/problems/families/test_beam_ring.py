@@ -369,7 +369,6 @@ def test_subdomains_of_extruded_bodies_have_the_same_solution():
         (dict(depth=-1), "depth=-1"),
         (dict(sides="plane-strain"), "sides=plane-strain is not used by depth=0"),
         (dict(depth=1, plane="stress"), "plane=stress with depth=1 is not built"),
-        (dict(depth=1, friction="tresca", bound=1.0), "friction=tresca with depth=1"),
         (dict(depth=1, kinematics="finite"), "kinematics=finite with depth=1 is not"),
     ],
 )
