@@ -48,9 +48,9 @@ from mortarbench.problems.feti.subdivision import (
     mesh_in_subdomains,
 )
 from mortarbench.problems.feti.tearing import (
-    block_positions,
-    blocks,
     compact_blocks,
+    compact_boxes,
+    grid_positions,
 )
 
 Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m → rows
@@ -112,7 +112,7 @@ class _Joined(Generic[B]):
 class StructuredGrids(_Joined[StructuredGrid]):
     """Structured grids; subdomains have at most size² cells."""
 
-    def layout(self, size: int | tuple[int, ...]) -> Layout:
+    def layout(self, size: int) -> Layout:
         """Cut each grid into blocks of at most `size` cells a side."""
         return Layout.of(self.parts, size)
 
@@ -131,7 +131,7 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 @dataclass(frozen=True, eq=False)
 class StructuredSolids:
-    """Hexahedra numbered as in boxes; subdomains are blocks of at most size³ cells."""
+    """Hexahedra numbered as in boxes; subdomains are compact blocks of cells."""
 
     parts: tuple[Mesh, ...]  #: see `problems.fem.mesh.box`, with different boundaries
     divisions: tuple[tuple[int, int, int], ...]  #: cells of each along x, y and z
@@ -156,13 +156,19 @@ class StructuredSolids:
         """Faces of the sides by name."""
         return self.mesh.boundaries
 
-    def layout(self, size: int | tuple[int, ...]) -> Subdivision:
-        """Cut each box into blocks of at most `size` cells a side."""
-        labels = [blocks(divisions, size) for divisions in self.divisions]
+    def layout(self, size: int) -> Subdivision:
+        """Cut each box into compact blocks of at most `size` cells a side."""
+        labels = [
+            compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
+            for mesh, (x, y, z) in zip(self.parts, self.divisions, strict=True)
+        ]
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        positions = [block_positions(divisions, size) for divisions in self.divisions]
+        positions = [
+            grid_positions(label, divisions)
+            for label, divisions in zip(labels, self.divisions, strict=True)
+        ]
         return mesh_in_subdomains(
             self.mesh, label, self.body, named, np.concatenate(positions)
         )

@@ -115,7 +115,18 @@ class LocalDual:
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
-        """Return bounds of the multipliers of owned rows, with friction bounds (k,)."""
+        """Return bounds of the multipliers of owned rows, with friction bounds (k,).
+
+        Raises
+        ------
+        InputError
+            For friction in space, whose multipliers are in discs.
+
+        """
+        if bound.size and self.subdomains.problem.contact.tangents > 1:
+            raise InputError(
+                "friction in space on MPI ranks is not built; expected one process"
+            )
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
         scale = self.subdomains.problem.contact_scale
         pressing = scale.size - bound.size

@@ -73,7 +73,8 @@ from mortarbench.problems.feti.spectrum import (
     Spectrum,
     spectra_over_ranks,
 )
-from mortarbench.problems.feti.subdivision import Subdivision
+from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
@@ -81,6 +82,7 @@ from mortarbench.problems.feti.subdomains import (
     LocalSubdomains,
     on_one_process,
 )
+from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
 LOAD = 1e6  #: F₀, the load, N/m, in space N
@@ -212,7 +214,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Return the decomposed problem of complete keys."""
     p: Any = params
     shape, (moduli, D) = _shape(p), _stiffness(p)
-    layout = shape.layout(_side(p))
+    layout = _layout(shape, _side(p))
     # no contact rows, but the interface of problems with contact
     none = np.zeros(0)
     return DecomposedProblem(
@@ -278,6 +280,18 @@ def _shape(p: Mapping[str, Any]) -> StructuredGrids | StructuredSolids:
         return StructuredSolids((box((0.0,) * 3, size, divisions),), ((x, y, z),))
     (width, height), (nx, ny) = size, divisions
     return StructuredGrids((rectangle_grid((0.0, 0.0), (width, height), (nx, ny)),))
+
+
+def _layout(
+    shape: StructuredGrids | StructuredSolids, side: tuple[int, ...]
+) -> Subdivision:
+    """Cut the plate into subdomains with the same numbers of cells along each axis."""
+    if isinstance(shape, StructuredGrids):
+        return Layout.of(shape.parts, side)
+    named = np.unique(np.concatenate(list(shape.sides.values())))
+    label = blocks(shape.divisions[0], side)
+    positions = grid_positions(label, shape.divisions[0])
+    return mesh_in_subdomains(shape.mesh, label, shape.body, named, positions)
 
 
 def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:
