@@ -166,12 +166,15 @@ class StructuredSolids:
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
         positions = [
-            grid_positions(label, divisions)
-            for label, divisions in zip(labels, self.divisions, strict=True)
+            at
+            for one, divisions in zip(labels, self.divisions, strict=True)
+            if (at := grid_positions(one, divisions)) is not None
         ]
+        is_grid = len(positions) == len(labels)
         return mesh_in_subdomains(
-            self.mesh, label, self.body, named, np.concatenate(positions)
-        )
+            self.mesh, label, self.body, named,
+            np.concatenate(positions) if is_grid else None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,18 +60,17 @@ def blocks(
 
 def grid_positions(
     label: NDArray[np.int64], divisions: tuple[int, ...]
-) -> NDArray[np.int64]:
-    """Return the positions (blocks, dim) of blocks in the grid of their first cells.
-
-    Blocks that were cut at different places have positions among all cuts along each
-    axis.
+) -> NDArray[np.int64] | None:
+    """Return the positions (blocks, dim) of blocks in their grid; None without a grid.
 
     label, divisions : see `blocks`
     """
     first = np.unique(label, return_index=True)[1]
     starts = np.unravel_index(first, divisions[::-1])
     along = [np.unique(start, return_inverse=True)[1] for start in starts[::-1]]
-    return np.stack(along, axis=1)
+    positions = np.stack(along, axis=1)
+    # blocks that are cut at different places leave gaps in the grid of all cuts
+    return positions if np.prod(positions.max(axis=0) + 1) == first.size else None
 
 
 Block = tuple[slice, slice]  #: rows and columns of cells

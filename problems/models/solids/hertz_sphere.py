@@ -254,7 +254,7 @@ def _near(block: _Block, half_width: float) -> Nodes:
     reach = np.abs(block.mesh.points[block.contact][..., :2])
     within = reach <= half_width * (1 + 1e-9)
     corners = within.all(axis=1) if block.up > 0 else within.any(axis=1)
-    return block.contact[corners.all(axis=1)]
+    return block.contact[np.asarray(corners).all(axis=1)]
 
 
 def _far_forces(

@@ -123,7 +123,8 @@ def test_the_way_back_ends_at_a_solution_of_the_primal_with_all_its_multipliers(
     transform,
 ):
     bodies = model(4, 3, 6, "strain")
-    rows = node_to_segment(bodies.mesh.points, np.zeros(848), *bodies.pairs[0])
+    slave, master, *_ = bodies.pairs[0]
+    rows = node_to_segment(bodies.mesh.points, np.zeros(848), slave, master)
     primal = primal_qp(bodies, rows)
     way = dualise if transform == "dual" else dual_bounds
     inverse = (
