@@ -104,7 +104,8 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 def refuse_full_disk(folder: Path, failure: str) -> None:
     """Raise if a failure was caused by a full disk.
 
-    folder : folder that was written to failure : message of the failure
+    folder : folder that was written to
+    failure : message of the failure
 
     Raises
     ------

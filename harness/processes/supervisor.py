@@ -174,9 +174,10 @@ class WorkerProcess:
         is repeated once in a new process: an earlier solve may have damaged it.
 
         time_limit : seconds from the event "start" on, which excludes imports, warm-up
-        and loading of the QP. Ranks that assemble the QP have the same limit for the
-        assembly and for the evaluation of the answer, but at least `POINT_SECONDS` for
-        the latter memory_limit : limit for all processes of the worker together, MiB
+            and loading of the QP. Ranks that assemble the QP have the same limit for
+            the assembly and for the evaluation of the answer, but at least
+            `POINT_SECONDS` for the latter
+        memory_limit : limit for all processes of the worker together, MiB
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
@@ -701,7 +702,8 @@ def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     wrong result. It shows in their peak memory or, if a single allocation was refused,
     in the message of the library.
 
-    message : message of the failure, including the last line of output limit : MiB
+    message : message of the failure, including the last line of output
+    limit : MiB
     """
     near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit
     return near or _ALLOCATION_FAILURE.search(message) is not None

@@ -297,8 +297,8 @@ def claim(
 ) -> None:
     """Assign a locked folder to a suite and an environment.
 
-    environment : environment, with its digest under the key ``digest`` fresh : delete
-    the previous content first; without it, call `refuse_other` before
+    environment : environment, with its digest under the key ``digest``
+    fresh : delete the previous content first; without it, call `refuse_other` before
     """
     if fresh:
         for name in _FOLDERS:

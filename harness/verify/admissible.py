@@ -157,9 +157,10 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : exact data whose columns of B are the components (w,) that the rows touch R
-    : (w, p) rigid motions that contact feels, which cost no energy softness : (w,)
-    1/Kᵢᵢ, zero at prescribed components u : (w,)
+    exact : exact data whose columns of B are the components (w,) that the rows touch
+    R : (w, p) rigid motions that contact feels, which cost no energy
+    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
+    u : (w,)
 
     Returns
     -------
@@ -240,9 +241,9 @@ def _compliance(
 ) -> Callable[[Vector], Vector]:
     """Return the solve with F_VV + ρUUᵀ: Cholesky, or CG for very many rows.
 
-    The matrix may be singular up to rounding. It is shifted in its last digits; the
-    next round of the caller corrects the error of that. CG is preconditioned by
-    B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    The matrix may be singular up to rounding, so its diagonal is shifted in the last
+    digits; the next round of the caller corrects the resulting error. CG is
+    preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:

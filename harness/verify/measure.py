@@ -70,12 +70,13 @@ def measure(
     which counts as preparation as well.
 
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
-    `harness.plugin.Chained` sample_seconds : a faster solve is repeated, including its
-    preparation, until the repetitions together take this time. The answer is that of
-    the first repetition; the times are means of the others, since the first one runs
-    with cold caches. Every repetition gets a QP of new objects, so that a solver cannot
-    recognise it by identity starts, ends : called just before the clock starts, and
-    after it has stopped
+        `harness.plugin.Chained`
+    sample_seconds : a faster solve is repeated, including its preparation, until the
+        repetitions together take this time. The answer is that of the first repetition;
+        the times are means of the others, since the first one runs with cold caches.
+        Every repetition gets a QP of new objects, so that a solver cannot recognise it
+        by identity
+    starts, ends : called just before the clock starts, and after it has stopped
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
