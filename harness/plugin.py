@@ -309,7 +309,7 @@ class Family(ABC):
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file that a case is read from, which results keep a copy of."""
+        """Return the file from which a case is read; results contain a copy of it."""
         return None
 
     def with_copies(self, folder: Path) -> Family:

@@ -324,8 +324,9 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    For `declines` of a solver that reads entries of P. If a solver declines for this
-    reason, a run assembles a small P, on the clock, and calls `declines` again.
+    This is for use in `declines` of a solver that reads entries of P. If a solver
+    declines for this reason, a run assembles a small P, on the clock, and calls
+    `declines` again.
 
     Examples
     --------

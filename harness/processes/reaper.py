@@ -127,7 +127,7 @@ def kill_descendants(root: int) -> None:
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process of the tree, but to no later one of the same number.
+    """Send a signal to a process of the tree, but never to a later one with its number.
 
     A pidfd refers to one process for ever. If the number belongs to the tree after the
     pidfd was opened, the pidfd refers to that process.

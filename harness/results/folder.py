@@ -180,7 +180,7 @@ class FolderLock:
     def is_there(self) -> bool:
         """Return True if the path still leads to the locked folder, False if deleted.
 
-        A deleted folder is created again and locked; so is a deleted lock.
+        A deleted folder, or a deleted lock, is created and locked again.
 
         Raises
         ------

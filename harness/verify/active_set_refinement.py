@@ -73,7 +73,7 @@ def suggested(exact: Exact, u: Extended, multipliers: Extended) -> States:
 
 
 def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:
-    """Return the states (m,) for λ + v/D: closed within its bounds, at one beyond.
+    """Return the states (m,) for λ + v/D: closed within bounds of λ, else at a bound.
 
     room : (m,) distances of λ from its lower and its upper bound, inf without a bound
     """

@@ -301,7 +301,8 @@ def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     Parameters
     ----------
     along, terms : (q,) load along each motion, and the sum of its absolute terms
-    most : (q,) that sum with the largest entry of the motion in place of each entry
+    most : (q,) the same sum, with every entry of the motion replaced by its largest
+        entry
 
     """
     return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
@@ -360,10 +361,10 @@ class Balance(NamedTuple):
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
-        λ̂ is within its bounds, λ̂ ≥ 0 of contact and |λ̂| ≤ g of friction, and minimises
-        ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, with the distance of λᵢ from its bounds for the weight wᵢ (wᵢ ≈
-        λᵢ of contact): corrections must not act across wide gaps or against slip, where
-        they would do work. Along motions that λ does not support
+        λ̂ is within its bounds, λ̂ ≥ 0 for contact and |λ̂| ≤ g for friction, and
+        minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from its bounds
+        (for contact, wᵢ ≈ λᵢ), because corrections must not act across wide gaps or
+        against slip, where they would do work. Along motions that λ does not support
         (`supported_and_floating`), the load has to vanish up to its rounding; otherwise
         all rows contribute, in the last attempt with equal weights.
 

@@ -421,8 +421,9 @@ def _natural_energies(
 ) -> Vector:
     """List the energy that each variable alone can gain, where this is determined.
 
-    Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
-    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ with the feasible width wᵢ, if that is less.
+    This is the energy |½Pᵢᵢxᵢ² + qᵢxᵢ| of the variable at its minimum within the
+    bounds. If the minimum is at xᵢ = 0, it is qᵢ²/Pᵢᵢ or, if that is less, |qᵢ|wᵢ with
+    the feasible width wᵢ.
 
     bounds : lower and upper (n,) each, tightened by rows or not
     by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² where q is

@@ -274,8 +274,9 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    These are of the last call in the file of the solver's class, as in ``KeyError:
-    'rho' (mine.py:24)``. They are omitted if the file is not part of the traceback.
+    File and line are those of the last call in the file of the solver's class, as in
+    ``KeyError: 'rho' (mine.py:24)``. They are omitted if this file is not in the
+    traceback.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))

@@ -416,7 +416,7 @@ class Sharing:
         return np.asarray(b)
 
     def matched(self, v: Extended) -> Extended:
-        """Subtract the rigid motions Rα that minimise the jumps of v (N,), as Z weighs.
+        """Subtract the rigid motions Rα that minimise jumps of v (N,), weighted by Z.
 
         RᵀZ(v − Rα) = 0 is the coarse problem of the balance of forces. On fixed
         components the jump is the difference from zero.

@@ -114,7 +114,7 @@ def symmetric_interval(values: Array, cases: Sequence[str]) -> tuple[float, floa
 
 
 def _signs(cases: Sequence[str]) -> Array:
-    """Return patterns of signs up to a common sign, all of them or else `DRAWS`.
+    """Return all patterns of signs up to a common sign, or `DRAWS` random ones.
 
     The first pattern is that of the data, all ones.
     """
