@@ -304,7 +304,8 @@ class Family(ABC):
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Describe the part of the geometry that `refined` does not refine, or "".
 
-        The text follows an error of the mesh: "of the bodies as they are meshed".
+        The text is printed after an error of the mesh, such as "of the bodies as they
+        are meshed".
         """
         return ""
 

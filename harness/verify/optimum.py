@@ -334,7 +334,7 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Mark the KKT conditions that a solution of its equations violates.
+    """Mark the KKT conditions that a solution of the KKT equations violates.
 
     Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a bound that is
     absent or not active.
