@@ -174,9 +174,8 @@ class WorkerProcess:
         is repeated once in a new process: an earlier solve may have damaged it.
 
         time_limit : seconds from the event "start" on, which excludes imports, warm-up
-            and loading of the QP. Ranks that assemble the QP have the same limit for
-            the assembly and for the evaluation of the answer, but at least
-            `POINT_SECONDS` for the latter
+            and loading of the QP. Ranks have the same limit to assemble the QP, and the
+            larger of it and `POINT_SECONDS` to evaluate the answer
         memory_limit : limit for all processes of the worker together, MiB
         """
         self._peak_mib, self._emitted = 0.0, None

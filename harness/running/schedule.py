@@ -133,7 +133,7 @@ class Schedule:
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
-        """Return the remaining turns of a block in random order; None without any.
+        """Return the remaining turns of a block in random order; None if none remain.
 
         A sequence is repeated as a whole: a solver carries data from step to step.
         """

@@ -85,7 +85,7 @@ class Optimum:
     doubt: float  #: bound of the error of f*, plus the rounding of an exact answer
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
-    own: Vector  #: (n,) the same without any energy, see `own_sizes`
+    own: Vector  #: (n,) sizes that do not depend on energies, see `own_sizes`
 
 
 Proves = Callable[[QP], Optimum | None]

@@ -137,7 +137,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) likewise; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) in the same way; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 

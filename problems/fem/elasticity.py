@@ -4,9 +4,9 @@ In the plane this is the bilinear quadrilateral of the paper (Section 2); triang
 degenerate quadrilaterals with two coincident corners, see `problems.fem.mesh`.
 
 Voigt's notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy) in the plane,
-(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) and likewise for stress in space. Plane stiffness is
-per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m and forces
-are in N.
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in space, and stress in the same order. Plane
+stiffness is per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m
+and forces are in N.
 """
 
 from __future__ import annotations

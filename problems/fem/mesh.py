@@ -78,7 +78,8 @@ class Mesh:
 class StructuredGrid:
     """Structured grid, of which any block can be generated without the rest.
 
-    Node (row j, column i) has the number  j·(columns) + i,  and likewise cells.
+    Node (row j, column i) has the number j·(columns) + i; cells are numbered in the
+    same way.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes

@@ -115,7 +115,7 @@ class FastestSolver:
 
     @property
     def following(self) -> Competitor | None:
-        """The next significantly slower competitor; None if there is none."""
+        """The next significantly slower competitor, or None."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:

@@ -49,7 +49,7 @@ def limits(draws: Array, cases: int) -> tuple[Array, Array]:
     Percentiles are expanded [2]_: the scatter of a resample of n cases is too small by
     √((n−1)/n), with normal instead of Student's tails, so the quantile is that of
     −√(n/(n−1))·t₀.₉₇₅,ₙ₋₁ under the normal law. A monotone transform of the statistic
-    transforms the interval likewise.
+    transforms the interval in the same way.
     """
     tail = float(ndtr(-np.sqrt(cases / (cases - 1)) * student(cases - 1)))
     low, high = np.quantile(draws, (tail, 1 - tail), axis=0)
