@@ -33,7 +33,7 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
-TOL = 1e-8
+TOL = 1e-8  #: tolerance of all solves of the strings
 #: largest difference relative to the energies; a factor of 10 for residuals that add up
 #: over rows
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL

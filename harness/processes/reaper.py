@@ -267,7 +267,7 @@ def _execute(command: list[str]) -> NoReturn:
 
 
 def _end_as(status: int | None) -> NoReturn:
-    """End with the exit code or signal of a wait status; with 0 if the parent asked."""
+    """End with the exit code or signal of a wait status; with 0 if asked to end."""
     if status is None or os.WIFEXITED(status):
         os._exit(0 if status is None else os.WEXITSTATUS(status))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of this process

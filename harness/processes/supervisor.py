@@ -49,7 +49,7 @@ from mortarbench.harness.processes.protocol import (
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
-POLL_SECONDS = 0.02
+POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit of imports, and of loading a QP
 WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
 POINT_SECONDS = 120.0  #: time limit of writing the point of an answer

@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # it needs the package distributed
     from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
-CONNECT_SECONDS = 10
+CONNECT_SECONDS = 10  #: time limit of the connection, and to fetch a finished result
 #: time between two checks for workers that joined or were lost
 CLUSTER_POLL_SECONDS = 2.0
 MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up

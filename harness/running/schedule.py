@@ -28,7 +28,7 @@ Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 @dataclass(eq=False, kw_only=True)
 class Schedule:
-    """Blocks of a suite that remain to be measured, given those in its journal."""
+    """Blocks of a suite that are not in the journal and remain to be measured."""
 
     suite: Suite
     #: options of each solver, defaults resolved
