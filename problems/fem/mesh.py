@@ -161,7 +161,7 @@ class HalfDisc:
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Numbers of cells along a ring and of rings, including the triangles."""
+        """Number of cells along a ring; number of rings, including the triangles."""
         return self.angles.size - 1, self.radii.size
 
     @property
