@@ -15,7 +15,7 @@ set:
     face       CG steps with the active rows as equations, to a reduction of 1e-6
     face none  the same without a preconditioner
 
-Prints a table, and the exponents of c·n^p with 95 % intervals.
+The script prints a table, and the exponents p of c·n^p with 95 % intervals.
 """
 
 import argparse

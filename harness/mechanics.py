@@ -84,7 +84,7 @@ class Friction:
 
     ::
 
-        Σ gᵢ|Tᵢu − sᵢ|  is added to the energy;  its multipliers satisfy  |λᵢ| ≤ gᵢ
+        Σ gᵢ|Tᵢu − sᵢ|  is added to the energy;  the multipliers satisfy  |λᵢ| ≤ gᵢ
 
     T u is the tangential motion of the slave relative to the master, and s its initial
     value: zero for a single static load, and T u of the previous step for slip

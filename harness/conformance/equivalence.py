@@ -58,7 +58,7 @@ class DeclinedError(Exception):
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
-    """Solve the strings in a form unchanged and changed, and compare the answers.
+    """Solve the unchanged and the changed string problem; compare the answers.
 
     change : a key of `CHANGES`
     old : the answer to the unchanged QP, if it is available

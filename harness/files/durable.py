@@ -32,8 +32,9 @@ _MIB = 2**20
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a new file that replaces `path` at the end of the block.
 
-    It is flushed to the disk before. After a crash, `path` is either the old file or
-    the complete new one. Processes that have opened or mapped the old file keep it.
+    The new file is first flushed to the disk. After a crash, `path` is either the old
+    file or the complete new one. Processes that have opened or mapped the old file keep
+    it.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:

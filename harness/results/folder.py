@@ -36,7 +36,7 @@ from mortarbench.harness.suite.suite import Suite, read_stored
 #: everything that a run and its evaluations write; `fresh` deletes these, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-#: files of `mortarbench validate` and of faults
+#: file written by `mortarbench validate`, and file of the faults of runs
 _RESULT_FILES = ("validation.json", FAULTS)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: levels accepted in a result folder; runs write three

@@ -289,7 +289,7 @@ def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constrai
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     """Measure the worst violation of a row or bound as in `kkt_residuals`.
 
-    X : (n,) sizes of the variables from the scale of energy
+    X : (n,) sizes of the variables that follow from the scale of energy
     own : (n,) sizes of the variables themselves (`own_sizes`)
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)

@@ -167,8 +167,8 @@ def rigid_motions(points: Floats) -> Floats:
 def rigid_modes(points: Floats) -> Floats:
     """Return an orthonormal basis R (n, r) of ker K of one body, for eq. (4).
 
-    The analytic formula: in the plane the rigid motions are orthogonal; in space,
-    rotations about the principal axes of inertia of the nodes are.
+    In the plane, the analytic rigid motions are orthogonal already; in space, they are
+    if the rotations are about the principal axes of inertia of the nodes.
     """
     R = rigid_motions(points)
     dim = points.shape[1]

@@ -250,7 +250,7 @@ def box(corner: tuple[float, ...], size: tuple[float, ...],
         divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
     """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
 
-    Boundaries as of `box_grid`. Lengths are in m.
+    The boundaries have the names of those of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
