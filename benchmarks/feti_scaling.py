@@ -17,7 +17,7 @@ set:
     kappa_dirichlet   the same with the Dirichlet preconditioner
     face none  steps without a preconditioner
 
-Prints a table, and the exponents of c·n^p with 95 % intervals.
+The script prints a table, and the exponents p of c·n^p with 95 % intervals.
 """
 
 import argparse

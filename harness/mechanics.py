@@ -647,9 +647,10 @@ def _largest(R: Any) -> Any:
 def cancelling(K: csr_array, R: Extended) -> Extended:
     """Return KR (n, r) to about twice the digits of doubles, in spite of cancellation.
 
-    K and R are split into leading parts, with 26 and 24 bits relative to the largest
-    entry of a row and of R, and rests. In extended precision (64 bits) the products of
-    the leading parts are exact, and so are their sums over a row of K.
+    K and R are split into remainders and leading parts, which have 26 and 24 bits
+    relative to the largest entry of a row of K and of R. In extended precision (64
+    bits) the products of the leading parts are exact, and so are their sums over a row
+    of K.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))

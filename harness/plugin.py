@@ -306,12 +306,13 @@ class Family(ABC):
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Describe the part of the geometry that `refined` does not refine, or "".
 
-        The text follows an error of the mesh: "of the bodies as they are meshed".
+        The text is printed after an error of the mesh, such as "of the bodies as they
+        are meshed".
         """
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file that a case is read from, which results keep a copy of."""
+        """Return the file from which a case is read; results contain a copy of it."""
         return None
 
     def with_copies(self, folder: Path) -> Family:

@@ -176,9 +176,10 @@ class QP:
         ----------
         P : (n, n) symmetric, both triangles
         q : (n,)
-        G, h : (p, n) and (p,), the rows G x ≤ h A, b : (m, n) and (m,), the rows A x =
-        b lb, ub : (n,) bounds, -inf and inf for absent ones sets : convex sets of
-        further blocks of variables
+        G, h : (p, n) and (p,), the rows G x ≤ h
+        A, b : (m, n) and (m,), the rows A x = b
+        lb, ub : (n,) bounds, -inf and inf for absent ones
+        sets : convex sets of further blocks of variables
 
         Raises
         ------
@@ -323,8 +324,9 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    For `declines` of a solver that reads entries of P. If a solver declines for this
-    reason, a run assembles a small P, on the clock, and calls `declines` again.
+    This is for use in `declines` of a solver that reads entries of P. If a solver
+    declines for this reason, a run assembles a small P, on the clock, and calls
+    `declines` again.
 
     Examples
     --------
@@ -364,8 +366,8 @@ def check_convex(P: Matrix) -> None:
     """Raise if P has negative curvature, since a KKT point may then be a maximum.
 
     With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to exceed −1e-6:
-    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues above that may be
-    negative because of rounding. For more than 2000 rows, only the diagonal is checked.
+    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues between −1e-6 and 0
+    may be due to rounding. For more than 2000 rows, only the diagonal is checked.
 
     Raises
     ------
@@ -458,7 +460,8 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, also from a matrix with one row or column.
 
-    name : name of the vector in messages n : expected number of entries; None for any
+    name : name of the vector in messages
+    n : expected number of entries; None for any
 
     Raises
     ------

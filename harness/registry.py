@@ -333,7 +333,7 @@ def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
     It searches the folders of `sys.path`, which is faster than importing
-    importlib.metadata. An archive on the path counts as a package that does.
+    importlib.metadata. An archive on the path counts as a package that may.
     """
     for place in sys.path:
         if os.path.isfile(place):

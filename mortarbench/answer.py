@@ -519,7 +519,7 @@ def verify(
     x : (n,) point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
     tol : relative KKT accuracy; a point is verified if every residual is within 10·tol
-    or, for a small QP with a proven optimum, if the error of the objective is
+        or, for a small QP with a proven optimum, if the error of the objective is
 
     Raises
     ------

@@ -44,7 +44,7 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def check_result_folder(folder: Path) -> Path:
-    """Return a folder that exists.
+    """Return the path of an existing folder.
 
     Raises
     ------

@@ -266,8 +266,9 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
 def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
     """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
 
-    FCLIB holds problems over friction cones (`Cones`). For a case ``fclib:PATH`` it is
-    the problem of the file, with all arrays unchanged, not one of its convex steps.
+    FCLIB files contain problems over friction cones (`Cones`). For a case
+    ``fclib:PATH``, the problem of the original file is written with all arrays
+    unchanged, instead of the convex problem of the case.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
-TOL = 1e-8
+TOL = 1e-8  #: tolerance of all solves of the strings
 #: largest difference relative to the energies; a factor of 10 for residuals that add up
 #: over rows
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
@@ -58,7 +58,7 @@ class DeclinedError(Exception):
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
-    """Solve the strings in a form unchanged and changed, and compare the answers.
+    """Solve the unchanged and the changed string problem; compare the answers.
 
     change : a key of `CHANGES`
     old : the answer to the unchanged QP, if it is available

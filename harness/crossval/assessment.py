@@ -126,7 +126,7 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
 
 
 def point_norm(qp: QP, s: Solution) -> float:
-    """Return √max(xᵀPx, |qᵀx|), which errors of x are relative to."""
+    """Return √max(xᵀPx, |qᵀx|), the scale of relative errors of x."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
 
 

@@ -116,8 +116,9 @@ def compare_answers(
     """Judge all answers to one problem.
 
     answers : answers to one problem: equal ``mechanics.program``, or one QP without
-    mechanics solve : the reference solve references : folder in which reference points
-    are cached; None for no cache
+        mechanics
+    solve : the reference solve
+    references : folder in which reference points are cached; None for no cache
     """
     prove = proves(solve)
     truth = ground_truth_of(answers, solve, references)

@@ -147,10 +147,10 @@ def discretisation_errors(
 
     An earlier estimate from more meshes is kept if this call runs out of time.
 
-    cases : cases; the forms of one physical case count once folder : result folder,
-    with the cache of reference points in ``references`` budget : seconds; a mesh that
-    is expected to take longer than the rest is skipped tell : called with a message
-    before each case
+    cases : cases; the forms of one physical case count once
+    folder : result folder, with the cache of reference points in ``references``
+    budget : seconds; a mesh that is expected to take longer than the rest is skipped
+    tell : called with a message before each case
     """
     end, found = perf_counter() + budget, dict[str, Discretisation]()
     earlier: dict[str, Discretisation] = {}

@@ -114,7 +114,7 @@ def validate_folder(
 ) -> Validation:
     """Judge all answers of a result folder.
 
-    reference : the reference solve, none of the solvers
+    reference : the reference solve, which is independent of all solvers
     tell : called with the name of each case before it is judged
 
     Raises

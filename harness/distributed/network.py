@@ -24,9 +24,9 @@ def network(comm: Comm) -> dict[str, float]:
 
     Returns
     -------
-    reduction_seconds : time to reduce one number over all ranks, s message_seconds :
-    time to send eight bytes to a neighbour, s seconds_per_byte : time per byte of long
-    messages to a neighbour, s
+    reduction_seconds : time to reduce one number over all ranks, s
+    message_seconds : time to send eight bytes to a neighbour, s
+    seconds_per_byte : time per byte of long messages to a neighbour, s
 
     """
     right, left = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size

@@ -329,7 +329,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _entries(folder: Path) -> list[_Entry]:
-    """Read the list of a folder of copies; empty without a list.
+    """Read the list of copies in a folder; the result is empty if there is no list.
 
     Raises
     ------

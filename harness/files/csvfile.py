@@ -37,7 +37,7 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Prefix a text that a spreadsheet would evaluate with an apostrophe.
+    """Put an apostrophe before a text that a spreadsheet would evaluate.
 
     Characters that programs may skip before the sign are skipped here as well.
     """

@@ -130,9 +130,9 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Attribute all exceptions of a library, which parses a file, to the file.
+    """Attribute all exceptions of a library that parses a file to this file.
 
-    wrong : the message
+    wrong : message of the error
     room : bytes of memory that the library may use beside 256 MiB, as a limit of the
         address space
 

@@ -32,8 +32,9 @@ _MIB = 2**20
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a new file that replaces `path` at the end of the block.
 
-    It is flushed to the disk before. After a crash, `path` is either the old file or
-    the complete new one. Processes that have opened or mapped the old file keep it.
+    The new file is first flushed to the disk. After a crash, `path` is either the old
+    file or the complete new one. Processes that have opened or mapped the old file keep
+    it.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:
@@ -104,7 +105,8 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 def refuse_full_disk(folder: Path, failure: str) -> None:
     """Raise if a failure was caused by a full disk.
 
-    folder : folder that was written to failure : message of the failure
+    folder : folder that was written to
+    failure : message of the failure
 
     Raises
     ------

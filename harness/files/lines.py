@@ -18,7 +18,7 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import replace_file, sync_folder
 
-MAX_LINE_BYTES = 2**24
+MAX_LINE_BYTES = 2**24  #: bounds the memory to read one line of a foreign file
 _CHUNK_BYTES = 2**16  #: number of bytes that are read at a time
 
 

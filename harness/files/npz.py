@@ -24,7 +24,7 @@ from mortarbench.harness.files.datafile import check_size, opened
 from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
-ALIGNMENT = 64
+ALIGNMENT = 64  #: bytes of a cache line, so that alignment does not affect times
 _LOCAL_HEADER = 30  #: bytes before name and extra field of a member
 _PADDING = b"\xfe\xca"  #: id of an extra field that readers skip
 _ENCRYPTED = 1  #: flag of an encrypted member

@@ -351,7 +351,8 @@ def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
     Folders that killed processes left behind are removed first. They are recognised by
-    the lock in them: its owner holds it, and the kernel releases it with the process.
+    a free lock: the owner of a folder holds its lock, which the kernel releases when
+    the owner ends.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):

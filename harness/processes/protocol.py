@@ -31,7 +31,7 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-MAX_REPLY_BYTES = 2**22
+MAX_REPLY_BYTES = 2**22  #: bounds the memory to read one reply of foreign code
 MAX_EXCERPT_CHARACTERS = 200  #: length of a foreign reply that is quoted in a message
 MAX_FAULT_CHARACTERS = 2000  #: length of the message of a fault
 

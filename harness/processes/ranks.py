@@ -196,7 +196,7 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks, on a CPU of its own for each if there are enough.
+    """Join the other ranks; each rank has its own CPU if there are enough.
 
     The speed of communication is measured here, before any solve is timed.
     """

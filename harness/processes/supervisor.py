@@ -49,7 +49,7 @@ from mortarbench.harness.processes.protocol import (
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
-POLL_SECONDS = 0.02
+POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
 START_SECONDS = 120.0  #: time limit of imports, and of loading a QP
 WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
 POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
@@ -174,9 +174,9 @@ class WorkerProcess:
         is repeated once in a new process: an earlier solve may have damaged it.
 
         time_limit : seconds from the event "start" on, which excludes imports, warm-up
-        and loading of the QP. Ranks that assemble the QP have the same limit for the
-        assembly and for the evaluation of the answer, but at least `POINT_SECONDS` for
-        the latter memory_limit : limit for all processes of the worker together, MiB
+            and loading of the QP. Ranks have the same limit to assemble the QP, and the
+            larger of it and `POINT_SECONDS` to evaluate the answer
+        memory_limit : limit for all processes of the worker together, MiB
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
@@ -701,7 +701,8 @@ def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     wrong result. It shows in their peak memory or, if a single allocation was refused,
     in the message of the library.
 
-    message : message of the failure, including the last line of output limit : MiB
+    message : message of the failure, including the last line of output
+    limit : MiB
     """
     near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit
     return near or _ALLOCATION_FAILURE.search(message) is not None

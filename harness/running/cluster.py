@@ -44,7 +44,7 @@ if TYPE_CHECKING:  # it needs the package distributed
     from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
-CONNECT_SECONDS = 10
+CONNECT_SECONDS = 10  #: time limit of the connection, and to fetch a finished result
 #: time between two checks for workers that joined or were lost
 CLUSTER_POLL_SECONDS = 2.0
 MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up
@@ -72,10 +72,12 @@ def on_cluster(
     Connecting first refuses a wrong address before a result folder is created.
 
     address : address of a scheduler, or "local" to start one with a worker for each CPU
-    of this machine plugins : files that exist under the same paths on every node
-    operators : makers of operators P by name, except those of `plugins` environment :
-    environment of this process, with which nodes are compared keep : stores a node's
-    environment under its digest warn : receives messages to the user, one line each
+        of this machine
+    plugins : files that exist under the same paths on every node
+    operators : makers of operators P by name, except those of `plugins`
+    environment : environment of this process, with which nodes are compared
+    keep : stores a node's environment under its digest
+    warn : receives messages to the user, one line each
 
     Raises
     ------

@@ -47,9 +47,10 @@ class ExecutorPlugin(WorkerPlugin):
     """Executor in every Dask worker, including workers that join later.
 
     commands : commands of the parent, in which its Python is replaced by that of the
-    node plugins : files that must exist under the same paths on the node operators :
-    makers of operators P by name, except those of `plugins` sharing : largest number of
-    Dask workers on one machine. Several disturb each other,
+        node
+    plugins : files that must exist under the same paths on the node
+    operators : makers of operators P by name, except those of `plugins`
+    sharing : largest number of Dask workers on one machine. Several disturb each other,
         so the number is a part of the environment
     packages : names of the packages whose versions an environment contains
     """
@@ -74,8 +75,8 @@ class ExecutorPlugin(WorkerPlugin):
     def teardown(self, worker: Worker | None = None) -> None:
         """End the processes of the executor, at the latest after a current measurement.
 
-        Dask cannot stop a block that is being executed. While one is, its thread holds
-        the lock and calls this method when it is done.
+        Dask cannot stop a block that is being executed. The thread that executes it
+        holds the lock and calls this method when the block is done.
         """
         self._ended = True
         if not self._busy.acquire(blocking=False):

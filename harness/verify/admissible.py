@@ -159,9 +159,10 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : exact data whose columns of B are the components (w,) that the rows touch R
-    : (w, p) rigid motions that contact feels, which cost no energy softness : (w,)
-    1/Kᵢᵢ, zero at prescribed components u : (w,)
+    exact : exact data whose columns of B are the components (w,) that the rows touch
+    R : (w, p) rigid motions that contact feels, which cost no energy
+    softness : (w,) 1/Kᵢᵢ, zero at prescribed components
+    u : (w,)
 
     Returns
     -------
@@ -242,9 +243,9 @@ def _compliance(
 ) -> Callable[[Vector], Vector]:
     """Return the solve with F_VV + ρUUᵀ: Cholesky, or CG for very many rows.
 
-    The matrix may be singular up to rounding. It is shifted in its last digits; the
-    next round of the caller corrects the error of that. CG is preconditioned by
-    B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    The matrix may be singular up to rounding, so its diagonal is shifted in the last
+    digits; the next round of the caller corrects the resulting error. CG is
+    preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:
@@ -301,7 +302,8 @@ def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     Parameters
     ----------
     along, terms : (q,) load along each motion, and the sum of its absolute terms
-    most : (q,) that sum with the largest entry of the motion in place of each entry
+    most : (q,) the same sum, with every entry of the motion replaced by its largest
+        entry
 
     """
     return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
@@ -359,10 +361,10 @@ class Balance(NamedTuple):
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
-        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, with the distance of λᵢ from the boundary of Λ
-        for the weight wᵢ (wᵢ ≈ λᵢ of contact): corrections must not act across wide
-        gaps or against slip, where they would do work. Along motions that λ does not
-        support (`supported_and_floating`), the load has to vanish up to its rounding;
+        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
+        boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections must not act across
+        wide gaps or against slip, where they would do work. Along motions that λ does
+        not support (`supported_and_floating`), the load has to vanish up to its rounding;
         otherwise all rows contribute, in the last attempt with equal weights.
 
         Raises

@@ -289,7 +289,7 @@ def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constrai
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     """Measure the worst violation of a row or bound as in `kkt_residuals`.
 
-    X : (n,) sizes of the variables from the scale of energy
+    X : (n,) sizes of the variables that follow from the scale of energy
     own : (n,) sizes of the variables themselves (`own_sizes`)
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
@@ -314,10 +314,10 @@ def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
 
 
 def own_sizes(qp: QP, x: Vector) -> Vector:
-    """Return sizes (n,) of the variables at a solution x (n,), without any energy.
+    """Return sizes (n,) of the variables at x (n,) that do not depend on energies.
 
-    The larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other variables
-    shift the minimum along j.
+    The size is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, the shift of the
+    minimum along j that the other variables cause.
     """
     shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
     sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
@@ -383,7 +383,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     smallest natural energy of a variable (`_natural_energies`).
 
     generous : ignore cancellation, and use the median of the natural energies, in full
-    where the point has no energy of its own
+        where the point has no energy of its own
     """
     terms = _sup(t.energies)
     if np.isnan(terms):
@@ -421,13 +421,14 @@ def _natural_energies(
 ) -> Vector:
     """List the energy that each variable alone can gain, where this is determined.
 
-    Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
-    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ with the feasible width wᵢ, if that is less.
+    This is the energy |½Pᵢᵢxᵢ² + qᵢxᵢ| of the variable at its minimum within the
+    bounds. If the minimum is at xᵢ = 0, it is qᵢ²/Pᵢᵢ or, if that is less, |qᵢ|wᵢ with
+    the feasible width wᵢ.
 
     bounds : lower and upper (n,) each, tightened by rows or not
     by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² where q is
-    rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 if there is
-    no length
+        rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 if there
+        is no length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)

@@ -70,12 +70,13 @@ def measure(
     which counts as preparation as well.
 
     prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
-    `harness.plugin.Chained` sample_seconds : a faster solve is repeated, including its
-    preparation, until the repetitions together take this time. The answer is that of
-    the first repetition; the times are means of the others, since the first one runs
-    with cold caches. Every repetition gets a QP of new objects, so that a solver cannot
-    recognise it by identity starts, ends : called just before the clock starts, and
-    after it has stopped
+        `harness.plugin.Chained`
+    sample_seconds : a faster solve is repeated, including its preparation, until the
+        repetitions together take this time. The answer is that of the first repetition;
+        the times are means of the others, since the first one runs with cold caches.
+        Every repetition gets a QP of new objects, so that a solver cannot recognise it
+        by identity
+    starts, ends : called just before the clock starts, and after it has stopped
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
     with _garbage_collection_off():
@@ -273,8 +274,9 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    These are of the last call in the file of the solver's class, as in ``KeyError:
-    'rho' (mine.py:24)``. They are omitted if the file is not part of the traceback.
+    File and line are those of the last call in the file of the solver's class, as in
+    ``KeyError: 'rho' (mine.py:24)``. They are omitted if this file is not in the
+    traceback.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))

@@ -40,8 +40,8 @@ from mortarbench.harness.verify.optimum import EPS
 #: A row takes part if a multiplier that moves the stationarity residual by tol moves
 #: complementarity by at most this many tol: multipliers of farther rows cannot help.
 MAX_COMPLEMENTARITY_RATIO = 100.0
-#: Steps of Newton's method, the first half of them careful (`_Bearing`). With 8, rows
-#: that act on balls alone leave 6e-7
+#: Number of Newton steps, careful ones (`_Bearing`) in the first half. With 8, the
+#: residual is 6e-7 for rows that act on balls alone
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
 STEP = 2.0**-26  #: step of difference quotients of Π

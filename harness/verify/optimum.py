@@ -85,7 +85,7 @@ class Optimum:
     doubt: float  #: bound of the error of f*, plus the rounding of an exact answer
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
-    own: Vector  #: (n,) the same without any energy, see `own_sizes`
+    own: Vector  #: (n,) sizes that do not depend on energies, see `own_sizes`
 
 
 Proves = Callable[[QP], Optimum | None]
@@ -100,8 +100,8 @@ def decided(
 ) -> float | None:
     """Measure a point against the proven optimum; None where residuals decide.
 
-    They decide where they exceed 10·tol even against the most generous scales, where
-    the QP is large, or where nothing could be proven.
+    Residuals decide if they exceed 10·tol even with the most generous scales, if the QP
+    is large, or if nothing could be proven.
 
     prove : returns the optimum, see `proves`
 
@@ -303,7 +303,8 @@ class _ExactPoint(NamedTuple):
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
     """Solve the KKT equations of the rows with a multiplier, for three guesses.
 
-    Undetermined unknowns are zero; close to the least multipliers; or as in `s`.
+    The guesses set undetermined unknowns to zero, to values close to the least
+    multipliers, and to the values of `s`.
     """
     lower = (s.z_box < 0) & np.isfinite(qp.lb)
     upper = (s.z_box > 0) & np.isfinite(qp.ub)
@@ -333,7 +334,7 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Mark the KKT conditions that a solution of its equations violates.
+    """Mark the KKT conditions that a solution of the KKT equations violates.
 
     Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a bound that is
     absent or not active.
@@ -412,10 +413,10 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
     """Return the least multipliers if several balance the gradient.
 
-    For the rows with a multiplier in `s`, those with the least sum of squares of λᵢ
-    times the terms of row i; rows whose sign would change get none. Returns `s` if the
-    remaining rows do not balance the gradient, up to a negligible part, or if there are
-    other sets than bounds.
+    Among all multipliers of the rows that have one in `s`, these minimise the sum of
+    the squares of λᵢ times the terms of row i; a row whose sign would change gets the
+    multiplier zero. Return `s` if the remaining rows do not balance the gradient, up to
+    a negligible part, or if there are other sets than bounds.
     """
     if len(qp.sets) > 1:
         return s

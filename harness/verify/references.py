@@ -133,8 +133,8 @@ def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
     """Guess the states of the rows by the dual QP.
 
-    Without rows, or with more than are dense, the guess follows from the displacement
-    without contact.
+    If there are no rows, or too many for a dense matrix, the guess follows from the
+    displacement without contact.
     """
     inverse = mechanics.inverse
     R, exact = mechanics.motions.felt.toarray().astype(np.float64), mechanics.exact

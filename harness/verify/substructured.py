@@ -137,7 +137,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) likewise; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) in the same way; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
@@ -416,7 +416,7 @@ class Sharing:
         return np.asarray(b)
 
     def matched(self, v: Extended) -> Extended:
-        """Subtract the rigid motions Rα that minimise the jumps of v (N,), as Z weighs.
+        """Subtract the rigid motions Rα that minimise jumps of v (N,), weighted by Z.
 
         RᵀZ(v − Rα) = 0 is the coarse problem of the balance of forces. On fixed
         components the jump is the difference from zero.

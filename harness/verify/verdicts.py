@@ -57,7 +57,8 @@ def new_record(
     """Return the record of a measurement that has not begun.
 
     options : all options of the solver, including defaults
-    environment : digest of the environment mode, accuracy, session : see `Record`
+    environment : digest of the environment
+    mode, accuracy, session : see `Record`
     """
     options = plain(options)
     identity = [IDENTITY, case.name, spec.label, spec.name, options, tol, repeat]

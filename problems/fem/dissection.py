@@ -35,8 +35,8 @@ class Fronts:
     """Fronts: sets of positions in the elimination order, in postorder of their tree.
 
     Front s eliminates the positions start[s] … start[s + 1] − 1. Its border,
-    border[first[s]:first[s + 1]], consists of the later positions with entries in its
-    rows, from the matrix or by fill-in, ascending. Its children are the last
+    border[first[s]:first[s + 1]], consists of the later positions, ascending, with
+    entries in its rows from the matrix or from fill-in. Its children are the last
     `children[s]` roots of subtrees before s.
     """
 

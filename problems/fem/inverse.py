@@ -136,7 +136,7 @@ def regular_inverse(
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When K_ff is singular; the latter without an interface.
+        When K_ff is singular; CHOLMOD's error is raised without an interface.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)

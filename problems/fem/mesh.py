@@ -78,7 +78,8 @@ class Mesh:
 class StructuredGrid:
     """Structured grid, of which any block can be generated without the rest.
 
-    Node (row j, column i) has the number  j·(columns) + i,  and likewise cells.
+    Node (row j, column i) has the number j·(columns) + i; cells are numbered in the
+    same way.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes
@@ -160,7 +161,7 @@ class HalfDisc:
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Numbers of cells along a ring and of rings, including the triangles."""
+        """Number of cells along a ring; number of rings, including the triangles."""
         return self.angles.size - 1, self.radii.size
 
     @property
@@ -249,7 +250,7 @@ def box(corner: tuple[float, ...], size: tuple[float, ...],
         divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
     """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
 
-    Boundaries as of `box_grid`. Lengths are in m.
+    The boundaries have the names of those of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()

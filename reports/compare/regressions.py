@@ -57,7 +57,7 @@ class Slower:
 
 @dataclass(frozen=True, kw_only=True)
 class Regressions:
-    """Slowdowns, and the number of tests behind them."""
+    """Slowdowns, and the number of statistical tests from which they result."""
 
     slower: tuple[Slower, ...]
     solvers: int  #: number of solvers judged over their cases

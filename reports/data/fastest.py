@@ -115,7 +115,7 @@ class FastestSolver:
 
     @property
     def following(self) -> Competitor | None:
-        """The next significantly slower competitor; None if there is none."""
+        """The next significantly slower competitor, or None."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
@@ -211,8 +211,9 @@ def _compared(
     """Compare with the first on the cases that both solved, in one environment.
 
     On each case, the ratio is that of the blocks in which both were measured. Over
-    cases, Student's interval is widened to that of flipped signs. Student's assumes
-    normal logarithms, the other one symmetric ones; neither assumption is safe for six
+    cases, Student's interval is widened to the interval of the sign-flip test if that
+    is wider. Student's interval assumes that logarithms are normally distributed, the
+    other that their distribution is symmetric. Neither assumption is safe for six
     cases, so both intervals must exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]

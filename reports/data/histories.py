@@ -54,7 +54,7 @@ class SolverRun:
 
     @cached_property
     def gradient(self) -> Vector | None:
-        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over the first one."""
+        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
         phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:
             return None

@@ -131,7 +131,7 @@ def fixed_keys(
 def size_series(evidence: Evidence) -> list[SizeSeries]:
     """Return the series of at least three sizes.
 
-    n is the number of dofs, m that of the rows of equalities and contact.
+    n is the number of dofs, and m is the number of equality and contact rows.
     """
     series = []
     answers = [(n, o) for n, o in sized(evidence) if o.first.role != COPIES]

@@ -30,7 +30,7 @@ from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import limits
 
-RESAMPLES = 400
+RESAMPLES = 400  #: bootstrap resamples; a tail of 2.5 % then consists of 10 of them
 SMALLEST = 1e-17  #: lower bound of errors, so that zero has a logarithm
 
 Floats = NDArray[np.float64]

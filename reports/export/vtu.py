@@ -89,9 +89,9 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
-    """Return pressure and gap at the nodes (N,); on several sides, the tightest one.
+    """Return the largest pressure and the smallest gap of all sides at the nodes (N,).
 
-    With friction also the shear traction and the index of each state in `STATES`.
+    With friction, add the shear traction and the index of each state in `STATES`.
     """
     if not sides:
         return {}

@@ -252,7 +252,8 @@ def _pressure_panel(
 ) -> FieldPanel:  # fmt: skip
     """Show the pressure on the undeformed faces of a side, along its mean normal.
 
-    If that is about an axis, the view is along it, with positive axes to the right.
+    If this normal is nearly parallel to an axis, the view is along the axis, and
+    positive axes point to the right.
     """
     camera = camera_towards(
         np.where(np.abs(normal).max() > _ALONG, np.rint(normal), normal)

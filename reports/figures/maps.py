@@ -33,7 +33,7 @@ _CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
 
 def traction_maps(fields: Fields) -> FieldFigure | None:
-    """Show the tractions on the surface of half-spaces; None without any.
+    """Show the tractions on the surface of half-spaces; None if there are no tractions.
 
     With friction, arrows are the direction in which the upper body slips, opposite to
     the shear traction on it. Circles are the exact contact and the exact stick zone.

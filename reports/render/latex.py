@@ -39,7 +39,7 @@ def latex(
     reads them.
 
     name : name of the section; the k-th table has the label tab:NAME-k, a single table
-    has tab:NAME
+        has tab:NAME
     """
     long = any(len(table.rows) > ROWS for table in tables)
     packages = rf"% \usepackage{{booktabs{',longtable' * long}}}" + "\n"

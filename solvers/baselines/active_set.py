@@ -175,7 +175,7 @@ def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Activ
 def _exchange(active: Active, new: Active, index: int) -> Active:
     """Return `active` with the constraint of this index taken from `new`.
 
-    index : below n, of a variable's bounds; n + i, of row i of G
+    index : i for the bounds of variable i < n; n + i for row i of G
     """
     side, rows = active.side.copy(), active.rows.copy()
     if index < side.size:

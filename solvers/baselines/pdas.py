@@ -123,7 +123,7 @@ class PDAS:
         return lambda: run()[0]
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Return the `prepare` of a sequence, started at the last point and set."""
+        """Return the `prepare` of a sequence that reuses the last point and set."""
         carry: Carry | None = None
 
         def prepare(qp: QP) -> Callable[[], Solution]:

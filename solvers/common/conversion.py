@@ -21,8 +21,8 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
-#: absolute tolerance for solvers whose test is ≤ absolute + relative·size, so that the
-#: relative one decides
+#: absolute tolerance for solvers that test a residual against absolute + relative·size,
+#: so small that the relative tolerance decides
 NEGLIGIBLE = 1e-14
 #: convex sets that have rows in second-order cones
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)

@@ -70,9 +70,9 @@ def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
     """Yield a refined point for each active set that is tried; often there is one.
 
     qp : QP whose largest entries are about one, with P, A and G all dense or all sparse
-    start : point near a solution, such as that of an interior-point method delta : δ; a
-    smaller value resolves weaker curvature and more nearly parallel rows, but brings
-    the matrix closer to singularity
+    start : point near a solution, such as that of an interior-point method
+    delta : δ; a smaller value resolves weaker curvature and more nearly parallel rows,
+        but brings the matrix closer to singularity
     """
     problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))

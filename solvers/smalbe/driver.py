@@ -234,13 +234,14 @@ def _estimated_spectrum(
 def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     """Return the number of Lanczos steps.
 
-    Few steps suffice for few unknowns, where more would cost as much as the CG steps;
-    and if P offers a preconditioner, since the spectrum of decomposed bodies is flat
-    and only its norm is used. With bounds alone fewer are enough: seven or eight for 73
-    to 85 unknowns save as many products as they cost, of which CG takes about ten.
-    Seven for all would save up to a fifth on dense duals with bounds alone, but cost up
-    to 1.9 times as many on dense matrices whose spectrum falls slowly. A sequence
-    reuses the spectrum, so that further steps pay there: with fewer, the 24 problems of
+    Few steps suffice for few unknowns, where more steps would cost as much as CG. They
+    also suffice if P offers a preconditioner, since the spectrum of decomposed bodies
+    is flat and only its norm is used. With bounds alone fewer steps are enough: for 73
+    to 85 unknowns, where CG takes about ten products, the steps beyond seven or eight
+    save no more products than they cost. Seven steps for all sizes would save up to a
+    fifth of the products on dense duals with bounds alone, but take up to 1.9 times as
+    many on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
+    so that further steps are worthwhile: with fewer steps, the 24 problems of
     greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":

@@ -63,7 +63,7 @@ class _Saddle:
     factor: Array  #: (k, k) Cholesky factor of P_EE, in the upper triangle
     G_E: Array  #: (r, k) rows of full rank
     PG: Array  #: P_EE⁻¹G_Eᵀ (k, r)
-    schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, likewise
+    schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, in the upper triangle
 
     def __call__(self, top: Vector, bottom: Vector) -> tuple[Vector, Vector]:
         w = dpotrs(self.factor, top)[0]

@@ -28,8 +28,8 @@ class Step(NamedTuple):
     """State of MPRGP where the CG step x − αp would leave the box.
 
     Costs, gradients and lengths are those of the augmented Lagrangian
-    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span those
-    of the equality constraints; without these, of the QP itself.
+    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span the
+    equality rows; without equality rows, they are those of the QP itself.
     """
 
     x: Vector  #: (n,) iterate, within the bounds

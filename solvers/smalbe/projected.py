@@ -143,7 +143,7 @@ def by_lanczos(
 ) -> Spectrum:
     """Estimate the norm and the upper Ritz pairs by `steps` products.
 
-    start : (n,), by default random
+    start : (n,) start vector; default: random
     """
     start = random_start(C.n) if start is None else start
     ritz = Ritz(*compiled.lanczos(F, C, start, steps))
