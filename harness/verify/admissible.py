@@ -364,8 +364,8 @@ class Balance(NamedTuple):
         λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
         boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections must not act across
         wide gaps or against slip, where they would do work. Along motions that λ does
-        not support (`supported_and_floating`), the load has to vanish up to its rounding;
-        otherwise all rows contribute, in the last attempt with equal weights.
+        not support (`supported_and_floating`), the load has to vanish up to its
+        rounding; otherwise all rows contribute, in the last attempt with equal weights.
 
         Raises
         ------

@@ -388,10 +388,10 @@ def average_free(
 ) -> Composition:
     """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
 
-    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding would let the iterates
-    of preconditioned conjugate gradients drift along these. B_DΠ maps to them, and
-    (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 since C = LᵀB for some L: the preconditioner is the same up
-    to such multipliers, and its images are free of them.
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding would let the
+    iterates of preconditioned conjugate gradients drift along these. B_DΠ maps to them,
+    and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 since C = LᵀB for some L: the preconditioner is the
+    same up to such multipliers, and its images are free of them.
 
     weights : (M,) W, equal for all subdomains of a class
     """

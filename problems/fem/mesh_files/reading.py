@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from mortarbench.problems.fem.mesh_files.gmsh import read_msh_sets
 from mortarbench.problems.fem.mesh_files.inp import read_inp
 from mortarbench.problems.fem.mesh_files.med import read_med
-from mortarbench.problems.fem.mesh_files.gmsh import read_msh_sets
 from mortarbench.problems.fem.mesh_files.named import (
     FileMesh,
     NamedMesh,
