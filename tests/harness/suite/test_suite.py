@@ -406,6 +406,13 @@ def test_crossval_has_every_family_in_every_form_and_many_solvers():
     }
 
 
+def test_the_suite_of_fclib_has_both_loops():
+    fclib = shipped("fclib")
+
+    assert [c.params["loop"] for c in fclib.cases] == ["cones", "tresca"]
+    assert paths_of(fclib)[0].endswith("boxes.hdf5")
+
+
 def paths_of(suite):
     return [c.params["path"] for c in suite.cases if "path" in c.params]
 
