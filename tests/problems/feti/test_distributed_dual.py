@@ -28,6 +28,8 @@ CASES = (
     "obstacle/n=11/shape=hemisphere/feti=4/dual",
     "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e5/slave=lower/dual",
     "cube-wall/n=4/feti=2/dual",
+    "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
+    "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
 #: that solutions come before, by number of cells the smallest there are: contact is
 #: linearised there, or the bound of Coulomb's law is theirs
