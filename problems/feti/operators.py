@@ -79,6 +79,9 @@ STRIP_COLUMNS = 256  #: columns per product when an implicit block is evaluated
 CONTACT_SHIFT = 1e-8
 #: eigenvalues of a block of B W Bᵀ below this share of the largest count as zero
 EIGENVALUE_CUTOFF = 1e-10
+#: least diagonal of B K̃⁺Bᵀ relative to that of B K⁺Bᵀ. Rounding 2⁻⁵³ of the terms then
+#: counts as a residual of 1e5·2⁻⁵³: far below any tolerance
+LEAST_DIAGONAL = 1e-10
 #: off-diagonal entries of B W Bᵀ below this share of the diagonal are rounding
 COUPLING_ROUNDING = 1e-12
 
@@ -305,8 +308,10 @@ class DualOperator:
         diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
         if joints is None:
             return diagonal
-        # not negative; rounding may make it so where C determines a row of B
-        return np.maximum(diagonal + joints.diagonal(self.packed.B), 0.0)
+        # C may determine a row of B, which F then maps to zero up to rounding of its
+        # terms; relative to a scale of zero, that rounding would be an error
+        joined = diagonal + joints.diagonal(self.packed.B)
+        return np.maximum(joined, LEAST_DIAGONAL * diagonal)
 
     @cached_property
     def _blocks(self) -> _Blocks:

@@ -20,6 +20,17 @@ def test_blocks_multiply_columns(n, columns):
     assert Y[:3].tolist() == [2, 4, 6]  # not overwritten by the second block
 
 
+@pytest.mark.parametrize(("rows", "n"), [(3, 7), (9, 2), (0, 4), (5, 0)])
+def test_blocks_need_not_be_square(rows, n):
+    M, X = np.arange(1.0, rows * n + 1).reshape(rows, n), np.ones((n, 13))
+    maps = BlockDiagonal([M, 2 * np.ones((1, 1))], [n, 1], [13, 2])
+
+    Y = maps(np.append(X, [1.0, 2.0]))
+
+    assert maps.shape == (13 * rows + 2, 13 * n + 2)
+    assert np.append(M @ X, [2.0, 4.0]).tolist() == Y.tolist()
+
+
 @pytest.mark.parametrize("columns", [1, 2, 5])
 def test_triangles_and_objects_multiply_matrices_like_arrays(columns):
     rng = np.random.default_rng(columns)

@@ -33,6 +33,8 @@ CASES = (
     "cube-wall/n=4/feti=2/dual",
     "plate/Sx=2/Sy=2/n=2/pattern=checkerboard/jump=10/dim=3/Sz=2/dual",
     "contact-patch/lower=3/upper=2/feti=2/dim=3/distort=0.2/dual",
+    "beam-ring/Nr=3/Nh=2/steps=1/feti=2/glue=redundant/cluster=2/dual",
+    "plate/Sx=4/Sy=4/n=2/pattern=column/jump=10/cluster=2/dual",
 )
 #: that solutions come before, by number of cells the smallest there are: contact is
 #: linearised there, or the bound of Coulomb's law is theirs
