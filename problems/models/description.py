@@ -113,7 +113,7 @@ _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
 #: keys of the shapes of rigid bodies, by dimension; those but radius are vectors
-_RIGID = {
+_RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
     2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
     3: {
         "plane": ("point", "normal"),
@@ -415,7 +415,7 @@ def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
         return ContactPair(slave, slave[:0], rigid, clamped)
     if np.intersect1d(slave, sides["master"]).size:
         raise InputError("slave and master share nodes; expected sides that are apart")
-    return ContactPair(**sides)
+    return ContactPair(slave, sides["master"])
 
 
 def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:

@@ -258,8 +258,8 @@ def _near(block: _Block, half_width: float) -> Nodes:
     """
     reach = np.abs(block.mesh.points[block.contact][..., :2])
     within = reach <= half_width * (1 + 1e-9)
-    corners = within.all(axis=1) if block.up > 0 else within.any(axis=1)
-    return block.contact[corners.all(axis=1)]
+    along: NDArray[np.bool_] = (np.all if block.up > 0 else np.any)(within, axis=1)
+    return block.contact[along.all(axis=1)]
 
 
 def _far_forces(
@@ -400,15 +400,21 @@ def _shear_quantities(
     """Compare stick and tangential force with Cattaneo and Mindlin's; full sphere.
 
     tangential_force: along x on the lower sphere, N. stick_radius: of a disc with the
-    area of the sticking nodes, m. c_over_a: over the exact contact radius.
+    area of the sticking nodes, m, too large by up to half a cell. c_over_a: over the
+    exact contact radius. c_over_a_moment: from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), exact for
+    Cattaneo and Mindlin's q.
     """
     (side,) = contact_sides(*solution.sides)
+    assert side.friction_force is not None
     area = copies * side.length[side.friction == "stick"].sum()
     radius, total = np.sqrt(area / np.pi), -copies * side.force[:, 0].sum()
-    limit = exact.mu * exact.normal.P
+    limit, a = exact.mu * exact.normal.P, exact.normal.a
+    r2 = (solution.sides.bodies.mesh.points[side.nodes, :2] ** 2).sum(axis=1)
+    moment = -copies * (side.friction_force[:, 0] @ r2) / (0.4 * limit * a**2)
     return {
         "tangential_force": float(total),
         "tangential_force_error": float(total / (exact.Q * limit) - 1),
-        "stick_radius": float(radius), "c_over_a": float(radius / exact.normal.a),
+        "stick_radius": float(radius), "c_over_a": float(radius / a),
         "c_over_a_error": float(radius / exact.c - 1),
+        "c_over_a_moment": float(max(1 - moment, 0.0) ** 0.2),
     }  # fmt: skip
