@@ -9,7 +9,10 @@ from mortarbench.harness import InputError, certify
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.models.half_space.point_contact import PointContact
-from mortarbench.problems.models.solids.hertz_sphere import point_force_stress
+from mortarbench.problems.models.solids.hertz_sphere import (
+    point_force_stress,
+    tangential_force_stress,
+)
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 
@@ -140,19 +143,23 @@ def test_units_do_not_matter():
     assert other["p_max"] == pytest.approx(1e-6 * one["p_max"])
 
 
-def test_the_far_field_is_in_equilibrium_with_the_force():
+@pytest.mark.parametrize(
+    ("stress", "force"),
+    [(point_force_stress, [0, 0, 1]), (tangential_force_stress, [1, 0, 0])],
+)
+def test_far_fields_are_in_equilibrium_with_a_point_force(stress, force):
     nu, rng, step = 0.27, np.random.default_rng(8), 1e-5
-    x = rng.uniform(0.5, 2, (50, 3))
+    x = rng.uniform(0.5, 2, (50, 3)) * rng.choice([-1, 1], (50, 3))
+    x[:, 2] = abs(x[:, 2])
     divergence = sum(
-        point_force_stress(x + step * axis, nu)[:, k]
-        - point_force_stress(x - step * axis, nu)[:, k]
+        stress(x + step * axis, nu)[:, k] - stress(x - step * axis, nu)[:, k]
         for k, axis in enumerate(np.eye(3))
     ) / (2 * step)  # fmt: skip
     assert abs(divergence).max() <= 1e-8
-    sigma = point_force_stress(x, nu)
+    sigma = stress(x, nu)
     np.testing.assert_allclose(sigma, sigma.transpose(0, 2, 1), atol=1e-16)
-    # no tractions on the free surface, and a total of −1 on every half sphere
-    flat = point_force_stress(x * [1, 1, 0], nu)
+    # no tractions on the free surface, and the opposite total on every half sphere
+    flat = stress(x * [1, 1, 0], nu)
     assert abs(flat[:, 2]).max() <= 1e-15
     z, weights = np.polynomial.legendre.leggauss(20)
     z, weights = (z + 1) / 2, weights / 2
@@ -162,9 +169,38 @@ def test_the_far_field_is_in_equilibrium_with_the_force():
          np.outer(np.sqrt(1 - z**2), np.sin(around)),
          np.outer(z, np.ones(16))], axis=-1,
     ).reshape(-1, 3)  # fmt: skip
-    traction = np.einsum("kij,kj->ki", point_force_stress(normal, nu), normal)
+    traction = np.einsum("kij,kj->ki", stress(normal, nu), normal)
     total = np.repeat(weights * 2 * np.pi / 16, 16) @ traction
-    assert total == pytest.approx([0, 0, -1], abs=1e-12)
+    assert total == pytest.approx([-f for f in force], abs=1e-12)
+    # compatible with Hooke's law: Beltrami's equation, (1 + ν)∇²σ + ∇∇tr σ = 0
+    h, axes = 1e-3, np.eye(3)
+    at = x[:5] / np.linalg.norm(x[:5], axis=1, keepdims=True)
+    laplacian = sum(
+        stress(at + h * e, nu) - 2 * stress(at, nu) + stress(at - h * e, nu)
+        for e in axes
+    ) / h**2  # fmt: skip
+    trace = lambda p: np.trace(stress(p, nu), axis1=1, axis2=2)  # noqa: E731
+    hessian = np.stack([[
+        (trace(at + h * (e + f)) - trace(at + h * (e - f))
+         - trace(at - h * (e - f)) + trace(at - h * (e + f))) / (4 * h**2)
+        for e in axes] for f in axes]).transpose(2, 0, 1)  # fmt: skip
+    assert abs((1 + nu) * laplacian + hessian).max() <= 2e-4
+
+
+def test_a_tangential_force_leaves_the_middle_sticking():
+    """Cattaneo and Mindlin; on this mesh c has an error of up to half a cell, 0.2 a."""
+    values = solved(f"n=2/{MOOSE}/Q=0.5/dual")[2]
+    pressed = solved(f"n=2/{MOOSE}/dual")[2]
+    force = 0.5 * 0.3 * 10_000
+
+    assert values["tangential_force"] == pytest.approx(force, rel=1e-6)
+    assert values["contact_force"] == pytest.approx([force, 0, -10_000], rel=1e-6)
+    assert values["c_over_a"] == pytest.approx(0.5 ** (1 / 3), abs=0.25)
+    assert values["c_over_a_moment"] == pytest.approx(0.5 ** (1 / 3), rel=0.05)
+    assert values["friction_residual"] <= 1e-9
+    # bodies of one material: Q does not change the pressure
+    for name in ("contact_radius", "p_max", "approach"):
+        assert values[name] == pytest.approx(pressed[name], rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -175,6 +211,9 @@ def test_the_far_field_is_in_equilibrium_with_the_force():
         ("against=spher/dual", "against='spher' is unknown, expected 'plane' or 'sph"),
         ("contact=nts/dual", "contact=nts is not used by against=plane; expected aga"),
         ("basis=standard/dual", "basis=standard is not used by against=plane"),
+        ("Q=0.5/dual", "Q=0.5 with against=plane; expected against=sphere"),
+        ("against=sphere/Q=1/dual", "Q=1.0 must be at least 0 and below 1, a part of"),
+        ("against=sphere/mu=0.2/dual", "mu=0.2 is not used without a tangential force"),
         ("dual-bounds", "dual-bounds"),
         ("n=0/dual", "n=0 must be at least 1"),
     ],

@@ -1,12 +1,21 @@
 """Contact of described bodies with rigid planes, cylinders and spheres."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
+from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.linearise import linearisation
+from mortarbench.problems.contact.rigid import RigidSphere
+from mortarbench.problems.duality.case_forms import case_of
+from mortarbench.problems.duality.problem import Choice
 from mortarbench.problems.fem.mesh import box, rectangle
+from mortarbench.problems.models.half_space.point_contact import PointContact
+from mortarbench.problems.models.line_contact import LineContact
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
 from tests.support.gmsh_files import msh22, solids22
@@ -193,3 +202,40 @@ def test_a_wrong_rigid_body_is_refused_in_one_line(tmp_path, toml, old, new, mes
 
     assert message in str(e.value)
     assert "\n" not in str(e.value)
+
+
+def against(problem, rigid):
+    """Return the quantities of a body with one contact pair, on another rigid body."""
+    (pair,) = problem.bodies.pairs
+    pairs = (ContactPair(pair.slave, pair.master, rigid),)
+    changed = replace(
+        problem, bodies=replace(problem.bodies, pairs=pairs),
+        linearise=lambda bodies, laws: linearisation(bodies, "nts", "dual", laws),
+    )  # fmt: skip
+    case = case_of(changed, "dual", Choice(), reference_solution)
+    return case.quantities(SOLVERS["smalbe"].prepare(case.qp, 1e-11)())
+
+
+def test_a_sphere_on_a_rigid_sphere_touches_as_hertz_says():
+    """1/R = 1/8 + 1/24."""
+    family = PROBLEMS["hertz-sphere"]
+    problem = family.contact_problem(family.complete({"n": 4}))
+    values = against(problem, RigidSphere((0.0, 0.0, -24.0), 24.0))
+    exact = PointContact(10.0, 6.0, 200 / (1 - NU**2))
+
+    assert values["contact_radius"] == pytest.approx(exact.a, rel=0.03)
+    assert values["p_max"] == pytest.approx(exact.p0, rel=0.03)
+    assert values["approach"] == pytest.approx(exact.approach, rel=0.03)
+    assert values["contact_force"] == pytest.approx([0, 0, 10], abs=1e-8)
+
+
+def test_a_cylinder_on_a_rigid_cylinder_touches_as_hertz_says():
+    """1/R = 1/8 + 1/24 mm; in the plane, a cylinder is a disc."""
+    family = PROBLEMS["hertz-plane"]
+    problem = family.contact_problem(family.complete({"n": 8, "load": 5.0}))
+    values = against(problem, RigidSphere((0.0, -24e-3), 24e-3))
+    exact = LineContact(5e6, 6e-3, 200e9 / (1 - NU**2))
+
+    assert values["half_width"] == pytest.approx(exact.a, rel=0.02)
+    assert values["p_max"] == pytest.approx(exact.p0, rel=0.02)
+    assert values["contact_force"] == pytest.approx([0, 5e6], abs=1e-2)
