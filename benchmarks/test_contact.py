@@ -1,4 +1,4 @@
-"""Contact linearisation at the paper's size, and the cost of search per segment."""
+"""Contact linearisation at the paper's size and in space, and the cost of search."""
 
 from functools import partial
 
@@ -8,7 +8,16 @@ import pytest
 from mortarbench.problems.contact.mortar import mortar
 from mortarbench.problems.contact.node_to_segment import node_to_segment
 from mortarbench.problems.contact.segment_search import nearest
+from mortarbench.problems.contact.space.face_mortar import face_mortar
+from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import surface
+from mortarbench.problems.fem.elasticity import (
+    Material,
+    elasticity_matrix,
+    stiffness,
+)
+from mortarbench.problems.fem.inverse import regular_inverse
+from mortarbench.problems.fem.mesh import box, join, prefixed
 from mortarbench.problems.models.beam_ring import model
 
 
@@ -57,3 +66,29 @@ def test_cost_per_segment(race, note, method):
     exponents = np.diff(np.log10(list(medians.values())))
     note(f"{method.__name__}: exponents {exponents[0]:.2f}, {exponents[1]:.2f}")
     assert len(exponents) == 2
+
+
+@pytest.mark.parametrize("cells", [15, 24])
+def test_linearisation_in_space_against_a_factor(race, note, cells):
+    """Two stacked cubes whose meshes do not match; the lower one has fewer cells."""
+    lower = prefixed(box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (cells - 1,) * 3), "lower_")
+    upper = prefixed(box((0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (cells,) * 3), "upper_")
+    mesh, _ = join((lower, upper))
+    slave, master = mesh.boundaries["upper_bottom"], mesh.boundaries["lower_top"]
+    u = 1e-3 * np.sin(5 * mesh.points).ravel()
+    K = stiffness(mesh, elasticity_matrix(Material(E=1.0, nu=0.3), None))
+    free = np.flatnonzero(np.repeat(abs(mesh.points[:, 2] - 1) < 1, 3))
+
+    medians = race(
+        factor=lambda: regular_inverse(K, free),
+        node_to_face=lambda: node_to_face(mesh.points, u, slave, master),
+        face_mortar=lambda: face_mortar(mesh.points, u, slave, master),
+        rounds=3,
+    )
+
+    shares = {k: 100 * t / medians["factor"] for k, t in medians.items()}
+    note(
+        f"{mesh.dofs} components: node to face {shares['node_to_face']:.1f} %, face "
+        f"mortar {shares['face_mortar']:.1f} % of a factor"
+    )
+    assert len(shares) == 3
