@@ -73,6 +73,7 @@ class _Problem:
     discs: tuple[Discs, ...]  #: of positive radius
     #: factorises [P + D Bᵀ; B −W], B = [A; rows of discs; G]
     saddle: Callable[[Matrix], Factorise]
+    delta: float
 
     @property
     def rows(self) -> int:
@@ -118,8 +119,8 @@ class _Problem:
         m, p = self.b.size, self.rows
         w_box = w[p:]
         solve = self.saddle(rows)(
-            self.box_T(1 / w_box, start=curvature + DELTA, lower=1.0),
-            np.append(np.full(m, DELTA), w[:p]),
+            self.box_T(1 / w_box, start=curvature + self.delta, lower=1.0),
+            np.append(np.full(m, self.delta), w[:p]),
         )
 
         def solve_all(r: Vector, t: Vector) -> tuple[Vector, Vector]:
@@ -146,14 +147,14 @@ class _Problem:
 
 
 @np.errstate(all="ignore")  # a divergent residual is not finite and ends the loop
-def interior_point(qp: QP) -> Solution:
+def interior_point(qp: QP, delta: float = DELTA) -> Solution:
     """Return the iterate with the smallest KKT residual.
 
     The slacks and multipliers of all inequalities are positive. The constants suit a
     QP whose largest entries are about one (`equilibrate`). Nothing is raised if there
     is no solution; the caller checks the residual.
     """
-    problem = _problem(qp)
+    problem = _problem(qp, delta)
     best, least, stalled = Solution.without_point(qp, Status.FAILED), np.inf, 0
     try:
         at = _start(problem)
@@ -171,7 +172,7 @@ def interior_point(qp: QP) -> Solution:
     return best
 
 
-def _problem(qp: QP) -> _Problem:
+def _problem(qp: QP, delta: float) -> _Problem:
     lb, ub = hull(qp.sets, qp.q.size)
     is_fixed = lb == ub
     fixed, upper, lower = (
@@ -197,6 +198,7 @@ def _problem(qp: QP) -> _Problem:
         ]),
         fixed=fixed, upper=upper, lower=lower, discs=discs,
         saddle=lambda rows: without_rows or saddle(qp.P, _stacked(A, rows)),
+        delta=delta,
     )  # fmt: skip
 
 

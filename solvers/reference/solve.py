@@ -29,7 +29,7 @@ from mortarbench.harness import QP, Discs, Solution, Status, kkt_residuals
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
 from mortarbench.solvers.reference.equilibrate import equilibrate
-from mortarbench.solvers.reference.interior import interior_point
+from mortarbench.solvers.reference.interior import DELTA, interior_point
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates, refine
 
@@ -39,6 +39,9 @@ from mortarbench.solvers.reference.projection import projection_iterates, refine
 MAX_START_RESIDUAL = 1e-3
 MAX_IDLE_ROUNDS = 1  #: of projections, without a smaller residual, before they end
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
+#: δ of the interior-point method over discs where P is singular: with a smaller one,
+#: steps along its kernel leave discs far behind, whose linearisation then fails
+SINGULAR_DELTA = 1e-7
 #: data of a scaled QP larger than this times their median are first left out
 OUTLIER_FACTOR = 1e4
 
@@ -81,7 +84,11 @@ def reference_solution(qp: QP) -> Solution:
     )
     if len(qp.sets) > 1:
         smooth = all(isinstance(one, Discs) for one in qp.sets[1:])
-        ways = (_smooth_candidates(qp),) * smooth + (_projection_candidates(qp),)
+        shifts = (DELTA, SINGULAR_DELTA) if smooth else ()
+        ways = (
+            *(_smooth_candidates(qp, delta) for delta in shifts),
+            _projection_candidates(qp),
+        )
     for candidates in ways:
         residuals = list[float]()
         for point in candidates:
@@ -121,10 +128,10 @@ def _candidates(qp: QP) -> Iterator[Solution]:
     yield from map(scaled.recover, polish(scaled.qp, start))
 
 
-def _smooth_candidates(qp: QP) -> Iterator[Solution]:
+def _smooth_candidates(qp: QP, delta: float) -> Iterator[Solution]:
     """Yield points of a QP over bounds and discs, refined by projections."""
     scaled = equilibrate(qp)
-    start = interior_point(scaled.qp)
+    start = interior_point(scaled.qp, delta)
     yield scaled.recover(start)
     yield scaled.recover(refine(scaled.qp, start))
 
