@@ -54,7 +54,7 @@ CASES = {
 IN_SPACE = (
     "contact-patch/dim=3/lower=2/upper=1/ratio=0.1/friction=tresca/bound=1e5",
     "contact-patch/dim=3/lower=2/upper=1/ratio=1e-3/friction=tresca/bound=1e5",
-    "contact-patch/dim=3/lower=1/upper=2/ratio=1e3/friction=coulomb/mu=0.1",
+    "contact-patch/dim=3/lower=2/upper=2/ratio=1e3/friction=coulomb/mu=0.1",
     "contact-patch/dim=3/lower=2/upper=2/ratio=0.1/friction=coulomb/mu=0.2/distort=0.2",
     "greco/n=3/dim=3/depth=2",
     "contact-patch/dim=3/lower=2/upper=1/ratio=0.1/friction=coulomb/mu=0.2/feti=1",
