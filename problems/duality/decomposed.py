@@ -18,6 +18,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, vstack
 from mortarbench.harness import (
     QP,
     Friction,
+    InputError,
     ReferenceOverRanks,
     Solution,
     Status,
@@ -151,9 +152,14 @@ def distributed_qp_of(
     InputError
         If there are fewer subdomains than ranks, ranks have cut the bodies differently,
         or the fixed point of Coulomb's law does not converge or has fewer iterates than
-        selected.
+        selected. Also for friction in space, whose discs ranks do not support.
 
     """
+    laws = [law for stage in problem.stages for law in stage.laws]
+    if problem.bodies.shape.dim > 2 and any(law.acts for law in laws):
+        raise InputError(
+            "friction in space on several ranks is not built; expected one rank"
+        )
     path = decomposed_path(problem, choice, ranks, reference)
     chosen = path.problem(choice.step, choice.iterate)
     last = path.last_of(choice.step)
