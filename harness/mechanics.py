@@ -24,7 +24,9 @@ from scipy.sparse import (
 
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
 from mortarbench.harness.sets.blocks import norms
+from mortarbench.harness.sets.box import Box
 from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution
 
@@ -123,6 +125,10 @@ class Friction:
     def vectors(self) -> NDArray[np.int64]:
         """The friction rows (k/d, d) of each tangential vector."""
         return np.arange(self.row.size).reshape(-1, self.tangents)
+
+    def discs(self, first: int) -> Discs:
+        """Return the sets of the multipliers λ_t, of which `first` is the first."""
+        return friction_discs(self.bound, self.tangents, first)
 
     def slip(self, u: NDArray[Any]) -> NDArray[Any]:
         """Return Tᵢu − sᵢ (k/d, d) for u (n,)."""
@@ -251,41 +257,105 @@ def friction_multipliers(
     return s.y[:e], s.z[:m], tangential
 
 
+@dataclass(frozen=True, eq=False)
+class AdmissibleForces:
+    """Set of the multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction vectors."""
+
+    rows: int  #: m
+    discs: Discs  #: of the friction rows, the last ones
+
+    @cached_property
+    def contact(self) -> NDArray[np.bool_]:
+        """Mask (m,) of the contact rows."""
+        return np.arange(self.rows) < self.rows - self.discs.index.size
+
+    @property
+    def sets(self) -> tuple[ConvexSet, ...]:
+        """The same set for variables of a QP."""
+        upper = np.full(self.rows, np.inf)
+        return Box(np.where(self.contact, 0.0, -upper), upper), self.discs
+
+    def project(self, multipliers: Extended) -> Extended:
+        """Return the nearest admissible multipliers (m,)."""
+        nearest = self.discs.project(multipliers)
+        return np.where(self.contact, np.maximum(nearest, 0), nearest)
+
+    def room(self, multipliers: Extended) -> Extended:
+        """Return g − ‖λ‖ of each friction vector, zero if it is extended rounding.
+
+        Projected multipliers are on their circle up to rounding, and stand for the
+        nearest point on it: √ of 1e-19 in the work would dominate certificates.
+        """
+        radius = self.discs.radius
+        room = radius - norms(multipliers[self.discs.index])
+        rounding = 8 * np.finfo(Real).eps * radius
+        return np.where(np.abs(room) > rounding, room, 0)
+
+    def interior(self, multipliers: Extended) -> Extended:
+        """Return the distance (m,) from the boundary: λ of contact, g − ‖λ‖."""
+        distance = multipliers.copy()
+        distance[self.discs.index] = self.room(multipliers)[:, None]
+        return distance
+
+    def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
+        """Return the bounds (m,) of each λᵢ where the others keep their values."""
+        lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
+        squares = multipliers[self.discs.index] ** 2
+        others = squares.sum(axis=1, keepdims=True) - squares
+        room = self.discs.radius[:, None] ** 2 - others
+        upper[self.discs.index] = np.sqrt(np.maximum(room, 0))
+        lower[self.discs.index] = -upper[self.discs.index]
+        return lower, upper
+
+
 class Exact(NamedTuple):
     """The data of the contact problem except K, in extended precision.
 
-    The rows are those of contact, then those of friction. With v = Bu − c, all satisfy
-    the same law: the multiplier is within its bounds, v = 0 if it is strictly between
-    them, v ≤ 0 at the lower and v ≥ 0 at the upper bound.
+    The rows are those of contact, then those of friction. With v = Bu − c, multipliers
+    are normal to the motion: λ ∈ Λ and σ(v) = λᵀv with the support function σ of Λ,
+    zero for v ≤ 0 on contact rows, and Σ gᵢ‖vᵢ‖ on friction vectors.
     """
 
     f: Extended  #: (n,)
     B: Any  #: (m, n) sparse, contact and friction
     c: Extended  #: (m,)
-    lower: Extended  #: (m,) 0 for contact, −g for friction
-    upper: Extended  #: (m,) ∞ for contact, g for friction
+    forces: AdmissibleForces  #: Λ
     fixed: NDArray[np.int64]  #: prescribed components
     compliance: Extended  #: (m,) estimate for each row, B_i diag(K)⁻¹B_iᵀ
 
     @property
     def contact(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the contact rows, whose multipliers have no upper bound."""
-        return np.asarray(np.isinf(self.upper))
+        """Mask (m,) of the contact rows."""
+        return self.forces.contact
 
     def motion(self, u: Extended) -> Extended:
         """Return v = Bu − c (m,), the penetration or the slip of each row."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
-        """Return g|v| (m,), zero for contact rows."""
-        bound = np.where(self.contact, 0, self.upper)
-        return np.asarray(bound * np.abs(self.motion(u)))
+        """Return gᵢ‖vᵢ‖ of each friction vector."""
+        discs = self.forces.discs
+        return np.asarray(discs.radius * norms(self.motion(u)[discs.index]))
 
-    def interior(self, multipliers: Extended) -> Extended:
-        """Return the distance (m,) of multipliers from their bounds, λ for contact."""
-        return np.asarray(
-            np.minimum(multipliers - self.lower, self.upper - multipliers)
+    def missing_work(
+        self, multipliers: Extended, motion: Extended
+    ) -> tuple[Extended, Extended]:
+        """Return σ(v) − λᵀv ≥ 0 of each contact row and each friction vector.
+
+        That of a vector, g‖v‖ − λᵀv, is evaluated without cancellation as
+
+            (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
+        """
+        discs, contact = self.forces.discs, self.contact
+        lam, v = multipliers[discs.index], motion[discs.index]
+        force, slip = norms(lam), norms(v)
+        across = norms(force[:, None] * v - slip[:, None] * lam) ** 2
+        product = 2 * force * slip
+        angle = np.divide(
+            across, product, out=np.zeros_like(product), where=product > 0
         )
+        work = self.forces.room(multipliers) * slip + angle
+        return -multipliers[contact] * motion[contact], work
 
 
 class RigidMotions(NamedTuple):
@@ -478,15 +548,15 @@ class Mechanics:
         """The data in extended precision."""
         diagonal, B = self.primal.P.diagonal(), self.rows
         c = contact_rows(self.primal, self._active_friction)[1]
-        bound, contact = self._active_friction.bound.astype(Real), self.primal.h.size
         fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
         softness[fixed] = 0
         return Exact(
             f=-self.primal.q.astype(Real), B=B.astype(Real),
             c=c.astype(Real), fixed=fixed,
-            lower=np.append(np.zeros(contact, dtype=Real), -bound),
-            upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
+            forces=AdmissibleForces(
+                c.size, self._active_friction.discs(self.primal.h.size)
+            ),
             compliance=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 

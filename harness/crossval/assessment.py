@@ -88,7 +88,7 @@ def assess(
     true_gap = -exact.motion(truth.u)
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
     contradicted = (closed != true_closed) & strict & true_strict & contact
-    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.compliance
+    beyond = -exact.forces.interior(lam) * exact.compliance
     assessment = Assessment(
         error=_over(mechanics.norm(off), length),
         equilibrium_error=_over(mechanics.norm(off_rest), length),

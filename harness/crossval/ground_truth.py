@@ -127,7 +127,7 @@ def _best_certified(
     c, g = min(certified, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
         u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
-        states=suggested(mechanics.exact, c.u, c.multipliers),
+        states=suggested(mechanics.exact, c.u, c.multipliers).states,
         norm=c.norm, bound=c.bound,
     )  # fmt: skip
     return point, _origin(g)

@@ -13,9 +13,9 @@ solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
-Friction with a bound, Σ g|v| with the slip v = Tu − s, has multipliers |λ̂_t| ≤ g and
-adds nonnegative terms to (1): Σ(g|v*| − λ̂_t v*) and Σ(g|v̂| − λ_t* v̂) on the left, and
-on the right Σ(g|v̂| − λ̂_t v̂), the difference between the frictional work at the bound
+Friction with a bound, Σ g‖v‖ with the slip v = Tu − s, has multipliers ‖λ̂_t‖ ≤ g and
+adds nonnegative terms to (1): Σ(g‖v*‖ − λ̂_tᵀv*) and Σ(g‖v̂‖ − λ_t*ᵀv̂) on the left, and
+on the right Σ(g‖v̂‖ − λ̂_tᵀv̂), the difference between the frictional work at the bound
 and that of λ̂_t. For Coulomb's law the bounds g are fixed: the certificate is for the
 last Tresca problem of the fixed point iteration.
 
@@ -68,8 +68,6 @@ from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import (
-    CLOSED,
-    at_bounds,
     exchanged,
     suggested,
     unconstrained_guess,
@@ -123,7 +121,7 @@ class Certificate:
     off: Extended  #: û − u_λ (n,); with subdomains, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
-    work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
+    work: float  #: λ̂ᵀ(c − Bû) + Σ(g‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: the second term of `work`
     rounding: float  #: charge in (4) for KR ≠ 0 and an inexact balance
     stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, with the norm of K_T
@@ -278,8 +276,6 @@ def certify(mechanics: Mechanics, s: Solution) -> Certificate:
     """
     if not (np.isfinite(s.x).all() and np.isfinite(s.z).all()):
         raise UncertifiableError("the answer holds NaN or inf")
-    if mechanics.friction.tangents > 1:
-        raise UncertifiableError("certificates of friction in space are not built")
     if mechanics.certify_by_subdomains is not None:
         certificate: Certificate = mechanics.certify_by_subdomains(
             s.x, mechanics.multipliers(s)
@@ -321,9 +317,9 @@ def sharpest(
 def _least_norm(split: Undivided) -> float:
     """Bound ‖u*‖ from below by a pair that does not depend on an answer."""
     mechanics = split.mechanics
-    u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
+    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
-        return proof(split, u, u, lam, states == CLOSED).least
+        return proof(split, u, u, lam, active.closed).least
     except UncertifiableError:
         return 0.0
 
@@ -334,9 +330,9 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
-    multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    states = suggested(exact, u, multipliers)
-    complementary = at_bounds(exact, states, multipliers), states == CLOSED
+    multipliers = exact.forces.project(multipliers)
+    active = suggested(exact, u, multipliers)
+    complementary = active.at_bounds(multipliers), active.closed
     pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), complementary]
     bound = np.inf
     for pair in pairs:
@@ -348,8 +344,8 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
             bound = min(bound, outcome.bound)
     exchangeable = mechanics.kernel.shape[1] > 0
     if exchangeable and SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
-        v, mu, states = exchanged(mechanics, states, EXCHANGE_ROUNDS)
-        yield _proved(split, s.x, v, mu, states == CLOSED)
+        v, mu, active = exchanged(mechanics, active, EXCHANGE_ROUNDS)
+        yield _proved(split, s.x, v, mu, active.closed)
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
@@ -416,8 +412,8 @@ def proven(
 
     """
     lam, motion = multipliers, exact.motion(at_rows)
-    works = exact.friction_work(at_rows) - lam * motion
-    work = float(works.sum())
+    pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
+    work = float(pressing + sliding)
     at_u = split.residual(u)
     near = neighbour(split, at_u.rho + split.pulled(lam))
     drift = without_rigid_motion(split, claimed - u)
@@ -429,7 +425,7 @@ def proven(
             (moved, K_moved), (moved, near.Kd),
         )
     ))  # fmt: skip
-    supported, _ = supported_and_floating(G, relative(exact.interior(lam)))
+    supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
     # a small û, even zero with θ = 0, says nothing about the θ of the error
@@ -465,7 +461,7 @@ def proven(
     least = _root(u_u - u_d + 0.25 * d_d) - around
     certificate = Certificate(
         u=u, multipliers=lam, off=near.d, norm=_root(u_u), distance=total, work=work,
-        sliding=float(works[~exact.contact].sum()), rounding=rounding, claimed=in_K,
+        sliding=float(sliding), rounding=rounding, claimed=in_K,
         stretch=stretch, least=least / stretch, moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
     )  # fmt: skip
@@ -533,9 +529,10 @@ def _reach(
         return _Reach(*np.zeros((3, 0)))
     tiny = np.finfo(float).tiny
     phi, motions = np.sqrt(exact.compliance.astype(np.float64)), G.astype(np.float64)
-    down, up = lam > exact.lower, lam < exact.upper
-    below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
-    above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
+    lower, upper = exact.forces.chords(lam)
+    down, up = lam > lower, lam < upper
+    below = np.maximum((lam - lower)[down].astype(np.float64), tiny)
+    above = np.maximum((upper - lam)[up].astype(np.float64), tiny)
     open_by = np.maximum(np.where(exact.contact, 0, -gaps)[down], 0)
     opened = np.append(np.maximum(gaps, 0)[up], open_by).astype(np.float64)
     soft, pressed = np.append(phi[up], phi[down]), 0.5 / np.append(above, below)

@@ -27,19 +27,17 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.mechanics import (
+    AdmissibleForces,
     Exact,
     Extended,
     Real,
     Substructures,
     cancelling,
     felt_first,
+    friction_discs,
 )
 from mortarbench.harness.qp import Vector
-from mortarbench.harness.verify.active_set_refinement import (
-    CLOSED,
-    at_bounds,
-    suggested,
-)
+from mortarbench.harness.verify.active_set_refinement import suggested
 from mortarbench.harness.verify.admissible import (
     Balance,
     UncertifiableError,
@@ -73,6 +71,7 @@ class Contact:
     rows: csr_array  #: (m, n) with global components as columns
     c: Vector  #: (m,)
     bound: Vector  #: (k,) of the last rows
+    tangents: int = 1  #: number of friction rows of each tangential vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -240,9 +239,9 @@ def certify_over_ranks(
     at, exact, rigid, softness = split.at, split.exact, split.rigid, split.softness
     u = rigid.without_free(local, u)
     trace = local.reduction.values_at(u, at)
-    raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
-    states = suggested(exact, trace, raw)
-    complementary = at_bounds(exact, states, raw), states == CLOSED
+    raw = exact.forces.project(multipliers.astype(Real))
+    active = suggested(exact, trace, raw)
+    complementary = active.at_bounds(raw), active.closed
     none = np.zeros(raw.size, dtype=bool)
 
     def attempt(
@@ -299,8 +298,8 @@ def _admissible_pair(
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     """Return the rows restricted to the components they touch (w,), and 1/Kᵢᵢ (w,)."""
-    contact, k = local.contact, local.contact.bound.size
-    B, contacts = csr_array(contact.rows[:, at]), contact.c.size - k
+    contact = local.contact
+    B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
     diagonal = np.zeros(local.components.size)
     present = np.unique(places[here])
@@ -310,12 +309,13 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     free[local.fixed] = 0
     is_free = local.reduction.values_at(free, at) > 0
     softness = np.where(is_free & (diagonal > 0), 1 / diagonal, 0)
-    bound = contact.bound.astype(Real)
+    first = m - contact.bound.size
     return Exact(
         f=np.zeros(0, dtype=Real), B=B.astype(Real), c=contact.c.astype(Real),
         fixed=np.flatnonzero(~is_free),
-        lower=np.append(np.zeros(contacts, dtype=Real), -bound),
-        upper=np.append(np.full(contacts, np.inf, dtype=Real), bound),
+        forces=AdmissibleForces(
+            m, friction_discs(contact.bound, contact.tangents, first)
+        ),
         compliance=(B.multiply(B) @ softness).astype(Real),
     ), softness  # fmt: skip
 
@@ -363,10 +363,12 @@ def _rigid_motions(
     reduction, parts, floating = local.reduction, local.parts, local.floating
 
     if not floating.combinations.shape[1]:
-        none, rows = csr_array((local.components.size, 0)), exact.c.size
+        none = np.zeros((exact.c.size, 0), dtype=Real)
+        no_load = np.zeros(0, dtype=Real)
         return _RigidMotions(
-            none, np.zeros((at.size, 0)), np.zeros((local.motions, 0)),
-            Balance(*np.zeros((2, rows, 0)), *np.zeros((3, 0)), *np.zeros((2, rows))),
+            csr_array((local.components.size, 0)), np.zeros((at.size, 0)),
+            np.zeros((local.motions, 0)),
+            Balance(none, none, no_load, no_load, no_load, exact.forces),
         )  # fmt: skip
 
     def at_components(R: Any) -> NDArray[Any]:
@@ -398,7 +400,7 @@ def _rigid_motions(
             np.asarray(exact.B @ felt),
             np.asarray(abs(exact.B) @ np.where(felt, largest[:p], 0)),
             along[:p], (reduction.along(R != 0, size) * largest)[:p],
-            np.zeros(p, dtype=Real), exact.lower, exact.upper,
+            np.zeros(p, dtype=Real), exact.forces,
         ),
         why,
     )  # fmt: skip

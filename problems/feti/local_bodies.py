@@ -161,7 +161,7 @@ def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
         fixed=np.flatnonzero(np.isin(components, problem.fixed)),
         contact=Contact(
             rows=csr_array(contact.rows[active]), c=contact.c[active],
-            bound=contact.bound[contact.bound > 0],
+            bound=contact.bound[contact.bound > 0], tangents=contact.tangents,
         ),
         floating=_floating_bodies(local),
     ), multiplicity  # fmt: skip

@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
+from scipy.sparse import csc_array, diags_array
 
-from mortarbench.harness import QP, Matrix, Solution, Vector
+from mortarbench.harness import QP, Box, Matrix, Solution, Vector
+from mortarbench.harness.sets.blocks import Blocks
 
 #: rounds of scaling; entries whose units differ by factors of 1e±12 need fewer
 ROUNDS = 20
@@ -40,13 +41,19 @@ class ScaledQP:
 
 
 def equilibrate(qp: QP) -> ScaledQP:
-    """Scale a QP with an explicit P; its matrices become dense if P is, else sparse."""
+    """Scale a QP with an explicit P; its matrices become dense if P is, else sparse.
+
+    Its sets other than bounds are of blocks, which are scaled evenly.
+    """
     store = _dense if isinstance(qp.P, np.ndarray) else _sparse
     P, A, G = (store(M) for M in (qp.P, qp.A, qp.G))
+    blocks = [one for one in qp.sets[1:] if isinstance(one, Blocks)]
     d, e, h = (np.zeros(v.size, dtype=np.int64) for v in (qp.q, qp.b, qp.h))
     for _ in range(ROUNDS):
         P_, A_, G_ = _times(d, P, d), _times(e, A, d), _times(h, G, d)
         columns = np.maximum.reduce([_largest(M, 0) for M in (P_, A_, G_)])
+        for one in blocks:  # their variables have a common scale
+            columns[one.index] = columns[one.index].max(axis=1, keepdims=True)
         changes = [_root(v) for v in (columns, _largest(A_, 1), _largest(G_, 1))]
         if not any(c.any() for c in changes):
             break
@@ -56,7 +63,10 @@ def equilibrate(qp: QP) -> ScaledQP:
     D, E, H = (np.ldexp(1.0, k) for k in (d, e, h))
     scaled = QP(
         P=_times(d, P, d), q=D * qp.q, A=_times(e, A, d), b=E * qp.b,
-        G=_times(h, G, d), h=H * qp.h, lb=qp.lb / D, ub=qp.ub / D,
+        G=_times(h, G, d), h=H * qp.h, sets=(
+            Box(qp.lb / D, qp.ub / D),
+            *(one.substituted(diags_array(D), 0 * D) for one in qp.sets[1:]),
+        ),
     )  # fmt: skip
     return ScaledQP(scaled, D, E, H)
 

@@ -9,7 +9,9 @@ Trans. Math. Softw. 29), with C the rows of G and of the finite bounds. A step s
     [C          −S/Z] [dz]   [−(Cx + s − d) + Z⁻¹r_sz]
 
 for r_sz = sz (predictor), then r_sz = sz + ds dz − σμ (corrector). The step goes 0.995
-of the way to the boundary, with a common length for x, y, z and s. δ is the parameter
+of the way to the boundary, with a common length for x, y, z and s. A disc is the smooth
+constraint  ‖x_I‖²/2r + s = r/2:  its row of C is x_I/r at the current x, and its
+multiplier adds z/r to the diagonal of P. δ is the parameter
 of a proximal method of multipliers centred at the iterate (Pougkakiotis and Gondzio
 2021, Comput. Optim. Appl. 78): the solutions do not depend on it, and P may be singular
 and rows may be linearly dependent.
@@ -17,14 +19,25 @@ and rows may be linearly dependent.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csc_array, csr_array, eye_array, vstack
+from scipy.sparse import csr_array, eye_array, issparse, vstack
 
-from mortarbench.harness import QP, Matrix, Solution, Status, Vector, kkt_residuals
+from mortarbench.harness import (
+    QP,
+    Discs,
+    Matrix,
+    Solution,
+    Status,
+    Vector,
+    kkt_residuals,
+)
+from mortarbench.harness.sets.blocks import norms
+from mortarbench.harness.sets.convex import hull
 from mortarbench.solvers.reference.saddle import Factorise, Solve, saddle
 
 DELTA = 1e-10  #: δ, for a QP whose largest entries are about one
@@ -47,29 +60,46 @@ class Iterate(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """QP with rows of A for fixed variables; C stacks G, upper, then lower bounds."""
+    """QP with rows of A for fixed variables; C stacks discs, G, upper, lower bounds."""
 
     qp: QP
     A: Matrix
     b: Vector
     G: csr_array
-    G_T: csc_array
     d: Vector
     fixed: NDArray[np.int64]
     upper: NDArray[np.int64]
     lower: NDArray[np.int64]
-    saddle: Factorise  #: factorises [P + D Bᵀ; B −W], B = [A; G]
+    discs: tuple[Discs, ...]  #: of positive radius
+    #: factorises [P + D Bᵀ; B −W], B = [A; rows of discs; G]
+    saddle: Callable[[Matrix], Factorise]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of discs and G."""
+        return int(self.qp.h.size) + sum(len(one.index) for one in self.discs)
 
     def C(self, x: Vector) -> Vector:
-        """Return Cx."""
-        return np.concatenate([self.G @ x, x[self.upper], -x[self.lower]])
+        """Return Cx, and ‖x_I‖²/2r of discs."""
+        of_discs = [norms(x[one.index]) ** 2 / one.radius / 2 for one in self.discs]
+        return np.concatenate([*of_discs, self.G @ x, x[self.upper], -x[self.lower]])
 
-    def C_T(self, z: Vector) -> Vector:
-        """Return Cᵀz."""
-        p = self.G.shape[0]
-        return self._box_T(z[p:], start=self.G_T @ z[:p])
+    def at(self, x: Vector, z: Vector) -> tuple[csr_array, Vector]:
+        """Return the rows of discs and G at x, and what discs add to P's diagonal."""
+        n, first = x.size, 0
+        rows, curvature = list[Matrix](), np.zeros(n)
+        for one in self.discs:
+            k, d = one.index.shape
+            values = x[one.index] / one.radius[:, None]
+            start = d * np.arange(k + 1)
+            rows.append(
+                csr_array((values.ravel(), one.index.ravel(), start), shape=(k, n))
+            )
+            curvature[one.index] = (z[first : first + k] / one.radius)[:, None]
+            first += k
+        return csr_array(vstack([*rows, self.G])), curvature
 
-    def _box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
+    def box_T(self, z: Vector, *, start: Vector, lower: float = -1.0) -> Vector:
         """Add the multipliers z of upper and lower bounds to the vector `start` (n,).
 
         lower : factor of the multipliers of lower bounds
@@ -78,21 +108,23 @@ class _Problem:
         start[self.lower] += lower * z[self.upper.size :]
         return start
 
-    def factorise(self, w: Vector) -> Solve:
+    def factorise(self, w: Vector, rows: Matrix, curvature: Vector) -> Solve:
         """Factorise the system of a step with diag(w) = S/Z; return its solve.
 
         The rows of bounds are eliminated: they add 1/w to the diagonal of P.
+
+        rows, curvature : see `at`
         """
-        n, m, p = self.qp.q.size, self.b.size, self.qp.h.size
+        m, p = self.b.size, self.rows
         w_box = w[p:]
-        solve = self.saddle(
-            self._box_T(1 / w_box, start=np.full(n, DELTA), lower=1.0),
+        solve = self.saddle(rows)(
+            self.box_T(1 / w_box, start=curvature + DELTA, lower=1.0),
             np.append(np.full(m, DELTA), w[:p]),
         )
 
         def solve_all(r: Vector, t: Vector) -> tuple[Vector, Vector]:
             t_box = t[m + p :]
-            r = self._box_T(t_box / w_box, start=r.copy())
+            r = self.box_T(t_box / w_box, start=r.copy())
             dx, rest = solve(r, t[: m + p])
             box = np.append(dx[self.upper], -dx[self.lower])
             return dx, np.append(rest, (box - t_box) / w_box)
@@ -101,14 +133,16 @@ class _Problem:
 
     def solution(self, at: Iterate) -> Solution:
         """Return the iterate as a point of the QP."""
-        m, p = self.qp.b.size, self.qp.h.size
-        z_box = np.zeros(at.x.size)
+        m, p = self.qp.b.size, self.rows
+        _, curvature = self.at(at.x, at.z)
+        z_box = curvature * at.x  # of discs
         z_box[self.fixed] = at.y[m:]
         z_box[self.upper] += at.z[p : p + self.upper.size]
         z_box[self.lower] -= at.z[p + self.upper.size :]
         return Solution(
-            status=Status.SOLVED, x=at.x, y=at.y[:m], z=at.z[:p], z_box=z_box
-        )
+            status=Status.SOLVED, x=at.x, y=at.y[:m],
+            z=at.z[p - self.qp.h.size : p], z_box=z_box,
+        )  # fmt: skip
 
 
 @np.errstate(all="ignore")  # a divergent residual is not finite and ends the loop
@@ -138,7 +172,8 @@ def interior_point(qp: QP) -> Solution:
 
 
 def _problem(qp: QP) -> _Problem:
-    is_fixed = qp.lb == qp.ub
+    lb, ub = hull(qp.sets, qp.q.size)
+    is_fixed = lb == ub
     fixed, upper, lower = (
         np.flatnonzero(mask)
         for mask in (
@@ -147,15 +182,29 @@ def _problem(qp: QP) -> _Problem:
     )  # fmt: skip
     unit = eye_array(qp.q.size, format="csr")
     A: Matrix = csr_array(vstack([csr_array(qp.A), unit[fixed]]))
-    stack = vstack
     if isinstance(qp.P, np.ndarray):
-        A, stack = A.toarray(), np.vstack
-    G = csr_array(qp.G)
+        A = A.toarray()
+    discs = tuple(
+        Discs(one.index[one.radius > 0], one.radius[one.radius > 0])
+        for one in qp.sets
+        if isinstance(one, Discs)
+    )
+    without_rows = None if discs else saddle(qp.P, _stacked(A, qp.G))
     return _Problem(
-        qp=qp, A=A, b=np.append(qp.b, qp.lb[fixed]), G=G, G_T=G.T,
-        d=np.concatenate([qp.h, qp.ub[upper], -qp.lb[lower]]),
-        fixed=fixed, upper=upper, lower=lower, saddle=saddle(qp.P, stack([A, qp.G])),
+        qp=qp, A=A, b=np.append(qp.b, lb[fixed]), G=csr_array(qp.G),
+        d=np.concatenate([
+            *(one.radius / 2 for one in discs), qp.h, qp.ub[upper], -qp.lb[lower]
+        ]),
+        fixed=fixed, upper=upper, lower=lower, discs=discs,
+        saddle=lambda rows: without_rows or saddle(qp.P, _stacked(A, rows)),
     )  # fmt: skip
+
+
+def _stacked(A: Matrix, rows: Matrix) -> Matrix:
+    """Stack rows below A, dense if A is."""
+    if isinstance(A, np.ndarray):
+        return np.vstack([A, rows.toarray() if issparse(rows) else rows])
+    return vstack([A, rows])
 
 
 def _start(problem: _Problem) -> Iterate:
@@ -165,11 +214,15 @@ def _start(problem: _Problem) -> Iterate:
     section 5.3.
     """
     qp, m = problem.qp, problem.b.size
-    solve = problem.factorise(np.ones(problem.d.size))
+    solve = problem.factorise(
+        np.ones(problem.d.size), *problem.at(0 * qp.q, 0 * problem.d)
+    )
     x, rest = solve(-qp.q, np.append(problem.b, problem.d))
     y, z = rest[:m], rest[m:]
     unit = float(np.abs(z).max(initial=0.0)) or 1.0
     s, z = (v + max(0.0, unit - v.min(initial=unit)) for v in (-z, z))
+    for one in problem.discs:  # far outside, slacks would shrink before x arrives
+        x = one.project(x)
     return Iterate(x, y, z, s)
 
 
@@ -177,13 +230,16 @@ def _step(problem: _Problem, at: Iterate) -> Iterate:
     """Return the next iterate: predictor, centring and corrector."""
     qp, A, C, m = problem.qp, problem.A, problem.C, problem.b.size
     x, y, z, s = at
-    r_d = qp.P @ x + qp.q + A.T @ y + problem.C_T(z)
+    rows, curvature = problem.at(x, z)
+    p = problem.rows
+    r_d = qp.P @ x + qp.q + A.T @ y + problem.box_T(z[p:], start=rows.T @ z[:p])
     r_p, r_c = A @ x - problem.b, C(x) + s - problem.d
-    solve = problem.factorise(s / z)
+    solve = problem.factorise(s / z, rows, curvature)
 
     def direction(r_sz: Vector) -> Iterate:
         dx, rest = solve(-r_d, np.append(-r_p, r_sz / z - r_c))
-        return Iterate(dx, rest[:m], rest[m:], -r_c - C(dx))
+        C_dx = [rows @ dx, dx[problem.upper], -dx[problem.lower]]
+        return Iterate(dx, rest[:m], rest[m:], -r_c - np.concatenate(C_dx))
 
     step = direction(s * z)
     if z.size:

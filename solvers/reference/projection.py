@@ -18,6 +18,7 @@ conditions are a zero of the normal map (Robinson 1992, Math. Oper. Res. 17),
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,31 +41,79 @@ DIFFERENCE_STEP = 2.0**-26  #: √ε, step of difference quotients relative to t
 SHIFT = 1e-15
 
 
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """A QP with  Mx ∈ C."""
+
+    qp: QP
+    P: Any
+    M: Any  #: (r, n) normalised rows of A and G, then I
+    size: Vector  #: (m + p,) lengths of these rows
+
+    @classmethod
+    def of(cls, qp: QP) -> _Problem:
+        rows = np.vstack([_dense(qp.A), _dense(qp.G)])
+        size = np.linalg.norm(rows, axis=1)
+        size[size == 0] = 1
+        M = np.vstack([rows / size[:, None], np.eye(qp.q.size)])
+        return cls(qp, _dense(qp.P), M, size)
+
+    @property
+    def largest(self) -> float:
+        """Largest entry of P, a penalty in the units of P."""
+        return float(np.abs(self.P).max(initial=0)) or 1.0
+
+    def penalty(self, rho: float) -> Vector:
+        """Return R (r,) for the penalty of rows of G and of variables."""
+        m = self.qp.b.size
+        R: Vector = rho * np.ones(self.M.shape[0])
+        R[:m] *= EQUALITY_PENALTY
+        return R
+
+    def project(self, t: Any) -> Any:
+        """Return Π(t)."""
+        m, k = self.qp.b.size, self.size.size
+        x = t[k:]
+        for one in self.qp.sets:
+            x = one.project(x)
+        b, h = self.qp.b / self.size[:m], self.qp.h / self.size[m:]
+        return np.concatenate([b, np.minimum(t[m:k], h), x])
+
+    def solution(self, t: Any, R: Vector) -> Solution:
+        """Return the point Π(t) with the multipliers R(t − Π(t))."""
+        k, w = self.size.size, self.project(t)
+        force = R * (t - w)
+        y, z = np.split((force[:k] / self.size).astype(float), [self.qp.b.size])
+        return Solution(
+            status=Status.SOLVED, x=w[k:].astype(float), y=y, z=z,
+            z_box=force[k:].astype(float),
+        )  # fmt: skip
+
+
+def refine(qp: QP, start: Solution) -> Solution:
+    """Return the point of Newton's method from a point near the solution."""
+    problem = _Problem.of(qp)
+    R = problem.penalty(problem.largest)
+    forces = np.concatenate([np.append(start.y, start.z) * problem.size, start.z_box])
+    t = problem.M @ start.x + forces / R
+    return replace(
+        problem.solution(_newton(problem, R, t), R), iterations=start.iterations
+    )
+
+
 def projection_iterates(qp: QP) -> Iterator[Solution]:
     """Yield the point of each round; later ones took more steps."""
-    n, m, p = qp.q.size, qp.b.size, qp.h.size
-    P, rows = _dense(qp.P), np.vstack([_dense(qp.A), _dense(qp.G)])
-    size = np.linalg.norm(rows, axis=1)
-    size[size == 0] = 1
-    M = np.vstack([rows / size[:, None], np.eye(n)])
-    b, h = qp.b / size[:m], qp.h / size[m:]
-    relative_penalty = np.array([EQUALITY_PENALTY] * m + [1.0] * (p + n))
-
-    def project(t: Any) -> Any:
-        x = t[m + p :]
-        for one in qp.sets:
-            x = one.project(x)
-        return np.concatenate([b, np.minimum(t[m : m + p], h), x])
-
-    rho = float(np.abs(P).max(initial=0)) or 1.0
-    x, t, multipliers = np.zeros(n), np.zeros(m + p + n), np.zeros(m + p + n)
+    problem = _Problem.of(qp)
+    P, M, project, q = problem.P, problem.M, problem.project, qp.q
+    rho = problem.largest
+    t, multipliers = np.zeros(len(M)), np.zeros(len(M))
     for number in range(1, ROUNDS + 1):
-        R = rho * relative_penalty
+        R = problem.penalty(rho)
         t = project(t) + multipliers / R
         K = lu_factor(P + M.T @ (R[:, None] * M))
 
         def primal_point(t: Vector, R: Vector = R, K: Any = K) -> Vector:
-            x: Vector = lu_solve(K, M.T @ (R * (2 * project(t) - t)) - qp.q)
+            x: Vector = lu_solve(K, M.T @ (R * (2 * project(t) - t)) - q)
             return x
 
         t = _fixed_point(
@@ -74,17 +123,10 @@ def projection_iterates(qp: QP) -> Iterator[Solution]:
         )
         x, w = primal_point(t), project(t)
         multipliers = R * (t - w)
-        end = _newton(P, qp.q, M, R, project, x, t)
-        force = R * (end - project(end))
-        x_end = project(end)[m + p :].astype(float)
-        y, z = np.split((force[: m + p] / size).astype(float), [m])
-        yield Solution(
-            status=Status.SOLVED, x=x_end, y=y, z=z,
-            z_box=force[m + p :].astype(float),
-        )  # fmt: skip
+        yield problem.solution(_newton(problem, R, t), R)
         # balance the relative residuals: √(primal/dual), as OSQP updates its ρ
         primal = np.abs(M @ x - w).max() / max(np.abs(w).max(), np.abs(M @ x).max())
-        forces = [P @ x, qp.q, M.T @ multipliers]
+        forces = [P @ x, q, M.T @ multipliers]
         dual = np.abs(sum(forces)).max() / max(np.abs(f).max() for f in forces)
         change = float(np.sqrt(primal / dual))
         rho *= min(max(change, 1 / MAX_PENALTY_CHANGE), MAX_PENALTY_CHANGE)
@@ -120,31 +162,35 @@ def _fixed_point(step: Callable[[Vector], Vector], t: Vector, count: int) -> Vec
 
 
 @np.errstate(all="ignore")  # a residual that is not finite ends the loop
-def _newton(
-    P: Any, q: Vector, M: Any, R: Vector, project: Any, x: Vector, t: Vector
-) -> Any:
-    """Return the t with the least residual of (1) among the iterates from x and t."""
-    n, r = x.size, t.size
-    x, t = x.astype(np.longdouble), t.astype(np.longdouble)
+def _newton(problem: _Problem, R: Vector, t: Vector) -> Any:
+    """Return the t with the least residual of (1) among the iterates from t.
+
+    x = Π(t) on the rows of I is eliminated, so that the unknowns are t alone.
+    """
+    P, M, q, k = problem.P, problem.M, problem.qp.q, problem.size.size
+    t, rows = t.astype(np.longdouble), M[:k]
     P_x, M_x = P.astype(np.longdouble), M.astype(np.longdouble)
     best, least = t, np.inf
     for _ in range(NEWTON_STEPS):
-        w = project(t)
-        F = np.concatenate([P_x @ x + q + M_x.T @ (R * (t - w)), M_x @ x - w])
-        scale = np.append(np.full(n, np.abs(P @ x).max() + np.abs(q).max()),
-                          np.full(r, np.abs(w).max()))  # fmt: skip
-        size = float(np.abs(F / np.where(scale > 0, scale, 1)).max())
+        w = problem.project(t)
+        x = w[k:]
+        Px = P_x @ x
+        F = np.concatenate([M_x[:k] @ x - w[:k], Px + q + M_x.T @ (R * (t - w))])
+        sizes = np.abs(w).max(), np.abs(Px).max() + np.abs(q).max()
+        scale = np.repeat(sizes, [k, q.size])
+        size = float(np.abs(F / np.where(scale > 0, scale, 1)).max(initial=0))
         if not size < least:
             break
         best, least = t, size
-        D = _derivative(project, t.astype(float))
-        J = np.block([[P, M.T @ (R[:, None] * (np.eye(r) - D))], [M, -D]])
-        J += SHIFT * np.diag(np.repeat([np.abs(P).max(initial=0.0), -1.0], [n, r]))
+        D = _derivative(problem.project, t.astype(float))
+        D_x, off = D[k:, k:], M.T @ (R[:, None] * (np.eye(t.size) - D))
+        J = np.block([[-D[:k, :k], rows @ D_x], [off[:, :k], P @ D_x + off[:, k:]]])
+        J += SHIFT * np.diag(np.repeat([-1.0, problem.largest], [k, q.size]))
         try:
             step = np.linalg.solve(J, F.astype(float))
         except np.linalg.LinAlgError:  # a pivot is zero
             break
-        x, t = x - step[:n], t - step[n:]
+        t = t - step
     return best
 
 

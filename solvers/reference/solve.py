@@ -11,7 +11,8 @@ active constraints can be identified (`interior`), and the equations of the acti
 are refined in extended precision (`polish`). The result is the point with the smallest
 KKT residual, as the harness measures it on the original QP.
 
-A QP with sets other than bounds is solved by projections on the sets (`projection`).
+With discs the interior-point method is the same, and projections on the sets refine its
+point. A QP with other sets is solved by projections alone (`projection`).
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 
-from mortarbench.harness import QP, Solution, Status, kkt_residuals
+from mortarbench.harness import QP, Discs, Solution, Status, kkt_residuals
 from mortarbench.harness.operators import assembled
 from mortarbench.harness.verify.optimum import MAX_RESIDUAL, is_small
 from mortarbench.solvers.reference.equilibrate import equilibrate
 from mortarbench.solvers.reference.interior import interior_point
 from mortarbench.solvers.reference.polish import polish
-from mortarbench.solvers.reference.projection import projection_iterates
+from mortarbench.solvers.reference.projection import projection_iterates, refine
 
 #: largest KKT residual of a start for refinement. From a worse one, refinement of a QP
 #: with many solutions ended at one of size 1e10, whose rounding hid errors of the
@@ -73,12 +74,15 @@ def reference_solution(qp: QP) -> Solution:
     if not all(np.isfinite(M.sum()) for M in (qp.P, qp.A, qp.G)):
         raise ValueError("the reference solve needs finite matrices, got NaN or inf")
     best, least = Solution.without_point(qp, Status.FAILED), np.inf
-    ways = (
+    ways: tuple[Iterator[Solution], ...] = (
         _candidates(qp),
         _candidates_without_outliers(qp),
         _less_regularised_candidates(qp),
     )
-    for candidates in (_projection_candidates(qp),) if len(qp.sets) > 1 else ways:
+    if len(qp.sets) > 1:
+        smooth = all(isinstance(one, Discs) for one in qp.sets[1:])
+        ways = (_smooth_candidates(qp),) * smooth + (_projection_candidates(qp),)
+    for candidates in ways:
         residuals = list[float]()
         for point in candidates:
             residuals.append(worst := _residual(qp, point))
@@ -115,6 +119,14 @@ def _candidates(qp: QP) -> Iterator[Solution]:
     start = interior_point(scaled.qp)
     yield scaled.recover(start)
     yield from map(scaled.recover, polish(scaled.qp, start))
+
+
+def _smooth_candidates(qp: QP) -> Iterator[Solution]:
+    """Yield points of a QP over bounds and discs, refined by projections."""
+    scaled = equilibrate(qp)
+    start = interior_point(scaled.qp)
+    yield scaled.recover(start)
+    yield scaled.recover(refine(scaled.qp, start))
 
 
 def _projection_candidates(qp: QP) -> Iterator[Solution]:
