@@ -1,21 +1,23 @@
 """Total FETI against size: time, memory, steps and condition numbers at fixed H/h.
 
     python benchmarks/feti_scaling.py [--cells H/h] [--ways feti,whole] [Nr ...]
+    python benchmarks/feti_scaling.py --family cube-wall [--cells H/h] [n ...]
 
-The beam on its half ring in one load step, Nh = Nr/2. `feti` decomposes it into
-subdomains, `whole` is the dual of undivided bodies; both go from the mesh to an answer
-with a certified error below 1e-6, which needs different tolerances. Each runs in a
-separate process, so that its peak memory is measured. `cpu` is processor time, for
-comparisons on a busy machine.
+The beam on its half ring in one load step, Nh = Nr/2, or the cube of n³ hexahedra
+beside a wall. `feti` decomposes it into subdomains, `whole` is the dual of undivided
+bodies; both go from the mesh to an answer with a certified error below 1e-6, which
+needs different tolerances. Each runs in a separate process, so that its peak memory is
+measured. `cpu` is processor time, for comparisons on a busy machine.
 
 For `feti` the quantities of the theory are measured without the search for the active
 set:
 
     kappa      condition number of PFP on supports and gluing, no contact, by Lanczos
     face       CG steps with the active rows as equations, to a reduction of 1e-6
-    face none  the same without a preconditioner
+    kappa_dirichlet   the same with the Dirichlet preconditioner
+    face none  steps without a preconditioner
 
-Prints a table, and the exponents of c·n^p with 95 % intervals.
+The script prints a table, and the exponents p of c·n^p with 95 % intervals.
 """
 
 import argparse
@@ -30,9 +32,8 @@ import numpy as np
 from scipy.stats import linregress, t
 
 from mortarbench.harness import Mechanics, certify, no_rows
+from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import factorise_clamped, factorise_floating
-from mortarbench.problems.contact.node_to_segment import node_to_segment
-from mortarbench.problems.contact.stepping import load_steps
 from mortarbench.problems.duality.decomposed import decompose
 from mortarbench.problems.duality.dualisation import dualise
 from mortarbench.problems.duality.feti_dual import feti_dual
@@ -42,32 +43,45 @@ from mortarbench.problems.feti.local_bodies import certifier
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.spectrum import spectra_over_ranks
 from mortarbench.problems.feti.subdomains import Contact, on_one_process
-from mortarbench.problems.models.beam_ring import bodies as bodies_of
-from mortarbench.problems.models.beam_ring import model
 from mortarbench.solvers.baselines.feti import FETI
 from mortarbench.solvers.smalbe.solver import SMALBE
 
 TOL = {"feti": 1e-7, "whole": 1e-8}  #: tolerances for a certified error below 1e-6
 REDUCTION = 1e-6
+#: keys of a size, and sizes of about 10⁴ to 10⁶ components
+FAMILIES = {
+    "beam-ring": (
+        lambda Nr: {"Nr": Nr, "Nh": Nr // 2, "radial": Nr, "steps": 1},
+        [16, 24, 48, 96, 240],
+    ),
+    "cube-wall": (lambda n: {"n": n}, [16, 24, 32, 48, 72]),
+}
 STAGES = ("mesh", "dual", "prepare", "solve", "recover", "certify")
 
 
-def one(way, Nr, cells):
+def problem_of(family, size):
+    """Return the contact problem of one size."""
+    keys, _ = FAMILIES[family]
+    return PROBLEMS[family].contact_problem(PROBLEMS[family].complete(keys(size)))
+
+
+def one(way, family, size, cells):
     """Measure one size in this process."""
-    model(1, 1, 2, "strain")  # loads compiled modules, which is not measured
+    # loads compiled modules, which is not measured
+    assert problem_of(family, 2).bodies.assembled
     cpu_start, marks = process_time(), [perf_counter()]
 
     def lap():
         marks.append(perf_counter())
 
-    bodies = model(Nr, Nr // 2, Nr, "strain")
-    u = np.zeros(bodies.mesh.dofs)
-    primal = primal_qp(bodies, node_to_segment(bodies.mesh.points, u, *bodies.pairs[0]))
+    problem = problem_of(family, size)
+    of, (stage,) = problem.bodies, problem.stages
+    bodies = of.assembled
+    rows = problem.linearise(bodies, stage.laws)(np.zeros(bodies.mesh.dofs))
+    primal = primal_qp(bodies, rows)
     lap()
     pieces = certify_by_subdomains = parts = None
     if way == "feti":
-        of = bodies_of(Nr, Nr // 2, Nr, "strain")
-        (stage,) = load_steps(1, 1, of.forces, of.fixed)
         contact = Contact(primal.G, primal.h, np.zeros(0))
         layout = of.shape.layout(cells)
         parts = decompose(of, layout, "orthonormal", stage, contact)
@@ -111,7 +125,9 @@ def final_face(pieces, unbounded, qp, s):
     """Return κ without contact, and CG steps on the face of the solution."""
     equality = np.arange(qp.q.size) < pieces.equalities
     active = equality | (s.x > 1e-6 * s.x[~equality].max())
-    (spectrum,) = spectra_over_ranks(unbounded.P, unbounded.A, tol=1e-3)
+    plain, dirichlet = spectra_over_ranks(
+        unbounded.P, unbounded.A, [None, ("dirichlet", "multiplicity")], tol=1e-3
+    )
     m = int(active.sum())
     F = dual_operator(pieces.B[active], pieces.domains, pieces.equalities)
     face = replace(
@@ -124,7 +140,8 @@ def final_face(pieces, unbounded, qp, s):
         .counts["steps_to_tol"]
         for name, kind in (("face", "dirichlet"), ("face none", "none"))
     }
-    return {"kappa": spectrum.condition, **steps}
+    kappas = {"kappa": plain.condition, "kappa_dirichlet": dirichlet.condition}
+    return {**kappas, **steps}
 
 
 def exponent(n, values):
@@ -135,19 +152,20 @@ def exponent(n, values):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("Nr", type=int, nargs="*", default=[16, 24, 48, 96, 240])
+    parser.add_argument("sizes", type=int, nargs="*", help="Nr or n")
+    parser.add_argument("--family", choices=FAMILIES, default="beam-ring")
     parser.add_argument("--cells", type=int, default=8)
     parser.add_argument("--ways", default="feti,whole")
     parser.add_argument("--one", action="store_true", help="in this process, as JSON")
     args = parser.parse_args()
     if args.one:
-        print(json.dumps(one(args.ways, args.Nr[0], args.cells)))
+        print(json.dumps(one(args.ways, args.family, args.sizes[0], args.cells)))
         return
     rows = []
-    for Nr in args.Nr:
+    for size in args.sizes or FAMILIES[args.family][1]:
         for way in args.ways.split(","):
-            options = ["--one", "--ways", way, "--cells", str(args.cells), str(Nr)]
-            child = [sys.executable, __file__, *options]
+            options = ["--family", args.family, "--ways", way, "--cells", args.cells]
+            child = [sys.executable, __file__, "--one", *map(str, options), str(size)]
             rows.append(json.loads(subprocess.check_output(child, text=True)))
             print("  ".join(f"{k}={v:.4g}" if isinstance(v, float) else f"{k}={v}"
                             for k, v in rows[-1].items()), flush=True)  # fmt: skip

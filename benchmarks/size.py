@@ -3,8 +3,8 @@
     make size        or   .venv/bin/python benchmarks/size.py [FORM] [Nr ...]
 
 Nh = Nr/2. Each size runs in a separate process, so that its peak memory is measured.
-Prints a table and the exponents of c·n^p, by least squares on logarithms with 95 %
-intervals.
+The script prints a table and the exponents p of c·n^p, fitted to logarithms by least
+squares, with 95 % intervals.
 """
 
 import json

@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 Digest: TypeAlias = "_Hash"  #: a SHA-256 in progress; ``update`` adds another part
 
-_PIECE_BYTES = 2**20  #: that are read at a time
+_PIECE_BYTES = 2**20  #: number of bytes that are read at a time
 
 
 def hex_digest(parts: Iterable[bytes], digits: int = 12) -> str:
     """Return the first hexadecimal digits of the SHA-256 of concatenated parts.
 
-    digits : at most 64, with 4 bits each
+    digits : number of digits, at most 64, of 4 bits each
 
     >>> from mortarbench.harness.digest import hex_digest
     >>> hex_digest([b"a", b"b"]) == hex_digest([b"ab"])

@@ -16,7 +16,7 @@ _PIECES = re.compile(r"""'(?:[^'\\]|\\.)*+'|"(?:[^"\\]|\\.)*+"|\S++""")
 
 
 class InputError(Exception):
-    """Wrong input: one line that says what was wrong, where, and what would be right.
+    """Invalid input: one line that states what is wrong, where, and what is expected.
 
     The command line prints it without a traceback and exits with code 2.
     """

@@ -13,9 +13,21 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import block_array, csc_array, csr_array, eye_array, vstack
+from scipy.sparse import (
+    block_array,
+    csc_array,
+    csr_array,
+    eye_array,
+    hstack,
+    vstack,
+)
 
 from mortarbench.harness.qp import QP, Matrix, Vector, no_rows
+from mortarbench.harness.sets.blocks import norms
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.cones import Cones
+from mortarbench.harness.sets.convex import ConvexSet
+from mortarbench.harness.sets.discs import Discs
 from mortarbench.harness.solution import Solution
 
 #: Extended precision if the machine has it (x86: 64-bit mantissa), so that residuals of
@@ -84,24 +96,48 @@ class Friction:
 
     ::
 
-        Σ gᵢ|Tᵢu − sᵢ|  is added to the energy;  its multipliers satisfy  |λᵢ| ≤ gᵢ
+        Σ gᵢ‖Tᵢu − sᵢ‖  is added to the energy;  its multipliers satisfy  ‖λᵢ‖ ≤ gᵢ
 
     T u is the tangential motion of the slave relative to the master, and s its initial
     value: zero for a single static load, and T u of the previous step for slip
-    increments. A contact row may have several friction rows, one for each tangential
-    direction in turn.
+    increments. A contact row i with friction has d consecutive rows Tᵢ, one for each
+    tangential direction, of equal bound: d = 1 in the plane, where ‖·‖ is |·|, and 2
+    in space.
 
     By the law of friction the bound should be g = cohesion + mu·λ_n, with the
     multiplier λ_n of the contact row: mu = 0 for Tresca, cohesion = 0 for Coulomb.
     """
 
-    T: csr_array  #: (k, n) tangential rows
+    T: csr_array  #: (k, n) tangential rows, d of each contact row in turn
     bound: Vector  #: (k,) g ≥ 0, a force
     start: Vector  #: (k,) s, a length
     row: NDArray[np.int64]  #: (k,) contact row of each friction row
     cohesion: Vector  #: (k,) a force
     mu: Vector  #: (k,) coefficient of friction
     unsettled: float = 0.0  #: `residual` at the solution with this bound; 0 if unknown
+
+    @property
+    def tangents(self) -> int:
+        """Number d of tangential directions: of rows per contact row with friction."""
+        return int(np.bincount(self.row).max(initial=1))
+
+    @property
+    def vectors(self) -> NDArray[np.int64]:
+        """The friction rows (k/d, d) of each tangential vector."""
+        return np.arange(self.row.size).reshape(-1, self.tangents)
+
+    def discs(self, first: int) -> Discs:
+        """Return the sets of the multipliers λ_t, of which `first` is the first."""
+        return friction_discs(self.bound, self.tangents, first)
+
+    def slip(self, u: NDArray[Any]) -> NDArray[Any]:
+        """Return Tᵢu − sᵢ (k/d, d) for u (n,)."""
+        return np.asarray((self.T @ u - self.start)[self.vectors])
+
+    def work(self, u: NDArray[Any]) -> float:
+        """Return Σ gᵢ‖Tᵢu − sᵢ‖ for u (n,)."""
+        radius = self.bound[self.vectors[:, 0]]
+        return float(radius @ norms(self.slip(u)))
 
     def demanded(self, normal: Vector) -> Vector:
         """Return cohesion + mu·max(λ_n, 0) (k,) for normal forces (m,)."""
@@ -116,6 +152,20 @@ class Friction:
         """Return the selected rows (an index array or a mask)."""
         rows = {k: v[selected] for k, v in vars(self).items() if k != "unsettled"}
         return replace(self, **rows)
+
+
+def friction_discs(bound: Vector, tangents: int, first: int) -> Discs:
+    """Return the sets ‖λᵢ‖ ≤ gᵢ of multipliers of friction rows.
+
+    Parameters
+    ----------
+    bound : (k,) g of each row, equal for the d rows of a vector
+    tangents : d
+    first : number of the first of these multipliers
+
+    """
+    index = first + np.arange(bound.size).reshape(-1, tangents)
+    return Discs(index, bound[::tangents])
 
 
 _EMPTY = np.zeros(0)
@@ -134,21 +184,47 @@ def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
 
 
 def with_friction(primal: QP, friction: Friction) -> QP:
-    """Return the problem with friction as a QP, with one more variable per |·|.
+    """Return the problem with friction as a QP, with further variables.
+
+    For the friction rows with g > 0, in the plane one t per |·|,
 
     ::
 
         min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
                                               Tu − t ≤ s,  −Tu − t ≤ −s
 
-    for the friction rows with g > 0. The unknown is (u, t), and the multiplier of a
-    friction row is the difference of those of its two rows. Without friction rows,
-    `primal` itself is returned.
+    and in space the slip w = Tu − s and one t per ‖·‖, over second-order cones,
+
+    ::
+
+        min ½uᵀKu − fᵀu + gᵀt   subject to   B_D u = 0,  B u ≤ c,
+                                              Tu − w = s,  ‖wᵢ‖ ≤ tᵢ
+
+    The unknown is (u, t) or (u, t, w). Without friction rows, `primal` itself is
+    returned. See `friction_multipliers` for those of the friction rows.
     """
     moving = friction[friction.bound > 0]
     k, n = moving.T.shape
     if not k:
         return primal
+    vectors = moving.vectors
+    if vectors.shape[1] > 1:
+        v = len(vectors)
+        t = n + np.arange(v)
+        return QP(
+            P=csc_array(
+                block_array([[primal.P, None], [None, csc_array((v + k, v + k))]])
+            ),
+            q=np.concatenate([primal.q, moving.bound[vectors[:, 0]], np.zeros(k)]),
+            A=csr_array(block_array([
+                [primal.A, csr_array((primal.b.size, v)), None],
+                [moving.T, None, -eye_array(k)],
+            ])),
+            b=np.append(primal.b, moving.start),
+            G=csr_array(hstack([primal.G, csr_array((primal.h.size, v + k))])),
+            h=primal.h,
+            sets=(Cones(np.column_stack([t, n + v + vectors]), np.ones(v)),),
+        )  # fmt: skip
     one = eye_array(k)
     return QP(
         P=csc_array(block_array([[primal.P, None], [None, csc_array((k, k))]])),
@@ -163,41 +239,123 @@ def with_friction(primal: QP, friction: Friction) -> QP:
     )  # fmt: skip
 
 
+def friction_multipliers(
+    s: Solution, primal: QP, friction: Friction
+) -> tuple[Vector, Vector, Vector]:
+    """Split a solution of `with_friction`: y of supports, z of contact, λ_t.
+
+    λ_t (k,) is in the plane the difference of the multipliers of the two rows of each
+    |·|, and in space the multiplier of Tu − w = s; zero where g = 0.
+    """
+    e, m, acts = primal.b.size, primal.h.size, friction.bound > 0
+    tangential = np.zeros(acts.size)
+    if friction.vectors.shape[1] > 1:
+        tangential[acts] = s.y[e:]
+    else:
+        forwards, backwards = s.z[m:].reshape(2, -1)
+        tangential[acts] = forwards - backwards
+    return s.y[:e], s.z[:m], tangential
+
+
+@dataclass(frozen=True, eq=False)
+class AdmissibleForces:
+    """Set of the multipliers (m,): λ ≥ 0 of contact, ‖λᵢ‖ ≤ gᵢ of friction vectors."""
+
+    rows: int  #: m
+    discs: Discs  #: of the friction rows, the last ones
+
+    @cached_property
+    def contact(self) -> NDArray[np.bool_]:
+        """Mask (m,) of the contact rows."""
+        return np.arange(self.rows) < self.rows - self.discs.index.size
+
+    @property
+    def sets(self) -> tuple[ConvexSet, ...]:
+        """The same set for variables of a QP."""
+        upper = np.full(self.rows, np.inf)
+        return Box(np.where(self.contact, 0.0, -upper), upper), self.discs
+
+    def project(self, multipliers: Extended) -> Extended:
+        """Return the nearest admissible multipliers (m,)."""
+        nearest = self.discs.project(multipliers)
+        return np.where(self.contact, np.maximum(nearest, 0), nearest)
+
+    def room(self, multipliers: Extended) -> Extended:
+        """Return g − ‖λ‖ of each friction vector, zero if it is extended rounding.
+
+        Projected multipliers are on their circle up to rounding, and stand for the
+        nearest point on it: √ of 1e-19 in the work would dominate certificates.
+        """
+        radius = self.discs.radius
+        room = radius - norms(multipliers[self.discs.index])
+        rounding = 8 * np.finfo(Real).eps * radius
+        return np.where(np.abs(room) > rounding, room, 0)
+
+    def interior(self, multipliers: Extended) -> Extended:
+        """Return the distance (m,) from the boundary: λ of contact, g − ‖λ‖."""
+        distance = multipliers.copy()
+        distance[self.discs.index] = self.room(multipliers)[:, None]
+        return distance
+
+    def chords(self, multipliers: Extended) -> tuple[Extended, Extended]:
+        """Return the bounds (m,) of each λᵢ where the others keep their values."""
+        lower, upper = np.zeros_like(multipliers), np.full_like(multipliers, np.inf)
+        squares = multipliers[self.discs.index] ** 2
+        others = squares.sum(axis=1, keepdims=True) - squares
+        room = self.discs.radius[:, None] ** 2 - others
+        upper[self.discs.index] = np.sqrt(np.maximum(room, 0))
+        lower[self.discs.index] = -upper[self.discs.index]
+        return lower, upper
+
+
 class Exact(NamedTuple):
     """The data of the contact problem except K, in extended precision.
 
-    The rows are those of contact, then those of friction. With v = Bu − c, all satisfy
-    the same law: the multiplier is within its bounds, v = 0 if it is strictly between
-    them, v ≤ 0 at the lower and v ≥ 0 at the upper bound.
+    The rows are those of contact, then those of friction. With v = Bu − c, multipliers
+    are normal to the motion: λ ∈ Λ and σ(v) = λᵀv with the support function σ of Λ,
+    zero for v ≤ 0 on contact rows, and Σ gᵢ‖vᵢ‖ on friction vectors.
     """
 
     f: Extended  #: (n,)
     B: Any  #: (m, n) sparse, contact and friction
     c: Extended  #: (m,)
-    lower: Extended  #: (m,) 0 for contact, −g for friction
-    upper: Extended  #: (m,) ∞ for contact, g for friction
+    forces: AdmissibleForces  #: Λ
     fixed: NDArray[np.int64]  #: prescribed components
     compliance: Extended  #: (m,) estimate for each row, B_i diag(K)⁻¹B_iᵀ
 
     @property
     def contact(self) -> NDArray[np.bool_]:
-        """Mask (m,) of the contact rows, whose multipliers have no upper bound."""
-        return np.asarray(np.isinf(self.upper))
+        """Mask (m,) of the contact rows."""
+        return self.forces.contact
 
     def motion(self, u: Extended) -> Extended:
         """Return v = Bu − c (m,), the penetration or the slip of each row."""
         return np.asarray(self.B @ u - self.c)
 
     def friction_work(self, u: Extended) -> Extended:
-        """Return g|v| (m,), zero for contact rows."""
-        bound = np.where(self.contact, 0, self.upper)
-        return np.asarray(bound * np.abs(self.motion(u)))
+        """Return gᵢ‖vᵢ‖ of each friction vector."""
+        discs = self.forces.discs
+        return np.asarray(discs.radius * norms(self.motion(u)[discs.index]))
 
-    def interior(self, multipliers: Extended) -> Extended:
-        """Return the distance (m,) of multipliers from their bounds, λ for contact."""
-        return np.asarray(
-            np.minimum(multipliers - self.lower, self.upper - multipliers)
+    def missing_work(
+        self, multipliers: Extended, motion: Extended
+    ) -> tuple[Extended, Extended]:
+        """Return σ(v) − λᵀv ≥ 0 of each contact row and each friction vector.
+
+        That of a vector, g‖v‖ − λᵀv, is evaluated without cancellation as
+
+            (g − ‖λ‖)‖v‖ + ‖ ‖λ‖v − ‖v‖λ ‖² / (2‖λ‖‖v‖).
+        """
+        discs, contact = self.forces.discs, self.contact
+        lam, v = multipliers[discs.index], motion[discs.index]
+        force, slip = norms(lam), norms(v)
+        across = norms(force[:, None] * v - slip[:, None] * lam) ** 2
+        product = 2 * force * slip
+        angle = np.divide(
+            across, product, out=np.zeros_like(product), where=product > 0
         )
+        work = self.forces.room(multipliers) * slip + angle
+        return -multipliers[contact] * motion[contact], work
 
 
 class RigidMotions(NamedTuple):
@@ -246,7 +404,7 @@ FACETS = {
 class CellBlock(NamedTuple):
     """Cells of one kind."""
 
-    kind: str  #: its name in meshio
+    kind: str  #: name of the kind in meshio
     nodes: NDArray[np.int64]  #: (k, corners)
     cells: NDArray[np.int64]  #: (k,) their rows in the table
 
@@ -344,13 +502,14 @@ class Mechanics:
     #: contact and friction rows
     to_primal: Callable[[Solution], Solution]
     factorise: Callable[[], Inverse]  #: returns K⁺; called at most once
-    mesh_size: float  #: of the contact side, in the unit of length of `primal`
+    #: cell size of the contact side, in the unit of length of `primal`
+    mesh_size: float
     #: (n, r) rigid motions of each body, regardless of supports, to measure the balance
     #: of forces
     rigid: NDArray[np.float64]
     names: tuple[
         str, ...
-    ] = ()  #: of the bodies, in the order of the columns of `rigid`
+    ] = ()  #: names of the bodies, in the order of the columns of `rigid`
     scale: float = 1.0  #: energy = scale·objective of `primal` + constant, as `Case`
     constant: float = 0.0
     #: needed to compare meshes, see `harness.crossval.discretisation`
@@ -390,15 +549,15 @@ class Mechanics:
         """The data in extended precision."""
         diagonal, B = self.primal.P.diagonal(), self.rows
         c = contact_rows(self.primal, self._active_friction)[1]
-        bound, contact = self._active_friction.bound.astype(Real), self.primal.h.size
         fixed = np.unique(csr_array(self.primal.A).indices).astype(np.int64)
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
         softness[fixed] = 0
         return Exact(
             f=-self.primal.q.astype(Real), B=B.astype(Real),
             c=c.astype(Real), fixed=fixed,
-            lower=np.append(np.zeros(contact, dtype=Real), -bound),
-            upper=np.append(np.full(contact, np.inf, dtype=Real), bound),
+            forces=AdmissibleForces(
+                c.size, self._active_friction.discs(self.primal.h.size)
+            ),
             compliance=(B.multiply(B) @ softness).astype(Real),
         )  # fmt: skip
 
@@ -488,9 +647,10 @@ def _largest(R: Any) -> Any:
 def cancelling(K: csr_array, R: Extended) -> Extended:
     """Return KR (n, r) to about twice the digits of doubles, in spite of cancellation.
 
-    K and R are split into leading parts, with 26 and 24 bits relative to the largest
-    entry of a row and of R, and rests. In extended precision (64 bits) the products of
-    the leading parts are exact, and so are their sums over a row of K.
+    K and R are split into remainders and leading parts, which have 26 and 24 bits
+    relative to the largest entry of a row of K and of R. In extended precision (64
+    bits) the products of the leading parts are exact, and so are their sums over a row
+    of K.
     """
     leading = csr_array(K.copy())
     sizes = np.repeat(abs(K).max(axis=1).toarray().ravel(), np.diff(K.indptr))

@@ -79,7 +79,7 @@ class SerialisableOperator(LinearOperator):  # type: ignore[misc]  # scipy has n
     """A symmetric operator x ↦ Px on vectors of `n` components.
 
     maker : name of a function in `makers`
-    arrays : its argument, plain arrays by name
+    arrays : plain arrays by name, the argument of that function
     makers : functions by name; workers have the same table, with the ``OPERATORS`` of
         the same plug-ins
 

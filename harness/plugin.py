@@ -121,9 +121,9 @@ class About:
     linear_solver: str  #: solver of its linear systems
     phases: str  #: work timed as preparing, and work timed as solving
     package: str = (
-        ""  #: to install; its module has the same name unless `module` is set
+        ""  #: package to install; its module has the same name unless `module` is set
     )
-    module: str = ""  #: to import, if its name differs
+    module: str = ""  #: name of the module to import, if it differs
     sequence: str = ""  #: work reused from one QP to the next; empty for none
     limits: tuple[str, ...] = ()  #: known limitations, each with evidence
 
@@ -144,17 +144,19 @@ SLIDING = "sliding without contact"
 class ContactSide:
     """Results of a contact along its slave side, node by node; SI units."""
 
-    name: str  #: of the pair of bodies, such as "disc on plate"
-    nodes: NDArray[Any]  #: (s,) along the side
+    name: str  #: name of the pair of bodies, such as "disc on plate"
+    nodes: NDArray[Any]  #: (s,) numbers of the nodes along the side
     length: Vector  #: (s,) share of the undeformed side of each node, m
-    force: NDArray[Any]  #: (s, dim) on each node from this contact, N/m; N in space
+    force: NDArray[Any]  #: (s, dim) force of this contact on each node, N/m; N in space
     pressure: Vector  #: (s,) Pa, positive in compression
     gap: Vector  #: (s,) m, positive if open; NaN without an opposite side
     #: (s,) compressive force along the normal of the contact row of each node, N/m
     push: Vector | None = None
-    shear: Vector | None = None  #: (s,) tangential traction on the side, Pa
+    #: (s,) tangential traction on the side, Pa; in space its size
+    shear: Vector | None = None
     #: (s,) "open", "stick", "slip" or `SLIDING`; old files have "open" for the last
     friction: NDArray[Any] | None = None
+    friction_force: NDArray[Any] | None = None  #: (s, dim) part of `force`, tangential
     #: (k, 3) exact solution, if known: distance along the side from its middle, m,
     #: pressure and shear, Pa
     exact: NDArray[Any] | None = None
@@ -202,7 +204,7 @@ class Fields:
     @property
     def blocks(self) -> tuple[CellBlock, ...]:
         """Cells by kind, with the names of meshio."""
-        from mortarbench.harness.mechanics import cell_blocks  # late: loads numpy
+        from mortarbench.harness.mechanics import cell_blocks  # loads NumPy
 
         return cell_blocks(self.cells, self.dim)
 
@@ -230,8 +232,9 @@ class Case:
     dualise_seconds: float | None = None
     mechanics: Mechanics | None = None  #: needed to certify errors
     remarks: tuple[str, ...] = ()  #: doubts about the input, a line each
-    #: relative distance of the QP from the fixed point that it is an iterate of, which
-    #: no solution of this QP can reduce; 0 at the fixed point, or without one
+    #: relative distance of the QP from the fixed point of the iteration to which it
+    #: belongs; no solution of this QP can reduce it. 0 at the fixed point, or without
+    #: an iteration
     unsettled: float = 0.0
 
 
@@ -239,9 +242,10 @@ class Case:
 class SourceFile:
     """A file that a case is read from, identified by its content."""
 
-    path: str  #: in the name of the case
+    path: str  #: path in the name of the case
     sha256: str  #: first 12 hexadecimal digits
-    suffix: str  #: of its format, for the name of a copy; not taken from the path
+    #: suffix of the format, for the name of a copy; not taken from the path
+    suffix: str
 
 
 class Family(ABC):
@@ -274,8 +278,8 @@ class Family(ABC):
 
     name: str  #: first component of its case names
     defaults: Mapping[str, Value]  #: all keys, in the order of canonical names
-    forms: tuple[str, ...]  #: of its QPs
-    path_suffix: str | None = None  #: of its input files; see `harness.names`
+    forms: tuple[str, ...]  #: forms of the QPs
+    path_suffix: str | None = None  #: suffix of the input files; see `harness.names`
     #: reason why refinement has no limit of finite energy; empty if it has one
     singular: str = ""
 
@@ -302,12 +306,13 @@ class Family(ABC):
     def unrefined(self, params: Mapping[str, Value]) -> str:
         """Describe the part of the geometry that `refined` does not refine, or "".
 
-        The text follows an error of the mesh: "of the bodies as they are meshed".
+        The text is printed after an error of the mesh, such as "of the bodies as they
+        are meshed".
         """
         return ""
 
     def source_file(self, params: Mapping[str, Value]) -> SourceFile | None:
-        """Return the file that a case is read from, which results keep a copy of."""
+        """Return the file from which a case is read; results contain a copy of it."""
         return None
 
     def with_copies(self, folder: Path) -> Family:
@@ -326,11 +331,11 @@ class Family(ABC):
     ) -> Callable[[Ranks, ReferenceOverRanks], DistributedQP] | None:
         """Return a function that assembles the QP of `build` on ranks, or None.
 
-        It is called by all ranks, with a reference for distributed QPs. None means that
-        one process builds the QP. This method itself builds nothing and does not need
-        MPI.
+        All ranks call the returned function, with a reference solver for distributed
+        QPs. None means that one process builds the QP. The method itself builds nothing
+        and does not need MPI.
 
-        params : complete
+        params : values of all keys
         """
         return None
 

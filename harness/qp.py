@@ -22,13 +22,14 @@ NEEDS_MATRICES = "needs explicit matrices"
 Matrix = Any  #: (r, c) ndarray, scipy.sparse array, or (P only) LinearOperator
 #: Largest entry of P − Pᵀ, relative to that of P, that counts as rounding.
 SYMMETRY_TOLERANCE = 1e-12
-_MAX_FACTORED_ROWS = 2000  #: of a P that is checked by a Cholesky factor: 0.25 s
+#: rows of the largest P that is checked by a Cholesky factor (0.25 s)
+_MAX_FACTORED_ROWS = 2000
 #: Least eigenvalue of the scaled P: text formats may store no more than six digits.
 _MIN_CURVATURE = -1e-6
 #: Least diagonal entry for scaling, relative to the largest entry of P: smaller ones
 #: may be mostly rounding.
 _MIN_DIAGONAL = 1e-4
-_STRIP_ROWS = 256  #: of a dense matrix that are compared at a time, to save memory
+_STRIP_ROWS = 256  #: rows of a dense matrix that are compared at a time, to save memory
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,7 +95,8 @@ class QP:
     G: Matrix  #: (p, n)
     h: Vector  #: (p,)
     sets: tuple[ConvexSet, ...]  #: the `Box` of lb and ub, then sets of other blocks
-    structure: Structure | None = None  #: that a solver may use, but must not require
+    #: data that a solver may use but must not require
+    structure: Structure | None = None
 
     def __init__(
         self,
@@ -174,8 +176,8 @@ class QP:
         ----------
         P : (n, n) symmetric, both triangles
         q : (n,)
-        G, h : (p, n) and (p,) of G x ≤ h
-        A, b : (m, n) and (m,) of A x = b
+        G, h : (p, n) and (p,), the rows G x ≤ h
+        A, b : (m, n) and (m,), the rows A x = b
         lb, ub : (n,) bounds, -inf and inf for absent ones
         sets : convex sets of further blocks of variables
 
@@ -322,8 +324,9 @@ def no_rows(n: int) -> Matrix:
 def needs_matrices(qp: QP) -> str | None:
     """Return the reason to decline a `qp` whose P is an operator, or None.
 
-    For `declines` of a solver that reads entries of P. If a solver declines for this
-    reason, a run assembles a small P, on the clock, and calls `declines` again.
+    This is for use in `declines` of a solver that reads entries of P. If a solver
+    declines for this reason, a run assembles a small P, on the clock, and calls
+    `declines` again.
 
     Examples
     --------
@@ -363,8 +366,8 @@ def check_convex(P: Matrix) -> None:
     """Raise if P has negative curvature, since a KKT point may then be a maximum.
 
     With dᵢ = max(Pᵢᵢ, 1e-4 max|P|), the eigenvalues of D⁻½PD⁻½ have to exceed −1e-6:
-    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues above that may be
-    negative because of rounding. For more than 2000 rows, only the diagonal is checked.
+    a Cholesky factor of D⁻½PD⁻½ + 1e-6·I has to exist. Eigenvalues between −1e-6 and 0
+    may be due to rounding. For more than 2000 rows, only the diagonal is checked.
 
     Raises
     ------
@@ -457,7 +460,7 @@ def _numbers(name: str, value: Any) -> NDArray[np.float64]:
 def numeric_vector(name: str, value: Any, n: int | None = None) -> Vector:
     """Return a copy of a vector, also from a matrix with one row or column.
 
-    name : of the vector in messages
+    name : name of the vector in messages
     n : expected number of entries; None for any
 
     Raises

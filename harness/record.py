@@ -24,9 +24,9 @@ SCHEMA = 2
 VERIFIED_FACTOR = 10.0  #: verified: every residual ≤ this times the tolerance
 READABLE = (1, 2)  #: versions that `Record.from_json` accepts
 TIGHTENING = "sequence, tighten="  #: prefix of the mode of a tightening sequence
-LARGEST_INTEGER = 2**63 - 1  #: of 64-bit readers such as Parquet
+LARGEST_INTEGER = 2**63 - 1  #: largest integer of 64-bit readers such as Parquet
 SECONDS = (1e-12, 1e10)  #: limits of measured times other than 0
-MAX_LEVELS = 20  #: of nesting in a field
+MAX_LEVELS = 20  #: largest depth of nesting in a field
 
 _WRONG_SCHEMA = f"not a journal line of schema {' or '.join(map(str, READABLE))}"
 _TOO_LARGE = "expected an integer of at most 64 bits"
@@ -113,23 +113,23 @@ class Record(Measurement):
     block: int  #: number of the unit of work; its measurements ran consecutively
     verdict: Verdict
     claimed: str | None = None  #: the solver's own status
-    message: str = ""  #: of the solver, reason to decline, or cause of death
+    message: str = ""  #: message of the solver, reason to decline, or cause of death
     iterations: int | None = None
     counts: Mapping[str, Any] = field(default_factory=dict)
     reported: Mapping[str, Any] = field(
         default_factory=dict
     )  #: other data from the solver, such as its own times in seconds
     build_seconds: float | None = (
-        None  #: of building the case, in the process that built it
+        None  #: time to build the case, in the process that built it
     )
     #: the part of `build_seconds` for factor and dual; dual forms only
     dualise_seconds: float | None = None
     #: peak resident memory of the process that built the case anew; see `growing`
     build_peak_mib: float | None = None
-    recover_seconds: float | None = None  #: of computing quantities from the point
-    certify_seconds: float | None = None  #: of computing `energy_bound`
+    recover_seconds: float | None = None  #: time to compute quantities from the point
+    certify_seconds: float | None = None  #: time to compute `energy_bound`
     canary_seconds: float | None = (
-        None  #: of a fixed computation just before, which shows drift
+        None  #: time of a fixed computation just before, which shows drift
     )
     threads: int | None = None  #: largest number of any library in the worker
     cpu: int | None = None  #: CPU that the worker was bound to
@@ -160,7 +160,8 @@ class Record(Measurement):
     #: "residuals"; "reference": `optimum_error` decided the verdict; "certificate": a
     #: claim of infeasibility was proven
     decided_by: str = "residuals"
-    optimum_error: float | None = None  #: see `harness.verify.optimum`
+    #: error against a proven optimum, see `harness.verify.optimum`
+    optimum_error: float | None = None
     energy_bound: float | None = (
         None  #: certified bound of the relative error, energy norm
     )
@@ -244,7 +245,7 @@ class Record(Measurement):
             field with a wrong type or value.
 
         """
-        import msgspec  # late: processes that measure do not read journals
+        import msgspec  # measuring processes do not need it
 
         try:
             try:

@@ -71,8 +71,8 @@ _BESIDE = "beside a plug-in: "  #: prefix of a folder in the path of its package
 class SolverSpec:
     """A solver in a suite: its name, label and options."""
 
-    name: str  #: in the registry, e.g. "NAME" or "PREFIX:BACKEND"
-    label: str  #: in records and reports
+    name: str  #: name in the registry, e.g. "NAME" or "PREFIX:BACKEND"
+    label: str  #: label in records and reports
     options: Mapping[str, Any] = field(
         default_factory=dict
     )  #: that differ from defaults
@@ -160,7 +160,7 @@ class Plugin:
     operators: Mapping[str, Maker] = field(
         default_factory=dict
     )  #: makers, see `harness.operators`
-    origin: str = ""  #: its file, or "entry points"
+    origin: str = ""  #: path of its file, or "entry points"
 
 
 @dataclass(frozen=True)
@@ -333,7 +333,7 @@ def _some_package_offers() -> bool:
     """Return True if an installed package may declare entry points for mortarbench.
 
     It searches the folders of `sys.path`, which is faster than importing
-    importlib.metadata. An archive on the path counts as a package that does.
+    importlib.metadata. An archive on the path counts as a package that may.
     """
     for place in sys.path:
         if os.path.isfile(place):

@@ -29,8 +29,9 @@ from mortarbench.harness.qp import QP, Vector
 
 History = Mapping[str, NDArray[Any]]
 
-_MAX_TEXT = 16  #: characters of an entry
-MAX_HISTORY_BYTES = 2**28  #: keeps a result folder from filling the disk
+_MAX_TEXT = 16  #: largest number of characters of an entry
+#: largest size, which keeps a result folder from filling the disk
+MAX_HISTORY_BYTES = 2**28
 _STORED_AS = {"b": np.int64, "i": np.int64, "u": np.int64, "f": np.float64}
 
 
@@ -70,12 +71,13 @@ class Solution:
 
     status: Status
     x: Vector  #: (n,)
-    y: Vector  #: (m,) of A x = b
-    z: Vector  #: (p,) of G x ≤ h, nonnegative
-    z_box: Vector  #: (n,) of the bounds, ≤ 0 at an active lb, ≥ 0 at an active ub
+    y: Vector  #: (m,) multipliers of A x = b
+    z: Vector  #: (p,) multipliers of G x ≤ h, nonnegative
+    #: (n,) multipliers of bounds, ≤ 0 at an active lb and ≥ 0 at an active ub
+    z_box: Vector
     iterations: int | None = None  #: None if the solver does not report it
     counts: Mapping[str, int] = field(default_factory=dict)  #: e.g. {"P_products": 61}
-    message: str = ""  #: of the solver, stored in the record
+    message: str = ""  #: message of the solver, stored in the record
     reported: Mapping[str, float | str] = field(
         default_factory=dict
     )  #: other data, e.g. {"linear_solver": "qdldl", "setup_seconds": 0.01}

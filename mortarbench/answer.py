@@ -139,7 +139,7 @@ class Answer:
 
         The reference solver solves the case on finer meshes.
 
-        budget : seconds; meshes that would exceed it are not solved
+        budget : seconds; a mesh on which the solve would exceed them is skipped
         """
         from mortarbench.harness.crossval.discretisation import discretisation_errors
 
@@ -402,7 +402,7 @@ def solver_session(
     forks: bool = False,
     ranks: int = 1,
 ) -> Iterator[Callable[[Case, float], Answer]]:
-    """Start a process for a solver; yield the call that solves a case to a tolerance.
+    """Start a process for a solver; yield a function that solves a case to a tolerance.
 
     solver, options, ranks : see `solve`
     forks : the process may be a fork of this one, if that is safe; see
@@ -424,7 +424,7 @@ def solver_session(
     configured = resolve(spec, solvers)
     defaults = options_of(resolve(SolverSpec(name=name, label=name), solvers))
     if options_of(configured).get("history") is False and "history" not in requested:
-        # recording costs time, but the time of a single solve is compared with nothing
+        # recording takes time, but a single solve is not used for comparisons of times
         defaults = {**defaults, "history": True}
         spec = replace(spec, options={**requested, "history": True})
         configured = resolve(spec, solvers)
@@ -470,20 +470,21 @@ def solver_session(
 class Multipliers(NamedTuple):
     """Multipliers with the signs of `QP`: P x + q + Aᵀy + Gᵀz + z_box = 0."""
 
-    y: Vector  #: (m,) of A x = b
-    z: Vector  #: (p,) of G x ≤ h
-    z_box: Vector  #: (n,) of the bounds
+    y: Vector  #: (m,) multipliers of A x = b
+    z: Vector  #: (p,) multipliers of G x ≤ h
+    z_box: Vector  #: (n,) multipliers of the bounds
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Verification:
-    """Verdict on a point that `verify` was called with."""
+    """Verdict of `verify` on a point."""
 
     verdict: Verdict  #: `verified`, or if refuted `inaccurate` or `wrong`
     residuals: Residuals  #: relative KKT residuals
-    multipliers: Multipliers  #: those passed to `verify`; computed ones for the others
+    #: multipliers passed to `verify`, completed by computed ones
+    multipliers: Multipliers
     objective: float  #: ½xᵀPx + qᵀx
-    optimum_error: float | None  #: distance from a proven optimum if that decided
+    optimum_error: float | None  #: error against the proven optimum if it decided
     normality: (
         Normality | None
     )  #: further measures over discs and cones, if there are any
@@ -517,8 +518,8 @@ def verify(
     qp : a QP, a case of `build`, or its name
     x : (n,) point
     y, z, z_box : multipliers of A x = b, G x ≤ h and the bounds, if known
-    tol : relative KKT accuracy; verified means that every residual is within 10·tol, or
-        for small QPs that the error against a proven optimum is
+    tol : relative KKT accuracy; a point is verified if every residual is within 10·tol
+        or, for a small QP with a proven optimum, if the error of the objective is
 
     Raises
     ------

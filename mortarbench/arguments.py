@@ -16,7 +16,7 @@ PICTURES = (".png", ".pdf", ".svg")
 FORMATS = ("html", "md", "tex", "csv", "parquet")  #: formats of a report
 GATES = ("worse", "slower")  #: conditions on which a comparison may fail
 MAX_SCALE = 1e9  #: largest factor of displacements in pictures
-GRIDS = (".vtu", ".pvd")  #: for ParaView: one state, or a series of load steps
+GRIDS = (".vtu", ".pvd")  #: formats for ParaView: one state, or a series of load steps
 
 
 def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
@@ -44,7 +44,7 @@ def check_output_file(path: str | Path, suffixes: tuple[str, ...]) -> Path:
 
 
 def check_result_folder(folder: Path) -> Path:
-    """Return a folder that exists.
+    """Return the path of an existing folder.
 
     Raises
     ------
@@ -64,7 +64,7 @@ def tolerance(tol: float, where: str = "tol") -> float:
     Raises
     ------
     InputError
-        Unless it is a number between 0 and 1, both excluded.
+        If it is not a number between 0 and 1, both excluded.
 
     """
     if not isinstance(tol, Real) or isinstance(tol, bool) or not 0 < tol < 1:
@@ -100,7 +100,7 @@ def check_scale(scale: float, where: str = "scale") -> float:
     Raises
     ------
     InputError
-        If it is not a number of size at most 1e9.
+        If it is not a number of absolute value at most 1e9.
 
     """
     if not abs(scale) <= MAX_SCALE:  # `not ≤` is true for NaN as well
@@ -116,7 +116,7 @@ def budget(seconds: float, where: str = "budget") -> float:
     Raises
     ------
     InputError
-        Unless it is a number ≥ 0.
+        If it is not a number ≥ 0.
 
     """
     if not checked.is_number(seconds) or not seconds >= 0:  # true for NaN as well

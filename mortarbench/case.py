@@ -1,4 +1,4 @@
-"""Cases by name, and QPs without mechanics, with the recovery of physical results."""
+"""Cases, defined by a name or a bare QP, with the recovery of physical results."""
 
 from __future__ import annotations
 
@@ -146,8 +146,8 @@ class Case(plugin.Case):
         Raises
         ------
         InputError
-            If the suffix is another one, the format cannot store the QP, or the file
-            cannot be written.
+            If the suffix is unknown, the format cannot store the QP, or the file cannot
+            be written.
 
         """
         path = check_output_file(path, EXPORTS)
@@ -266,8 +266,9 @@ def as_case(problem: Case | QP | str, plugins: Plugins = ()) -> Case:
 def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) -> Path:
     """Write a QP for other programs: .npz, .mat, .parquet, .qps, or .hdf5 (FCLIB).
 
-    FCLIB holds problems over friction cones (`Cones`). For a case ``fclib:PATH`` it is
-    the problem of the file, with all arrays unchanged, not one of its convex steps.
+    FCLIB files contain problems over friction cones (`Cones`). For a case
+    ``fclib:PATH``, the problem of the original file is written with all arrays
+    unchanged, instead of the convex problem of the case.
 
     Parameters
     ----------
@@ -278,8 +279,8 @@ def export(case: Case | QP | str, path: str | Path, *, plugins: Plugins = ()) ->
     Raises
     ------
     InputError
-        If there is no such case, it cannot be built, the suffix is another one, the
-        format cannot store the QP, or the file cannot be written.
+        If there is no such case, it cannot be built, the suffix is unknown, the format
+        cannot store the QP, or the file cannot be written.
 
     Examples
     --------

@@ -218,8 +218,8 @@ class _Html:
 def remaining(measured: int, to_do: int, seconds: float) -> str:
     """Return the time left at the present rate, "H:MM:SS left"; empty if unknown.
 
-    measured : number of measurements that took the `seconds`; those of earlier runs,
-        which took no time now, do not count
+    measured : number of measurements that took the `seconds`; measurements of earlier
+        runs do not count
     """
     if measured <= 0 or to_do <= 0:
         return ""

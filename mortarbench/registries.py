@@ -116,7 +116,7 @@ def defer_parts_of_numpy() -> None:
 
 
 def reference(qp: QP) -> Solution:
-    """Solve to about rounding, without using a solver under test."""
+    """Solve to nearly rounding accuracy, without using a solver under test."""
     from mortarbench.solvers.reference.solve import reference_solution
 
     return reference_solution(qp)

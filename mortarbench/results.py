@@ -56,7 +56,8 @@ class Results:
 
     folder: Path
     records: tuple[Record, ...]  #: one per measurement, in the order of the journal
-    solvers: tuple[str, ...] = ()  #: labels of the suite, in its order; `load`: of all
+    #: solver labels in the order of the suite; from `load`, those of all records
+    solvers: tuple[str, ...] = ()
     cases: frozenset[str] = frozenset()  #: names of the requested cases; empty: all
     #: requested measurements that are missing; repeating the call measures them
     missing: Missing = field(default_factory=lambda: Missing(unbuilt=[], faults=[]))
@@ -294,7 +295,7 @@ def run(
     Parameters
     ----------
     suite : path of a TOML file, the name of one of `suites`, or a dict with the keys of
-        such a file, whose relative paths start in the working directory
+        such a file; its relative paths refer to the working directory
     out : result folder; default: ``out/NAME`` for the suite NAME
     solvers : measure only these solvers; solvers that are not in the suite are added
     cases : measure only these cases, given by names or patterns

@@ -111,7 +111,7 @@ def summary(records: Iterable[Record], solvers: Sequence[str]) -> str:
 def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list[str]]:
     """Return a table of the claims and verdicts of each solver, with a header row.
 
-    `solvers` come first, other solvers of the records after them.
+    The `solvers` come first, followed by the other solvers of the records.
     """
     latest = {r.run_id: r for r in records}.values()
     header = [

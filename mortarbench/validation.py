@@ -136,7 +136,7 @@ def validate(
 
 
 def _refines(case: CaseId) -> bool:
-    """Return True if there is a finer mesh, or a reason why there is none."""
+    """Return True if a finer mesh exists, or a reason why none exists."""
     try:
         return case.family.refined(case.params) is not None
     except InputError:  # the reason, which `discretisation_errors` repeats
@@ -261,7 +261,7 @@ class Conformance:
     """Results of the conformance suite for one solver."""
 
     solver: str  #: name, or class of an object
-    results: Mapping[str, Result]  #: by the name of the check
+    results: Mapping[str, Result]  #: results by the name of the check
 
     @property
     def conforms(self) -> bool:

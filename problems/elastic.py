@@ -47,7 +47,6 @@ from mortarbench.problems.duality.problem import (
     keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import NamedMesh, read_msh
 from mortarbench.problems.fem.mesh import (
     Mesh,
     dofs_of,
@@ -58,6 +57,8 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
+from mortarbench.problems.fem.mesh_files.named import NamedMesh
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.problems.ranges import (
     GLUES,
     LAW_PARAMETERS,

@@ -92,13 +92,13 @@ METHODS = schema(contact=choice("nts", "mortar"), basis=choice("dual", "standard
 PLANES = schema(plane=choice("strain", "stress"))
 #: key of the gluing rows, which join the copies of a node (`problems.feti.subdomains`)
 GLUES = schema(glue=choice("orthonormal", "chain", "redundant"))
-#: keys of a decomposition into subdomains: H/h (0: one piece per body), and `GLUES`
-DECOMPOSITION = schema(feti=key(0, 0), **GLUES)
+#: key of clusters: subdomains along a side of a cluster; 0: no clusters
+CLUSTERS = schema(cluster=key(0, 0))
+#: keys of a decomposition into subdomains: H/h (0: one piece per body), and the others
+DECOMPOSITION = schema(feti=key(0, 0), **GLUES, **CLUSTERS)
 DIMENSION = schema(dim=choice(2, 3))
 #: keys that families in space do not support yet, with the only value they allow
-PLANE_ONLY: Mapping[str, Value] = {
-    "friction": "none", "kinematics": "linear", "plane": "strain"
-}  # fmt: skip
+PLANE_ONLY: Mapping[str, Value] = {"kinematics": "linear", "plane": "strain"}
 #: laws of friction, each with the key of its parameter
 LAWS = {"none": "", "tresca": "bound", "coulomb": "mu"}
 #: parameters of the laws of friction, with their allowed values
@@ -249,11 +249,12 @@ def check_decomposition(
 
     key, what : key that requests subdomains, and its meaning for the message
     """
-    if not params[key] and params["glue"] != GLUES["glue"].default:
-        raise InputError(
-            f"{family}: glue={params['glue']} is not used by {key}=0, one piece per "
-            f"body; expected no glue, or {key}, {what}"
-        )
+    for name, default in defaults_of({**GLUES, **CLUSTERS}).items():
+        if not params[key] and params.get(name, default) != default:
+            raise InputError(
+                f"{family}: {name}={params[name]} is not used by {key}=0, one piece "
+                f"per body; expected no {name}, or {key}, {what}"
+            )
 
 
 def check_kinematics(family: str, params: Mapping[str, Value]) -> None:

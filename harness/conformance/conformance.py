@@ -69,8 +69,8 @@ _DECLINE_OPERATORS = (
 )
 #: rounding of a gradient relative to its largest term, as in dual residuals
 GRADIENT_ROUNDING = 8 * float(np.finfo(float).eps)
-#: difference between repeats that is neglected: the alignment of arrays in memory
-#: determines the order of sums
+#: neglected difference between repeats: the alignment of arrays in memory determines
+#: the order of sums
 REPEAT_ROUNDING = 1e-12
 
 
@@ -157,8 +157,9 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 def _solves_over_sets(shape: str, solver: Solver) -> Result:
     """Require the objective to 1e-8, and report the error in x.
 
-    An error δ of x costs at least 0.05 δ², as the eigenvalues of P exceed 0.1: so the
-    points of interior-point methods may be off by √(20·1e-8·|f|).
+    An error δ of x increases the objective by at least 0.05 δ², since the eigenvalues
+    of P exceed 0.1. The points of interior-point methods may therefore have errors of
+    up to √(20·1e-8·|f|).
     """
     qp, expected = manufactured_over_sets(shape)
     s = _solved(solver, qp, 1e-9, VERIFIED_FACTOR)
@@ -276,7 +277,7 @@ def _runs_in_one_thread(solver: Solver) -> None:
     """Require that one thread computes: its CPU time cannot exceed the wall time."""
     qp, _ = manufactured("everything", n=300, dense=True)
     allowed = os.sched_getaffinity(0)
-    # all CPUs: two threads on one would alternate, and not be seen
+    # on all CPUs: two threads on a single CPU would alternate and escape notice
     os.sched_setaffinity(0, range(os.cpu_count() or 1))
     try:
         used, passed = time.process_time(), time.perf_counter()

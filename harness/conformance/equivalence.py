@@ -33,8 +33,9 @@ from mortarbench.harness.solution import Solution, Status
 from mortarbench.harness.verify.kkt import kkt_residuals, verdict
 from mortarbench.harness.verify.measure import measure
 
-TOL = 1e-8
-#: relative to the energies; a factor of 10 for residuals that add up over rows
+TOL = 1e-8  #: tolerance of all solves of the strings
+#: largest difference relative to the energies; a factor of 10 for residuals that add up
+#: over rows
 MAX_ENERGY_CHANGE = 10 * VERIFIED_FACTOR * TOL
 
 #: load and length of beam-ring (10⁸ N/m and 2 m) in each system of units, as powers of
@@ -57,7 +58,7 @@ class DeclinedError(Exception):
 def same_answer(
     form: str, change: str, solver: Solver, old: Solution | None = None
 ) -> tuple[int | None, int | None]:
-    """Solve the strings in a form unchanged and changed, and compare the answers.
+    """Solve the unchanged and the changed string problem; compare the answers.
 
     change : a key of `CHANGES`
     old : the answer to the unchanged QP, if it is available
@@ -140,10 +141,11 @@ def _rows_scaled(qp: QP, form: str) -> Equivalent:
     return scale_rows(qp, *np.split(2.0**exponents, [qp.b.size]))
 
 
-#: by form: about half of the largest deflection, or contact force
+#: shift for each form: about half of the largest deflection, or contact force
 _SHIFTS = {"primal": 2.0**-5, "dual": 2.0**-7, "dual-bounds": 2.0**-7}
 
-Change = Callable[[QP, str], Equivalent]  #: from the strings in a form
+#: function of the strings and the form that returns an equivalent QP
+Change = Callable[[QP, str], Equivalent]
 
 UNCHANGED = "as it is"
 

@@ -97,11 +97,11 @@ SET_SHAPES: Mapping[str, tuple[int, int, int]] = {
 def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solution]:
     """Return a random QP over discs and cones, with its solution.
 
-    The blocks have two tangents and sizes between 0.1 and 10. In turn, discs are
-    active, active and not; cones slip, are open (at the apex) and stick. Forces on
-    active blocks are at least 0.5 from the boundary of the normal cone: complementarity
-    is strict. P is positive definite with eigenvalues above 0.1. Two more variables
-    have bounds, one of them active.
+    The blocks have two tangents and sizes between 0.1 and 10. Of three successive
+    discs, two are active and one is not; of three successive cones, one slips, one is
+    open (at the apex) and one sticks. Forces on active blocks are at least 0.5 from the
+    boundary of the normal cone: complementarity is strict. P is positive definite with
+    eigenvalues above 0.1. Two more variables have bounds, one of them active.
 
     shape : a key of `SET_SHAPES`
 
@@ -199,7 +199,7 @@ def membrane(k: int) -> QP:
     )  # fmt: skip
 
 
-FORMS = ("primal", "dual", "dual-bounds")  #: of `strings`
+FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
 
 
 def strings(form: str) -> QP:

@@ -21,7 +21,7 @@ from mortarbench.harness.conformance.manufactured import FORMS
 
 MIN_LISTED_WORK_RATIO = 2.0  #: ratios of iterations below this are not listed
 
-Results = Mapping[str, Result]  #: of one solver, by the name of the check
+Results = Mapping[str, Result]  #: results of one solver, by the name of the check
 
 HEAD = f"""\
 # Effects of equivalent formulations
@@ -59,8 +59,8 @@ DEGENERATE_HEAD = """\
 ## The degenerate cone
 
 min ½‖x‖² − 4x₁ − 4x₂ over ‖(x₂, x₃)‖ ≤ x₁ has the solution (4, 4, 0) with multiplier
-zero. The error in x is of the order of the square root of that in complementarity, also
-of a verified answer.
+zero. The error in x is of the order of the square root of the error in complementarity,
+even if the answer is verified.
 
 | solver | largest error in x |
 | --- | --- |

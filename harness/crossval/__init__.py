@@ -1,1 +1,1 @@
-"""Answers of all solvers held against one another and the truth."""
+"""Comparison of the answers of all solvers with each other and with references."""

@@ -56,7 +56,7 @@ class Deviation(NamedTuple):
     """Difference of an answer from the reference, over ‖u*‖; see `distances`."""
 
     u: Vector  #: (n,)
-    equilibrium: Vector | None  #: (n,) of u_λ; None without mechanics
+    equilibrium: Vector | None  #: (n,) difference of u_λ; None without mechanics
 
 
 def energy_allowed(tol: float) -> float:
@@ -88,7 +88,7 @@ def assess(
     true_gap = -exact.motion(truth.u)
     true_closed, true_strict = _closed(exact, truth.multipliers, true_gap, small)
     contradicted = (closed != true_closed) & strict & true_strict & contact
-    beyond = np.maximum(exact.lower - lam, lam - exact.upper) * exact.compliance
+    beyond = -exact.forces.interior(lam) * exact.compliance
     assessment = Assessment(
         error=_over(mechanics.norm(off), length),
         equilibrium_error=_over(mechanics.norm(off_rest), length),
@@ -126,7 +126,7 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
 
 
 def point_norm(qp: QP, s: Solution) -> float:
-    """Return √max(xᵀPx, |qᵀx|), which errors of x are relative to."""
+    """Return √max(xᵀPx, |qᵀx|), the scale of relative errors of x."""
     return float(np.sqrt(max(s.x @ (qp.P @ s.x), abs(qp.q @ s.x))))
 
 

@@ -2,7 +2,7 @@
 
 The reference is a point with a proven error (`harness.verify.references`), computed by
 none of the solvers under test. An answer is refuted by its own residuals, or if its
-distance to the reference, less the error of the reference, exceeds what the claim
+distance to the reference, minus the error of the reference, exceeds what the claim
 allows (`harness.crossval.assessment`). Which answer is wrong therefore does not depend
 on a majority. Distances between answers need no reference: two answers that differ by
 more than both claims allow, neither of them refuted, are an unresolved disagreement.
@@ -57,17 +57,19 @@ class Answer:
     claimed: str
     stored: Verdict  #: verdict of the run
     verdict: Verdict  #: verdict on the stored point now, at 10·tol
-    residuals: Mapping[str, float]  #: the four of `harness.verify.kkt`
+    residuals: Mapping[str, float]  #: the four residuals of `harness.verify.kkt`
     optimum_error: (
         float | None
     )  #: decides in place of the residuals, see `harness.verify.optimum`
     allowed: float  #: largest residual of a verified answer
-    energy_allowed: float  #: its largest relative error in the energy norm
+    energy_allowed: float  #: largest relative error in the energy norm that is allowed
     energy_bound: float | None  #: certificate stored by the run
     doubt: float | None  #: uncertainty ± of the errors in `assessment`
     assessment: Assessment | None
     refuted: tuple[str, ...] = ()  #: reasons why the claim is false
-    contradiction: str = ""  #: of the run's certificate by the reference: a bug here
+    #: contradiction between the run's certificate and the reference: an error of this
+    #: program
+    contradiction: str = ""
     remarks: tuple[str, ...] = ()
 
     @property
@@ -99,8 +101,9 @@ class Problem:
     doubt: float | None  #: bound of its relative error in the energy norm
     closed: int | None  #: number of closed rows of the truth
     answers: tuple[Answer, ...]
-    pairs: tuple[Pair, ...]  #: of answers at one tolerance
-    unresolved: tuple[Pair, ...]  #: beyond `allowed`, with neither answer refuted
+    pairs: tuple[Pair, ...]  #: pairs of answers at one tolerance
+    #: pairs whose distance exceeds `allowed` although neither answer is refuted
+    unresolved: tuple[Pair, ...]
     note: str = ""  #: reason why there is no reference
 
 
@@ -112,7 +115,8 @@ def compare_answers(
 ) -> Problem:
     """Judge all answers to one problem.
 
-    answers : to one problem: equal ``mechanics.program``, or one QP without mechanics
+    answers : answers to one problem: equal ``mechanics.program``, or one QP without
+        mechanics
     solve : the reference solve
     references : folder in which reference points are cached; None for no cache
     """

@@ -42,11 +42,14 @@ from mortarbench.harness.names import CaseId, assemble, unbuilt
 from mortarbench.harness.plugin import Family, Reference
 from mortarbench.harness.verify.references import UnsolvedError, reference_point
 
-FILE = "discretisation.json"  #: in the result folder
-SCHEMA = 1  #: version of the file
-MAX_UNKNOWNS = 200_000  #: of a mesh that is solved
-GROWTH = 4.0  #: of the unknowns by the first halving; later ones use the observed ratio
-TIME_EXPONENT = 1.5  #: p in the growth of the time of a reference solve, unknowns^p
+FILE = "discretisation.json"  #: name of the file in the result folder
+SCHEMA = 1  #: version of the format of the file
+MAX_UNKNOWNS = 200_000  #: largest number of unknowns of a mesh that is solved
+#: factor by which the first halving multiplies the unknowns; later ones use the
+#: observed ratio
+GROWTH = 4.0
+#: exponent p in the growth of the time of a reference solve, unknowns^p
+TIME_EXPONENT = 1.5
 MAX_LEVELS = 3  #: fewest meshes that determine a rate
 MIN_RATE = 0.5  #: least q that is extrapolated: below it, 1/(1 − 2^−q) exceeds 3.4
 #: Least relative error of u that is assumed where certificates prove less: rounding of
@@ -63,7 +66,8 @@ class Level:
     energy: float  #: J_h; J/m in the plane
     norm: float  #: ‖û‖, in √energy
     bound: float  #: certified relative error of the reference solution
-    distance: float | None = None  #: to the solution on the level before, in √energy
+    #: distance to the solution on the previous level, in √energy
+    distance: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,7 +84,9 @@ class Discretisation:
     error: float | None = None  #: relative to ‖û‖, energy norm
     change: float | None = None  #: ‖u_h − u_{h/2}‖/‖û‖
     rate: float | None = None  #: q of the squared error, observed
-    note: str = ""  #: reason for a lesser kind; for a limit, the geometry that it is of
+    #: reason for a kind other than "limit"; for a limit, the geometry to which it
+    #: applies
+    note: str = ""
     levels: tuple[Level, ...] = ()  #: coarsest first, which is the case itself
     params: Mapping[str, object] = field(default_factory=dict)  #: all keys of the case
 
@@ -118,12 +124,14 @@ def estimate_error(
         return replace(found, note=singular or note)
     if rate <= 0:
         return replace(
-            found, note="it does not fall on these meshes: the next halving changes "
-            f"{2 ** (-rate / 2):.3g} times as much",
-        )  # fmt: skip
+            found,
+            note="the error does not decrease on these meshes: the next halving "
+            f"changes {2 ** (-rate / 2):.3g} times as much",
+        )
     if rate < MIN_RATE:
         return replace(
-            found, note=f"it falls slowly on these meshes, like h^{rate / 2:.2f}"
+            found,
+            note=f"the error decreases slowly on these meshes, like h^{rate / 2:.2f}",
         )
     return replace(found, kind="limit", error=change / sqrt(1 - 2**-rate))
 
@@ -139,7 +147,7 @@ def discretisation_errors(
 
     An earlier estimate from more meshes is kept if this call runs out of time.
 
-    cases : of which the forms of one physical case count once
+    cases : cases; the forms of one physical case count once
     folder : result folder, with the cache of reference points in ``references``
     budget : seconds; a mesh that is expected to take longer than the rest is skipped
     tell : called with a message before each case
@@ -278,10 +286,10 @@ class _Halving:
             text = case.name
             mechanics = case.build(self.reference).mechanics
             if mechanics is None:
-                self.why = "there is no elastic problem behind it"
+                self.why = "the case has no elastic problem"
                 return None
             if mechanics.grid is None:
-                self.why = "its family does not say what its mesh is"
+                self.why = "the family does not provide the mesh"
                 return None
             unknowns = mechanics.primal.q.size
             if first and self._refused(GROWTH * unknowns):

@@ -45,7 +45,7 @@ class StoredAnswer:
     """A stored answer, and the case as rebuilt for its judgement."""
 
     record: Record
-    label: str  #: of the solver; sequences have a label of their own
+    label: str  #: label of the solver; sequences have a label of their own
     repeats: int  #: number of measurements that returned exactly this point
     case: Case
     solution: Solution
@@ -76,7 +76,7 @@ def ground_truth_of(
     mechanics = mechanics.whole
     try:
         truth = _elastic_truth(mechanics, answers, solve, references)
-    except Exception as e:  # the family's code, of the factorisation
+    except Exception as e:  # the factorisation is the family's code
         return note_of("reference", e)
     if isinstance(truth, str):
         return truth
@@ -127,7 +127,7 @@ def _best_certified(
     c, g = min(certified, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
         u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
-        states=suggested(mechanics.exact, c.u, c.multipliers),
+        states=suggested(mechanics.exact, c.u, c.multipliers).states,
         norm=c.norm, bound=c.bound,
     )  # fmt: skip
     return point, _origin(g)

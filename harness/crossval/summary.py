@@ -182,7 +182,9 @@ def _headline(
         claims = _many(len(wrong), "claim")
         parts.append(f"{claims} refuted, of {some(culprits, 6)}")
     if counts["unresolved"]:
-        parts.append(f"{_many(counts['unresolved'], 'pair')} apart without a culprit")
+        parts.append(
+            f"{_many(counts['unresolved'], 'pair')} apart, neither answer refuted"
+        )
     if counts["contradictions"]:
         broken = _many(counts["contradictions"], "certificate")
         parts.append(f"{broken} contradicted by the reference")

@@ -41,7 +41,8 @@ from mortarbench.harness.verify.references import reference_point
 from mortarbench.harness.verify.verdicts import has_point
 
 _CHANGED = "the stored point is not the one that was measured: its file was changed"
-MAX_FORCE_DIFFERENCE = 1e-3  #: relative, between contact forces that count as equal
+#: largest relative difference between contact forces that count as equal
+MAX_FORCE_DIFFERENCE = 1e-3
 #: Largest error bound of a solution that refutes a claim of infeasibility.
 MAX_SOLUTION_ERROR = 1e-2
 
@@ -63,8 +64,10 @@ class Validation:
 
     problems: tuple[Problem, ...]
     solvers: tuple[str, ...]  #: labels of all solvers with a record
-    false_claims: tuple[Listed, ...]  #: without a point, hence not in `problems`
-    unanswered: tuple[Listed, ...]  #: neither claim nor point: crashed, failed, limit
+    #: false claims without a point, hence not in `problems`
+    false_claims: tuple[Listed, ...]
+    #: measurements with neither claim nor point: crashed, failed, limit
+    unanswered: tuple[Listed, ...]
     not_validated: tuple[Listed, ...]  #: stored points that could not be judged
     declined: int
     proven: int = 0  #: claims of infeasibility that a certificate proves
@@ -111,7 +114,7 @@ def validate_folder(
 ) -> Validation:
     """Judge all answers of a result folder.
 
-    reference : the reference solve, none of the solvers
+    reference : the reference solve, which is independent of all solvers
     tell : called with the name of each case before it is judged
 
     Raises

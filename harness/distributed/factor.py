@@ -103,8 +103,8 @@ class LocalFactor:
 
     at: Touched
     changing: int  #: number of changing rows, the first of the border
-    #: of A_p with 1 added to the diagonal of shared rows, in the order of unchanging,
-    #: changing and shared rows
+    #: factor of A_p with 1 added to the diagonal of shared rows, in the order of
+    #: unchanging, changing and shared rows
     factor: BorderedFactor
 
     @property
@@ -168,9 +168,9 @@ class SummedFactor:
 
     local: LocalFactor
     root: float  #: √(1 + κ)
-    L_cc: Dense  #: (c, c) of the changing rows of this rank
-    L_sc: Dense  #: (s_p, c) of its shared rows
-    L_ss: Dense  #: (s, s) of all shared rows, replicated
+    L_cc: Dense  #: (c, c) block of the changing rows of this rank
+    L_sc: Dense  #: (s_p, c) block of the shared rows of this rank
+    L_ss: Dense  #: (s, s) block of all shared rows, replicated
 
     @property
     def least_pivot(self) -> float:
@@ -310,10 +310,10 @@ def bordered_factor(A: Matrix, border: Rows) -> BorderedFactor:
 def independent_rows(gram: Matrix) -> Rows:
     """Return a maximal set of independent rows of a matrix G, from GGᵀ (r, r).
 
-    The pivot of a row is the square of its distance from the span of the rows before.
-    The row is dependent if that is at most `DEPENDENCE_TOLERANCE` times the square of
-    its length. Only the first such row is dropped before all pivots are computed again,
-    since the pivots behind it are rounding.
+    The pivot of a row is the square of its distance from the span of the previous rows.
+    The row is dependent if its pivot is at most `DEPENDENCE_TOLERANCE` times the square
+    of its length. Only the first such row is dropped before all pivots are computed
+    again, since the pivots after it are rounding errors.
 
     Returns
     -------

@@ -1,8 +1,8 @@
 """Collective handling of failures: all ranks raise, or all processes end.
 
-If one rank raised while others wait for its messages, these would wait for ever. Ranks
-therefore exchange the outcome of each piece of work (`run_collectively`), on a
-communicator that is used for nothing else. A rank that failed waits there for the
+If one rank raised an exception while others wait for its messages, they would wait for
+ever. Ranks therefore exchange the outcome of each piece of work (`run_collectively`),
+on a communicator that is used for nothing else. A rank that failed waits there for the
 others. If they do not arrive, they are blocked in a message that it will never send,
 and all processes are ended (`abort`).
 """
@@ -24,12 +24,12 @@ from mortarbench.harness.distributed.vectors import Ranks
 
 T = TypeVar("T")
 
-PEER_TIMEOUT = 5.0  #: seconds that a rank which failed waits for the others
+PEER_TIMEOUT = 5.0  #: time that a failed rank waits for the others, s
 #: Environment variable with the file descriptor on which `harness.processes.ranks`
 #: reads failures of ranks. The output of a solver is not searched for them.
 RECORD = "MORTARBENCH_RANK_RECORD"
-_POLL_SECONDS = 1e-3  #: between two tests whether the others have arrived
-_MESSAGE_BYTES = 500  #: of the description of a failure; longer ones are cut
+_POLL_SECONDS = 1e-3  #: time between two tests whether the other ranks have arrived
+_MESSAGE_BYTES = 500  #: length to which the description of a failure is cut
 
 
 class RankFailedError(Exception):
@@ -42,8 +42,8 @@ def run_collectively(ranks: Ranks, work: Callable[[], T]) -> T:
     Raises
     ------
     RankFailedError
-        On every rank, if some ranks failed, or with different exceptions. An exception
-        that all ranks raise with equal messages is raised as it is.
+        On every rank, if only some ranks failed or their exceptions differ. An
+        exception that all ranks raise with equal messages is raised unchanged.
 
     """
     # created here, since all ranks are here: Dup is collective

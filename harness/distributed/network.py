@@ -12,8 +12,8 @@ import numpy as np
 if TYPE_CHECKING:
     from mpi4py.MPI import Comm
 
-LARGE_BYTES = 2**20  #: of a message whose time is determined by bandwidth
-_BATCHES = 5  #: of calls that are timed together; the first one warms up
+LARGE_BYTES = 2**20  #: size of a message whose time is determined by bandwidth
+_BATCHES = 5  #: number of batches of timed calls; the first one warms up
 
 
 def network(comm: Comm) -> dict[str, float]:
@@ -24,9 +24,9 @@ def network(comm: Comm) -> dict[str, float]:
 
     Returns
     -------
-    reduction_seconds : of one number over all ranks, s
-    message_seconds : of eight bytes to a neighbour, s
-    seconds_per_byte : of long messages to a neighbour, s
+    reduction_seconds : time to reduce one number over all ranks, s
+    message_seconds : time to send eight bytes to a neighbour, s
+    seconds_per_byte : time per byte of long messages to a neighbour, s
 
     """
     right, left = (comm.rank + 1) % comm.size, (comm.rank - 1) % comm.size

@@ -54,9 +54,9 @@ class Ranks:
     """The processes of one solve, with timers and counters of this process."""
 
     comm: Comm
-    #: s, spent on each of the `PARTS`, which do not overlap
+    #: time spent on each of the `PARTS`, which do not overlap, s
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(PARTS, 0.0))
-    #: number of reductions; of messages to single ranks, and of their bytes
+    #: numbers of reductions, of messages to single ranks, and of their bytes
     counts: dict[str, int] = field(
         default_factory=lambda: {"reductions": 0, "messages": 0, "bytes": 0}
     )

@@ -14,10 +14,11 @@ from mortarbench.harness.environment.environment import digest
 from mortarbench.harness.environment.noise import NoiseFloor
 
 MIN_MEMORY_MIB = 2048
-MAX_QUIET_LOAD = 0.5  #: cores that other programs may keep busy, one-minute average
+MAX_QUIET_LOAD = 0.5  #: largest load of other programs: one-minute average, in cores
 MAX_CLOCK_STEP_SECONDS = 1e-6
-MAX_PAIR_SCATTER = 0.10  #: difference of two equal measurements, not exceeded by 95 %
-MAX_RATIO_BIAS = 0.01  #: deviation of an A/A ratio from 1 that is neglected
+#: difference that 95 % of the pairs of equal measurements do not exceed
+MAX_PAIR_SCATTER = 0.10
+MAX_RATIO_BIAS = 0.01  #: deviation of an A/A ratio from 1 that is ignored
 ONE_THREAD = (
     "export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 "
     "RAYON_NUM_THREADS=1"

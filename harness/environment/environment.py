@@ -52,7 +52,8 @@ CHOLMOD_OWNERS = (
 
 VOLATILE = ("now",)  #: parts of an environment that its digest excludes
 
-_CODE = ("harness", "problems", "solvers", "reports", "mortarbench")  #: in a checkout
+#: folders of the code in a checkout
+_CODE = ("harness", "problems", "solvers", "reports", "mortarbench")
 _CPU = Path("/sys/devices/system/cpu")
 _CGROUP = Path("/sys/fs/cgroup")
 

@@ -30,7 +30,7 @@ MAX_FILE_MIB = (
 )
 MAX_FOLDER_MIB = 256  #: sum of all copies in a result folder
 
-_DIGITS = 12  #: of the SHA-256 of a file, as in the parameters of cases
+_DIGITS = 12  #: digits of the SHA-256 of a file, as in the parameters of cases
 _COPY = re.compile(rf"([0-9a-f]{{{_DIGITS}}})((?:\.[a-z0-9]{{1,8}}){{1,2}})")
 
 
@@ -61,9 +61,9 @@ def is_copy(name: str) -> bool:
 class _Entry(NamedTuple):
     """An entry of the list of files."""
 
-    path: str  #: in the names of cases
+    path: str  #: path in the names of cases
     sha256: str
-    size: int  #: bytes
+    size: int  #: size of the content, bytes
 
 
 class Copies:
@@ -329,7 +329,7 @@ def _names(folder: Path) -> list[str]:
 
 
 def _entries(folder: Path) -> list[_Entry]:
-    """Read the list of a folder of copies; empty without a list.
+    """Read the list of copies in a folder; the result is empty if there is no list.
 
     Raises
     ------

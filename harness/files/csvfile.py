@@ -13,7 +13,8 @@ from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from io import StringIO
 
-_FORMULA = frozenset("=+-@＝＋－＠")  #: also full-width, for East Asian spreadsheets
+#: first characters of formulas; East Asian spreadsheets also use full-width ones
+_FORMULA = frozenset("=+-@＝＋－＠")
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})  #: categories that programs skip
 _CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})
 #: direction controls; other characters of Cf join letters and symbols
@@ -36,7 +37,7 @@ def _cell(value: object) -> object:
 
 @lru_cache(1 << 16)
 def inert(text: str) -> str:
-    """Prefix a text that a spreadsheet would evaluate with an apostrophe.
+    """Put an apostrophe before a text that a spreadsheet would evaluate.
 
     Characters that programs may skip before the sign are skipped here as well.
     """

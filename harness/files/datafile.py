@@ -24,10 +24,10 @@ from mortarbench.harness.files import reading
 
 VARIABLE = "MORTARBENCH_MOST_MIB"
 DEFAULT_MIB = 2048
-MIB = 2**20  #: bytes
+MIB = 2**20  #: number of bytes
 
-_PIECE_BYTES = 2**20  #: expanded at a time
-_PARSER_BYTES = 256 * MIB  #: allowed for the code of a parser itself
+_PIECE_BYTES = 2**20  #: number of bytes that are expanded at a time
+_PARSER_BYTES = 256 * MIB  #: memory that is allowed for the code of a parser itself
 
 
 def max_bytes() -> int:
@@ -130,9 +130,9 @@ def content(path: Path, expected: str, *, copies: int = 1) -> bytes:
 
 @contextmanager
 def parsing(path: Path, wrong: str, room: int) -> Iterator[None]:
-    """Attribute all exceptions of a library, which parses a file, to the file.
+    """Attribute all exceptions of a library that parses a file to this file.
 
-    wrong : the message
+    wrong : message of the error
     room : bytes of memory that the library may use beside 256 MiB, as a limit of the
         address space
 

@@ -24,7 +24,7 @@ _OLD = ("suite.tmp", "environment.tmp")  #: names in older versions
 
 #: Codes of an OSError for a full disk, an exhausted quota or a file size limit.
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-_PROBE_BYTES = 2**16  #: written to find out whether a disk is full
+_PROBE_BYTES = 2**16  #: data written to test whether a disk is full
 _MIB = 2**20
 
 
@@ -32,8 +32,9 @@ _MIB = 2**20
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """Open a new file that replaces `path` at the end of the block.
 
-    It is flushed to the disk before. After a crash, `path` is either the old file or
-    the complete new one. Processes that have opened or mapped the old file keep it.
+    The new file is first flushed to the disk. After a crash, `path` is either the old
+    file or the complete new one. Processes that have opened or mapped the old file keep
+    it.
     """
     new = path.with_name(_UNFINISHED.replace("*", token_hex(8)))
     try:
@@ -85,7 +86,7 @@ def remove_unfinished(
 def report_full_disk(folder: Path) -> Iterator[None]:
     """Convert an OSError for a full disk, raised in the block, to an InputError.
 
-    folder : that the block writes to
+    folder : folder that the block writes to
 
     Raises
     ------
@@ -104,7 +105,7 @@ def report_full_disk(folder: Path) -> Iterator[None]:
 def refuse_full_disk(folder: Path, failure: str) -> None:
     """Raise if a failure was caused by a full disk.
 
-    folder : that was written to
+    folder : folder that was written to
     failure : message of the failure
 
     Raises

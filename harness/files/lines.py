@@ -18,8 +18,8 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.files.datafile import opened
 from mortarbench.harness.files.durable import replace_file, sync_folder
 
-MAX_LINE_BYTES = 2**24
-_CHUNK_BYTES = 2**16  #: read at a time
+MAX_LINE_BYTES = 2**24  #: bounds the memory to read one line of a foreign file
+_CHUNK_BYTES = 2**16  #: number of bytes that are read at a time
 
 
 def read_lines(path: Path, expected: str) -> Iterator[bytes]:
@@ -140,7 +140,7 @@ class Lines:
         if not is_same:
             raise InputError(
                 f"{self._path} was changed by another program while the run wrote it; "
-                "the same command continues with what it holds now"
+                "the same command continues with its present content"
             )
         self._times = _times(
             held

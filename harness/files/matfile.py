@@ -43,9 +43,9 @@ _TYPES = {
 _TEXT, _SPARSE = 4, 5  #: classes of variables
 _CLASSES = frozenset(
     (_TEXT, _SPARSE, *range(6, 16))
-)  #: and numeric arrays of every type
+)  #: texts, sparse matrices and numeric arrays of every type
 _COMPLEX = 0x800  #: flag of a variable
-_COPIES = 8  #: of the content that a parser may store
+_COPIES = 8  #: number of copies of the content that a parser may store
 
 _VECTORS = ("q", "h", "b", "lb", "ub")
 _MATRICES = ("P", "G", "A")
@@ -110,7 +110,7 @@ def read_mat(path: Path) -> dict[str, Any]:
 class _Element(NamedTuple):
     """An element of a version 5 file, after the header."""
 
-    order: str  #: of bytes, in the notation of struct and NumPy
+    order: str  #: byte order, in the notation of struct and NumPy
     kind: int
     body: bytes
 

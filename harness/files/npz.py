@@ -24,13 +24,14 @@ from mortarbench.harness.files.datafile import check_size, opened
 from mortarbench.harness.files.durable import replacing
 
 EXPECTED = "an npz file"
-ALIGNMENT = 64
+ALIGNMENT = 64  #: bytes of a cache line, so that alignment does not affect times
 _LOCAL_HEADER = 30  #: bytes before name and extra field of a member
 _PADDING = b"\xfe\xca"  #: id of an extra field that readers skip
-_ENCRYPTED = 1  #: among the flags of a member
+_ENCRYPTED = 1  #: flag of an encrypted member
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_KINDS = "biufcSU"  #: kinds of dtypes: no objects, which are pickles, and no structures
-_PIECE_BYTES = 2**20  #: decompressed at a time
+#: kinds of dtypes that are read: neither objects, which are pickles, nor structures
+_KINDS = "biufcSU"
+_PIECE_BYTES = 2**20  #: number of bytes that are decompressed at a time
 
 
 class _PickledError(ValueError):

@@ -57,7 +57,7 @@ def save_parquet(path: Path, qp: QP, meta: Mapping[str, Any]) -> None:
         When a matrix is too large for a dense format, or the file cannot be written.
 
     """
-    import pyarrow as pa  # late: slow to import, and workers need neither
+    import pyarrow as pa  # loads slowly, and workers do not need it
     import pyarrow.parquet as pq
 
     n = qp.q.size
@@ -132,7 +132,7 @@ def load_parquet(path: Path) -> tuple[QP, dict[str, Any]]:
 def _columns(path: Path) -> tuple[dict[str, Vector | None], str]:
     """Read the columns and the text of `meta` in a process of its own.
 
-    `harness.files.parquetreader` has the reason.
+    The reason is stated in `harness.files.parquetreader`.
 
     Raises
     ------

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-CPU_SECONDS = 60  #: after which the kernel kills this process
+CPU_SECONDS = 60  #: CPU time after which the kernel kills this process
 SECONDS = 600  #: the same for elapsed time: a file may block
 ROOM = 2**29  #: bytes of address space beside four times the declared size
 

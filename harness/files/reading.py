@@ -26,7 +26,7 @@ from mortarbench.harness.files.durable import FULL
 VARIABLE = "MORTARBENCH_TEXT_MIB"  #: size of the largest text file that is read
 MAX_TOML_MIB = 1.0  #: default of the variable for TOML, which takes 1 s to parse
 MAX_JSON_MIB = 64.0  #: default of the variable for other files
-MAX_LEVELS = 50  #: of nesting
+MAX_LEVELS = 50  #: largest depth of nesting
 
 #: A TOML key with more parts than allowed levels. It has to be found before parsing,
 #: since the time of the parser grows like the square of the number of parts.

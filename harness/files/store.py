@@ -32,7 +32,7 @@ _NODAL = "nodal_"
 _SIDE = "side_{}_"  #: prefix of the arrays of a contact, with its number
 _ALONG = ("nodes", "length", "force", "pressure", "gap")
 #: optional arrays of a contact
-_SOME = ("push", "shear", "friction", "exact")
+_SOME = ("push", "shear", "friction", "friction_force", "exact")
 _HISTORY = "history_"
 
 

@@ -30,7 +30,7 @@ class StoredCase:
     """A built case in the folder."""
 
     qp: Path  #: file that contains the QP, see `harness.files.qpfile`
-    digest: str  #: of the content of that file
+    digest: str  #: digest of the content of that file
     meta: Mapping[str, Any]  #: meta data that the case worker reported
 
 

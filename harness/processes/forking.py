@@ -38,7 +38,7 @@ def is_safe() -> bool:
 
 
 class Fork:
-    """Sub-reaper above a forked worker, with the used part of `subprocess.Popen`."""
+    """Sub-reaper above a forked worker, with the methods of `Popen` that we use."""
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid

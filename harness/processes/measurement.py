@@ -43,7 +43,7 @@ from mortarbench.harness.verify.verdicts import (
     quantities_of,
 )
 
-#: CPU time of the harness between "start" and "timed", beside the worker's clock
+#: CPU time of the harness between "start" and "timed" that the worker's clock excludes
 HARNESS_SECONDS = 0.005
 #: the same per repeat; 0.12 ms were seen on a busy machine, and no solver is to be
 #: suspected because of it
@@ -51,8 +51,8 @@ HARNESS_SECONDS_PER_REPEAT = 3e-4
 #: A repeat is suspected of reusing results if it is faster than the first solve by this
 #: factor and also by the time below: the ratio of two tiny times alone proves nothing.
 MIN_SUSPICIOUS_SPEEDUP = 20.0
-MIN_GAIN_SECONDS = 1e-3  #: between the solves of one measurement
-MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: between two measurements
+MIN_GAIN_SECONDS = 1e-3  #: smallest gain between the solves of one measurement
+MIN_GAIN_BETWEEN_SECONDS = 5e-3  #: smallest gain between two measurements
 
 _NO_POINT = dict.fromkeys(("objective", *Residuals._fields), nan)
 _SCRATCH, _LOCK = "mortarbench-scratch-", "in-use"
@@ -351,7 +351,8 @@ def scratch_folder() -> Iterator[Path]:
     """Create a folder for temporary files, removed at the end of the context.
 
     Folders that killed processes left behind are removed first. They are recognised by
-    the lock in them: its owner holds it, and the kernel releases it with the process.
+    a free lock: the owner of a folder holds its lock, which the kernel releases when
+    the owner ends.
     """
     for stale in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):

@@ -31,9 +31,9 @@ from typing import Any, TextIO
 
 from mortarbench.harness.record import finite
 
-MAX_REPLY_BYTES = 2**22
-MAX_EXCERPT_CHARACTERS = 200  #: of a foreign reply, quoted in a message
-MAX_FAULT_CHARACTERS = 2000  #: of the message of a fault
+MAX_REPLY_BYTES = 2**22  #: bounds the memory to read one reply of foreign code
+MAX_EXCERPT_CHARACTERS = 200  #: length of a foreign reply that is quoted in a message
+MAX_FAULT_CHARACTERS = 2000  #: length of the message of a fault
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ from mortarbench.harness.verify.measure import memory_mib
 from mortarbench.harness.verify.verdicts import evaluated_by_ranks
 
 _ORDER = 7  #: MPI tag of the orders that rank 0 sends to the others
-_IDLE_SECONDS = 2e-4  #: between two probes for an order
+_IDLE_SECONDS = 2e-4  #: time between two probes for an order
 
 
 def launch(ranks: int, command: Sequence[str]) -> int:
@@ -196,11 +196,11 @@ def _describe_exit(status: int) -> str:
 
 
 def this_rank() -> Ranks:
-    """Join the other ranks, on a CPU of its own for each if there are enough.
+    """Join the other ranks; each rank has its own CPU if there are enough.
 
     The speed of communication is measured here, before any solve is timed.
     """
-    from mpi4py import MPI  # late: runs without ranks do not need it installed
+    from mpi4py import MPI  # only runs with ranks need it
 
     cpus = sorted(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {cpus[MPI.COMM_WORLD.rank % len(cpus)]})
@@ -281,8 +281,8 @@ def _wait_for_order(ranks: Ranks, seconds: float) -> bool:
 class RankCosts(NamedTuple):
     """Cost of a solve on several ranks: (mean, largest); empty tables on one rank."""
 
-    seconds: Mapping[str, tuple[float, float]] = {}  #: by phase
-    counts: Mapping[str, tuple[float, float]] = {}  #: by operation
+    seconds: Mapping[str, tuple[float, float]] = {}  #: times by phase
+    counts: Mapping[str, tuple[float, float]] = {}  #: counts by operation
     network: Mapping[str, tuple[float, float]] = {}  #: speed measured at the start
 
     def fields(self) -> dict[str, Any]:

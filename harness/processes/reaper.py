@@ -40,7 +40,8 @@ TYPE_CHECKING = False  # importing typing (or json) would cost each worker 10 ms
 if TYPE_CHECKING:
     from typing import NoReturn
 
-SEGMENTS = "/proc/sysvipc/shm"  #: see proc(5)
+#: list of the System V segments of shared memory, see proc(5)
+SEGMENTS = "/proc/sysvipc/shm"
 END_SECONDS = 5.0  #: longest wait for processes that were sent SIGKILL
 
 _PR_SET_CHILD_SUBREAPER = 36  # prctl(2)
@@ -126,7 +127,7 @@ def kill_descendants(root: int) -> None:
 
 
 def _send(process: int, number: int, root: int) -> None:
-    """Send a signal to a process of the tree, but to no later one of the same number.
+    """Send a signal to a process of the tree, but never to a later one with its number.
 
     A pidfd refers to one process for ever. If the number belongs to the tree after the
     pidfd was opened, the pidfd refers to that process.
@@ -266,7 +267,7 @@ def _execute(command: list[str]) -> NoReturn:
 
 
 def _end_as(status: int | None) -> NoReturn:
-    """End with the exit code or signal of a wait status; with 0 if the parent asked."""
+    """End with the exit code or signal of a wait status; with 0 if asked to end."""
     if status is None or os.WIFEXITED(status):
         os._exit(0 if status is None else os.WEXITSTATUS(status))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of this process

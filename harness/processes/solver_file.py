@@ -34,7 +34,7 @@ def write_solver(path: Path, solver: Solver) -> None:
         If it refers to something that cannot be copied, such as an open file.
 
     """
-    import cloudpickle  # late: solvers of the registry are resolved by name instead
+    import cloudpickle  # not needed for solvers of the registry
 
     kind = type(solver).__name__
     with ExitStack() as stack:

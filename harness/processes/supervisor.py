@@ -1,4 +1,4 @@
-"""Parent's side of a worker process: requests, limits and diagnosis of its exit.
+"""Supervision of a worker process by its parent: requests, limits, diagnosis of exits.
 
 Only SIGKILL to all processes of a worker stops every solver: C code ignores alarms, and
 some solvers ignore SIGTERM. A sub-reaper (`harness.processes.reaper`) above each worker
@@ -49,21 +49,22 @@ from mortarbench.harness.processes.protocol import (
 from mortarbench.harness.record import Verdict
 from mortarbench.harness.verify.measure import one_line
 
-POLL_SECONDS = 0.02
-START_SECONDS = 120.0  #: limit of imports, and of loading a QP
-WARM_UP_SECONDS = 60.0  #: limit of the warm-up
-POINT_SECONDS = 120.0  #: limit of writing the point of an answer
+POLL_SECONDS = 0.02  #: time between two checks of the memory of a worker
+START_SECONDS = 120.0  #: time limit of imports, and of loading a QP
+WARM_UP_SECONDS = 60.0  #: time limit of the warm-up
+POINT_SECONDS = 120.0  #: time limit of writing the point of an answer
 CLOSE_SECONDS = 1.0  #: time to end after the requests are closed, before SIGKILL
 END_SECONDS = 1.0  #: time for the sub-reaper to end when all below it are dead
-SETTLE_SECONDS = 0.5  #: idle threads of pools spin for less than that after an answer
+SETTLE_SECONDS = 0.5  #: time that idle threads of pools may spin after an answer
 #: CPU time between answer and request, relative to wall time, above which a worker
 #: counts as busy
 MAX_IDLE_CPU_SHARE = 0.5
-MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is neglected
+MIN_BUSY_CPU_SECONDS = 0.01  #: CPU time between answer and request that is ignored
 LOG_BYTES = 2**20  #: size at which the log of a worker is truncated
-MAX_LAST_LINE_CHARACTERS = 300  #: of the last line of the log, quoted in a message
+#: length of the last line of the log that is quoted in a message
+MAX_LAST_LINE_CHARACTERS = 300
 _LOG_TAIL_BYTES = 2**16  #: part of the log that is searched for its last line
-_MIN_FD = 3  #: a pipe must not take the place of a standard stream that is closed
+_MIN_FD = 3  #: a pipe must not get the number of a standard stream that is closed
 #: share of the memory limit above which a failure is attributed to lack of memory
 MEMORY_LIMIT_SHARE = 0.9
 
@@ -172,10 +173,10 @@ class WorkerProcess:
         If the process of an earlier request dies before the solve starts, the request
         is repeated once in a new process: an earlier solve may have damaged it.
 
-        time_limit : s, from the event "start" on, which excludes imports, warm-up and
-            loading the QP. Ranks that emit the QP themselves have the same time for
-            that, and to evaluate the answer, in that case `POINT_SECONDS` at least
-        memory_limit : MiB, of all processes of the worker together
+        time_limit : seconds from the event "start" on, which excludes imports, warm-up
+            and loading of the QP. Ranks have the same limit to assemble the QP, and the
+            larger of it and `POINT_SECONDS` to evaluate the answer
+        memory_limit : limit for all processes of the worker together, MiB
         """
         self._peak_mib, self._emitted = 0.0, None
         cpu = max(os.sched_getaffinity(0))
@@ -390,7 +391,7 @@ class WorkerProcess:
     ) -> dict[str, Any]:
         """Wait for an event.
 
-        stage : of a measurement; prefix of the error's message
+        stage : stage of a measurement, the prefix of the error's message
 
         Raises
         ------
@@ -631,7 +632,7 @@ def _pipe() -> tuple[int, int]:
 def _describe_exit(process: int) -> tuple[str, int]:
     """Describe the end of a process; return with it the signal that ended it, or 0.
 
-    process : its pidfd
+    process : pidfd of the process
 
     Raises
     ------
@@ -700,7 +701,7 @@ def out_of_memory(message: str, peak_mib: float | None, limit: float) -> bool:
     wrong result. It shows in their peak memory or, if a single allocation was refused,
     in the message of the library.
 
-    message : of the failure, including the last line of output
+    message : message of the failure, including the last line of output
     limit : MiB
     """
     near = peak_mib is not None and peak_mib >= MEMORY_LIMIT_SHARE * limit

@@ -132,7 +132,7 @@ class _SolverHost:
         """Measure once, or run one check."""
         if "check" in request:
             from mortarbench.harness.conformance.conformance import (
-                run_check,  # late: few requests need it
+                run_check,  # few requests need it
             )
 
             events.start()
@@ -272,8 +272,8 @@ def _one_thread() -> int:
 def _limit_memory(mib: float | None) -> None:
     """Let allocations beyond `mib` more MiB fail; None lifts the limit.
 
-    The parent polls resident memory and kills, which is too late for a single
-    allocation that exceeds the memory of the machine.
+    The parent polls resident memory and kills workers above the limit, which is too
+    late for a single allocation that exceeds the memory of the machine.
     """
     hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
     soft = hard

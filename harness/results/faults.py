@@ -30,9 +30,9 @@ class Fault:
     """A failure of the harness or the machine that prevented a measurement once."""
 
     time: str  #: UTC, ISO 8601
-    run_id: str  #: of the prevented measurement
+    run_id: str  #: run_id of the prevented measurement
     case: str  #: canonical name
-    solver: str  #: its label
+    solver: str  #: label of the solver
     what: str  #: reason, one line
     tried_again: bool  #: True if the same run retried at once, False if it gave up
 

@@ -36,7 +36,8 @@ from mortarbench.harness.suite.suite import Suite, read_stored
 #: everything that a run and its evaluations write; `fresh` deletes these, nothing else
 _FOLDERS = ("journal", "vectors", "cases", "environments", "references", "report")
 _FILES = ("environment.json", "suite.toml")
-_RESULT_FILES = ("validation.json", FAULTS)  #: of `mortarbench validate`, and of faults
+#: file written by `mortarbench validate`, and file of the faults of runs
+_RESULT_FILES = ("validation.json", FAULTS)
 REMEDY = "choose another --out or use --fresh"
 MAX_FOLDER_DEPTH = 30  #: levels accepted in a result folder; runs write three
 _LOCK = ".lock"
@@ -179,7 +180,7 @@ class FolderLock:
     def is_there(self) -> bool:
         """Return True if the path still leads to the locked folder, False if deleted.
 
-        A deleted folder is created again and locked; so is a deleted lock.
+        A deleted folder, or a deleted lock, is created and locked again.
 
         Raises
         ------
@@ -296,7 +297,7 @@ def claim(
 ) -> None:
     """Assign a locked folder to a suite and an environment.
 
-    environment : with its digest under the key ``digest``
+    environment : environment, with its digest under the key ``digest``
     fresh : delete the previous content first; without it, call `refuse_other` before
     """
     if fresh:

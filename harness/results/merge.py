@@ -130,7 +130,8 @@ def _journal(folder: Path) -> Path:
 def _read(source: Path, tell: Callable[[str], None]) -> list[Record]:
     """Read a folder; records of old versions, without a session, get one.
 
-    It is a digest of the environment and the start of its first such measurement.
+    The session is a digest of the environment and of the start of the earliest
+    measurement among these records with that environment.
     """
     records = read_journal(source, tell)
     if not records:

@@ -34,7 +34,8 @@ class StoredRun:
 
     record: Record
     repeats: list[Record]  #: all repeats of its cell, including itself
-    cases: tuple[CaseId, ...]  #: its case; in a sequence, after the earlier steps
+    #: case of the measurement; in a sequence, after the earlier steps
+    cases: tuple[CaseId, ...]
     spec: SolverSpec
     environment: Mapping[str, Any]
     time_limit: float  #: s

@@ -21,7 +21,8 @@ from mortarbench.harness.record import Record
 class Commands:
     """Command lines of the processes of a run, without the two pipes of each."""
 
-    solvers: Mapping[str, list[str]]  #: by label; they run `harness.processes.worker`
+    #: commands by label; they run `harness.processes.worker`
+    solvers: Mapping[str, list[str]]
     case_worker: list[str]  #: runs `harness.processes.case_worker`
     #: True if all code in the solvers' processes is ours; ranks then judge answers
     own_code_only: bool = False
@@ -35,8 +36,8 @@ class WorkUnit:
     #: one turn per solver, in the order of measurement: its records, to be completed,
     #: one for the case or one for each step of the sequence
     turns: tuple[tuple[Record, ...], ...]
-    time_limit: float  #: s per measurement
-    memory_limit: float  #: MiB per measurement
+    time_limit: float  #: time limit of a measurement, s
+    memory_limit: float  #: memory limit of a measurement, MiB
     #: Fields of a small case that a new process builds first, so that the time of its
     #: next build excludes first calls. None: cases of earlier blocks may be reused
     warm_up: Mapping[str, Any] | None = None
@@ -68,14 +69,14 @@ class BuildFailure:
 
     block: WorkUnit
     reason: str  #: one line
-    trace: str = ""  #: of the family's code
+    trace: str = ""  #: traceback of the family's code
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeasurementFault:
     """Outcome of a measurement that the harness or the machine prevented."""
 
-    record: Record  #: of the missing measurement
+    record: Record  #: record of the missing measurement
     reason: str  #: one line
     tried_again: bool  #: True if another `MeasurementFault`, or a `Result`, follows
 

@@ -3,8 +3,8 @@
 Every Dask worker executes one block at a time, with the same supervisor as a run on one
 machine. A task is one turn of a block: one solver, measured on one case or on the steps
 of one sequence. The parent writes the records of a turn before it submits the next one.
-If a worker is lost, the turns that it has not returned are measured by another one, as
-a separate block. Only the parent writes the result folder.
+If a worker is lost, another worker measures the turns that were not returned, as a
+separate block. Only the parent writes the result folder.
 """
 
 from __future__ import annotations
@@ -44,9 +44,10 @@ if TYPE_CHECKING:  # it needs the package distributed
     from mortarbench.harness.running.dask_worker import Delivery
 
 LOCAL = "local"
-CONNECT_SECONDS = 10
-CLUSTER_POLL_SECONDS = 2.0  #: between two checks for workers that joined or were lost
-MAX_LOST_WORKERS = 4  #: a block is given up when it has lost so many workers
+CONNECT_SECONDS = 10  #: time limit of the connection, and to fetch a finished result
+#: time between two checks for workers that joined or were lost
+CLUSTER_POLL_SECONDS = 2.0
+MAX_LOST_WORKERS = 4  #: number of lost workers after which a block is given up
 #: exit code of a process whose main script starts a run at its import
 _UNGUARDED_SCRIPT_CODE = 75
 
@@ -70,11 +71,11 @@ def on_cluster(
 
     Connecting first refuses a wrong address before a result folder is created.
 
-    address : of a scheduler, or "local" to start one with a worker for each CPU of this
-        machine
+    address : address of a scheduler, or "local" to start one with a worker for each CPU
+        of this machine
     plugins : files that exist under the same paths on every node
     operators : makers of operators P by name, except those of `plugins`
-    environment : of this process, with which nodes are compared
+    environment : environment of this process, with which nodes are compared
     keep : stores a node's environment under its digest
     warn : receives messages to the user, one line each
 
@@ -199,7 +200,7 @@ class _Cluster:
     """
 
     client: Any
-    name: str  #: of the plug-in of this run
+    name: str  #: name of the plug-in of this run
     nodes: Nodes
     address: str
     warn: Callable[[str], None]
@@ -388,11 +389,11 @@ def _refuse_unguarded_script() -> None:
 
 @contextmanager
 def _delay_interrupt() -> Iterator[None]:
-    """Shield processes started in this context from Ctrl-C, and delay it until the end.
+    """Shield processes started in this context from Ctrl-C, delayed to its end.
 
-    A terminal sends SIGINT to all processes of its group, and each of Dask's would
-    print a traceback. They inherit the signal mask of this thread, and end with the
-    cluster, which this process closes. A second Ctrl-C is not delayed.
+    A terminal sends SIGINT to all processes of its group, and each Dask process would
+    print a traceback. Dask processes inherit the signal mask of this thread, and end
+    with the cluster, which this process closes. A second Ctrl-C is not delayed.
     """
     if current_thread() is not main_thread():  # only the main thread is interrupted
         yield

@@ -38,7 +38,7 @@ class Delivery:
 
     outcomes: list[Outcome]
     node: str  #: host name
-    digest: str  #: of the environment
+    digest: str  #: digest of the environment
     environment: dict[str, Any]
 
 
@@ -46,7 +46,8 @@ class Delivery:
 class ExecutorPlugin(WorkerPlugin):
     """Executor in every Dask worker, including workers that join later.
 
-    commands : of the parent; its Python is replaced by that of the node
+    commands : commands of the parent, in which its Python is replaced by that of the
+        node
     plugins : files that must exist under the same paths on the node
     operators : makers of operators P by name, except those of `plugins`
     sharing : largest number of Dask workers on one machine. Several disturb each other,
@@ -74,8 +75,8 @@ class ExecutorPlugin(WorkerPlugin):
     def teardown(self, worker: Worker | None = None) -> None:
         """End the processes of the executor, at the latest after a current measurement.
 
-        Dask cannot stop a block that is being executed. While one is, its thread holds
-        the lock and calls this method when it is done.
+        Dask cannot stop a block that is being executed. The thread that executes it
+        holds the lock and calls this method when the block is done.
         """
         self._ended = True
         if not self._busy.acquire(blocking=False):

@@ -9,7 +9,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from scipy.special import stdtrit
 
-COVERAGE = 0.95  #: of the intervals
+COVERAGE = 0.95  #: coverage of the intervals
 
 #: session and repeat; solvers that share it, for one case and tolerance, were measured
 #: next to each other
@@ -66,7 +66,7 @@ def unpaired_ratio(
     in the interval. Return None for fewer than two values in either sample.
 
     a, b : seconds
-    coverage : of the interval
+    coverage : coverage of the interval
 
     References
     ----------

@@ -30,12 +30,13 @@ Cell = tuple[str, str, float]  #: mode, case and tolerance
 
 @dataclass(eq=False, kw_only=True)
 class Schedule:
-    """Blocks of a suite that remain to be measured, given those in its journal."""
+    """Blocks of a suite that are not in the journal and remain to be measured."""
 
     suite: Suite
-    options: Mapping[str, Mapping[str, Any]]  #: of each solver, defaults resolved
-    environment: str  #: digest
-    session: str = ""  #: of the run, see `harness.record.Record`
+    #: options of each solver, defaults resolved
+    options: Mapping[str, Mapping[str, Any]]
+    environment: str  #: digest of the environment
+    session: str = ""  #: session of the run, see `harness.record.Record`
     progress: Progress
     unbuilt: list[str] = field(default_factory=list)  #: cases that could not be built
     #: records by cell; empty unless the suite sets a precision
@@ -151,7 +152,7 @@ class Schedule:
         return width is None or width <= self.suite.precision
 
     def _block(self, group: Group, tol: float, repeat: int) -> WorkUnit | None:
-        """Return the remaining turns of a block in random order; None without any.
+        """Return the remaining turns of a block in random order; None if none remain.
 
         A sequence is repeated as a whole: a solver carries data from step to step.
         """

@@ -88,7 +88,7 @@ def _parts(
 ) -> dict[str, Any]:
     """Return the arguments of a set, or an empty dict if `arrays` has no such set.
 
-    names : of the arrays not yet assigned to a set; those of this set are removed
+    names : names of the arrays not yet assigned to a set; those of this set are removed
     """
     both = {f"{prefix}_{field.name}": field.name for field in fields(kind)}
     here = names.intersection(both)

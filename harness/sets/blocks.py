@@ -18,7 +18,7 @@ class Blocks:
     Both arrays are copied. Subclasses add the geometry of a kind of sets.
     """
 
-    prefix: ClassVar[str]  #: of the names of arrays in files
+    prefix: ClassVar[str]  #: prefix of the names of arrays in files
     least: ClassVar[int]  #: smallest d
     columns: ClassVar[str]  #: meaning of the d columns, for messages
 
@@ -107,10 +107,9 @@ class Blocks:
         return column[self.index], entry[self.index]
 
 
-def norms(blocks: Vector) -> Vector:
-    """Return the Euclidean norm (k,) of each row of (k, d)."""
-    sizes: Vector = np.linalg.norm(blocks, axis=1)
-    return sizes
+def norms(blocks: NDArray[Any]) -> NDArray[Any]:
+    """Return the Euclidean norm (k,) of each row of (k, d), in the precision of it."""
+    return np.asarray(np.linalg.norm(blocks, axis=1))
 
 
 def _numbers(one: Blocks, name: str) -> NDArray[Any]:

@@ -131,7 +131,8 @@ class Cones(Blocks):
         return Cones(columns, self.slope * normal / tangents[:, 0])
 
     def _terms(self, v: Vector) -> Vector:
-        return self.slope * v[self.index[:, 0]] + norms(v[self.index[:, 1:]])
+        part: Vector = self.slope * v[self.index[:, 0]] + norms(v[self.index[:, 1:]])
+        return part
 
     def _normal(self, v: Vector) -> Vector:
         part: Vector = v[self.index[:, 0]]

@@ -54,13 +54,13 @@ class Discs(Blocks):
         size[self.index] = self.radius[:, None]
         return -size, size
 
-    def project(self, x: Vector) -> Vector:
-        """Shorten the blocks outside their discs."""
+    def project(self, x: NDArray[Any]) -> NDArray[Any]:
+        """Shorten the blocks outside their discs, in the precision of x."""
         sizes = self._norms(x)
         is_outside = sizes > self.radius
-        x = x.copy()
-        factor = self.radius[is_outside] / sizes[is_outside]
-        x[self.index[is_outside]] *= factor[:, None]
+        x, outside = x.copy(), self.index[is_outside]
+        outward = x[outside] / sizes[is_outside, None]
+        x[outside] = self.radius[is_outside, None] * outward
         return x
 
     def limits(self, x: Vector) -> list[Limits]:

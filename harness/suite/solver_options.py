@@ -91,7 +91,7 @@ def options_for(
 ) -> dict[str, Any]:
     """Return the options of one solver, with one value for each.
 
-    name : of the solver in the registry
+    name : name of the solver in the registry
 
     Raises
     ------
@@ -227,7 +227,7 @@ def _text(value: object) -> str:
 def _readings(text: str, kind: Any, default: object) -> Iterator[Any]:
     """Yield the values of type `kind` that a text may stand for.
 
-    default : of the option; "none" is accepted only if it is None
+    default : default of the option; "none" is accepted only if it is None
     """
     if text == "none" and default is None:
         yield None

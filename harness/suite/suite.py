@@ -39,7 +39,7 @@ DEFAULTS: Mapping[str, Any] = {
 _SUITE_KEYS = ("name", *DEFAULTS, "solvers", "problems")
 _NAME = re.compile(r"[\w.-]*\w[\w.-]*")
 _SOLVER_KEYS = ("name", "label", "options")
-NULL_SUFFIX = " (A/A)"  #: of the label of a solver's second copy, see `null_arm`
+NULL_SUFFIX = " (A/A)"  #: end of the label of a solver's second copy, see `null_arm`
 
 
 def _between(key: str, value: Any) -> float | None:
@@ -71,7 +71,7 @@ class Group(NamedTuple):
     """Cases of one block: a single case, or the steps of a sequence."""
 
     cases: tuple[CaseId, ...]
-    mode: str  #: of the records
+    mode: str  #: mode of the records
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,12 +81,13 @@ class Suite:
     name: str
     tolerances: tuple[float, ...]
     repeats: int
-    time_limit: float  #: s per measurement
-    memory_limit: float  #: MiB per measurement
-    solvers: tuple[SolverSpec, ...]  #: with distinct labels
+    time_limit: float  #: time limit of a measurement, s
+    memory_limit: float  #: memory limit of a measurement, MiB
+    solvers: tuple[SolverSpec, ...]  #: solvers with distinct labels
     cases: tuple[CaseId, ...]  #: cases that are solved cold, all distinct
     text: str  #: TOML of the suite, with the limits that apply
-    sequences: tuple[tuple[CaseId, ...], ...] = ()  #: steps of each, in order
+    #: sequences of cases, in the order of their steps
+    sequences: tuple[tuple[CaseId, ...], ...] = ()
     #: place in a series of growing sizes, by name of the case
     growing: Mapping[str, Growth] = field(default_factory=dict)
     #: values of θ (`harness.record.Record.tighten`); each sequence is solved with each
@@ -95,7 +96,7 @@ class Suite:
     #: None: `repeats` alone decides
     precision: float | None = None
     max_repeats: int = 30  #: largest number of repeats, if a precision is set
-    budget: float = 600.0  #: s per case and tolerance, if a precision is set
+    budget: float = 600.0  #: seconds per case and tolerance, if a precision is set
     #: tolerance of the verdicts; None: the one that the solver was asked for
     accuracy: float | None = None
     every: frozenset[str] = frozenset()  #: names of all cases, before ``--case``
@@ -192,14 +193,14 @@ def name_in(text: str) -> str:
 def read_stored(path: Path) -> dict[str, Any]:
     """Read the suite of a result folder, and check only the types of its values.
 
-    Names of solvers and families, and ranges, may be those of another version or of a
-    plug-in.
+    Names and ranges are not checked, since the suite may come from another version or
+    need a plug-in.
 
     Raises
     ------
     InputError
-        If a value has another type than in a suite that a run wrote; the message names
-        the file and the value.
+        If a value does not have the type that a run writes; the message names the file
+        and the value.
 
     """
     table = read_toml(path, "the suite of a result folder")

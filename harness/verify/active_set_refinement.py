@@ -2,32 +2,58 @@
 
 For a set A of closed rows, displacement and multipliers solve linear equations,
 
-    K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,   λ_N at a bound elsewhere,
+    K u + B_Aᵀλ_A = f − B_Nᵀλ_N,   B_A u = c_A,   λ_N prescribed elsewhere,
 
-refined with residuals in extended precision. A row is closed, or its multiplier is at
-the lower or the upper bound: an open contact is at the lower one, zero; friction
-sticks, or slips at −g or g. As in a primal-dual active set method, rows are exchanged
-whose multiplier exceeds a bound, or whose motion contradicts the bound of the
-multiplier (a negative gap), until there are none.
+refined with residuals in extended precision. A row is closed, or its multiplier is on
+the boundary of Λ: that of an open contact is zero; friction sticks, or slips with
+‖λ‖ = g. As in a primal-dual active set method, rows are exchanged
+whose multiplier leaves Λ, or whose motion contradicts its multiplier (a negative gap),
+until there are none.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
+from mortarbench.harness.mechanics import (
+    AdmissibleForces,
+    Exact,
+    Extended,
+    Mechanics,
+    Real,
+)
+from mortarbench.harness.sets.blocks import norms
 from mortarbench.harness.verify.admissible import closing
 
-MAX_EXCHANGES = 60  #: of active sets
-REFINEMENTS = 6  #: of a solution, each with a residual in extended precision
+MAX_EXCHANGES = 60  #: largest number of exchanges of active sets
+#: refinements of a solution, each with a residual in extended precision
+REFINEMENTS = 6
 
-States = NDArray[np.int8]  #: (m,) of each row
-LOWER, CLOSED, UPPER = -1, 0, 1  #: multiplier at its lower bound, free, at its upper
+States = NDArray[np.int8]  #: (m,) state of each row
+#: multiplier at its lower bound, free, at its upper bound; that of a friction vector
+#: with several rows is UPPER anywhere on its circle
+LOWER, CLOSED, UPPER = -1, 0, 1
 
 _EPS = Real(np.finfo(Real).eps)
+
+
+class ActiveSet(NamedTuple):
+    """States of the rows, and the multipliers of those that are not closed."""
+
+    states: States
+    limits: Extended  #: (m,) on the boundary of Λ where a row is not closed
+
+    @property
+    def closed(self) -> NDArray[np.bool_]:
+        """Mask (m,) of the closed rows."""
+        return np.asarray(self.states == CLOSED)
+
+    def at_bounds(self, multipliers: Extended) -> Extended:
+        """Replace the multipliers (m,) of rows that are not closed by their limits."""
+        return np.where(self.closed, multipliers, self.limits)
 
 
 def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]:
@@ -48,92 +74,118 @@ def equilibrium(mechanics: Mechanics, force: Extended) -> tuple[Extended, float]
     return u - step, left  # the u that the last residual belongs to
 
 
-def unconstrained_guess(mechanics: Mechanics) -> States:
+def unconstrained_guess(mechanics: Mechanics) -> ActiveSet:
     """Guess the states from the displacement without contact: violated rows close.
 
     If only contact supports a body, all rows are guessed to be closed. Friction rows
     are guessed to stick.
     """
     exact = mechanics.exact
+    none = np.zeros(exact.c.size, dtype=Real)
     if mechanics.inverse.kernel.shape[1]:
-        return np.full(exact.c.size, CLOSED, dtype=np.int8)
+        return ActiveSet(np.full(exact.c.size, CLOSED, dtype=np.int8), none)
     open_ = exact.motion(equilibrium(mechanics, exact.f)[0]) <= 0
-    return np.where(open_ & exact.contact, LOWER, CLOSED).astype(np.int8)
+    states = np.where(open_ & exact.contact, LOWER, CLOSED).astype(np.int8)
+    return ActiveSet(states, none)
 
 
-def suggested(exact: Exact, u: Extended, multipliers: Extended) -> States:
-    """Guess states from a pair: closed where λ + v/D is within its bounds, v = Bu − c.
+def suggested(exact: Exact, u: Extended, multipliers: Extended) -> ActiveSet:
+    """Guess states from a pair: closed where λ + v/D is inside Λ, with v = Bu − c.
 
     D is the compliance of the row; this is the prediction of a primal-dual active set
     method.
     """
-    room = multipliers - exact.lower, exact.upper - multipliers
-    return predicted(room, exact.compliance, exact.motion(u))
+    return predicted(exact.forces, multipliers, exact.compliance, exact.motion(u))
 
 
-def predicted(room: tuple[Any, Any], softness: Any, v: Any) -> States:
-    """Return the states (m,) for λ + v/D: closed within its bounds, at one beyond.
+def predicted(
+    forces: AdmissibleForces, multipliers: Any, softness: Any, v: Any
+) -> ActiveSet:
+    """Return the states (m,) for λ + v/D: closed inside Λ, on its boundary beyond.
 
-    room : (m,) distances of λ from its lower and its upper bound, inf without a bound
+    softness : (m,) D ≥ 0
     """
+    discs = forces.discs
+    states = np.where(multipliers * softness <= -v, LOWER, CLOSED)
+    limits = np.zeros_like(multipliers)
+    soft = softness[discs.index].mean(axis=1, keepdims=True)
+    push = multipliers[discs.index] * soft + v[discs.index]
+    size = norms(push)[:, None]
+    slips = size >= discs.radius[:, None] * soft
+    # without any push, the direction is that of λ
+    limits[discs.index] = np.where(
+        size > 0, push / np.where(size > 0, size, 1) * discs.radius[:, None],
+        multipliers[discs.index],
+    )  # fmt: skip
+    states[discs.index] = np.where(slips, _sides(limits[discs.index]), CLOSED)
+    return ActiveSet(states.astype(np.int8), limits)
 
-    def passed(room: Any, push: Any) -> Any:
-        bounded = np.isfinite(room)
-        return bounded & (np.where(bounded, room, 0) * softness <= push)
 
-    below, above = passed(room[0], -v), passed(room[1], v)
-    return np.where(below, LOWER, np.where(above, UPPER, CLOSED)).astype(np.int8)
-
-
-def at_bounds(exact: Exact, states: States, multipliers: Extended) -> Extended:
-    """Set the multipliers of rows that are not closed to their bounds."""
-    upper = np.where(states == UPPER, exact.upper, multipliers)
-    return np.asarray(np.where(states == LOWER, exact.lower, upper))
+def _sides(limits: Extended) -> States:
+    """Return the states of friction vectors (k, d) that are not closed."""
+    if limits.shape[1] > 1:
+        return np.full(limits.shape, UPPER, dtype=np.int8)
+    return np.where(limits < 0, LOWER, UPPER).astype(np.int8)
 
 
 def exchanged(
-    mechanics: Mechanics, states: States, rounds: int = MAX_EXCHANGES
-) -> tuple[Extended, Extended, States]:
-    """Exchange rows, starting from a guess; return u (n,), multipliers (m,), states.
+    mechanics: Mechanics, active: ActiveSet, rounds: int = MAX_EXCHANGES
+) -> tuple[Extended, Extended, ActiveSet]:
+    """Exchange rows, starting from a guess; return u (n,), multipliers (m,), the set.
 
-    If a set recurs, or after `rounds` sets, the last one is returned. It need not be
-    optimal: a certificate decides.
+    Vectors that slip keep the direction of their limits. If a set recurs, or after
+    `rounds` sets, the last one is returned. It need not be optimal: a certificate
+    decides.
     """
     exact, visited = mechanics.exact, set[bytes]()
     for _ in range(rounds):
-        u, lam = _solved(mechanics, states)
-        v = exact.motion(u)
-        rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
-        force = 1e4 * _EPS * np.abs(lam).max(initial=Real(0))
-        closed = states == CLOSED
-        below = closed & (lam < exact.lower - force)
-        above = closed & (lam > exact.upper + force)
-        closes = ((states == LOWER) & (v > rounding)) | (
-            (states == UPPER) & (v < -rounding)
-        )
-        if not (below | above | closes).any() or states.tobytes() in visited:
+        u, lam = _solved(mechanics, active)
+        following = _next(exact, active, u, lam)
+        if following is None or active.states.tobytes() in visited:
             break
-        visited.add(states.tobytes())
-        states = np.where(below, LOWER, np.where(above, UPPER, states))
-        states = np.where(closes, CLOSED, states).astype(np.int8)
-    within = np.clip(lam, exact.lower, exact.upper)
-    return u, at_bounds(exact, states, within), states
+        visited.add(active.states.tobytes())
+        active = following
+    return u, active.at_bounds(exact.forces.project(lam)), active
 
 
-def _solved(mechanics: Mechanics, states: States) -> tuple[Extended, Extended]:
+def _next(
+    exact: Exact, active: ActiveSet, u: Extended, lam: Extended
+) -> ActiveSet | None:
+    """Exchange the rows of a solution that violate a condition; None without any."""
+    v, discs = exact.motion(u), exact.forces.discs
+    rounding = 1e4 * _EPS * (abs(exact.B) @ np.abs(u) + np.abs(exact.c))
+    force = 1e4 * _EPS * np.abs(lam).max(initial=Real(0))
+    states, limits = active.states.copy(), active.limits.copy()
+    opens = exact.contact & active.closed & (lam < -force)
+    closes = exact.contact & ~active.closed & (v > rounding)
+    sticking = active.closed[discs.index].all(axis=1)
+    along = (active.limits * v)[discs.index].sum(axis=1)
+    reach = discs.radius * norms(rounding[discs.index])
+    slips = sticking & (norms(lam[discs.index]) > discs.radius + force)
+    sticks = ~sticking & (along < -reach)
+    if not (opens.any() or closes.any() or slips.any() or sticks.any()):
+        return None
+    states[opens], states[closes], limits[opens] = LOWER, CLOSED, 0
+    at = discs.index[slips]
+    limits[at] = exact.forces.project(lam)[at]
+    states[at], states[discs.index[sticks]] = _sides(limits[at]), CLOSED
+    return ActiveSet(states, limits)
+
+
+def _solved(mechanics: Mechanics, active: ActiveSet) -> tuple[Extended, Extended]:
     """Solve with equality on the closed rows: u (n,) and multipliers (m,)."""
-    exact, motions = mechanics.exact, mechanics.motions
-    R, active = motions.felt, states == CLOSED
-    close = closing(mechanics, active)
-    lam = at_bounds(exact, states, np.zeros(exact.c.size, dtype=Real))
+    exact, motions, closed = mechanics.exact, mechanics.motions, active.closed
+    R = motions.felt
+    close = closing(mechanics, closed)
+    lam = active.at_bounds(np.zeros(exact.c.size, dtype=Real))
     alpha = np.zeros(R.shape[1], dtype=Real)
     for _ in range(REFINEMENTS):
         force = exact.f - exact.B.T @ lam
         elastic = equilibrium(mechanics, force - motions.KR @ alpha)[0]
         u = elastic + R @ alpha
-        excess = (exact.B @ u - exact.c)[active]
+        excess = (exact.B @ u - exact.c)[closed]
         force = R.T @ force - motions.KR.T @ u
         mu, further = close(excess.astype(np.float64), force.astype(np.float64))
-        lam[active] += mu
+        lam[closed] += mu
         alpha = alpha + further
     return u, lam

@@ -25,6 +25,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from mortarbench.harness.mechanics import (
     MOTION_ROUNDING,
+    AdmissibleForces,
     Exact,
     Extended,
     Mechanics,
@@ -32,10 +33,13 @@ from mortarbench.harness.mechanics import (
     felt_first,
 )
 from mortarbench.harness.qp import Vector
+from mortarbench.harness.sets.blocks import norms
 
-MAX_ROUNDS = 20  #: of extending the set of rows that are closed
-MAX_DENSE_ROWS = 2000  #: rows for which F_VV is formed; beyond, it is applied
-#: Singular values of √W G below this part of the largest belong to floating motions.
+MAX_ROUNDS = 20  #: largest number of extensions of the set of closed rows
+#: number of rows up to which F_VV is formed; for more rows it is only applied
+MAX_DENSE_ROWS = 2000
+#: Singular values of √W G below this fraction of the largest belong to floating
+#: motions.
 SUPPORT_THRESHOLD = 1e-5
 #: Largest load along a floating or free motion that counts as rounding, relative to the
 #: sum of its absolute terms.
@@ -50,7 +54,7 @@ class UncertifiableError(Exception):
 def admissible(
     mechanics: Mechanics, u: Extended, closed: NDArray[np.bool_]
 ) -> Extended | None:
-    """Return û near u with Bû ≤ c, and equality on the rows `closed`; None if none.
+    """Return û near u with Bû ≤ c and equality on the rows `closed`, or None.
 
     û = u − K⁺B_Vᵀμ + Rα with F_VV μ = (Bu − c)_V + B_V Rα is the nearest point in the
     energy norm with equality on the rows V; V is extended until Bû ≤ c.
@@ -155,7 +159,7 @@ def feasible_at_rows(
 
     Parameters
     ----------
-    exact : with the components (w,) that the rows touch as the columns of B
+    exact : exact data whose columns of B are the components (w,) that the rows touch
     R : (w, p) rigid motions that contact feels, which cost no energy
     softness : (w,) 1/Kᵢᵢ, zero at prescribed components
     u : (w,)
@@ -239,9 +243,9 @@ def _compliance(
 ) -> Callable[[Vector], Vector]:
     """Return the solve with F_VV + ρUUᵀ: Cholesky, or CG for very many rows.
 
-    The matrix may be singular up to rounding. It is shifted in its last digits; the
-    next round of the caller corrects the error of that. CG is preconditioned by
-    B_V K B_Vᵀ, the lumped preconditioner of FETI.
+    The matrix may be singular up to rounding, so its diagonal is shifted in the last
+    digits; the next round of the caller corrects the resulting error. CG is
+    preconditioned by B_V K B_Vᵀ, the lumped preconditioner of FETI.
     """
     v, inverse = B_V.shape[0], mechanics.inverse
     if v <= MAX_DENSE_ROWS:
@@ -288,8 +292,7 @@ def balanced(mechanics: Mechanics, multipliers: Extended, u: Extended) -> Extend
         motions.felt.T @ f,
         motions.largest.T @ np.abs(f),
         motions.KR.T @ u,
-        exact.lower,
-        exact.upper,
+        exact.forces,
     ).near(multipliers)
 
 
@@ -299,7 +302,8 @@ def is_driven(along: Extended, terms: Extended, most: Extended) -> bool:
     Parameters
     ----------
     along, terms : (q,) load along each motion, and the sum of its absolute terms
-    most : (q,) that sum with the largest entry of the motion in place of each entry
+    most : (q,) the same sum, with every entry of the motion replaced by its largest
+        entry
 
     """
     return bool((np.abs(along) > MOTION_ROUNDING * terms + LOAD_ROUNDING * most).any())
@@ -317,7 +321,7 @@ def driven(pushed: Extended, names: Sequence[str]) -> str:
     return (
         f"nothing balances the load of {which} "
         f"{directions[most % 3] if per_body == 3 else 'along a rigid motion'}: "
-        "contact does not feel that motion, and no support holds it"
+        "contact does not resist that motion, and no support holds it"
     )
 
 
@@ -352,18 +356,16 @@ class Balance(NamedTuple):
     load: Extended  #: (p,)  Rᵀf
     load_terms: Extended  #: (p,) sums of its absolute terms
     bent: Extended  #: (p,)  (KR)ᵀu
-    lower: Extended  #: (m,) of λ
-    upper: Extended  #: (m,)
+    forces: AdmissibleForces  #: Λ
 
     def near(self, multipliers: Extended) -> Extended:
         """Return the λ̂ nearest to `multipliers` that satisfies the equations.
 
-        λ̂ is within its bounds, λ̂ ≥ 0 of contact and |λ̂| ≤ g of friction, and minimises
-        ½Σ(λ̂ᵢ − λᵢ)²/wᵢ, with the distance of λᵢ from its bounds for the weight wᵢ (wᵢ ≈
-        λᵢ of contact): corrections must not act across wide gaps or against slip, where
-        they would do work. Along motions that λ does not support
-        (`supported_and_floating`), the load has to vanish up to its rounding; otherwise
-        all rows contribute, in the last attempt with equal weights.
+        λ̂ ∈ Λ minimises ½Σ(λ̂ᵢ − λᵢ)²/wᵢ. The weight wᵢ is the distance of λᵢ from the
+        boundary of Λ (for contact, wᵢ ≈ λᵢ), because corrections must not act across
+        wide gaps or against slip, where they would do work. Along motions that λ does
+        not support (`supported_and_floating`), the load has to vanish up to its
+        rounding; otherwise all rows contribute, in the last attempt with equal weights.
 
         Raises
         ------
@@ -373,14 +375,14 @@ class Balance(NamedTuple):
         """
         if not self.G.shape[1]:
             return multipliers
-        w = relative(np.minimum(multipliers - self.lower, self.upper - multipliers))
+        w = relative(self.forces.interior(multipliers))
         for shares in (w, w + 1e-6, np.ones_like(w)):
             if (balanced := self._solved(multipliers, shares)) is not None:
                 return balanced
         raise UncertifiableError(
             "contact would have to pull to balance the load: some body is driven away "
             "from all that touches it, and no support holds it"
-            if np.isinf(self.upper).all()
+            if self.forces.contact.all()
             else "contact would have to pull, or friction to exceed its bound, to "
             "balance the load: some body is driven away, or along, and no support "
             "holds it"
@@ -389,28 +391,18 @@ class Balance(NamedTuple):
     def _solved(self, multipliers: Extended, w: Extended) -> Extended | None:
         """Solve with corrections of the rows with w > 0; None if that is impossible.
 
-        λ̂ is the projection of λ + WGν onto its bounds, where ν minimises a convex
-        function with one variable per motion.
+        λ̂ is the projection of λ + WGν on Λ, where ν minimises a convex function with
+        one variable per motion.
         """
         supported, floating = supported_and_floating(self.G, w)
-        on = w > 0
         basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
-
-        def all_rows(lam: Extended) -> Extended:
-            whole = multipliers.copy()
-            whole[on] = lam
-            return whole
-
-        load = self.load - self.bent - self.G[~on].T @ multipliers[~on]
-        corrected = _newton(
-            multipliers[on], w[on], self.G[on] @ basis,
-            np.asarray(basis.T @ load, dtype=Real),
-            (self.lower[on], self.upper[on]),
-            lambda lam: np.abs(basis).T @ self._terms(all_rows(lam)),
+        lam = _newton(
+            self.forces, multipliers, w, self.G @ basis,
+            np.asarray(basis.T @ (self.load - self.bent), dtype=Real),
+            lambda lam: np.abs(basis).T @ self._terms(lam),
         )  # fmt: skip
-        if corrected is None:
+        if lam is None:
             return None
-        lam = all_rows(corrected)
         missing = np.abs(floating.T @ (self.load - self.G.T @ lam))
         total = np.abs(floating).T @ self._terms(lam)
         return lam if (missing <= LOAD_ROUNDING * total).all() else None
@@ -426,34 +418,56 @@ def _whitening(M: Extended) -> NDArray[np.float64]:
 
 
 def _newton(
-    multipliers: Extended, w: Extended, G: Extended, load: Extended,
-    bounds: tuple[Extended, Extended], terms: Callable[[Extended], Extended],
+    forces: AdmissibleForces, multipliers: Extended, w: Extended, G: Extended,
+    load: Extended, terms: Callable[[Extended], Extended],
 ) -> Extended | None:  # fmt: skip
-    """Solve the equations of `Balance` for w > 0 and GᵀWG = I; None if impossible.
+    """Solve the equations of `Balance` for GᵀWG = I; None if that is impossible.
 
-    Damped Newton's method for the dual function of `Balance.near`.
+    Damped Newton's method for the dual function of `Balance.near`. Rows with w = 0 keep
+    their multipliers.
     """
+    on = w > 0
 
-    def shifted(nu: Extended) -> tuple[Extended, Any]:
+    def shifted(nu: Extended) -> tuple[Extended, Extended, Any]:
         free = multipliers + w * (G @ nu)
-        lam = np.clip(free, *bounds)
-        return lam, (lam / w) @ (free - 0.5 * lam) - load @ nu
+        lam = np.where(on, forces.project(free), multipliers)
+        inner = (lam[on] / w[on]) @ (free[on] - 0.5 * lam[on])
+        return free, lam, inner + multipliers[~on] @ (G[~on] @ nu) - load @ nu
 
     nu = np.zeros(load.size, dtype=Real)
-    lam, value = shifted(nu)
+    free, lam, value = shifted(nu)
     for _ in range(100):
         missing = load - G.T @ lam
         if (np.abs(missing) <= 64 * _EPS * terms(lam)).all():
             return np.asarray(lam)
-        on = (lam > bounds[0]) & (lam < bounds[1])
-        hessian = (G[on].T @ (w[on, None] * G[on])).astype(np.float64)
+        hessian = _curvature(forces, free, w, G).astype(np.float64)
         # it is singular where all rows of a motion are at their bounds; GᵀWG = I
         hessian += 1e-8 * np.eye(load.size)
         step = np.linalg.solve(hessian, missing.astype(np.float64))
         for _ in range(60):
-            lam, trial = shifted(nu + step)
+            free, lam, trial = shifted(nu + step)
             if trial <= value - 1e-4 * (missing @ step) + 4 * _EPS * abs(value):
                 break
             step = step / 2
         nu, value = nu + step, trial
     return None
+
+
+def _curvature(
+    forces: AdmissibleForces, free: Extended, w: Extended, G: Extended
+) -> Extended:
+    """Return GᵀW Π'(λ) G (p, p) for the projection Π on Λ at free multipliers λ (m,).
+
+    Π' is the identity inside, and (g/‖λ‖)(I − nnᵀ) with n = λ/‖λ‖ outside a disc.
+    """
+    discs = forces.discs
+    at, size = free[discs.index], norms(free[discs.index])
+    outside = size > discs.radius
+    inside = np.asarray(free > 0)
+    inside[discs.index] = ~outside[:, None]
+    total = G[inside].T @ (w[inside, None] * G[inside])
+    normal = at[outside] / size[outside, None]
+    rows = G[discs.index[outside]]  # (k, d, p)
+    across = rows - normal[..., None] * (normal[:, None] @ rows)
+    share = w[discs.index[outside, 0]] * discs.radius[outside] / size[outside]
+    return np.asarray(total + np.einsum("k,kdp,kdq->pq", share, across, across))

@@ -13,9 +13,9 @@ solution, bounds both errors:
 
     ‖û − u*‖² + ‖u_λ − u*‖² ≤ 2g,      g = J(û) − D(λ̂)                           (2)
 
-Friction with a bound, Σ g|v| with the slip v = Tu − s, has multipliers |λ̂_t| ≤ g and
-adds nonnegative terms to (1): Σ(g|v*| − λ̂_t v*) and Σ(g|v̂| − λ_t* v̂) on the left, and
-on the right Σ(g|v̂| − λ̂_t v̂), the difference between the frictional work at the bound
+Friction with a bound, Σ g‖v‖ with the slip v = Tu − s, has multipliers ‖λ̂_t‖ ≤ g and
+adds nonnegative terms to (1): Σ(g‖v*‖ − λ̂_tᵀv*) and Σ(g‖v̂‖ − λ_t*ᵀv̂) on the left, and
+on the right Σ(g‖v̂‖ − λ̂_tᵀv̂), the difference between the frictional work at the bound
 and that of λ̂_t. For Coulomb's law the bounds g are fixed: the certificate is for the
 last Tresca problem of the fixed point iteration.
 
@@ -68,8 +68,6 @@ from mortarbench.harness.mechanics import Exact, Extended, Mechanics, Real
 from mortarbench.harness.qp import QP, Vector
 from mortarbench.harness.solution import Solution
 from mortarbench.harness.verify.active_set_refinement import (
-    CLOSED,
-    at_bounds,
     exchanged,
     suggested,
     unconstrained_guess,
@@ -104,11 +102,12 @@ POWER_ITERATION_FACTOR = 2.0
 #: A pair with less work than this times the distance squared counts as sharp: without
 #: any work, the bound √(d² + 2·work) would be 5 % smaller.
 SHARP_WORK = 0.05
-SHARP_BOUND = 1e-7  #: bound below which no other pair is tried.
+SHARP_BOUND = 1e-7  #: bound below which no other pair is tried
 #: Largest bound for which the closed rows are those of the answer: beyond, a solution
 #: for these rows would describe another point.
 MAX_EXCHANGE_BOUND = 1e-3
-EXCHANGE_ROUNDS = 5  #: from the closed rows of the answer to a better pair
+#: rounds of exchanges that lead from the closed rows of the answer to a better pair
+EXCHANGE_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -119,11 +118,11 @@ class Certificate:
     """
 
     u: Extended  #: û (n,)
-    multipliers: Extended  #: λ̂ (m,), of contact, then of friction rows
+    multipliers: Extended  #: λ̂ (m,): multipliers of contact, then of friction rows
     off: Extended  #: û − u_λ (n,); with subdomains, Tû − u_λ (N,)
     norm: float  #: ‖û‖
     distance: float  #: ‖û − u_λ‖, including the error of the solve for u_λ
-    work: float  #: λ̂ᵀ(c − Bû) + Σ(g|v̂| − λ̂_t v̂) ≥ 0
+    work: float  #: λ̂ᵀ(c − Bû) + Σ(g‖v̂‖ − λ̂_tᵀv̂) ≥ 0
     sliding: float  #: the second term of `work`
     rounding: float  #: charge in (4) for KR ≠ 0 and an inexact balance
     stretch: float  #: upper bound of ‖v‖_K/‖Tv‖, with the norm of K_T
@@ -252,7 +251,7 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
         moved=_root(float(moved)), norm=_root(float(norm)),
     )  # fmt: skip
     if not np.isfinite(certificate.error):
-        raise UncertifiableError("the answer is too large for arithmetic")
+        raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
 
 
@@ -319,9 +318,9 @@ def sharpest(
 def _least_norm(split: Undivided) -> float:
     """Bound ‖u*‖ from below by a pair that does not depend on an answer."""
     mechanics = split.mechanics
-    u, lam, states = exchanged(mechanics, unconstrained_guess(mechanics))
+    u, lam, active = exchanged(mechanics, unconstrained_guess(mechanics))
     try:
-        return proof(split, u, u, lam, states == CLOSED).least
+        return proof(split, u, u, lam, active.closed).least
     except UncertifiableError:
         return 0.0
 
@@ -332,9 +331,9 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
     exact, u = mechanics.exact, s.x.astype(Real)
     u[exact.fixed] = 0
     multipliers = mechanics.multipliers(s).astype(Real)
-    multipliers = np.clip(multipliers, exact.lower, exact.upper)
-    states = suggested(exact, u, multipliers)
-    complementary = at_bounds(exact, states, multipliers), states == CLOSED
+    multipliers = exact.forces.project(multipliers)
+    active = suggested(exact, u, multipliers)
+    complementary = active.at_bounds(multipliers), active.closed
     pairs = [(multipliers, np.zeros(multipliers.size, dtype=bool)), complementary]
     bound = np.inf
     for pair in pairs:
@@ -346,8 +345,8 @@ def _certificates(split: Undivided, s: Solution) -> Iterator[Certificate | str]:
             bound = min(bound, outcome.bound)
     exchangeable = mechanics.kernel.shape[1] > 0
     if exchangeable and SHARP_BOUND < bound <= MAX_EXCHANGE_BOUND:
-        v, mu, states = exchanged(mechanics, states, EXCHANGE_ROUNDS)
-        yield _proved(split, s.x, v, mu, states == CLOSED)
+        v, mu, active = exchanged(mechanics, active, EXCHANGE_ROUNDS)
+        yield _proved(split, s.x, v, mu, active.closed)
 
 
 def _at_rest(split: Undivided, s: Solution) -> Certificate | str:
@@ -387,7 +386,7 @@ def proof(
     mechanics = split.mechanics
     feasible = admissible(mechanics, u, closed)
     if feasible is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
+        raise UncertifiableError("the penetration of the answer could not be removed")
     lam = balanced(mechanics, multipliers, feasible)
     return proven(
         split, mechanics.exact, mechanics.motions.G, claimed=claimed, u=feasible,
@@ -410,12 +409,12 @@ def proven(
     Raises
     ------
     UncertifiableError
-        When the answer is too large for arithmetic.
+        When the answer is so large that its energy overflows.
 
     """
     lam, motion = multipliers, exact.motion(at_rows)
-    works = exact.friction_work(at_rows) - lam * motion
-    work = float(works.sum())
+    pressing, sliding = (w.sum() for w in exact.missing_work(lam, motion))
+    work = float(pressing + sliding)
     at_u = split.residual(u)
     near = neighbour(split, at_u.rho + split.pulled(lam))
     drift = without_rigid_motion(split, claimed - u)
@@ -427,7 +426,7 @@ def proven(
             (moved, K_moved), (moved, near.Kd),
         )
     ))  # fmt: skip
-    supported, _ = supported_and_floating(G, relative(exact.interior(lam)))
+    supported, _ = supported_and_floating(G, relative(exact.forces.interior(lam)))
     p, noise = G.shape[1], split.noise(u)
     theta, off = at_u.theta, None
     # a small û, even zero with θ = 0, says nothing about the θ of the error
@@ -445,8 +444,8 @@ def proven(
     rounding = _charge(reach, known, pull, theta, square)
     if np.isinf(rounding) and np.isfinite(square):
         raise UncertifiableError(
-            "the answer is too far off: along rigid motions that large, rounding of "
-            "the stiffness outweighs all that contact holds"
+            "the answer is too far off: along such large rigid motions, the rounding "
+            "of the stiffness outweighs the contact forces"
         )
     gap = 0.5 * (square + rounding)
     around = _root(gap - 0.25 * nearest * nearest) + left / 2
@@ -463,12 +462,12 @@ def proven(
     least = _root(u_u - u_d + 0.25 * d_d) - around
     certificate = Certificate(
         u=u, multipliers=lam, off=near.d, norm=_root(u_u), distance=total, work=work,
-        sliding=float(works[~exact.contact].sum()), rounding=rounding, claimed=in_K,
+        sliding=float(sliding), rounding=rounding, claimed=in_K,
         stretch=stretch, least=least / stretch, moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
     )  # fmt: skip
     if not np.isfinite(certificate.error):
-        raise UncertifiableError("the answer is too large for arithmetic")
+        raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
 
 
@@ -531,9 +530,10 @@ def _reach(
         return _Reach(*np.zeros((3, 0)))
     tiny = np.finfo(float).tiny
     phi, motions = np.sqrt(exact.compliance.astype(np.float64)), G.astype(np.float64)
-    down, up = lam > exact.lower, lam < exact.upper
-    below = np.maximum((lam - exact.lower)[down].astype(np.float64), tiny)
-    above = np.maximum((exact.upper - lam)[up].astype(np.float64), tiny)
+    lower, upper = exact.forces.chords(lam)
+    down, up = lam > lower, lam < upper
+    below = np.maximum((lam - lower)[down].astype(np.float64), tiny)
+    above = np.maximum((upper - lam)[up].astype(np.float64), tiny)
     open_by = np.maximum(np.where(exact.contact, 0, -gaps)[down], 0)
     opened = np.append(np.maximum(gaps, 0)[up], open_by).astype(np.float64)
     soft, pressed = np.append(phi[up], phi[down]), 0.5 / np.append(above, below)
@@ -561,7 +561,7 @@ def _reach(
 
 def _combination(columns: NDArray[np.float64], target: Vector) -> Vector:
     """Return y ≥ 0 with  columns·y = target  (p,); inf if none is found."""
-    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
+    from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
     try:
         y, left = nnls(columns, target)

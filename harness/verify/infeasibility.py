@@ -43,14 +43,18 @@ from mortarbench.harness.verify.rational import (
 #: Least margin of a proof. Redundant rows whose right-hand sides are rounded sums of
 #: thousands of terms contradict one another by less.
 MIN_MARGIN = 1e-12
-#: Multipliers below these parts of the largest, in scaled rows, are dropped in turn:
-#: iterative solvers leave small ones in rows that do not contribute to the proof.
+#: Fractions of the largest multiplier, in scaled rows, below which multipliers are
+#: dropped, tried in turn: iterative solvers return small multipliers for rows that do
+#: not contribute to the proof.
 CUTS = (0.0, 1e-9, 1e-6, 1e-3)
 MAX_CANCELLED = 1e-3  #: largest |cⱼ| that may stand for 0, relative to its terms
-MAX_ENTRIES = 10**6  #: of A and G; nothing is proven for larger QPs
-MAX_PIVOTS = 40  #: of an elimination in rational arithmetic, which takes about 1 s
-MAX_TABLEAU = 1500  #: entries of a rational linear program, which takes seconds
-MAX_ENCLOSURE = 1500  #: rows and columns of an enclosure
+#: largest number of entries of A and G; nothing is proven for larger QPs
+MAX_ENTRIES = 10**6
+#: largest number of pivots of an elimination in rational arithmetic (about 1 s)
+MAX_PIVOTS = 40
+#: largest number of entries of a rational linear program, which takes seconds
+MAX_TABLEAU = 1500
+MAX_ENCLOSURE = 1500  #: largest number of rows and columns of an enclosure
 #: Bounds beyond this multiple of the largest right-hand side are left out of the first
 #: search: costs of such different sizes hide one another.
 MAX_BOUND_RATIO = 1e6
@@ -61,7 +65,7 @@ EPS, TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 class Ray(NamedTuple):
     """Multipliers of the rows [A; G] that may prove infeasibility."""
 
-    rows: NDArray[np.int64]  #: (k,) with a nonzero multiplier
+    rows: NDArray[np.int64]  #: (k,) indices of the rows with a nonzero multiplier
     centre: Any  #: (k,) fractions
     radius: Any  #: (k,) fractions: |ray − centre| is at most this
     vanish: NDArray[np.bool_]  #: (n,) mask of the variables with cⱼ = 0 exactly
@@ -145,7 +149,7 @@ def _corrected(
     is small and of the wrong sign. The ray itself comes first, then one with cⱼ = 0
     wherever it is small, then one with cⱼ = 0 where required only.
 
-    M, w : of the rows that carry a multiplier
+    M, w : entries and multipliers of the rows with a nonzero multiplier
     """
     exact = rational(w)
     zero = 0 * exact
@@ -263,7 +267,7 @@ def _solved(
     M, rhs, lb, ub : scaled; the first m rows are equations, right-hand sides at most 1
     reach : largest bound that takes part
     """
-    from scipy.optimize import linprog  # late: it is slow to import
+    from scipy.optimize import linprog  # imported here because it loads slowly
 
     n, k = M.shape[1], M.shape[0]
     lower, upper = (np.flatnonzero(np.abs(v) <= reach) for v in (lb, ub))

@@ -29,18 +29,20 @@ from mortarbench.harness.verify import scales
 #: like √k·2⁻⁵³, so that this covers k = 256. A row of zero fails without it
 #: (`test_rounding_of_the_product_of_an_operator_is_no_error_of_the_answer`).
 ROUNDING = 8 * float(np.finfo(float).eps)
-#: Share of a scale that three digits leave open, and the most of it that may be called
-#: rounding: beside the 5e-4 that `MAX_CANCELLATION` allows at tol 1e-8, twice this, of
-#: doubt and of rounding, keeps the error of the objective below 1e-3. With 2e-3,
+#: Share of a scale that an answer of three digits leaves undetermined, and the largest
+#: share of it that may be attributed to rounding. `MAX_CANCELLATION` allows an error of
+#: 5e-4 of the objective at tol 1e-8; with this share added twice, for doubt and for
+#: rounding, the error stays below 1e-3. With 2e-3,
 #: `test_multipliers_that_cancel_leave_no_doubt_of_an_exact_point` fails; with 1e-9, the
 #: rounded solutions of `test_what_is_left_when_terms_cancel_is_known_exactly`.
 NEGLIGIBLE = 2e-4
-#: Least scale of energy, relative to a natural energy. A solution with more than this
-#: share of it has an energy of its own; the errors of one that vanishes are divided by
-#: this: `test_rounding_errors_about_a_zero_solution_are_small` fails with 1e-3.
+#: Least scale of energy, relative to a natural energy. The energy of a solution is used
+#: if it exceeds this share; if the solution vanishes, errors are divided by this share
+#: of the natural energy. With 1e-3,
+#: `test_rounding_errors_about_a_zero_solution_are_small` fails.
 LEAST_ENERGY = 1e-2
-#: A point whose energy is less than this times a natural energy has none of its own,
-#: and is compared with the natural energy, if generously. With 1,
+#: With the generous scale, a point whose energy is less than this times a natural
+#: energy is compared with the natural energy instead of its own. With 1,
 #: `test_the_code_of_your_own_solver` fails: answers with residuals of 1.2e-2 and 3.6e-2
 #: are then left to the proven optimum at tol 1e-3, and verified.
 NO_ENERGY = 1e-6
@@ -79,7 +81,8 @@ class Normality(NamedTuple):
     """
 
     natural_map: float  #: ‖x − Π(x − g/L)‖·L/‖q‖
-    normal_distance: float  #: of z_box to the normal cones at x, relative to forces
+    #: distance of z_box to the normal cones at x, relative to forces
+    normal_distance: float
 
 
 class Scales(NamedTuple):
@@ -94,7 +97,7 @@ class _Constraints(NamedTuple):
 
     equalities: Limits
     inequalities: Limits
-    sets: list[Sequence[Limits]]  #: of each set of the QP
+    sets: list[Sequence[Limits]]  #: limits of each set of the QP
 
     def inequalities_and_limits(self) -> Iterator[Limits]:
         """Yield inequality rows, if there are any, then the limits of the sets."""
@@ -111,7 +114,7 @@ class _Terms:
     x: Vector  #: |x|
     constraints: _Constraints
     Px: Vector
-    Px_size: Vector  #: at least Σ|Pᵢⱼ||xⱼ|
+    Px_size: Vector  #: upper bound of Σ|Pᵢⱼ||xⱼ|
     curvature: Vector  #: Pᵢᵢ, zero for an operator without diagonal
     has_diagonal: bool  #: False for an operator without diagonal
     forces: Vector  #: Aᵀy + Gᵀz + z_box
@@ -286,7 +289,7 @@ def _constraints(qp: QP, x: Vector, A_size: Matrix, G_size: Matrix) -> _Constrai
 def violation(qp: QP, x: Vector, X: Vector, own: Vector) -> float:
     """Measure the worst violation of a row or bound as in `kkt_residuals`.
 
-    X : (n,) sizes of the variables from the scale of energy
+    X : (n,) sizes of the variables that follow from the scale of energy
     own : (n,) sizes of the variables themselves (`own_sizes`)
     """
     return _violation(_constraints(qp, x, _abs(qp.A), _abs(qp.G)), X, own)
@@ -311,10 +314,10 @@ def _violation(constraints: _Constraints, X: Vector, own: Vector) -> float:
 
 
 def own_sizes(qp: QP, x: Vector) -> Vector:
-    """Return sizes (n,) of the variables at a solution x (n,), without any energy.
+    """Return sizes (n,) of the variables at x (n,) that do not depend on energies.
 
-    The larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, by which the other variables
-    shift the minimum along j.
+    The size is the larger of 10|xⱼ| and |Σₖ Pⱼₖxₖ|/Pⱼⱼ over k ≠ j, the shift of the
+    minimum along j that the other variables cause.
     """
     shifts = scales.minimum_shifts(qp.P @ x, _curvature(qp)[0], x, dtype=float)
     sizes: Vector = np.maximum(scales.TERMS_FACTOR * np.abs(x), shifts)
@@ -379,7 +382,7 @@ def _energy(qp: QP, t: _Terms, generous: bool) -> float:
     times the objective (`energy_scale` in scales.h). At least `LEAST_ENERGY` times the
     smallest natural energy of a variable (`_natural_energies`).
 
-    generous : ignore cancellation, and pick the median of natural energies, all of it
+    generous : ignore cancellation, and use the median of the natural energies, in full
         where the point has no energy of its own
     """
     terms = _sup(t.energies)
@@ -416,14 +419,16 @@ def _median(values: Vector) -> float:
 def _natural_energies(
     qp: QP, d: Vector, bounds: tuple[Vector, Vector], *, by_length: bool
 ) -> Vector:
-    """List what each variable alone can gain, for those where this is determined.
+    """List the energy that each variable alone can gain, where this is determined.
 
-    Its own energy |½Pᵢᵢxᵢ² + qᵢxᵢ| where it is least within its bounds; where that is
-    at xᵢ = 0, qᵢ²/Pᵢᵢ, or |qᵢ|wᵢ with the feasible width wᵢ, if that is less.
+    This is the energy |½Pᵢᵢxᵢ² + qᵢxᵢ| of the variable at its minimum within the
+    bounds. If the minimum is at xᵢ = 0, it is qᵢ²/Pᵢᵢ or, if that is less, |qᵢ|wᵢ with
+    the feasible width wᵢ.
 
     bounds : lower and upper (n,) each, tightened by rows or not
-    by_length : without curvature at most |qᵢ|lᵢ, and Pᵢᵢlᵢ² where q is rounding, with
-        the least length lᵢ from a row or bound (`_lengths`), 1 without any length
+    by_length : limit energies without curvature to |qᵢ|lᵢ, and use Pᵢᵢlᵢ² where q is
+        rounding; lᵢ is the least length from a row or bound (`_lengths`), or 1 if there
+        is no length
     """
     q, (lb, ub) = np.abs(qp.q), bounds
     gain = np.where(q > 0, np.minimum(_over(q**2, d), q * np.maximum(ub - lb, 0)), 0)

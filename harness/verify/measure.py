@@ -30,11 +30,12 @@ from mortarbench.harness.solution import Solution, Status, usable_history
 
 T = TypeVar("T")
 SAMPLE_SECONDS = 0.005  #: least duration of a sample, nearly; see `measure`
-MAX_INNER_LOOPS = 100  #: repetitions within a sample
-MAX_ASSEMBLED_ROWS = 3000  #: of an operator P that is assembled for a solver
+MAX_INNER_LOOPS = 100  #: largest number of repetitions within a sample
+#: rows of the largest operator P that is assembled for a solver
+MAX_ASSEMBLED_ROWS = 3000
 MAX_COUNT = 2**53  #: beyond, integers are not exact in other programs
-MAX_MESSAGE = 1900  #: characters of a solver's message
-_MAX_NAME = 60  #: characters of a file name in a message
+MAX_MESSAGE = 1900  #: largest length of a solver's message, in characters
+_MAX_NAME = 60  #: largest length of a file name in a message, in characters
 
 _VECTORS = ("x", "y", "z", "z_box")
 
@@ -44,7 +45,7 @@ class Timed(NamedTuple):
 
     solution: Solution  #: always with float vectors of the right shapes
     cost: Measurement
-    first_seconds: float | None = None  #: of the first solve, if it was repeated
+    first_seconds: float | None = None  #: time of the first solve, if it was repeated
 
 
 Prepare = Callable[[QP], Callable[[], Solution]]
@@ -68,12 +69,13 @@ def measure(
     (`harness.needs_matrices`) is assembled if it has at most MAX_ASSEMBLED_ROWS rows,
     which counts as preparation as well.
 
-    prepare : in place of ``solver.prepare``, for a step of a sequence; see
+    prepare : function that replaces ``solver.prepare`` in a step of a sequence; see
         `harness.plugin.Chained`
-    sample_seconds : a faster solve is repeated, including its preparation, until all
-        repetitions take as long. The answer is that of the first one, the times are
-        means of the others, since the first one runs with cold caches. Every repetition
-        gets a QP of new objects, so that a solver cannot recognise it by identity
+    sample_seconds : a faster solve is repeated, including its preparation, until the
+        repetitions together take this time. The answer is that of the first repetition;
+        the times are means of the others, since the first one runs with cold caches.
+        Every repetition gets a QP of new objects, so that a solver cannot recognise it
+        by identity
     starts, ends : called just before the clock starts, and after it has stopped
     """
     preparation = _Preparation(solver, prepare or (lambda qp: solver.prepare(qp, tol)))
@@ -272,8 +274,9 @@ def one_line(message: object) -> str:
 def failure(solver: Solver, e: BaseException) -> str:
     """Describe an exception of a solver in one line, with file name and line number.
 
-    These are of the last call in the file of the solver's class, as in ``KeyError:
-    'rho' (mine.py:24)``. They are omitted if the file is not part of the traceback.
+    File and line are those of the last call in the file of the solver's class, as in
+    ``KeyError: 'rho' (mine.py:24)``. They are omitted if this file is not in the
+    traceback.
     """
     line = one_line(f"{type(e).__name__}: {_text_of(e)}")
     file = _file_of(type(getattr(solver, "__wrapped__", solver)))

@@ -40,21 +40,22 @@ from mortarbench.harness.verify.optimum import EPS
 #: A row takes part if a multiplier that moves the stationarity residual by tol moves
 #: complementarity by at most this many tol: multipliers of farther rows cannot help.
 MAX_COMPLEMENTARITY_RATIO = 100.0
-#: Steps of Newton's method, the first half of them careful (`_Bearing`). With 8, rows
-#: that act on balls alone leave 6e-7
+#: Number of Newton steps, careful ones (`_Bearing`) in the first half. With 8, the
+#: residual is 6e-7 for rows that act on balls alone
 #: (`test_multipliers_over_balls_are_found_whatever_rows_they_share`).
 NEWTON_STEPS = 16
-STEP = 2.0**-26  #: of difference quotients of Π
+STEP = 2.0**-26  #: step of difference quotients of Π
 #: Rest of a dependent column after elimination, relative to the largest column.
 RANK_TOLERANCE = 1e-12
-MAX_ENTRIES = 2**25  #: of the dense least-squares matrix: 256 MiB
+#: largest number of entries of the dense least-squares matrix: 256 MiB
+MAX_ENTRIES = 2**25
 
 
 class _Scales(NamedTuple):
     """Weights of the two sums."""
 
-    w: Vector  #: (n,) of stationarity, 1 over its scale; 0 at fixed variables
-    E: float  #: of complementarity, divides
+    w: Vector  #: (n,) 1 over the scale of stationarity; 0 at fixed variables
+    E: float  #: scale of complementarity
 
     def reach(self) -> float:
         """Return the parameter τ = E/S² of the natural map, with the largest force S.
@@ -134,7 +135,7 @@ class _Bearing:
         np.bool_
     ]  #: (n,) mask of their variables; none if their force is known
     x: Vector  #: (n,)
-    tau: float  #: of the natural map
+    tau: float  #: step τ of the natural map
     force: Vector | None = None  #: (n,); None if the sets can balance any force
     #: apply the derivative to the residual as well: this converges more slowly than
     #: Newton's method, but from farther away
@@ -243,7 +244,7 @@ def _least_squares(
     y is eliminated by an orthonormal basis of the range of w·free, which may have
     dependent columns; these get no multiplier.
     """
-    from scipy.optimize import nnls  # late: slow to import, and not needed by workers
+    from scipy.optimize import nnls  # loads slowly, and workers do not need it
 
     w = scales.w[:, None]
     Q, R, pivots = qr(w * free, mode="economic", pivoting=True)

@@ -52,24 +52,26 @@ from mortarbench.harness.verify.kkt import (
 from mortarbench.harness.verify.rational import rational, solutions
 from mortarbench.harness.verify.scales import MAX_CANCELLATION, TERMS_FACTOR
 
-#: Coupled variables and rows of a QP that is solved once more; the dense reference
-#: solve takes a few times as long as that of a solver.
+#: Largest number of coupled variables and rows of a QP that is solved once more; the
+#: dense reference solve takes a few times as long as the solve of a solver.
 MAX_COUPLED = 400
-#: Variables of such a QP, the others coupled to none: each costs one division.
+#: Largest number of variables of such a QP; those that are not coupled cost one
+#: division each.
 MAX_VARIABLES = 4000
-#: Variables and rows of a QP whose operator P is assembled, by one product a variable.
+#: Largest number of variables and rows of a QP whose operator P is assembled, by one
+#: product per variable.
 MAX_ASSEMBLED = 800
-#: Unknowns of equations that are solved in rational arithmetic, whose cost grows faster
-#: than with the cube.
+#: Largest number of unknowns of equations that are solved in rational arithmetic, whose
+#: cost grows faster than the cube of this number.
 MAX_RATIONAL = 40
-#: Lengths over which the energy changes by all of it: x*ⱼ is assumed no farther from
-#: x̂ⱼ. The quadratic term alone gains E over √2 lengths from its minimum.
-#: `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails with 0, and
-#: with no limit.
+#: Assumed largest distance of x*ⱼ from x̂ⱼ, in units of the length over which the
+#: energy changes by E. The quadratic term alone gains E over √2 lengths from its
+#: minimum. `test_multipliers_that_cancel_prove_nothing_in_any_unit_of_energy` fails
+#: with 0, and with no limit.
 MAX_DISTANCE = 2.0
 EPS = float(np.finfo(float).eps)
-#: KKT residual of a reference point, beyond rounding: x̃ is assumed as close to x̂ as
-#: that. The reference solve refines no further. With 1e-8,
+#: Largest KKT residual of a reference point, beyond rounding, and the assumed distance
+#: of x̃ from x̂. The reference solve does not refine further. With 1e-8,
 #: `test_residuals_refute_no_point_between_nearly_parallel_rows` fails.
 MAX_RESIDUAL = 1e-14
 
@@ -83,7 +85,7 @@ class Optimum:
     doubt: float  #: bound of the error of f*, plus the rounding of an exact answer
     energy: float  #: scale of errors of the objective
     x: Vector  #: (n,) sizes of the variables
-    own: Vector  #: (n,) the same without any energy, see `own_sizes`
+    own: Vector  #: (n,) sizes that do not depend on energies, see `own_sizes`
 
 
 Proves = Callable[[QP], Optimum | None]
@@ -98,8 +100,8 @@ def decided(
 ) -> float | None:
     """Measure a point against the proven optimum; None where residuals decide.
 
-    They decide where they exceed 10·tol even against the most generous scales, where
-    the QP is large, or where nothing could be proven.
+    Residuals decide if they exceed 10·tol even with the most generous scales, if the QP
+    is large, or if nothing could be proven.
 
     prove : returns the optimum, see `proves`
 
@@ -301,7 +303,8 @@ class _ExactPoint(NamedTuple):
 def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
     """Solve the KKT equations of the rows with a multiplier, for three guesses.
 
-    Undetermined unknowns are zero; close to the least multipliers; or as in `s`.
+    The guesses set undetermined unknowns to zero, to values close to the least
+    multipliers, and to the values of `s`.
     """
     lower = (s.z_box < 0) & np.isfinite(qp.lb)
     upper = (s.z_box > 0) & np.isfinite(qp.ub)
@@ -331,7 +334,7 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
 
 
 def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
-    """Mark the KKT conditions that a solution of its equations violates.
+    """Mark the KKT conditions that a solution of the KKT equations violates.
 
     Gx > h (p,), x < lb (n,), x > ub (n,), z < 0 (p,), and z_box (n,) of a bound that is
     absent or not active.
@@ -408,12 +411,12 @@ def _objective(qp: QP, x: Any) -> np.longdouble:
 
 
 def _least_multipliers(qp: QP, s: Solution) -> Solution:
-    """Return the least multipliers, where several balance the gradient.
+    """Return the least multipliers if several balance the gradient.
 
-    For the rows with a multiplier in `s`, those with the least sum of squares of λᵢ
-    times the terms of row i; rows whose sign would change get none. Returns `s` if the
-    remaining rows do not balance the gradient, up to a negligible part, or if there are
-    other sets than bounds.
+    Among all multipliers of the rows that have one in `s`, these minimise the sum of
+    the squares of λᵢ times the terms of row i; a row whose sign would change gets the
+    multiplier zero. Return `s` if the remaining rows do not balance the gradient, up to
+    a negligible part, or if there are other sets than bounds.
     """
     if len(qp.sets) > 1:
         return s

@@ -27,19 +27,17 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.harness.mechanics import (
+    AdmissibleForces,
     Exact,
     Extended,
     Real,
     Substructures,
     cancelling,
     felt_first,
+    friction_discs,
 )
 from mortarbench.harness.qp import Vector
-from mortarbench.harness.verify.active_set_refinement import (
-    CLOSED,
-    at_bounds,
-    suggested,
-)
+from mortarbench.harness.verify.active_set_refinement import suggested
 from mortarbench.harness.verify.admissible import (
     Balance,
     UncertifiableError,
@@ -70,9 +68,10 @@ from mortarbench.harness.verify.substructured import (
 class Contact:
     """Rows of contact, then of friction with a positive bound; replicated."""
 
-    rows: csr_array  #: (m, n) with global components as columns
+    rows: csr_array  #: (m, n) rows, with global components as columns
     c: Vector  #: (m,)
-    bound: Vector  #: (k,) of the last rows
+    bound: Vector  #: (k,) friction bounds of the last rows
+    tangents: int = 1  #: number of friction rows of each tangential vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -83,10 +82,12 @@ class FloatingBodies:
     components of all ranks.
     """
 
-    motions: csr_array  #: (n, k) of each body in turn, regardless of supports
+    motions: (
+        csr_array  #: (n, k) rigid motions of each body in turn, regardless of supports
+    )
     #: (k, r) combinations that do not move prescribed components
     combinations: NDArray[np.float64]
-    names: tuple[str, ...]  #: of these bodies
+    names: tuple[str, ...]  #: names of these bodies
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -94,7 +95,8 @@ class LocalBodies:
     """The part of decomposed bodies that one rank stores."""
 
     ranks: Ranks
-    parts: Substructures  #: its subdomains; T has a column for each of its components
+    #: subdomains of the body; T has a column for each of its components
+    parts: Substructures
     components: NDArray[np.int64]  #: (n,) their global numbers, ascending
     shared: NDArray[np.bool_]  #: (n,) mask of components that other ranks store as well
     coarse: NDArray[np.int64]  #: (r,) global number of each local column of R
@@ -219,7 +221,7 @@ def certify_over_ranks(
     Parameters
     ----------
     claimed : (n,) displacement of the local components
-    multipliers : (m,) of all rows, replicated
+    multipliers : (m,) multipliers of all rows, replicated
 
     Returns
     -------
@@ -240,9 +242,9 @@ def certify_over_ranks(
     at, exact, rigid, softness = split.at, split.exact, split.rigid, split.softness
     u = rigid.without_free(local, u)
     trace = local.reduction.values_at(u, at)
-    raw = np.clip(multipliers.astype(Real), exact.lower, exact.upper)
-    states = suggested(exact, trace, raw)
-    complementary = at_bounds(exact, states, raw), states == CLOSED
+    raw = exact.forces.project(multipliers.astype(Real))
+    active = suggested(exact, trace, raw)
+    complementary = active.at_bounds(raw), active.closed
     none = np.zeros(raw.size, dtype=bool)
 
     def attempt(
@@ -288,7 +290,7 @@ def _admissible_pair(
     at, softness, start = trace
     found = feasible_at_rows(exact, rigid.at_rows, softness, start, closed)
     if found is None:
-        raise UncertifiableError("the answer penetrates beyond repair")
+        raise UncertifiableError("the penetration of the answer could not be removed")
     if rigid.driven:
         raise UncertifiableError(rigid.driven)
     places, here = local.reduction.places(at)
@@ -299,8 +301,8 @@ def _admissible_pair(
 
 def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     """Return the rows restricted to the components they touch (w,), and 1/Kᵢᵢ (w,)."""
-    contact, k = local.contact, local.contact.bound.size
-    B, contacts = csr_array(contact.rows[:, at]), contact.c.size - k
+    contact = local.contact
+    B, m = csr_array(contact.rows[:, at]), contact.c.size
     places, here = local.reduction.places(at)
     diagonal = np.zeros(local.components.size)
     present = np.unique(places[here])
@@ -310,12 +312,13 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     free[local.fixed] = 0
     is_free = local.reduction.values_at(free, at) > 0
     softness = np.where(is_free & (diagonal > 0), 1 / diagonal, 0)
-    bound = contact.bound.astype(Real)
+    first = m - contact.bound.size
     return Exact(
         f=np.zeros(0, dtype=Real), B=B.astype(Real), c=contact.c.astype(Real),
         fixed=np.flatnonzero(~is_free),
-        lower=np.append(np.zeros(contacts, dtype=Real), -bound),
-        upper=np.append(np.full(contacts, np.inf, dtype=Real), bound),
+        forces=AdmissibleForces(
+            m, friction_discs(contact.bound, contact.tangents, first)
+        ),
         compliance=(B.multiply(B) @ softness).astype(Real),
     ), softness  # fmt: skip
 
@@ -333,7 +336,7 @@ class _RigidMotions:
     all: Any
     at_rows: NDArray[np.float64]  #: (w, p) felt motions at the components of the rows
     together: NDArray[np.float64]  #: (motions, r) coefficients in R of all subdomains
-    balance: Balance  #: of the load along felt motions
+    balance: Balance  #: balance of the load along constrained motions
     driven: str = ""  #: the load along free motions that nothing balances, if any
 
     def without_free(self, local: LocalBodies, v: Extended) -> Extended:
@@ -363,10 +366,12 @@ def _rigid_motions(
     reduction, parts, floating = local.reduction, local.parts, local.floating
 
     if not floating.combinations.shape[1]:
-        none, rows = csr_array((local.components.size, 0)), exact.c.size
+        none = np.zeros((exact.c.size, 0), dtype=Real)
+        no_load = np.zeros(0, dtype=Real)
         return _RigidMotions(
-            none, np.zeros((at.size, 0)), np.zeros((local.motions, 0)),
-            Balance(*np.zeros((2, rows, 0)), *np.zeros((3, 0)), *np.zeros((2, rows))),
+            csr_array((local.components.size, 0)), np.zeros((at.size, 0)),
+            np.zeros((local.motions, 0)),
+            Balance(none, none, no_load, no_load, no_load, exact.forces),
         )  # fmt: skip
 
     def at_components(R: Any) -> NDArray[Any]:
@@ -398,7 +403,7 @@ def _rigid_motions(
             np.asarray(exact.B @ felt),
             np.asarray(abs(exact.B) @ np.where(felt, largest[:p], 0)),
             along[:p], (reduction.along(R != 0, size) * largest)[:p],
-            np.zeros(p, dtype=Real), exact.lower, exact.upper,
+            np.zeros(p, dtype=Real), exact.forces,
         ),
         why,
     )  # fmt: skip

@@ -59,7 +59,7 @@ RANDOM_ULPS = 4.0
 #: The same with the sign of u. A slender body has few soft modes, which random signs
 #: may miss: with ¼, the error of a plate 60 : ½ exceeded its bound by 1 %.
 SMOOTH_ULPS = 1.0
-MAX_REFINEMENTS = 6  #: of d
+MAX_REFINEMENTS = 6  #: largest number of refinements of d
 #: Relative size of a correction of d that ends the refinement. Bounds are reported to
 #: fewer digits.
 REFINEMENT_TOLERANCE = 1e-6
@@ -137,7 +137,7 @@ class Rounding(NamedTuple):
         return float(rigid + theta * size * size)
 
     def stored(self, size: float, gamma: Vector, theta: float) -> float:
-        """Bound √(eᵀKe) likewise; ‖e'‖ is the norm of K_T."""
+        """Bound √(eᵀKe) in the same way; ‖e'‖ is the norm of K_T."""
         return float(np.sqrt(size * size + self.work(size, gamma, theta)))
 
 
@@ -341,7 +341,7 @@ class Reduction(Protocol):
     def coarse(self, M: csr_array, S: csr_array, scale: Vector, at: Any) -> csr_array:
         """Return  M − Sᵀ diag(scale) S  (r, r); M and S are sums over all subdomains.
 
-        S : (t, local) with rows for the components `at`
+        S : (t, local) matrix with a row for each of the components `at`
         """
 
 
@@ -416,7 +416,7 @@ class Sharing:
         return np.asarray(b)
 
     def matched(self, v: Extended) -> Extended:
-        """Subtract the rigid motions Rα that minimise the jumps of v (N,), as Z weighs.
+        """Subtract the rigid motions Rα that minimise jumps of v (N,), weighted by Z.
 
         RᵀZ(v − Rα) = 0 is the coarse problem of the balance of forces. On fixed
         components the jump is the difference from zero.

@@ -57,7 +57,7 @@ def new_record(
     """Return the record of a measurement that has not begun.
 
     options : all options of the solver, including defaults
-    environment : its digest
+    environment : digest of the environment
     mode, accuracy, session : see `Record`
     """
     options = plain(options)

@@ -91,8 +91,8 @@ def solvers_page(solvers: Mapping[str, Solver]) -> str:
 def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
     """Describe the solvers of a registry on several pages, by the names of their files.
 
-    The first page has the table and the solvers whose backend can be chosen. The others
-    have the sections of our solvers and of the solvers of libraries.
+    The first page contains the table and the solvers whose backend can be chosen. The
+    others contain the sections on our solvers and on the solvers of libraries.
     """
     pages: dict[str, list[str]] = {
         "solvers.md": [HEAD, *_overview(solvers)],

@@ -235,7 +235,7 @@ def _option(what: str) -> _Option:
 
 
 class _Command(NamedTuple):
-    """Command: its module in `mortarbench.cli`, help and arguments."""
+    """Subcommand with its module in `mortarbench.cli`, its help and its arguments."""
 
     module: str
     what: str  #: help text

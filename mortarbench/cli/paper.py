@@ -54,7 +54,7 @@ def measure_and_write(
     Raises
     ------
     InputError
-        If the folder is in use, or contains other files than results of this command.
+        If the folder is in use, or contains files that are not results of this command.
 
     """
     from mortarbench.harness.files.experiment import save_experiment
@@ -86,6 +86,6 @@ def measure_and_write(
 
 
 def _answer(registries: Registries, name: str) -> Reference:
-    """Return the solve of one of our solvers at 1e-8; the paper states no accuracy."""
+    """Return a function that solves QPs by one of our solvers at tolerance 1e-8."""
     solver = registries.solvers[name]
     return lambda qp: solver.prepare(qp, 1e-8)()

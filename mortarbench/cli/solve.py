@@ -131,8 +131,8 @@ def _hint(answer: Answer) -> str:
 def _imports_from_working_directory() -> bool:
     """Return True if libraries may have been imported from the working directory.
 
-    ``python -m`` looks there first, but workers do not (-P): a fork of this process
-    could run other libraries than a worker of a run.
+    ``python -m`` searches this directory first, but workers do not (-P). A fork of this
+    process could therefore use other libraries than the worker of a run.
     """
     first, *others = sys.path
     return first in ("", os.getcwd()) and first not in others

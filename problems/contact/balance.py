@@ -11,7 +11,7 @@ load.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ MAX_IMBALANCE = 1e-6
 #: components of a motion below this share of the largest one are not reported
 _MIN_MOTION = 1e-3
 _AXES = "xyz"
+#: sides of polygons around discs: their corners are 1/cos(π/16) = 1.02 times as far out
+POLYGON = 16
 
 Floats = NDArray[np.float64]
 
@@ -104,9 +106,10 @@ def check_friction(
 ) -> None:
     """Raise an error for a load that friction with its bounds cannot balance.
 
-    There must be forces λ_n ≥ 0 of the contact rows B and |λ_t| ≤ g of the friction
+    There must be forces λ_n ≥ 0 of the contact rows B and ‖λ_t‖ ≤ g of the friction
     rows T with  Zᵀ(f − Bᵀλ_n − Tᵀλ_t) = 0.  A linear program minimises the 1-norm of
-    this residual.
+    this residual. In space, polygons with `POLYGON` sides around the discs replace
+    them: loads that exceed friction by less than 2 % are left to the solve.
 
     step, share : number of the load step, and the share of the load that acts in it
 
@@ -128,10 +131,11 @@ def check_friction(
     rows = B.shape[0]
     limits = [(0, None)] * rows + [(-g, g) for g in friction.bound]
     size = np.abs(bodies.f).sum() * share
+    sides = _polygons(friction, rows, 2 * len(eye))
     # unknowns: λ_n, λ_t, and the positive and negative parts of the residual
     program = linprog(
         np.append(np.zeros(forces.shape[1]), np.ones(2 * len(eye))),
-        A_eq=np.hstack([forces, eye, -eye]), b_eq=load,
+        A_eq=np.hstack([forces, eye, -eye]), b_eq=load, **sides,
         bounds=limits + [(0, None)] * (2 * len(eye)), method="highs",
     )  # fmt: skip
     if program.x is not None and program.fun > MAX_IMBALANCE * size:
@@ -140,6 +144,26 @@ def check_friction(
             f"Tresca's law nothing balances {program.fun / size:.2%} of it; expected "
             "supports that hold the bodies, or a larger bound"
         )
+
+
+def _polygons(friction: Friction, before: int, after: int) -> dict[str, Any]:
+    """Return the rows of polygons around discs, with columns of other unknowns.
+
+    Empty in the plane, where the bounds of the unknowns suffice.
+    """
+    vectors = friction.vectors
+    if vectors.shape[1] == 1:
+        return {}
+    angle = 2 * np.pi * np.arange(POLYGON) / POLYGON
+    sides = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    row = np.arange(len(vectors) * POLYGON).reshape(-1, POLYGON, 1)
+    at = np.broadcast_to(before + vectors[:, None], (len(vectors), POLYGON, 2))
+    values = np.broadcast_to(sides, at.shape)
+    A = csr_array(
+        (values.ravel(), (np.broadcast_to(row, at.shape).ravel(), at.ravel())),
+        shape=(row.size, before + vectors.size + after),
+    )
+    return {"A_ub": A, "b_ub": np.repeat(friction.bound[vectors[:, 0]], POLYGON)}
 
 
 def _motions(bodies: UnassembledBodies) -> tuple[Floats, Floats, float]:

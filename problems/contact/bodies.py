@@ -12,6 +12,7 @@ from scipy.sparse import csc_array, csr_array, eye_array
 
 from mortarbench.harness import InputError, Vector
 from mortarbench.harness.mechanics import boundary_facets
+from mortarbench.problems.contact.rigid import NO_NODES, RigidBody
 from mortarbench.problems.fem.elasticity import (
     Material,
     Plane,
@@ -35,6 +36,21 @@ class ContactPair(NamedTuple):
 
     slave: Nodes
     master: Nodes  #: empty for a rigid one
+    rigid: RigidBody | None = None  #: master that does not deform
+    clamped: Nodes = NO_NODES  #: slave nodes that get no row against a rigid master
+
+    def renumbered(self, nodes: Nodes) -> ContactPair:
+        """Return the pair for a mesh of some nodes (k,), ascending."""
+        slave, master, clamped = (
+            np.searchsorted(nodes, part)
+            for part in (self.slave, self.master, self.clamped)
+        )
+        return ContactPair(slave, master, self.rigid, clamped)
+
+    @property
+    def sides(self) -> tuple[Nodes, Nodes]:
+        """Slave and master."""
+        return self.slave, self.master
 
     @property
     def slave_nodes(self) -> Nodes:

@@ -20,6 +20,7 @@ from mortarbench.problems.contact.node_to_segment import (
     geometric_stiffness,
     node_to_segment,
 )
+from mortarbench.problems.contact.rigid import rigid_rows
 from mortarbench.problems.contact.space.face_mortar import face_mortar
 from mortarbench.problems.contact.space.node_to_face import node_to_face
 from mortarbench.problems.contact.surface import current_positions, current_surface
@@ -43,7 +44,8 @@ def linearisation(
 
     The map raises InputError when it yields no row at u = 0.
 
-    contact : "nts" (node to segment, in space node to face) or "mortar"
+    contact : "nts" (node to segment, in space node to face) or "mortar"; rows of pairs
+        with a rigid master are nodal
     basis : of the multipliers of mortar contact, "dual" or "standard"
     laws : law of friction of each pair; empty: no friction
     fixed_segments : (places,) for node-to-segment contact, the segment of each slave
@@ -61,11 +63,16 @@ def linearisation(
 
     def linearise(u: Vector) -> ContactRows:
         parts = [
-            rows(bodies.mesh.points, u, *pair, tangential=tangential)
+            rows(bodies.mesh.points, u, *pair.sides, tangential=tangential)
+            if pair.rigid is None
+            else rigid_rows(
+                bodies.mesh.points, u, pair.slave, pair.rigid,
+                clamped=pair.clamped, tangential=tangential,
+            )
             for rows, pair, tangential in zip(
                 methods, bodies.pairs, has_friction, strict=True
             )
-        ]
+        ]  # fmt: skip
         if not any(part.c.size for part in parts) and not u.any():
             raise InputError(
                 "no node of a slave side faces its master within reach; expected two "
@@ -111,7 +118,7 @@ def contact_stiffness(
     def blocks(u: Vector, multipliers: Vector) -> tuple[NDArray[np.float64], Nodes]:
         forces = _split_by_pair(bodies, multipliers)
         per_pair = [
-            geometric_stiffness(bodies.mesh.points, u, *pair, force, own)
+            geometric_stiffness(bodies.mesh.points, u, *pair.sides, force, own)
             for pair, force, own in zip(bodies.pairs, forces, segments, strict=True)
         ]
         values, components = zip(*per_pair, strict=True)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mortarbench.harness import QP, Fields, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
 from mortarbench.harness.plugin import SLIDING
+from mortarbench.harness.sets.blocks import norms
 from mortarbench.problems.contact.bodies import Bodies, ContactSides
 from mortarbench.problems.contact.sides import (
     ACTIVE_THRESHOLD,
@@ -105,7 +106,7 @@ def _contact_force(
         return {}
     if not bodies.pairs:
         return {"contact_force": [0.0] * bodies.mesh.dim}
-    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0]
+    owner, (slave, master) = bodies.body_of_node, bodies.pairs[0].sides
     # contact forces act on both bodies: sum those on one of them, or they cancel
     loaded = owner == owner[(master if master.size else slave).flat[0]]
     return {"contact_force": forces[loaded].sum(axis=0).tolist()}
@@ -116,25 +117,24 @@ def friction_quantities(
 ) -> dict[str, Any]:
     """Return counts of friction states, the residual of Coulomb's law, dissipation.
 
-    open, stick, slip: numbers of rows that are inactive, active below the bound, and
-    active at the bound. sliding_without_contact: number of inactive rows that carry
-    shear, which Tresca's law allows; they do not count as open. shear_without_contact:
-    their share of Σ|λ_t|. friction_residual: ‖g − mu·λ_n‖/‖g‖ for Coulomb's law, 0 for
-    Tresca's. dissipation: Σ g|Tu − s|, the work of friction in this step, J/m.
+    open, stick, slip: numbers of contact rows with friction that are inactive, active
+    below the bound, and active at the bound. sliding_without_contact: number of
+    inactive rows that carry shear, which Tresca's law allows; they do not count as
+    open. shear_without_contact: their share of Σ‖λ_t‖. friction_residual:
+    ‖g − mu·λ_n‖/‖g‖ for Coulomb's law, 0 for Tresca's. dissipation: Σ g‖Tu − s‖, the
+    work of friction in this step, J/m; J in space.
     """
     state = states(primal, s, friction)
-    shear = np.abs(s.z[primal.h.size :])
+    shear = norms(s.z[primal.h.size :][friction.vectors])
     without_contact = state == SLIDING
-    slip = friction.T @ s.x - friction.start
     shear_alone = float(shear[without_contact].sum() / (shear.sum() or 1.0))
     return {
         **{name: int((state == name).sum()) for name in ("open", "stick", "slip")},
         "sliding_without_contact": int(without_contact.sum()),
         "shear_without_contact": shear_alone,
         "friction_residual": friction.residual(s.z[: primal.h.size]),
-        "dissipation": float(friction.bound @ np.abs(slip))
-        * bodies.force * bodies.length,
-    }  # fmt: skip
+        "dissipation": friction.work(s.x) * bodies.force * bodies.length,
+    }
 
 
 def pair_results(
@@ -148,7 +148,9 @@ def pair_results(
     force: force on each of its bodies, N/m. largest_pressure: largest value at a slave
     node, Pa. smallest_gap: m; negative where bodies overlap. half_width: half the
     length of the undeformed slave side that belongs to nodes under pressure, m; in
-    space, pressed_area is the area that belongs to these nodes, m².
+    space, pressed_area is the area that belongs to these nodes, m². With friction:
+    friction_force, its part of the force on the slave, N/m, and the numbers of nodes
+    that stick and slip.
     """
     results = {}
     sides = contact_sides(bodies, primal, s, friction)
@@ -172,6 +174,12 @@ def pair_results(
                 else {"pressed_area": pressed}
             ),
         }
+        if side.friction is not None and side.friction_force is not None:
+            results[side.name] |= {
+                "friction_force": side.friction_force.sum(axis=0).tolist(),
+                "stick": int((side.friction == "stick").sum()),
+                "slip": int((side.friction == "slip").sum()),
+            }
     return results
 
 

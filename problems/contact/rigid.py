@@ -28,7 +28,7 @@ from mortarbench.problems.contact.surface import (
 )
 from mortarbench.problems.fem.mesh import Nodes, dofs_of
 
-_NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
+NO_NODES: Nodes = np.zeros(0, dtype=np.int64)
 
 
 class RigidBody(Protocol):
@@ -93,7 +93,7 @@ def rigid_rows(
     side: Nodes,
     rigid: RigidBody,
     *,
-    clamped: Nodes = _NO_NODES,
+    clamped: Nodes = NO_NODES,
     tangential: bool = False,
 ) -> ContactRows:
     """Return rows that keep the nodes of a side out of a rigid body, linearised at u.

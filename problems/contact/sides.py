@@ -1,9 +1,10 @@
 """Contact results along the slave side of each pair: forces, pressures, gaps, states.
 
 The rows of the primal QP are ordered pair by pair, and along the slave side within a
-pair. A row is assigned to the first pair, from the pair of the preceding row on, whose
-two sides contain all nodes of the row. If two pairs share nodes on both sides, rows on
-these nodes therefore belong to the first of them.
+pair. A rigid master has one row per slave node that is not clamped. Any other row is
+assigned to the first pair, from the pair of the preceding row on, whose two sides
+contain all nodes of the row. If two pairs share nodes on both sides, rows on these
+nodes therefore belong to the first of them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, ContactSide, Friction, Solution, Vector
 from mortarbench.harness.mechanics import NO_FRICTION
 from mortarbench.harness.plugin import SLIDING
+from mortarbench.harness.sets.blocks import norms
 from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
-from mortarbench.problems.contact.surface import current_surface
+from mortarbench.problems.contact.surface import current_surface, unit
 from mortarbench.problems.fem.mesh import (
     Nodes,
     as_vectors,
@@ -41,11 +43,13 @@ def contact_sides(
     length ∫N_j (in space, area) that belongs to the node. The gap is the slack c − Bu
     of the node's row; with mortar contact, this is the mean gap around the node with
     the weights of the row. With friction, the shear is the friction force along the
-    tangent (−n_y, n_x) over the same length, and each node has one of the `states`.
+    tangent (−n_y, n_x) over the same length, in space its size over the area, and each
+    node has one of the `states`.
     """
     B, l, F = csr_array(primal.G), bodies.length, bodies.force
     tangential, state = s.z[primal.h.size :], states(primal, s, friction)
     points, dim, u = bodies.mesh.points, bodies.mesh.dim, s.x * l
+    row = friction.row[friction.vectors[:, 0]]  # of each state
     slack = (primal.h - B @ s.x) * l
     sides = []
     for name, pair, rows in zip(
@@ -69,38 +73,43 @@ def contact_sides(
         push[place] = np.einsum("rx,rx->r", contact_force[place], -direction)
         push = np.nan_to_num(push)
         nodal_state = np.full(len(slave), "open", dtype=state.dtype)
-        nodal_state[place[friction.row[own] - rows.start]] = state[own]
+        here = (row >= rows.start) & (row < rows.stop)
+        nodal_state[place[row[here] - rows.start]] = state[here]
+        along = side.tangents[:, 0] if dim == 2 else unit(shearing, 0 * shearing)
         sides.append(
             ContactSide(
                 name=name, nodes=slave, length=length,
                 force=contact_force + shearing, pressure=(0.0 - normal) / length,
                 gap=gap, push=push,
-                shear=np.einsum("sx,sx->s", shearing, side.tangents[:, 0]) / length
+                shear=np.einsum("sx,sx->s", shearing, along) / length
                 if own.any() else None,
                 friction=nodal_state if own.any() else None,
+                friction_force=shearing if own.any() else None,
             )
         )  # fmt: skip
     return tuple(sides)
 
 
 def states(primal: QP, s: Solution, friction: Friction) -> NDArray[np.str_]:
-    """Classify friction rows (k,) as "open", "stick", "slip" or `SLIDING`.
+    """Classify tangential vectors (v,) as "open", "stick", "slip" or `SLIDING`.
 
-    Inactive rows are open, or `SLIDING` if they carry shear, which Tresca's law allows
-    and Coulomb's does not. An active row sticks if its slip is at most
-    (g − |λ_t|) T diag(K)⁻¹ Tᵀ, the slip that the unused part of the bound would cause
-    if only the nodes of the row could move.
+    Those of inactive rows are open, or `SLIDING` if they carry shear, which Tresca's
+    law allows and Coulomb's does not. One of an active row sticks if its slip is at
+    most (g − ‖λ_t‖) T diag(K)⁻¹ Tᵀ, the slip that the unused part of the bound would
+    cause if only the nodes of the row could move.
     """
-    if not friction.bound.size:
+    vectors = friction.vectors
+    if not vectors.size:
         return np.zeros(0, dtype=_STATE)
     normal, tangential = np.split(s.z, [primal.h.size])
     diagonal = csr_array(primal.P).diagonal()
     # T diag(K)⁻¹ Tᵀ of each row; components without stiffness count as of stiffness 1
     softness = friction.T.multiply(friction.T) @ (1 / np.where(diagonal, diagonal, 1.0))
-    slip = np.abs(friction.T @ s.x - friction.start)
-    sticks = (friction.bound - np.abs(tangential)) * softness >= slip
-    closed = active(normal)[friction.row]
-    sheared = np.abs(tangential) > ACTIVE_THRESHOLD * np.abs(s.z).max(initial=0.0)
+    shear, first = norms(tangential[vectors]), vectors[:, 0]
+    room = (friction.bound[first] - shear) * softness[vectors].mean(axis=1)
+    sticks = room >= norms(friction.slip(s.x))
+    closed = active(normal)[friction.row[first]]
+    sheared = shear > ACTIVE_THRESHOLD * np.abs(s.z).max(initial=0.0)
     apart = np.where(sheared, SLIDING, "open")
     touching = np.where(sticks, "stick", "slip")
     return np.where(closed, touching, apart).astype(_STATE)
@@ -134,16 +143,19 @@ def rows_of_pairs(B: csr_array, bodies: Bodies | ContactSides) -> list[slice]:
     m, (N, dim) = B.shape[0], bodies.mesh.points.shape
     # (m, N) nodes of each row, and for each pair a mask of rows with other nodes
     touches = csr_array((np.ones(B.nnz), B.indices // dim, B.indptr), shape=(m, N))
-    outside = []
-    for pair in bodies.pairs:
-        other = np.ones(N)
-        other[pair.nodes] = 0.0
-        outside.append(touches @ other > 0)
     slices, first = [], 0
-    for k in range(len(bodies.pairs)):
-        # the rows of pair k end before the first row with a node beyond its two sides
-        beyond = np.flatnonzero(outside[k][first:])
-        end = first + int(beyond[0]) if beyond.size else m
+    for pair in bodies.pairs:
+        if pair.rigid is not None:
+            end = first + pair.slave_nodes.size - pair.clamped.size
+        else:
+            # the rows of the pair end before the first row with a node beyond its two
+            # sides, or that of a rigid master, which has nodes of the slave only
+            other, opposite = np.ones(N), np.zeros(N)
+            other[pair.nodes] = 0.0
+            opposite[pair.master if pair.master.size else pair.slave] = 1.0
+            outside = (touches @ other > 0) | (touches @ opposite == 0)
+            beyond = np.flatnonzero(outside[first:])
+            end = first + int(beyond[0]) if beyond.size else m
         slices.append(slice(first, end))
         first = end
     return slices

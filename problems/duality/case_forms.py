@@ -63,10 +63,13 @@ def case_of(
     whole, friction, _ = path.problem(choice.step, choice.iterate)
     primal, count = whole.primal, path.iterates(choice.step)
     if choice.size:
-        contact = Contact(*contact_rows(primal, friction), friction.bound)
+        rows, c = contact_rows(primal, friction)
+        contact = Contact(rows, c, friction.bound, friction.tangents)
         stage = problem.stages[path.last_of(choice.step)]
         layout = cached_layout(elastic, choice.size)
-        decomposed = decompose(elastic, layout, choice.glue, stage, contact)
+        decomposed = decompose(
+            elastic, layout, choice.glue, stage, contact, choice.cluster
+        )
     bodies = elastic.assembled
 
     def results(s: Solution) -> Mapping[str, Any]:

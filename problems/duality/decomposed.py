@@ -120,7 +120,9 @@ def decomposed_path(
 
     def pose(stage: Stage, at: State) -> DecomposedLinearisation:
         sides = linearise_sides(problem, layout, stage, at)
-        parts = decompose(elastic, layout, choice.glue, stage, sides.contact)
+        parts = decompose(
+            elastic, layout, choice.glue, stage, sides.contact, choice.cluster
+        )
         if previous:  # the bodies are unchanged: their subdomain classes are reused
             previous[0] = LocalDual(previous[0].subdomains.with_problem(parts))
         else:
@@ -172,7 +174,7 @@ def distributed_qp_of(
 
 def decompose(
     bodies: ElasticBodies, layout: Subdivision, glue: str, stage: Stage,
-    contact: Contact,
+    contact: Contact, cluster: int = 0,
 ) -> DecomposedProblem:  # fmt: skip
     """Return the decomposed problem of elastic bodies under the load of a stage."""
     unit = bodies.length / bodies.force
@@ -185,6 +187,7 @@ def decompose(
         assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
         fixed=stage.fixed, load=force_lookup(load), glue=glue, contact=contact,
+        cluster=cluster,
     )  # fmt: skip
 
 
@@ -242,7 +245,7 @@ class LinearisedSides:
             (B.data, self.component[B.indices], B.indptr),
             shape=(B.shape[0], self.bodies.mesh.dim * self.nodes),
         )
-        return Contact(rows, c, friction.bound)
+        return Contact(rows, c, friction.bound, friction.tangents)
 
 
 def linearise_sides(
@@ -254,10 +257,7 @@ def linearise_sides(
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
         body_of_node=np.asarray(layout.body[layout.holder(node)]), names=elastic.names,
-        pairs=tuple(
-            ContactPair(*(np.searchsorted(node, side) for side in pair))
-            for pair in elastic.pairs
-        ),
+        pairs=tuple(pair.renumbered(node) for pair in elastic.pairs),
         length=elastic.length, force=elastic.force,
     )  # fmt: skip
     rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)

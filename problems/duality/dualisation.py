@@ -4,9 +4,9 @@ The primal QP is  min ½uᵀKu − fᵀu  subject to  B_E u = c_E, B_I u ≤ c_I
 returns the new problem together with a function that maps a solution of it to a
 solution (point and all multipliers) of the primal problem.
 
-Friction with a given bound g adds Σ g|Tu − s| to the objective. Its rows T, s come last
-in B and c, and their multipliers satisfy |λ_t| ≤ g, so that the dual remains a QP. In z
-of the primal problem they follow the multipliers of the contact rows.
+Friction with a given bound g adds Σ g‖Tu − s‖ to the objective. Its rows T, s come last
+in B and c, and their multipliers satisfy ‖λ_t‖ ≤ g: bounds in the plane, discs in
+space. In z of the primal problem they follow the multipliers of the contact rows.
 """
 
 from __future__ import annotations
@@ -19,7 +19,15 @@ import numpy as np
 from scipy.sparse import csr_array, vstack
 
 from mortarbench.harness import QP, Friction, Solution, Structure, Vector, no_rows
-from mortarbench.harness.mechanics import NO_FRICTION, contact_rows, with_friction
+from mortarbench.harness.mechanics import (
+    NO_FRICTION,
+    contact_rows,
+    friction_discs,
+    friction_multipliers,
+    with_friction,
+)
+from mortarbench.harness.sets.box import Box
+from mortarbench.harness.sets.convex import ConvexSet
 from mortarbench.problems.fem.inverse import GeneralisedInverse
 
 
@@ -37,20 +45,16 @@ class Transformed(NamedTuple):
 def primal_form(primal: QP, friction: Friction = NO_FRICTION) -> Transformed:
     """Return the primal problem as a QP, including the work of friction.
 
-    The inverse map drops the variables of `harness.mechanics.with_friction` and takes
-    λ_t as the difference of the multipliers of their two rows; λ_t = 0 where g = 0.
+    The inverse map drops the variables of `harness.mechanics.with_friction`.
     """
-    qp, n, m = with_friction(primal, friction), primal.q.size, primal.h.size
+    qp, n = with_friction(primal, friction), primal.q.size
     if not friction.bound.size:
         return Transformed(qp, lambda s: s, 1.0, 0.0, lambda s: s.x)
-    has_friction = friction.bound > 0
 
     def recover(s: Solution) -> Solution:
-        tangential = np.zeros(friction.bound.size)
-        forwards, backwards = s.z[m:].reshape(2, -1)
-        tangential[has_friction] = forwards - backwards
-        z = np.append(s.z[:m], tangential)
-        return replace(s, x=s.x[:n], z=z, z_box=np.zeros(n))
+        y, normal, tangential = friction_multipliers(s, primal, friction)
+        z = np.append(normal, tangential)
+        return replace(s, x=s.x[:n], y=y, z=z, z_box=np.zeros(n))
 
     return Transformed(qp, recover, 1.0, 0.0, lambda s: s.x[:n])
 
@@ -86,10 +90,8 @@ def dualise(
     R = inverse.kernel
     free = inverse(f) if free is None else free
     structure = Structure(K=primal.P, B=B, fixed=np.zeros(0, dtype=np.int64))
-    lb, ub = _bounds(primal, friction)
-    unbounded = np.full(m_E, np.inf)
-    lb, ub = np.append(-unbounded, lb), np.append(unbounded, ub)
-    qp = _dual(structure, c, inverse, free, lb, ub)
+    sets = multiplier_sets(m_E, primal.h.size, friction.bound, friction.tangents)
+    qp = _dual(structure, c, inverse, free, sets)
     if R.shape[1]:
         qp = replace(qp, A=np.ascontiguousarray((B @ R).T), b=R.T @ f)
 
@@ -136,7 +138,8 @@ def dual_bounds(
     free = clamped(f) if free is None else free
     fixed = np.unique(csr_array(primal.A).indices).astype(np.int64)
     structure = Structure(K=primal.P, B=B, fixed=fixed)
-    qp = _dual(structure, c, clamped, free, *_bounds(primal, friction))
+    sets = multiplier_sets(0, primal.h.size, friction.bound, friction.tangents)
+    qp = _dual(structure, c, clamped, free, sets)
 
     def recover(s: Solution) -> Solution:
         u = clamped(f - B.T @ s.x)
@@ -153,22 +156,28 @@ def dual_bounds(
 
 def with_friction_bound(dual: QP, friction: Friction) -> QP:
     """Return a dual with other friction bounds; its inverse map is the same."""
-    g = friction.bound
-    if not g.size:
-        return dual
-    contact = slice(0, -g.size)
-    return dual.with_bounds(
-        np.append(dual.lb[contact], -g), np.append(dual.ub[contact], g)
-    )
+    contact = dual.q.size - friction.bound.size
+    free = int(np.isinf(dual.lb[:contact]).sum())
+    sets = multiplier_sets(free, contact - free, friction.bound, friction.tangents)
+    return replace(dual, sets=sets)
 
 
-def _bounds(primal: QP, friction: Friction) -> tuple[Vector, Vector]:
-    """Return the bounds of the multipliers,  λ_n ≥ 0  and  −g ≤ λ_t ≤ g."""
-    m = primal.h.size
-    return (
-        np.append(np.zeros(m), -friction.bound),
-        np.append(np.full(m, np.inf), friction.bound),
-    )
+def multiplier_sets(
+    free: int, normal: int, bound: Vector, tangents: int
+) -> tuple[ConvexSet, ...]:
+    """Return the sets of multipliers: λ_E free, λ_n ≥ 0, then ‖λ_t‖ ≤ g.
+
+    Parameters
+    ----------
+    free, normal : numbers of equality rows and of contact rows
+    bound, tangents : (k,) bound of each friction row, and its number of directions
+
+    """
+    contact = free + normal
+    upper = np.full(contact + bound.size, np.inf)
+    lower = -upper
+    lower[free:contact] = 0.0
+    return Box(lower, upper), friction_discs(bound, tangents, contact)
 
 
 def _dual(
@@ -176,13 +185,12 @@ def _dual(
     c: Vector,
     inverse: GeneralisedInverse,
     free: Vector,
-    lb: Vector,
-    ub: Vector,
+    sets: tuple[ConvexSet, ...],
 ) -> QP:
-    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ,  lb ≤ λ ≤ ub; `free` is K⁺f."""
+    """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  over sets; `free` is K⁺f."""
     m, B = c.size, structure.B
     return QP(
         P=inverse.congruence(B), q=c - B @ free,
         A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=lb, ub=ub, structure=structure,
+        sets=sets, structure=structure,
     )  # fmt: skip

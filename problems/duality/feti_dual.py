@@ -7,7 +7,9 @@
 
 as in `problems.duality.dualisation`, but assembled from subdomains (Dostál, Horák and
 Kučera 2006): F is an operator, a sum over subdomains stored as plain arrays
-(`problems.feti.operators`), and RᵀBᵀ is sparse.
+(`problems.feti.operators`), and RᵀBᵀ is sparse. Where averages join subdomains to
+clusters, K̃⁺ and RN take the places of K⁺ and R
+(`problems.feti.subdomain_classes.Clusters`).
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import QP, Friction, Solution, Vector, no_rows
 from mortarbench.harness.mechanics import NO_FRICTION, contact_rows
-from mortarbench.problems.duality.dualisation import Transformed
+from mortarbench.problems.duality.dualisation import Transformed, multiplier_sets
 from mortarbench.problems.feti.operator_arrays import dual_operator
 from mortarbench.problems.feti.operators import block_bytes, touched_components
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
@@ -44,24 +46,23 @@ def feti_dual(
     friction : friction law with a prescribed bound
 
     """
-    domains, R, T = bodies.domains, bodies.domains.kernel, bodies.spread
+    units, R, T = bodies.units, bodies.units.kernel, bodies.spread
     B, f, m_E, scale = bodies.B, bodies.f, bodies.equalities, bodies.scale
-    free = domains.inverse(f)
+    free = units.inverse(f)
     m_I = primal.h.size
     bound = friction.bound / scale[m_I:]
     qp = QP(
-        P=dual_operator(B, domains, m_E), q=bodies.c - B @ free,
+        P=dual_operator(B, bodies.domains, m_E, bodies.clusters), q=bodies.c - B @ free,
         A=csr_array((B @ R).T), b=R.T @ f,
         G=no_rows(bodies.c.size), h=np.zeros(0),
-        lb=np.concatenate([np.full(m_E, -np.inf), np.zeros(m_I), -bound]),
-        ub=np.concatenate([np.full(m_E + m_I, np.inf), bound]),
+        sets=multiplier_sets(m_E, m_I, bound, friction.tangents),
     )  # fmt: skip
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
     copies[copies == 0] = 1  # eliminated components have no copy, and u = 0 there
     B_I = contact_rows(primal, friction)[0]
 
     def displacement(s: Solution) -> Vector:
-        v = domains.inverse(f - B.T @ s.x) - R @ s.y
+        v = units.inverse(f - B.T @ s.x) - R @ s.y
         return np.asarray((T.T @ v) / copies)
 
     def recover(s: Solution) -> Solution:
@@ -74,7 +75,7 @@ def feti_dual(
 
 def feti_matrices(bodies: DecomposedBodies, dual: QP) -> dict[str, Any]:
     """Return the matrices of the dual under their names in the paper: F, d, B, c, R."""
-    R = bodies.domains.kernel
+    R = bodies.units.kernel
     return {"F": dual.P, "d": -dual.q, "B": bodies.B, "c": bodies.c, "R": R}
 
 
@@ -82,9 +83,10 @@ def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, An
     """Return the quantities of a decomposition.
 
     kinds: number of classes of congruent subdomains, each with one factor. torn_dofs:
-    unknowns including all copies. multipliers: rows of B. explicit_subdomains: number
-    of subdomains with explicit blocks (K⁺)_bb and S_bb; the others take a solve in
-    every product. explicit_mib: memory for these blocks, MiB.
+    unknowns including all copies. multipliers: rows of B. coarse_unknowns: rigid
+    motions of all subdomains, or of all clusters. explicit_subdomains: number of
+    subdomains with explicit blocks (K⁺)_bb and S_bb; the others take a solve in every
+    product. explicit_mib: memory for these blocks, MiB.
     """
     explicit = dual.P.arrays["explicit"]
     sizes = np.array(
@@ -96,6 +98,7 @@ def decomposition_quantities(bodies: DecomposedBodies, dual: QP) -> dict[str, An
         "kinds": len(bodies.classes),
         "torn_dofs": bodies.f.size,
         "multipliers": bodies.c.size,
+        "coarse_unknowns": dual.b.size,
         "explicit_subdomains": int(explicit[bodies.class_of].sum()),
         "explicit_mib": float(taken[explicit].sum() / 2**20),
     }

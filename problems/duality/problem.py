@@ -47,7 +47,11 @@ from mortarbench.problems.feti.subdivision import (
     half_discs_in_blocks,
     mesh_in_subdomains,
 )
-from mortarbench.problems.feti.tearing import blocks, compact_blocks
+from mortarbench.problems.feti.tearing import (
+    compact_blocks,
+    compact_boxes,
+    grid_positions,
+)
 
 Linearise: TypeAlias = Callable[[Vector], ContactRows]  #: displacement in m → rows
 
@@ -127,7 +131,7 @@ class HalfDiscs(_Joined[HalfDisc]):
 
 @dataclass(frozen=True, eq=False)
 class StructuredSolids:
-    """Hexahedra numbered as in boxes; subdomains are blocks of at most size³ cells."""
+    """Hexahedra numbered as in boxes; subdomains are compact blocks of cells."""
 
     parts: tuple[Mesh, ...]  #: see `problems.fem.mesh.box`, with different boundaries
     divisions: tuple[tuple[int, int, int], ...]  #: cells of each along x, y and z
@@ -153,12 +157,24 @@ class StructuredSolids:
         return self.mesh.boundaries
 
     def layout(self, size: int) -> Subdivision:
-        """Cut each box into blocks of at most `size` cells a side."""
-        labels = [blocks(divisions, size) for divisions in self.divisions]
+        """Cut each box into compact blocks of at most `size` cells a side."""
+        labels = [
+            compact_boxes(mesh.points.reshape(z + 1, y + 1, x + 1, 3), size)
+            for mesh, (x, y, z) in zip(self.parts, self.divisions, strict=True)
+        ]
         first = np.cumsum([0] + [int(label.max()) + 1 for label in labels])
         label = np.concatenate([k + one for k, one in zip(first, labels, strict=False)])
         named = np.unique(np.concatenate(list(self.sides.values())))
-        return mesh_in_subdomains(self.mesh, label, self.body, named)
+        positions = [
+            at
+            for one, divisions in zip(labels, self.divisions, strict=True)
+            if (at := grid_positions(one, divisions)) is not None
+        ]
+        is_grid = len(positions) == len(labels)
+        return mesh_in_subdomains(
+            self.mesh, label, self.body, named,
+            np.concatenate(positions) if is_grid else None,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -328,10 +344,11 @@ class Choice(NamedTuple):
     iterate: int = 0  #: of the fixed point of Coulomb's law, from 1; 0: the last one
     size: int = 0  #: of subdomains, see `Shape.layout`; 0: undivided bodies
     glue: str = "orthonormal"  #: one of `problems.feti.subdomains.GLUE`
+    cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
 
 
 #: keys of a case that select one of the QPs of a problem
-CHOICES = ("step", "iterate", "feti", "parts", "glue")
+CHOICES = ("step", "iterate", "feti", "parts", "glue", "cluster")
 
 
 def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
@@ -351,8 +368,9 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
             f"{key} with form {form} is not built; expected form dual, or no {key}"
         )
     return Choice(
-        p.get("step", 1), p.get("iterate", 0), size, p.get("glue", "orthonormal")
-    )
+        p.get("step", 1), p.get("iterate", 0), size, p.get("glue", "orthonormal"),
+        p.get("cluster", 0),
+    )  # fmt: skip
 
 
 def cached_problem(

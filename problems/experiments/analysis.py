@@ -1,10 +1,10 @@
 """The whole analysis, mesh to displacement, timed part by part (Figure 6, Section 5).
 
 Two variants of the same ten load steps are compared, both with all Dirichlet rows in
-the dual. ``per-row``, that of the paper, solves with the factor of K for each row of B
-in each step, and its dual QPs by the textbook SMALBE. ``condensed``, ours, computes K⁺
-on the interface once, so that each step takes one small product, and solves the dual
-QPs by our SMALBE.
+the dual. The variant ``per-row`` of the paper solves with the factor of K for each row
+of B in each step, and solves the dual QPs by the textbook SMALBE. Our variant
+``condensed`` computes K⁺ on the interface once, so that each step takes one small
+product, and solves the dual QPs by our SMALBE.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Analysis:
     """Result of one analysis."""
 
     bodies: Bodies
-    primal: QP  #: of the last step
-    solution: Solution  #: of the last step
+    primal: QP  #: primal QP of the last step
+    solution: Solution  #: solution of the last step
     dual: QP
     laps: Laps
 
@@ -108,7 +108,7 @@ def scaling(plan: Plan, solve: Reference, baseline: Reference) -> Rows:
             "m_E": analysis.primal.b.size,
             "m_I": analysis.primal.h.size,
         }
-        # one warm-up, at the smallest size, is enough: larger runs take seconds
+        # one warm-up at the smallest size is enough, since larger runs take seconds
         for row in race(contestants, plan.scaling_rounds, warm=Nr == first):
             yield size | row
 

@@ -1,4 +1,4 @@
-"""Timing of experiments: methods take turns in one process.
+"""Timing of experiments, in which methods take turns in one process.
 
 Turns spread a drift of the machine evenly over all methods. Every sample is stored;
 reports compute medians and intervals.
@@ -22,7 +22,9 @@ class Rounds:
 
     most: int
     least: int = 5
-    seconds: float = 20.0  #: no round starts later than this, once `least` are done
+    seconds: float = (
+        20.0  #: time after which no round starts once `least` rounds are done, s
+    )
 
 
 class Stopwatch:
@@ -55,7 +57,7 @@ def race(
 ) -> list[dict[str, str | int | float]]:
     """Time methods in turns; return a row (method, part, repeat, seconds) per lap.
 
-    warm : True to run each once before, so that cold caches do not count
+    warm : True to run each method once before, so that cold caches do not count
 
     """
     if warm:

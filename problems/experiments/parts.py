@@ -79,8 +79,8 @@ def contact(plan: Plan) -> Rows:
             (pair,) = bodies.pairs
             points, u = bodies.mesh.points, np.zeros(bodies.mesh.dofs)
             contestants = {
-                "nts": timed_as_one(partial(node_to_segment, points, u, *pair)),
-                "mortar": timed_as_one(partial(mortar, points, u, *pair)),
+                "nts": timed_as_one(partial(node_to_segment, points, u, *pair.sides)),
+                "mortar": timed_as_one(partial(mortar, points, u, *pair.sides)),
             }
             size = {"master": len(pair.master) - 1, "slave": len(pair.slave) - 1}
             for row in race(contestants, plan.contact_rounds):

@@ -19,7 +19,8 @@ from mortarbench.problems.families.patch import ContactPatch
 from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths
 from mortarbench.problems.models.beam_ring import LENGTH, model
 
-#: (steps, linearisations per step) of a converged path: more of either change nothing
+#: (steps, linearisations per step) of a converged path; larger numbers give the same
+#: result
 CONVERGED = (2, 8)
 
 #: name of contact rows in figures → keys of a case
@@ -33,9 +34,9 @@ ROWS: Mapping[str, Mapping[str, Value]] = {
 def stepping(plan: Plan, solve: Reference) -> Rows:
     """Yield results at the full load for several numbers of steps and of `relin`.
 
-    A row holds steps, relin, tip_x, tip_y in m, energy in J/m, and force_x, force_y in
-    N/m. The last row is converged: contact is linearised at the solution itself. All
-    others approach it.
+    A row contains steps, relin, tip_x, tip_y in m, energy in J/m, and force_x, force_y
+    in N/m. The last row is the converged result, with contact linearised at the
+    solution itself; the other rows approach it.
     """
     bodies = model(*plan.stepped, 2 * plan.stepped[1], "strain")
     inverse, linearise = factorise_clamped(bodies), linearisation(bodies, "nts", "dual")
@@ -60,10 +61,10 @@ def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value
 def pressures(plan: Plan, solve: Reference) -> Rows:
     """Yield contact pressures along the arc for each load step and contact method.
 
-    A row holds contact, step, node, angle in degrees, length in m, force in N/m and
-    pressure in Pa of one slave node. angle: of the undeformed node about the centre of
-    the ring, from the right foot. length: share of the arc, ∫N_j. force: the normal
-    force ‖(Bᵀλ)_j‖. pressure: force per length.
+    A row contains contact, step, node, angle in degrees, length in m, force in N/m and
+    pressure in Pa of one slave node. The angle is that of the undeformed node about the
+    centre of the ring, from the right foot; the length is its share ∫N_j of the arc,
+    the force is the normal force ‖(Bᵀλ)_j‖, and the pressure is force per length.
     """
     bodies = model(plan.scaling[-1], plan.Nh, 2 * plan.Nh, "strain")
     inverse = factorise_clamped(bodies)
@@ -90,9 +91,9 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
 def verification(plan: Plan, solve: Reference) -> Rows:
     """Yield errors against exact solutions: the patch test and Hertz's pressure.
 
-    A row holds problem, contact, n and error for one mesh. n: elements along the upper
-    block, or per half width of the contact. error: max|σ_y + p|/p, or the relative L2
-    error of the pressure.
+    A row contains problem, contact, n and error for one mesh, where n is the number of
+    elements along the upper block, or per half width of the contact, and the error is
+    max|σ_y + p|/p, or the relative L2 error of the pressure.
     """
     for contact, keys in ROWS.items():
         for upper in plan.patch:

@@ -1,4 +1,4 @@
-"""Sizes and repeats of the experiments: those of the paper, and shorter ones."""
+"""Sizes and repeats of the experiments of the paper, and shorter ones."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ class Plan:
     dense: int  #: dofs up to which a dense pseudoinverse is computed
     scaling: tuple[int, ...]  #: Nr of Figure 6, ascending; the last is that of Table 1
     scaling_rounds: Rounds
-    Nh: int = 15  #: of Figures 6, 7 and Table 1
+    Nh: int = 15  #: size of Figures 6, 7 and Table 1
     example: tuple[int, int] = (4, 3)  #: Nr, Nh of Figure 2
     steps: int = 10  #: load steps
     stepped: tuple[int, int]  #: Nr, Nh of the study of the stepping
-    stepping: tuple[int, ...]  #: numbers of steps in it
-    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations of each step in it
+    stepping: tuple[int, ...]  #: numbers of steps in this study
+    relin: tuple[int, ...] = (1, 2, 3)  #: linearisations of each step in this study
     patch: tuple[int, ...]  #: elements along the upper block of the patch test
     hertz: tuple[int, ...]  #: elements per half width of Hertz's contact
 

@@ -1,4 +1,4 @@
-"""The family of bodies from gmsh; see `problems.models.gmsh_bodies`."""
+"""The family of bodies from mesh files; see `problems.models.gmsh_bodies`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 class GmshBodies(ContactFamily):
-    """Bodies of a user: a mesh from gmsh, and a TOML with materials, loads, contacts.
+    """Bodies of a user: a mesh, and a TOML with materials, loads, contacts.
 
     The digest of the content of both files is a parameter of the case, so that changed
     files are another case.

@@ -6,7 +6,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from mortarbench.problems.families.declared import DeclaredFamily
-from mortarbench.problems.ranges import GLUES, check_memory, key, schema
+from mortarbench.problems.ranges import (
+    CLUSTERS,
+    GLUES,
+    check_memory,
+    key,
+    schema,
+)
 
 if TYPE_CHECKING:
     from mortarbench.harness import Value
@@ -16,7 +22,7 @@ class Membranes(DeclaredFamily):
     """Two membranes in contact along an edge; the right one floats."""
 
     name = "membranes"
-    keys = schema(S=key(2, 1), n=key(8, 1), **GLUES)
+    keys = schema(S=key(2, 1), n=key(8, 1), **GLUES, **CLUSTERS)
     forms = ("primal", "dual")
     model = "membranes.membranes"
     subdomains = "membranes"

@@ -27,7 +27,9 @@ from mortarbench.problems.ranges import (
 if TYPE_CHECKING:
     from mortarbench.harness import Value
 
-MAX_DISTORTION = 0.35  #: cells turn inside out where nodes move by half a cell
+MAX_DISTORTION = (
+    0.35  #: largest shift; cells turn inside out where nodes move by half a cell
+)
 
 
 class ContactPatch(ContactFamily):

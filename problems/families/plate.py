@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 from mortarbench.harness import InputError
 from mortarbench.problems.families.declared import DeclaredFamily
 from mortarbench.problems.ranges import (
+    CLUSTERS,
+    DIMENSION,
     GLUES,
     PLANES,
     check_memory,
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Plate(DeclaredFamily):
-    """A clamped plate in subdomains, with jumps of E: a linear problem for FETI."""
+    """A clamped plate or box in subdomains, with jumps of E: linear, to study FETI."""
 
     name = "plate"
     keys = schema(
@@ -39,6 +41,9 @@ class Plate(DeclaredFamily):
         **PLANES,
         supports=choice("rows", "eliminated"),
         **GLUES,
+        **CLUSTERS,
+        **DIMENSION,
+        Sz=key(1, 1),
     )
     forms = ("primal", "dual")
     model = "plate.clamped_plate"
@@ -49,17 +54,29 @@ class Plate(DeclaredFamily):
         """Raise InputError unless every key is in its range."""
         super().check(params)
         p: Any = params
-        check_memory(self.name, 2 * p["Sx"] * p["Sy"] * p["n"] * (p["ny"] or p["n"]))
+        dim, in_plane = p["dim"], p["Sx"] * p["Sy"] * p["n"] * (p["ny"] or p["n"])
+        check_memory(self.name, dim * in_plane * (p["Sz"] * p["n"]) ** (dim - 2))
         positive(self.name, p, (name for name in ("width", "height") if p[name]))
         if p["pattern"] == "uniform" and p["jump"] != 1:
             raise InputError(
                 f"{self.name}: jump={p['jump']} is not used by pattern=uniform; "
                 "expected no jump, or pattern=checkerboard or pattern=column"
             )
-        if p["supports"] == "eliminated" and p["Sx"] * p["Sy"] == 1:
+        if dim == 2 and p["Sz"] != 1:
+            raise InputError(
+                f"{self.name}: Sz={p['Sz']} is not used by dim=2; expected no Sz, or "
+                "dim=3"
+            )
+        if p["supports"] == "eliminated" and p["Sx"] * p["Sy"] * p["Sz"] == 1:
             raise InputError(
                 f"{self.name}: supports=eliminated leaves a single subdomain without "
                 "any row; expected more subdomains, or supports=rows"
+            )
+
+        if p["supports"] == "eliminated" and p["cluster"]:
+            raise InputError(
+                f"{self.name}: cluster={p['cluster']} with supports=eliminated is not "
+                "built; expected no cluster, or supports=rows"
             )
 
     def is_divided(self, params: Mapping[str, Value]) -> bool:

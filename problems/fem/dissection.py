@@ -23,7 +23,7 @@ from mortarbench.harness import Matrix
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.fem.ordering import borders, dissect_components, node_graph
 
-LEAF_SIZE = 8  #: most nodes of a set that is not bisected further
+LEAF_SIZE = 8  #: largest number of nodes of a set that is not bisected further
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int32]
@@ -35,8 +35,8 @@ class Fronts:
     """Fronts: sets of positions in the elimination order, in postorder of their tree.
 
     Front s eliminates the positions start[s] … start[s + 1] − 1. Its border,
-    border[first[s]:first[s + 1]], consists of the later positions with entries in its
-    rows, from the matrix or by fill-in, ascending. Its children are the last
+    border[first[s]:first[s + 1]], consists of the later positions, ascending, with
+    entries in its rows from the matrix or from fill-in. Its children are the last
     `children[s]` roots of subtrees before s.
     """
 

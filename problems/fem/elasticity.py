@@ -4,9 +4,9 @@ In the plane this is the bilinear quadrilateral of the paper (Section 2); triang
 degenerate quadrilaterals with two coincident corners, see `problems.fem.mesh`.
 
 Voigt's notation: strain (ε_x, ε_y, γ_xy), stress (σ_x, σ_y, τ_xy) in the plane,
-(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) and likewise for stress in space. Plane stiffness is
-per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m and forces
-are in N.
+(ε_x, ε_y, ε_z, γ_yz, γ_xz, γ_xy) in space, and stress in the same order. Plane
+stiffness is per unit thickness: K is in Pa and forces are in N/m. In space, K is in N/m
+and forces are in N.
 """
 
 from __future__ import annotations
@@ -129,8 +129,8 @@ class Pattern:
     cells: NDArray[np.int32]  #: (E, c)
     ptr: NDArray[np.int32]  #: (N + 1,) row pointers of the node graph
     slot: NDArray[np.int32]  #: (E, c, c) index of node b among the neighbours of node a
-    indptr: NDArray[np.int32]  #: (n + 1,) of K in CSC
-    indices: NDArray[np.int32]  #: of K in CSC
+    indptr: NDArray[np.int32]  #: (n + 1,) column pointers of K in CSC
+    indices: NDArray[np.int32]  #: row indices of K in CSC
 
 
 def sparsity(mesh: Mesh) -> Pattern:
@@ -167,8 +167,8 @@ def rigid_motions(points: Floats) -> Floats:
 def rigid_modes(points: Floats) -> Floats:
     """Return an orthonormal basis R (n, r) of ker K of one body, for eq. (4).
 
-    The analytic formula: in the plane the rigid motions are orthogonal; in space,
-    rotations about the principal axes of inertia of the nodes are.
+    In the plane, the analytic rigid motions are orthogonal already; in space, they are
+    if the rotations are about the principal axes of inertia of the nodes.
     """
     R = rigid_motions(points)
     dim = points.shape[1]

@@ -15,8 +15,8 @@ the volumetric part depends on the average over the cell only,
 
     Π_e = ∫ w(F) dA + V U(θ̄),    θ̄ = 1/V ∫ θ(F) dA,    K_e = ∫ ∂²(w + U′(θ̄)θ) + U″/V ggᵀ
 
-with g = ∫ ∂θ/∂u dA. As Π_e is an energy, K_e is symmetric. On triangles it changes
-nothing. Q1P0 is known for hourglass modes under strong compression.
+with g = ∫ ∂θ/∂u dA. Since Π_e is an energy, K_e is symmetric. On triangles the method
+has no effect. Q1P0 may develop hourglass modes under strong compression.
 
 Units follow from those of the coordinates and moduli: with lengths in l and moduli in
 F₀/l, forces are in F₀ and energies in F₀l.
@@ -44,9 +44,9 @@ from mortarbench.problems.fem.hyperelastic import Hyperelastic
 from mortarbench.problems.fem.kernels import add_tangents, cell_tangents
 from mortarbench.problems.fem.mesh import Mesh, is_triangle
 
-#: smallest Poisson's ratio with mean dilatation; below, cells are those of linear
-#: elasticity. Without it, a cantilever with ν = 0.45 is 3.9 % too stiff, and one with
-#: ν = 0.4999 by a factor of 21
+#: smallest Poisson's ratio with mean dilatation; below it, cells are those of linear
+#: elasticity. Without mean dilatation, a cantilever is 3.9 % too stiff at ν = 0.45, and
+#: 21 times as stiff at ν = 0.4999
 NEARLY_INCOMPRESSIBLE = 0.4
 #: eigenvalues of a cell's tangent above −EIGENVALUE_ROUNDING times its largest count as
 #: rounding of the zero eigenvalues of translations
@@ -68,7 +68,7 @@ class Cells:
     """Data of the cells of hyperelastic bodies that do not depend on u."""
 
     mesh: Mesh
-    materials: tuple[Hyperelastic, ...]  #: one per body
+    materials: tuple[Hyperelastic, ...]  #: material of each body
     body: NDArray[np.int64]  #: (E,) body of each cell
     dofs: NDArray[np.int64]  #: (E, n·dim)
     gradients: Floats  #: (E, q, n, dim)  ∂N_a/∂X at the q Gauss points
@@ -225,7 +225,7 @@ def clip_eigenvalues(tangents: Floats) -> tuple[Floats, int]:
     vectors = vectors[changed]
     clipped = tangents.copy()
     product = (vectors * raised[:, None, :]) @ np.swapaxes(vectors, 1, 2)
-    # symmetric to the last digit
+    # makes the result symmetric to the last digit
     clipped[changed] = (product + np.swapaxes(product, 1, 2)) / 2
     return clipped, int(changed.sum())
 

@@ -1,8 +1,9 @@
 """Fixing nodes of a floating body: a few nodes spread over it.
 
-K without the rows of these nodes is the better conditioned the further they are apart:
-two neighbouring corners cost three digits, the central nodes of four parts hardly any.
-In space the nodes must not be on a line either, about which the body could rotate.
+The farther apart these nodes are, the better K without their rows and columns is
+conditioned: two neighbouring corners cost three digits, the central nodes of four parts
+hardly any. In space the nodes must not lie on a line, about which the body could
+rotate.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def fixing_nodes(points: NDArray[np.float64], parts: int = PARTS) -> Nodes:
 
     The nodes (N, dim) are bisected recursively across the longest principal axis, at
     most down to single nodes; the node nearest to the centroid of each part is chosen.
-    In space, the last one is moved to the side if all are about on a line.
+    In space, the last node is replaced by one off the line if all are nearly collinear.
     """
     groups = [np.arange(len(points))]
     while len(groups) < parts and all(group.size > 1 for group in groups):
@@ -54,7 +55,7 @@ def spectral_fixing_nodes(cells: Nodes, nodes: int, parts: int = PARTS) -> Nodes
 
     The nodes are bisected recursively at the median of the Fiedler vector (the second
     eigenvector of the graph Laplacian). In each part, the node with the largest entry
-    of the Perron vector of the adjacency matrix is chosen, its most central node.
+    of the Perron vector of the adjacency matrix, its most central node, is chosen.
 
     Parameters
     ----------

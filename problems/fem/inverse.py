@@ -100,7 +100,7 @@ class CondensedInverse:
     """K⁺ from a multifrontal factor; stores its block (K⁺)_cc on the interface."""
 
     factor: Multifrontal
-    interface: Nodes  #: c, components with entries in constraint rows, ascending
+    interface: Nodes  #: components c with entries in constraint rows, ascending
     compliance: NDArray[np.float64]  #: (K⁺)_cc, zero for prescribed components
     kernel: NDArray[np.float64]
     seconds: float  #: time of factorisation and condensation
@@ -136,7 +136,7 @@ def regular_inverse(
     Raises
     ------
     numpy.linalg.LinAlgError, sksparse.cholmod.CholmodNotPositiveDefiniteError
-        When K_ff is singular; the latter without an interface.
+        When K_ff is singular; CHOLMOD's error is raised without an interface.
 
     """
     return _inverse(csc_array(K), free, np.zeros((K.shape[0], 0)), interface)

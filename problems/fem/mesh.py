@@ -78,7 +78,8 @@ class Mesh:
 class StructuredGrid:
     """Structured grid, of which any block can be generated without the rest.
 
-    Node (row j, column i) has the number  j·(columns) + i,  and likewise cells.
+    Node (row j, column i) has the number j·(columns) + i; cells are numbered in the
+    same way.
     """
 
     columns: Vector  #: (nx + 1,) parameter of each column of nodes
@@ -160,7 +161,7 @@ class HalfDisc:
 
     @property
     def divisions(self) -> tuple[int, int]:
-        """Numbers of cells along a ring and of rings, including the triangles."""
+        """Number of cells along a ring; number of rings, including the triangles."""
         return self.angles.size - 1, self.radii.size
 
     @property
@@ -249,7 +250,7 @@ def box(corner: tuple[float, ...], size: tuple[float, ...],
         divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
     """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
 
-    Boundaries as of `box_grid`. Lengths are in m.
+    The boundaries have the names of those of `box_grid`. Lengths are in m.
 
     >>> mesh = box((0.0, 0.0, 0.0), (1.0, 1.0, 2.0), (1, 1, 2))
     >>> len(mesh.points), len(mesh.cells), mesh.boundaries["top"].tolist()
@@ -311,7 +312,7 @@ def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
 def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
     """Move the nodes of a `box` at random; those of a side stay in its plane.
 
-    share : largest move along an axis, relative to the mean cell size along it
+    share : largest shift along an axis, relative to the mean cell size along this axis
     """
     points = mesh.points
     low, high = points.min(axis=0), points.max(axis=0)
@@ -446,6 +447,11 @@ def nodal_areas(points: NDArray[np.float64], faces: Nodes) -> tuple[Nodes, Vecto
         measure = np.linalg.norm(np.cross(*tangents), axis=1)
         np.add.at(areas, place, weight * measure[:, None] * QUAD.shapes(xi))
     return nodes, areas
+
+
+def nodes_of_side(side: Nodes) -> Nodes:
+    """Return the nodes of a chain, in its order, or of faces, ascending."""
+    return side if side.ndim == 1 else np.unique(side)
 
 
 def dofs_of(nodes: Nodes, dim: int, axis: int | None = None) -> Nodes:

@@ -32,7 +32,7 @@ class Multifrontal:
     """Factor K_oo = LLᵀ, stored by fronts as U = Lᵀ, pivots × (pivots + border)."""
 
     order: Nodes  #: o, components in elimination order
-    fronts: Fronts  #: of positions in `order`
+    fronts: Fronts  #: fronts of positions in `order`
     offset: NDArray[np.int64]  #: (F + 1,) start of each front in `rows`
     rows: Floats  #: entries of U, front by front
 
@@ -44,7 +44,7 @@ class Multifrontal:
         return x.T.reshape(b.shape)
 
     def trailing(self) -> list[tuple[Nodes, Floats]]:
-        """Return the unknowns eliminated last, per connected part, and U on them."""
+        """Return the unknowns eliminated last in each connected part, and U on them."""
         f, blocks = self.fronts, []
         for s in np.flatnonzero(f.roots):
             positions = slice(f.start[s], f.start[s + 1])

@@ -51,24 +51,24 @@ add_tile(in M, Py_ssize_t stride, in X, Py_ssize_t depth, int rows, int w, out Y
                 Y[r * columns + c] += sum[r][c / 4][c % 4];
 }
 
-/* The same for all n rows and `some` <= 4w columns. */
+/* The same for all rows of M (rows, n) and `some` <= 4w columns. */
 INLINE void
-add_strip(in M, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y, Py_ssize_t columns,
-          Py_ssize_t some)
+add_strip(in M, Py_ssize_t rows, Py_ssize_t n, in X, Py_ssize_t depth, int w, out Y,
+          Py_ssize_t columns, Py_ssize_t some)
 {
     Py_ssize_t i = 0;
-    for (; i + ROWS <= n; i += ROWS)
+    for (; i + ROWS <= rows; i += ROWS)
         add_tile(M + i * n, n, X, depth, ROWS, w, Y + i * columns, columns, some);
-    for (; i < n; i++)
+    for (; i < rows; i++)
         add_tile(M + i * n, n, X, depth, 1, w, Y + i * columns, columns, some);
 }
 
-/* Y = M X with M (n, n), X and Y (n, columns), all stored by rows. */
+/* Y = M X with M (rows, n), X (n, columns) and Y (rows, columns), all stored by rows. */
 TWICE static void
-product(in M, Py_ssize_t n, in X, out Y, Py_ssize_t columns)
+product(in M, Py_ssize_t rows, Py_ssize_t n, in X, out Y, Py_ssize_t columns)
 {
     double packed[DEPTH * WIDTH];
-    memset(Y, 0, n * columns * sizeof(double));
+    memset(Y, 0, rows * columns * sizeof(double));
     for (Py_ssize_t first = 0; first < columns; first += WIDTH) {
         Py_ssize_t some = columns - first < WIDTH ? columns - first : WIDTH;
         Py_ssize_t w = (some + 3) / 4;
@@ -83,11 +83,14 @@ product(in M, Py_ssize_t n, in X, out Y, Py_ssize_t columns)
                         packed[4 * w * k + c] = c < some ? x[c] : 0.0;
             }
             if (w == 3)
-                add_strip(M + begin, n, packed, depth, 3, Y + first, columns, some);
+                add_strip(M + begin, rows, n, packed, depth, 3, Y + first, columns,
+                          some);
             else if (w == 2)
-                add_strip(M + begin, n, packed, depth, 2, Y + first, columns, some);
+                add_strip(M + begin, rows, n, packed, depth, 2, Y + first, columns,
+                          some);
             else
-                add_strip(M + begin, n, packed, depth, 1, Y + first, columns, some);
+                add_strip(M + begin, rows, n, packed, depth, 1, Y + first, columns,
+                          some);
         }
     }
 }

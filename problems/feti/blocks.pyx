@@ -7,6 +7,7 @@ product with two dozen columns. This module is compiled when the package is inst
 """
 
 from libc.stdlib cimport calloc, free
+from libc.string cimport memset
 from scipy.linalg.cython_blas cimport dspmv
 
 from mortarbench.harness.distributed.sparse cimport LinearMap
@@ -15,21 +16,22 @@ import numpy as np
 
 cdef extern from "blocks.h" nogil:
     void product(
-        const double *M, Py_ssize_t n, const double *X, double *Y, Py_ssize_t columns
+        const double *M, Py_ssize_t rows, Py_ssize_t n, const double *X, double *Y,
+        Py_ssize_t columns
     )
 
 ctypedef struct block:
-    Py_ssize_t n, members
+    Py_ssize_t rows, n, members
     const double *entries  # NULL for an object of Python
     bint is_triangle
 
 
 cdef class BlockDiagonal(LinearMap):
-    """The map of packed vectors by blocks M_g (n_g, n_g), each for S_g subdomains.
+    """The map of packed vectors by blocks M_g (r_g, n_g), each for S_g subdomains.
 
     The part of a vector that belongs to a block is a matrix (n_g, S_g), stored by rows.
 
-    blocks : symmetric; each an array (n_g, n_g), the upper triangle of one, column by
+    blocks : each an array (r_g, n_g); or, if symmetric, the upper triangle, column by
         column, as an array (n_g (n_g + 1)/2,) if S_g = 1, or an object with `@`
     sizes : n_g
     members : S_g
@@ -54,31 +56,34 @@ cdef class BlockDiagonal(LinearMap):
             raise MemoryError
         for i in range(self.count):
             n, w, M = int(sizes[i]), int(members[i]), self.blocks[i]
-            self.at[i].n, self.at[i].members = n, w
-            self.n += n * w
-            if not isinstance(M, np.ndarray):
+            is_array = isinstance(M, np.ndarray)
+            rows = M.shape[0] if is_array and M.ndim == 2 else n
+            self.at[i].rows, self.at[i].n, self.at[i].members = rows, n, w
+            self.n += rows * w
+            self.k += n * w
+            if not is_array:
                 continue
             self.at[i].is_triangle = M.ndim == 1
-            fits = M.shape == ((n, n) if M.ndim == 2 else (n * (n + 1) // 2,))
+            fits = M.shape == ((rows, n) if M.ndim == 2 else (n * (n + 1) // 2,))
             if not fits or (M.ndim == 1 and w != 1):
                 raise ValueError(f"{M.shape} times ({n}, {w})")
             self.blocks[i] = np.ascontiguousarray(M, dtype=np.float64)
             entries = self.blocks[i].reshape(-1)
-            self.at[i].entries = &entries[0] if n else NULL
-        self.k, self.shape = self.n, (self.n, self.n)
+            self.at[i].entries = &entries[0] if entries.shape[0] else NULL
+        self.shape = self.n, self.k
 
     def __dealloc__(self):
         free(self.at)
 
     cdef int apply(self, const double *x, double *y, Py_ssize_t columns) except -1:
-        cdef Py_ssize_t i, c, n, w
+        cdef Py_ssize_t i, c, rows, n, w
         cdef int size, step = <int> columns
         cdef double one = 1.0, zero = 0.0
         for i in range(self.count):
-            n, w = self.at[i].n, self.at[i].members * columns
-            if not n * w:
-                continue
-            if not self.at[i].entries:
+            rows, n, w = self.at[i].rows, self.at[i].n, self.at[i].members * columns
+            if not rows * n * w:
+                memset(y, 0, rows * w * sizeof(double))
+            elif not self.at[i].entries:
                 X = np.asarray(<double[:n, :w]> <double *> x)
                 Y = np.asarray(<double[:n, :w]> y)
                 Y[:] = self.blocks[i] @ X
@@ -88,7 +93,7 @@ cdef class BlockDiagonal(LinearMap):
                     dspmv(b"U", &size, &one, <double *> self.at[i].entries,
                           <double *> x + c, &step, &zero, y + c, &step)
             else:
-                product(self.at[i].entries, n, x, y, w)
+                product(self.at[i].entries, rows, n, x, y, w)
             x += n * w
-            y += n * w
+            y += rows * w
         return 0

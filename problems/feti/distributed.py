@@ -48,7 +48,12 @@ from mortarbench.problems.feti.operators import (
     scaled_columns,
     touched_components,
 )
-from mortarbench.problems.feti.subdomain_classes import Condensed, Dense, Subdomains
+from mortarbench.problems.feti.subdomain_classes import (
+    Clusters,
+    Condensed,
+    Dense,
+    Subdomains,
+)
 
 #: share of the work on a class that follows the factorisation of its stiffness matrix;
 #: an estimate that only balances the ranks
@@ -63,7 +68,9 @@ class Partition(NamedTuple):
     owner: NDArray[np.int64]  #: (m,) rank that owns each row
 
 
-def partition(B: csr_array, domains: Subdomains, ranks: int) -> Partition:
+def partition(
+    B: csr_array, domains: Subdomains, ranks: int, clusters: Clusters | None = None
+) -> Partition:
     """Distribute the subdomains and the rows of B (m, N) over ranks.
 
     Raises
@@ -79,7 +86,9 @@ def partition(B: csr_array, domains: Subdomains, ranks: int) -> Partition:
     touches = csr_array((ones, (rows, subdomain)), shape=(B.shape[0], S))
     touches.data[:] = 1
     work, size = _work(B, domains), np.diff(domains.start)
-    rank = balanced_partition(csr_array(touches.T @ touches), work, size, ranks)
+    graph = csr_array(touches.T @ touches)
+    cluster = None if clusters is None else clusters.cluster
+    rank = balanced_partition(graph, work, size, ranks, cluster)
     of_rank = csr_array((ones[:S], (np.arange(S), rank)), shape=(S, ranks))
     reach = csr_array(touches @ of_rank)
     reach.sort_indices()
@@ -109,8 +118,9 @@ SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
 
 
 def balanced_partition(
-    graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int
-) -> NDArray[np.int64]:
+    graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int,
+    cluster: NDArray[np.int64] | None = None,
+) -> NDArray[np.int64]:  # fmt: skip
     """Partition subdomains over ranks, balancing both work and size (S,).
 
     METIS balances a single weight, and the first one is the work. If the sizes are then
@@ -121,19 +131,25 @@ def balanced_partition(
     Parameters
     ----------
     graph : (S, S) number of rows shared by two subdomains
+    cluster : (S,) cluster of each subdomain; a rank has whole clusters
 
     Returns
     -------
     rank of each subdomain, (S,)
 
     """
+    name = "subdomain"
+    if cluster is not None:
+        name, members = "cluster", np.arange(cluster.size)
+        sums = csr_array((np.ones_like(cluster), (members, cluster)))
+        graph, work, size = csr_array(sums.T @ graph @ sums), work @ sums, size @ sums
     if work.size < ranks:
         raise InputError(
-            f"{ranks} ranks for {work.size} subdomains; expected at most one rank per "
-            "subdomain"
+            f"{ranks} ranks for {work.size} {name}s; expected at most one rank per "
+            f"{name}"
         )
     if ranks == 1:
-        return np.zeros(work.size, dtype=np.int64)
+        return np.zeros(work.size if cluster is None else cluster.size, dtype=np.int64)
     graph = graph.copy()
     graph.setdiag(0)
     graph.eliminate_zeros()
@@ -151,7 +167,7 @@ def balanced_partition(
         other = _partitioned(graph, (weight / weight.min()).astype(int), ranks, seed)
         if uneven(work, other) <= MAX_IMBALANCE and uneven(size, other) < best:
             rank, best = other, uneven(size, other)
-    return rank
+    return rank if cluster is None else rank[cluster]
 
 
 def _partitioned(
@@ -346,11 +362,34 @@ class RankOperator:
         solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
         return lambda x: self._rows.times(self._rows.transposed_times(solve(x)))
 
+    def average_forces(self) -> DistributedColumns:
+        """Return the multipliers whose forces act on averages alone, as rows (c, o).
+
+        Bᵀλ = Cᵀμ for independent rows μᵀC: these forces are orthogonal to all
+        displacements with Cv = 0, so that Fλ = 0. Without clusters, c = 0.
+        """
+        halo, packed, clusters = self.halo, self.local.packed, self.local.clusters
+        touched = csr_array((0, halo.rows.size))
+        if clusters is not None:
+            C = clusters.independent @ clusters.averages
+            touched = csr_array(C @ self.local.B.T)
+        counts = halo.ranks.comm.allgather(touched.shape[0])
+        first = sum(counts[: halo.ranks.rank])
+        solve = self._gram_inverse(csr_array(packed.B @ packed.BT))
+        rows = [np.zeros((0, halo.owned.size))]
+        for i in range(sum(counts)):
+            is_local = first <= i < first + touched.shape[0]
+            force = touched[[i - first]].toarray()[0] if is_local else None
+            part = np.zeros(halo.rows.size) if force is None else force
+            rows.append(solve(halo.accumulate(part))[None])
+        return DistributedColumns(csr_array(np.concatenate(rows)), halo.ranks)
+
     def preconditioner(self, kind: str, scaling: str) -> Product:
         """Return x ↦ B_D diag(D) B_Dᵀx; see `DualOperator.preconditioner`."""
         packed, ranks = self.local.packed, self.halo.ranks
         each, weights = self.local.weighted_blocks(kind, scaling)
-        blocks, BW = packed.block_diagonal(each), scaled_columns(packed.B, weights)
+        blocks = self.local.stiffness_map(each, weights)
+        BW = scaled_columns(packed.B, weights)
         rows = RowsOverRanks.of(BW, self.halo)
         solve = self._gram_inverse(csr_array(BW @ packed.BT))
 
@@ -640,7 +679,7 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
 
     """
     B, domains = operator.B, operator.domains
-    partitioned = partition(B, domains, ranks.size)
+    partitioned = partition(B, domains, ranks.size, operator.clusters)
     touched = np.flatnonzero(partitioned.reach[:, [ranks.rank]].toarray())
     reach = csr_array(partitioned.reach[touched])
     halo = build_halo(ranks, touched, reach, partitioned.owner[touched])
@@ -649,15 +688,16 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
     columns = np.concatenate(
         [np.arange(domains.start[s], domains.start[s + 1]) for s in subdomains]
     )
-    local = DualOperator(
-        csr_array(B[halo.rows][:, columns]),
-        Subdomains(
-            tuple(domains.classes[k].without_factor(str(k)) for k in classes), class_of
-        ),
-        operator.explicit[classes],
-        operator.equalities,
-        partial(condense_over_ranks, ranks=ranks),
+    local_domains = Subdomains(
+        tuple(domains.classes[k].without_factor(str(k)) for k in classes), class_of
     )
+    local = DualOperator(
+        csr_array(B[halo.rows][:, columns]), local_domains,
+        operator.explicit[classes], operator.equalities,
+        partial(condense_over_ranks, ranks=ranks),
+        operator.clusters
+        and operator.clusters.restrict(subdomains, classes, local_domains),
+    )  # fmt: skip
     owned = halo.rows[halo.owned]
     q, lb, ub = (distributed(v[owned], ranks) for v in (qp.q, qp.lb, qp.ub))
     qp_local = QP(

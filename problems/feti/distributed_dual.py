@@ -10,7 +10,7 @@ contributions to rows of q and RᵀBᵀ that other ranks own; and the parts of R
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import chain, pairwise
 from typing import Any
@@ -78,7 +78,7 @@ class LocalDual:
         local = self.subdomains
         return np.asarray(
             local.rows.c[self.halo.owned]
-            - self.halo.accumulate(local.rows.B @ local.domains.inverse(local.f))
+            - self.halo.accumulate(local.rows.B @ local.units.inverse(local.f))
         )
 
     @cached_property
@@ -100,9 +100,11 @@ class LocalDual:
         )
         classes = tuple(kind.without_factor() for kind in domains.classes)
         unfactored = Subdomains(classes, domains.class_of)
+        clusters = self.subdomains.clusters
         local = DualOperator(
             rows.B, unfactored, self.explicit, rows.equalities,
             partial(condense_over_ranks, ranks=ranks),
+            clusters and replace(clusters, domains=unfactored),
         )  # fmt: skip
         lower, upper = self.bounds(self.subdomains.problem.contact.bound)
         qp = QP(
@@ -113,7 +115,18 @@ class LocalDual:
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
-        """Return bounds of the multipliers of owned rows, with friction bounds (k,)."""
+        """Return bounds of the multipliers of owned rows, with friction bounds (k,).
+
+        Raises
+        ------
+        InputError
+            For friction in space, whose multipliers are in discs.
+
+        """
+        if bound.size and self.subdomains.problem.contact.tangents > 1:
+            raise InputError(
+                "friction in space on MPI ranks is not built; expected one process"
+            )
         ranks, E = self.subdomains.ranks, self.subdomains.rows.equalities
         scale = self.subdomains.problem.contact_scale
         pressing = scale.size - bound.size
@@ -179,7 +192,7 @@ def distributed_qp(
 
     bounds = dual.bounds(local.problem.contact.bound)
     return DistributedQP(
-        variables=local.rows.total, equality_rows=local.coarse_size,
+        variables=local.rows.total, equality_rows=local.unit_motions,
         bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
         share=dual.share, digest=digest,
         answer=evaluation(
@@ -205,6 +218,7 @@ def _decomposition(
     return {
         "subdomains": local.rank.size, "kinds": len(set().union(*classes)),
         "torn_dofs": int(dofs), "multipliers": rows.total,
+        "coarse_unknowns": local.unit_motions,
         "explicit_subdomains": int(formed), "explicit_mib": mib,
     }  # fmt: skip
 
@@ -228,7 +242,9 @@ def _digest(local: LocalSubdomains) -> str:
         name = hex_digest((names[domains.class_of[s]], *numbers))
         digests.append((int(local.number[s]), name))
     every = sorted(chain.from_iterable(local.ranks.comm.allgather(digests)))
-    shared = contact.rows.data, contact.c, contact.bound
+    shared = [contact.rows.data, contact.c, contact.bound]
+    if local.problem.clusters is not None:
+        shared.append(local.problem.clusters)
     content = (*(name.encode() for _, name in every), *(v.tobytes() for v in shared))
     return hex_digest(content, 64)
 
@@ -284,7 +300,7 @@ def _resultants(local: LocalSubdomains) -> Vector:
     """Return Rᵀf (r,) of all subdomains, on every rank."""
     loaded = np.flatnonzero(local.f)
     resultants = local.resultants(loaded, local.f[loaded])
-    total = np.zeros(local.coarse_size)
+    total = np.zeros(local.unit_motions)
     for number, part in local.ranks.comm.allgather(
         (resultants.indices, resultants.data)
     ):

@@ -77,11 +77,11 @@ def local_solution(local: LocalSubdomains, halo: Halo, s: Solution) -> LocalSolu
     supports eliminate are zero.
     """
     bodies, multiplicity = _local_bodies(local.floating)
-    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_motions]
+    T, alpha = bodies.parts.spread, np.asarray(s.y)[local.local_unit_motions]
     multipliers = halo.gather(np.asarray(s.x))
     v = np.zeros(T.shape[0])
-    v[local.free] = local.domains.inverse(local.f - local.rows.B.T @ multipliers)
-    v[local.free] -= local.domains.kernel @ alpha
+    v[local.free] = local.units.inverse(local.f - local.rows.B.T @ multipliers)
+    v[local.free] -= local.units.kernel @ alpha
     u = bodies.reduction.completed(T.T @ v) / multiplicity
     z = contact_multipliers(local, halo, s)
     return LocalSolution(subdomains=local, bodies=bodies, u=u, z=z)
@@ -161,7 +161,7 @@ def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
         fixed=np.flatnonzero(np.isin(components, problem.fixed)),
         contact=Contact(
             rows=csr_array(contact.rows[active]), c=contact.c[active],
-            bound=contact.bound[contact.bound > 0],
+            bound=contact.bound[contact.bound > 0], tangents=contact.tangents,
         ),
         floating=_floating_bodies(local),
     ), multiplicity  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import block_diag, csc_array, csr_array
@@ -12,7 +13,11 @@ from mortarbench.harness.distributed.vectors import Ranks, Share
 from mortarbench.harness.operators import Arrays, SerialisableOperator
 from mortarbench.problems.feti.distributed import local_share
 from mortarbench.problems.feti.operators import DualOperator, explicit_classes
-from mortarbench.problems.feti.subdomain_classes import SubdomainClass, Subdomains
+from mortarbench.problems.feti.subdomain_classes import (
+    Clusters,
+    SubdomainClass,
+    Subdomains,
+)
 
 NAME = "tfeti"  #: name in `problems.OPERATORS`, stored in files
 _PARTS = ("data", "indices", "indptr")
@@ -34,11 +39,18 @@ class StoredOperator(DualOperator):
 
 
 def dual_operator(
-    B: csr_array, domains: Subdomains, equalities: int
+    B: csr_array,
+    domains: Subdomains,
+    equalities: int,
+    clusters: Clusters | None = None,
 ) -> SerialisableOperator:
     """Return F as a serialisable operator: B, and the data of every class once.
 
+    Parameters
+    ----------
     equalities : number of equality rows of B, which come first
+    clusters : if given, F = B K̃⁺Bᵀ
+
     """
     classes = domains.classes
     K = csc_array(block_diag([template.K for template in classes], format="csc"))
@@ -61,6 +73,14 @@ def dual_operator(
     }
     for name in _BY_CLASS:
         arrays[f"{name}_ends"] = np.cumsum([len(getattr(k, name)) for k in classes])
+    if clusters is not None:
+        faces = csc_array(block_diag(clusters.faces, format="csc"))
+        arrays |= {
+            "cluster": clusters.cluster,
+            "faces_ends": np.cumsum([modes.shape[1] for modes in clusters.faces]),
+            **{f"faces_{part}": getattr(faces, part) for part in _PARTS},
+            **{f"joints_{part}": getattr(clusters.joints, part) for part in _PARTS},
+        }
     return SerialisableOperator(
         B.shape[0], NAME, arrays, {NAME: dual_operator_from_arrays}
     )
@@ -89,4 +109,24 @@ def dual_operator_from_arrays(arrays: Arrays) -> StoredOperator:
     )
     shape = arrays["B_indptr"].size - 1, domains.start[-1]
     B = csr_array(tuple(arrays[f"B_{part}"] for part in _PARTS), shape=shape)
-    return StoredOperator(B, domains, arrays["explicit"], int(arrays["equalities"]))
+    clusters = _clusters(arrays, domains) if "cluster" in arrays else None
+    return StoredOperator(
+        B, domains, arrays["explicit"], int(arrays["equalities"]), clusters=clusters
+    )
+
+
+def _clusters(arrays: Arrays, domains: Subdomains) -> Clusters:
+    data, indices, indptr = (arrays[f"faces_{part}"] for part in _PARTS)
+    ends, row, faces = np.append(0, arrays["faces_ends"]), 0, []
+    for template, (begin, end) in zip(domains.classes, pairwise(ends), strict=True):
+        columns, n = indptr[begin : end + 1], template.K.shape[0]
+        within = slice(columns[0], columns[-1])
+        modes = data[within], indices[within] - row, columns - columns[0]
+        faces.append(csr_array(csc_array(modes, shape=(n, end - begin))))
+        row += n
+    joints = tuple(arrays[f"joints_{part}"] for part in _PARTS)
+    coordinates = int(np.diff(ends)[domains.class_of].sum())
+    return Clusters(
+        domains=domains, cluster=arrays["cluster"], faces=tuple(faces),
+        joints=csr_array(joints, shape=(joints[2].size - 1, coordinates)),
+    )  # fmt: skip

@@ -39,8 +39,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
-from scipy.sparse import csc_array, csr_array, diags_array, vstack
+from scipy.sparse import (
+    block_diag,
+    csc_array,
+    csr_array,
+    diags_array,
+    eye_array,
+    kron,
+    vstack,
+)
 from scipy.sparse.csgraph import connected_components
 
 from mortarbench.harness import Vector
@@ -51,15 +58,18 @@ from mortarbench.harness.distributed.sparse import (
     DirectSum,
     Identity,
     LinearMap,
+    Sum,
 )
 from mortarbench.harness.operators import Product
 from mortarbench.problems.fem.mesh import Nodes
 from mortarbench.problems.feti.blocks import BlockDiagonal
 from mortarbench.problems.feti.subdomain_classes import (
+    Clusters,
     Condensed,
     Dense,
     SubdomainClass,
     Subdomains,
+    upper_triangle,
 )
 
 MAX_EXPLICIT_MIB = 2048  #: memory for all explicit blocks of an operator
@@ -101,7 +111,7 @@ class Packed:
     B: csr_array  #: (m, M) packed columns of B
     BT: csr_array  #: (M, m) the transpose, stored by rows
 
-    def congruence(self, blocks: BlockDiagonal) -> Composition:
+    def congruence(self, blocks: LinearMap) -> Composition:
         """Return the map x ↦ B_b diag(blocks) B_bᵀx for x (m,) or (m, k)."""
         return Composition(CompressedRows(self.B), blocks, CompressedRows(self.BT))
 
@@ -186,6 +196,7 @@ class DualOperator:
     condense: Callable[[Sequence[Group]], Iterable[tuple[int, Condensed]]] = (
         condense_groups
     )
+    clusters: Clusters | None = None  #: None if no subdomains are joined by averages
 
     def __call__(self, x: Dense) -> Dense:
         """Return Fx."""
@@ -226,7 +237,7 @@ class DualOperator:
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             solve = DirectSum(Identity(E), contact)
             self._preconditioners[kind, scaling] = Composition(
-                solve, CompressedRows(B_D), self.packed.block_diagonal(blocks),
+                solve, CompressedRows(B_D), self.stiffness_map(blocks, weights),
                 CompressedRows(csr_array(B_D.T)), solve,
             )  # fmt: skip
         return self._preconditioners[kind, scaling]
@@ -264,6 +275,16 @@ class DualOperator:
             weights = np.ones_like(weights)
         return blocks, weights
 
+    def stiffness_map(self, blocks: Sequence[Any], weights: Vector) -> LinearMap:
+        """Return the map of packed components by D, or by (I − Π)D(I − Π)ᵀ.
+
+        blocks, weights : from `weighted_blocks`
+        """
+        separate = self.packed.block_diagonal(blocks)
+        if self.clusters is None:
+            return separate
+        return average_free(self.clusters, self.packed, separate, weights)
+
     @cached_property
     def packed(self) -> Packed:
         """The rows B on the components that they touch."""
@@ -275,13 +296,17 @@ class DualOperator:
         return self._blocks.inverses
 
     @property
-    def inverse_map(self) -> BlockDiagonal:
-        """The map of packed components by (K⁺)_bb of each group."""
+    def inverse_map(self) -> LinearMap:
+        """The map of packed components by (K⁺)_bb of each group, or by (K̃⁺)_bb."""
         return self._blocks.inverse_map
 
     @cached_property
     def _diagonal(self) -> Vector:
-        return self.packed.diagonal(self.inverses)
+        diagonal, joints = self.packed.diagonal(self.inverses), self._blocks.joints
+        if joints is None:
+            return diagonal
+        # not negative; rounding may make it so where C determines a row of B
+        return np.maximum(diagonal + joints.diagonal(self.packed.B), 0.0)
 
     @cached_property
     def _blocks(self) -> _Blocks:
@@ -293,7 +318,12 @@ class DualOperator:
         inverses, schur = (
             [blocks_of[i][k] for i in range(len(groups))] for k in (0, 1)
         )
-        return _Blocks(inverses, schur, self.packed.block_diagonal(inverses))
+        separate = self.packed.block_diagonal(inverses)
+        if self.clusters is None:
+            return _Blocks(inverses, schur, separate, None)
+        joints = _joints(self.clusters, self.packed, inverses)
+        joined = Sum(separate, joints.linear_map)
+        return _Blocks(inverses, schur, joined, joints)
 
 
 class _Blocks(NamedTuple):
@@ -301,12 +331,156 @@ class _Blocks(NamedTuple):
 
     inverses: list[Any]  #: (K⁺)_bb
     schur: list[Any]  #: S_bb
-    inverse_map: BlockDiagonal  #: diag((K⁺)_bb)
+    inverse_map: LinearMap  #: diag((K⁺)_bb), or (K̃⁺)_bb
+    joints: _Joints | None  #: the difference between them; None without clusters
+
+
+@dataclass(frozen=True, eq=False)
+class _Joints:
+    """The term −V M⁺Vᵀ of `Clusters` on packed components.
+
+    The columns of V for a subdomain combine those of its class, [(K⁺Φ)_b, R_b].
+    """
+
+    groups: tuple[Group, ...]
+    columns: list[Dense]  #: (n_g, p_g) for each group
+    #: (k, p) combinations that yield (μ_1, α_1, μ_2, α_2, …), the unknowns of clusters;
+    #: columns are packed as components are
+    combine: csr_array
+    saddle_inverses: list[Vector]  #: upper triangle of M⁺ for each cluster
+    sizes: list[int]  #: number of unknowns of each cluster
+
+    @property
+    def linear_map(self) -> Composition:
+        """The map of packed components."""
+        members = [group.members.size for group in self.groups]
+        sizes = [group.touched.size for group in self.groups]
+        rows = [np.ascontiguousarray(block.T) for block in self.columns]
+        return Composition(
+            BlockDiagonal(self.columns, [len(block) for block in rows], members),
+            CompressedRows(csr_array(-self.combine.T)),
+            BlockDiagonal(self.saddle_inverses, self.sizes, [1] * len(self.sizes)),
+            CompressedRows(self.combine), BlockDiagonal(rows, sizes, members),
+        )  # fmt: skip
+
+    def diagonal(self, B: csr_array) -> Vector:
+        """Return the diagonal of −BV M⁺VᵀBᵀ (m,) for packed rows B."""
+        columns = [
+            kron(csr_array(block), eye_array(group.members.size), format="csr")
+            for group, block in zip(self.groups, self.columns, strict=True)
+        ]
+        U = csc_array(B @ (block_diag(columns, format="csr") @ self.combine.T))
+        total, end = np.zeros(B.shape[0]), 0
+        for n, triangle in zip(self.sizes, self.saddle_inverses, strict=True):
+            inverse = BlockDiagonal([triangle], [n], [1])(np.eye(n))
+            part = U[:, end : end + n]
+            rows = np.unique(part.indices)
+            part, end = csr_array(part[rows]), end + n
+            for begin in range(0, rows.size, STRIP_COLUMNS):
+                strip = slice(begin, begin + STRIP_COLUMNS)
+                u = part[strip].toarray()
+                total[rows[strip]] -= np.einsum("ij,ij->i", u @ inverse, u)
+        return total
+
+
+def average_free(
+    clusters: Clusters, packed: Packed, D: LinearMap, weights: Vector
+) -> Composition:
+    """Return (I − Π)D(I − Π)ᵀ with Π = Cᵀ(CWCᵀ)⁺CW, for packed components.
+
+    F vanishes on all multipliers with Bᵀλ = Cᵀμ, so that rounding would let the
+    iterates of preconditioned conjugate gradients drift along these. B_DΠ maps to them,
+    and (CWCᵀ)⁺CWBᵀB_D(I − Π) = 0 since C = LᵀB for some L: the preconditioner is the
+    same up to such multipliers, and its images are free of them.
+
+    weights : (M,) W, equal for all subdomains of a class
+    """
+    members = [group.members.size for group in packed.groups]
+    modes, weighted, grams, end = [], [], [], 0
+    for group, faces in zip(packed.groups, clusters.faces, strict=True):
+        Phi = faces[group.touched].toarray()
+        w = weights[end : end + Phi.shape[0] * group.members.size : group.members.size]
+        end += Phi.shape[0] * group.members.size
+        modes.append(Phi)
+        weighted.append(w[:, None] * Phi)
+        grams.append(Phi.T @ weighted[-1])
+    place = _column_places(clusters, packed, [Phi.shape[1] for Phi in modes])
+    C = csr_array(
+        (clusters.joints.data, place[clusters.joints.indices], clusters.joints.indptr),
+        clusters.joints.shape,
+    )
+    q = [Phi.shape[1] for Phi in modes]
+    n = [Phi.shape[0] for Phi in modes]
+
+    def oblique(left: list[Dense], right: list[Dense]) -> Sum:
+        rows = [np.ascontiguousarray(block.T) for block in right]
+        sizes = np.diff(clusters.rows).tolist()
+        minus_joined = Composition(
+            BlockDiagonal(left, q, members), CompressedRows(csr_array(-C.T)),
+            BlockDiagonal(clusters.gram_inverses(grams), sizes, [1] * len(sizes)),
+            CompressedRows(C), BlockDiagonal(rows, n, members),
+        )  # fmt: skip
+        return Sum(Identity(D.shape[0]), minus_joined)
+
+    return Composition(oblique(modes, weighted), D, oblique(weighted, modes))
+
+
+def _column_places(
+    clusters: Clusters, packed: Packed, sizes: Sequence[int]
+) -> NDArray[np.int64]:
+    """Return the places of the coordinates (Σq,) of `Clusters`, packed by groups.
+
+    sizes : number of columns of each group; its first ones are the coordinates
+    """
+    first = clusters.coordinates
+    place, end = np.empty(first[-1], dtype=np.int64), 0
+    for group, faces, p in zip(packed.groups, clusters.faces, sizes, strict=True):
+        members, q = group.members, np.arange(faces.shape[1])[:, None]
+        number = end + q * members.size + np.arange(members.size)
+        place[first[members] + q] = number
+        end += p * members.size
+    return place
+
+
+def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joints:
+    """Return the joints of clusters, from the blocks (K⁺)_bb of the groups."""
+    columns, compliance, end = list[Dense](), list[Dense](), 0
+    modes = clusters.domains.modes
+    first_motion = np.cumsum(modes) - modes
+    motion = np.empty(modes.sum(), dtype=np.int64)  # places among packed columns
+    for group, inverse, faces in zip(
+        packed.groups, inverses, clusters.faces, strict=True
+    ):
+        Phi = faces[group.touched].toarray()
+        image = BlockDiagonal([inverse], [group.touched.size], [1])(Phi)
+        compliance.append(Phi.T @ image)
+        columns.append(np.hstack([image, group.template.R[group.touched]]))
+        (q, p), members = (Phi.shape[1], columns[-1].shape[1]), group.members
+        place = end + np.arange(p * members.size).reshape(p, members.size)
+        motion[first_motion[members] + np.arange(p - q)[:, None]] = place[q:]
+        end += place.size
+    coordinate = _column_places(clusters, packed, [M.shape[1] for M in columns])
+    order, sizes = clusters.unknowns
+    C = clusters.joints
+    combine = vstack(
+        [
+            csr_array((C.data, coordinate[C.indices], C.indptr), (C.shape[0], end)),
+            csr_array(
+                (np.ones(motion.size), motion, np.arange(motion.size + 1)),
+                (motion.size, end),
+            ),
+        ],
+        format="csr",
+    )
+    return _Joints(
+        packed.groups, columns, csr_array(combine[order]),
+        clusters.saddle_inverses(compliance), sizes,
+    )  # fmt: skip
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:
     if group.members.size == 1:
-        return _triangle(blocks.compliance), _triangle(blocks.schur)
+        return upper_triangle(blocks.compliance), upper_triangle(blocks.schur)
     return blocks
 
 
@@ -317,11 +491,6 @@ def _implicit(group: Group) -> tuple[Any, Any]:
     return _Part(kind.K.shape[0], b, kind.inverse), _Part(
         g.size, at, kind.elimination(g).__matmul__
     )
-
-
-def _triangle(M: Dense) -> Vector:
-    """Return the upper triangle of a symmetric matrix, column by column."""
-    return np.asarray(lapack.dtrttp(M)[0])
 
 
 class _Part(NamedTuple):

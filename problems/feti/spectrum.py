@@ -1,6 +1,7 @@
 """Extreme eigenvalues of F on the null space of its equations, with error bounds.
 
-With P the orthogonal projector onto ker G ∩ range B, these are the spectra of
+With P the orthogonal projector onto ker G ∩ range B, less ker F where averages join
+subdomains, these are the spectra of
 
     P F P                 in the inner product  xᵀy,
     P M P F               in the inner product  xᵀF y,
@@ -22,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh_tridiagonal
-from scipy.sparse import csc_matrix
+from scipy.sparse import csc_matrix, csr_array, vstack
 from sksparse.cholmod import cholesky
 
 from mortarbench.harness import Vector
@@ -154,7 +155,9 @@ def spectra_over_ranks(
 
 
 def projector(F: RankOperator, G: DistributedColumns) -> Product:
-    """Return the orthogonal projector onto ker G ∩ range B; called by all ranks.
+    """Return the orthogonal projector onto ker G ∩ range B, less ker F.
+
+    Called by all ranks.
 
     Parameters
     ----------
@@ -163,13 +166,15 @@ def projector(F: RankOperator, G: DistributedColumns) -> Product:
 
     """
     within = F.onto_rows()
-    if not G.shape[0]:
+    excluded = csr_array(vstack([G.part, F.average_forces().part]))
+    if not excluded.shape[0]:
         return within
-    factor = cholesky(csc_matrix(G.gram()))
+    rows = DistributedColumns(excluded, G.ranks)
+    factor = cholesky(csc_matrix(rows.gram()))
 
     def project(x: Vector) -> Vector:
         y = within(x)
-        return np.asarray(y - np.asarray(G.T @ factor(G @ y)))
+        return np.asarray(y - np.asarray(rows.T @ factor(rows @ y)))
 
     return project
 

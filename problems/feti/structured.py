@@ -51,7 +51,7 @@ class Layout:
 
     @classmethod
     def of(
-        cls, grids: tuple[StructuredGrid, ...], most: int | tuple[int, int]
+        cls, grids: tuple[StructuredGrid, ...], most: int | tuple[int, ...]
     ) -> Layout:
         """Cut grids into blocks of at most `most` cells per side.
 
@@ -116,6 +116,11 @@ class Layout:
             np.arange(self.count) - self.block_start[body], self._blocks_per_row[body]
         )
         return Places(body, column, row)
+
+    @property
+    def positions(self) -> NDArray[np.int64]:
+        """Column and row of each block among those of its grid, (S, 2)."""
+        return np.stack(self.block[1:], axis=1).astype(np.int64)
 
     @cached_property
     def _blocks_per_row(self) -> NDArray[np.int64]:

@@ -54,6 +54,10 @@ class Subdivision(Protocol):
         """Body of each subdomain, (S,)."""
 
     @property
+    def positions(self) -> NDArray[np.int64] | None:
+        """Positions (S, dim) in a grid of subdomains per body; None without grids."""
+
+    @property
     def sizes(self) -> NDArray[np.int64]:
         """Number of nodes of each subdomain, (S,)."""
 
@@ -116,6 +120,7 @@ class ListedSubdivision:
     part: Callable[[int], tuple[Nodes, Nodes]]
     position: Callable[[Nodes], Points]
     labelling: Callable[[], NDArray[np.int64]]  #: computes `label`
+    positions: NDArray[np.int64] | None = None
 
     @property
     def label(self) -> NDArray[np.int64]:
@@ -290,7 +295,11 @@ def _perimeter(disc: HalfDisc, rings: slice, angles: slice) -> Nodes:
 
 
 def mesh_in_subdomains(
-    mesh: Mesh, label: NDArray[np.int64], body: NDArray[np.int64], named: Nodes
+    mesh: Mesh,
+    label: NDArray[np.int64],
+    body: NDArray[np.int64],
+    named: Nodes,
+    positions: NDArray[np.int64] | None = None,
 ) -> ListedSubdivision:
     """Return the subdivision of any mesh by labels of its cells; the mesh is stored.
 
@@ -298,6 +307,7 @@ def mesh_in_subdomains(
     ----------
     label, body : (E,) subdomain and body of each cell
     named : nodes to list although only one subdomain has them
+    positions : see `Subdivision`
 
     """
     points, cells, N = mesh.points, mesh.cells, len(mesh.points)
@@ -320,5 +330,5 @@ def mesh_in_subdomains(
         nodes=N, body=body[by_label[ends[:-1]]],
         sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
         holders=holders, part=part, position=points.__getitem__,
-        labelling=lambda: label,
+        labelling=lambda: label, positions=positions,
     )  # fmt: skip

@@ -10,25 +10,31 @@ that differ only by a rigid motion, such as those in one layer of a ring, are co
 they share one stiffness matrix, one factor and one explicit operator, and B contains
 the rotations. A displacement u (n,) of the undivided bodies gives v = T u, with one d×d
 block per copy of a node.
+
+In hybrid FETI (Klawonn and Rheinbach 2010, Comput. Methods Appl. Mech. Eng. 199), equal
+averages over the common faces of subdomains join these to clusters (`Clusters`). A
+cluster has the rigid motions of a single body, and the coarse problem shrinks.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, null_space, qr
-from scipy.sparse import csc_array, csc_matrix, csr_array
+from scipy.linalg import block_diag as block_diagonal
+from scipy.linalg import cho_solve, eigh, lapack, null_space, qr
+from scipy.sparse import block_diag, csc_array, csc_matrix, csr_array
 from sksparse.cholmod import Factor, analyze, cholesky
 
 from mortarbench.harness import Vector
 from mortarbench.harness.digest import hex_digest
 from mortarbench.harness.distributed.factor import with_int32
 from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.feti.blocks import BlockDiagonal
 
 Dense = NDArray[np.float64]
 _STRIP = 256  #: right-hand sides per solve, which bounds the memory for their images
@@ -195,11 +201,15 @@ class Subdomains:
         ends = np.cumsum(np.bincount(self.class_of, minlength=len(self.classes)))
         return tuple(np.split(order, ends[:-1]))
 
+    @property
+    def modes(self) -> NDArray[np.int64]:
+        """Number of rigid motions of each subdomain, (S,)."""
+        return np.array([kind.R.shape[1] for kind in self.classes])[self.class_of]
+
     @cached_property
     def kernel(self) -> csr_array:
         """R = diag(R_1 … R_S), (N, Σr)."""
-        modes = np.array([kind.R.shape[1] for kind in self.classes])[self.class_of]
-        sizes = np.diff(self.start)
+        modes, sizes = self.modes, np.diff(self.start)
         entries = np.concatenate([self.classes[k].R.ravel() for k in self.class_of])
         per_row = np.repeat(modes, sizes)
         ends = np.concatenate([[0], np.cumsum(per_row)])
@@ -233,6 +243,210 @@ class Subdomains:
         return v
 
 
+#: eigenvalues of C_cC_cᵀ below this share of the largest belong to dependent rows of C;
+#: averages over faces are orthonormal, so that others are far above it
+DEPENDENT_SHARE = 1e-10
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Clusters:
+    """Subdomains whose averages over common faces are equal within each cluster.
+
+    ::
+
+        min ½vᵀKv − bᵀv   subject to   Cv = 0
+
+    Row i of C is the difference between the averages of two subdomains, for one mode of
+    their common face. With v = K⁺(b − Cᵀμ) − Rα and V = [K⁺Cᵀ, R], the solution is
+
+        v = K̃⁺b − RNβ,   K̃⁺ = K⁺ − V M⁺Vᵀ,   M = ⎡CK⁺Cᵀ  CR⎤
+                                                  ⎣RᵀCᵀ    0⎦
+
+    with any β. N is an orthonormal basis of ker CR, the motions of clusters as rigid
+    bodies, and RN is the kernel. M⁺ is the pseudo-inverse of Moore and Penrose: it
+    allows for dependent rows of C, and K̃⁺ ≥ 0. M is block diagonal, with one block per
+    cluster.
+
+    The modes of a face are its rigid motions, orthonormal over its nodes. A class has
+    the modes of all faces at which some member is joined: Φ_k for class k. C applies to
+    the coordinates Φ_kᵀv_s, which are numbered subdomain by subdomain.
+    """
+
+    domains: Subdomains  #: all of them float
+    cluster: NDArray[np.int64]  #: (S,) cluster of each subdomain, from 0
+    faces: tuple[csr_array, ...]  #: Φ (n_k, q_k) for each class
+    joints: csr_array  #: C in these coordinates (c, Σq), rows ordered by clusters
+
+    @cached_property
+    def coordinates(self) -> NDArray[np.int64]:
+        """First coordinate of each subdomain, and their total: (S + 1,)."""
+        sizes = np.array([modes.shape[1] for modes in self.faces])
+        return np.concatenate([[0], np.cumsum(sizes[self.domains.class_of])])
+
+    @cached_property
+    def averages(self) -> csr_array:
+        """C, (c, N)."""
+        faces = block_diag([self.faces[k] for k in self.domains.class_of], format="csc")
+        return csr_array(self.joints @ faces.T)
+
+    @cached_property
+    def members(self) -> tuple[NDArray[np.int64], ...]:
+        """Subdomains of each cluster."""
+        order = np.argsort(self.cluster, kind="stable")
+        return tuple(np.split(order, np.cumsum(np.bincount(self.cluster))[:-1]))
+
+    @cached_property
+    def rows(self) -> NDArray[np.int64]:
+        """First row of C of each cluster, and their number: (clusters + 1,)."""
+        subdomain = np.searchsorted(
+            self.coordinates, self.joints.indices[self.joints.indptr[:-1]], side="right"
+        )
+        cluster = self.cluster[subdomain - 1]
+        return np.searchsorted(cluster, np.arange(len(self.members) + 1))
+
+    @cached_property
+    def unknowns(self) -> tuple[NDArray[np.int64], list[int]]:
+        """Places (c + r,) of (μ_1, α_1, μ_2, α_2, …) in (μ, α), and their sizes."""
+        start = np.concatenate([[0], np.cumsum(self.domains.modes)]) + self.rows[-1]
+        parts = [
+            np.concatenate(
+                [np.arange(first, end), *(np.arange(*start[[s, s + 1]]) for s in own)]
+            )
+            for first, end, own in zip(
+                self.rows[:-1], self.rows[1:], self.members, strict=True
+            )
+        ]
+        return np.concatenate(parts), [part.size for part in parts]
+
+    @cached_property
+    def _joined(self) -> list[_Joined]:
+        return [self._join(c) for c in range(len(self.members))]
+
+    def _join(self, c: int) -> _Joined:
+        domains = self.domains
+        rows = self.joints[self.rows[c] : self.rows[c + 1]]
+        parts, gram, motions = [], np.zeros((rows.shape[0],) * 2), list[Dense]()
+        for s in self.members[c]:
+            k = domains.class_of[s]
+            coordinates = slice(self.coordinates[s], self.coordinates[s + 1])
+            J, modes = rows[:, coordinates].toarray(), self.faces[k]
+            parts.append((int(k), J))
+            gram += J @ (modes.T @ modes).toarray() @ J.T
+            motions.append(J @ (modes.T @ domains.classes[k].R))
+        CR = np.concatenate(motions, axis=1)
+        # all subdomains float and are joined by faces: a cluster moves as each of them
+        last = domains.classes[domains.class_of[self.members[c][0]]].R.shape[1] - 1
+        N = eigh(CR.T @ CR, subset_by_index=(0, last))[1]
+        size, modes = np.linalg.eigh(gram)
+        dependent = size <= DEPENDENT_SHARE * size.max(initial=0.0)
+        return _Joined(parts, CR, N, modes[:, ~dependent], modes[:, dependent])
+
+    @cached_property
+    def motions(self) -> csr_array:
+        """N, in the order of the rigid motions of subdomains: (r, r̃)."""
+        order, rows = self.unknowns[0], self.rows[-1]
+        N = block_diag([part.N for part in self._joined], format="csr")
+        return csr_array(N[np.argsort(order[order >= rows])])
+
+    @property
+    def independent(self) -> csr_array:
+        """Orthonormal combinations (c', c) of the rows of C that are independent."""
+        return csr_array(
+            block_diag([part.independent.T for part in self._joined], format="csr")
+        )
+
+    @cached_property
+    def kernel(self) -> csr_array:
+        """RN, (N, r̃)."""
+        return csr_array(self.domains.kernel @ self.motions)
+
+    def saddle_inverses(self, compliance: Sequence[Dense]) -> list[Vector]:
+        """Return the upper triangle of M⁺ for each cluster, column by column.
+
+        compliance : ΦᵀK⁺Φ (q_k, q_k) of each class
+        """
+        return [upper_triangle(one.saddle_inverse(compliance)) for one in self._joined]
+
+    def gram_inverses(self, grams: Sequence[Dense]) -> list[Vector]:
+        """Return the upper triangle of (CWCᵀ)⁺ for each cluster, column by column.
+
+        grams : ΦᵀWΦ (q_k, q_k) of each class
+        """
+        return [upper_triangle(one.gram_inverse(grams)) for one in self._joined]
+
+    @cached_property
+    def _saddle_inverse(self) -> BlockDiagonal:
+        """M⁺ in the order of `unknowns`."""
+        compliance = [
+            modes.T @ template.inverse(modes.toarray())
+            for template, modes in zip(self.domains.classes, self.faces, strict=True)
+        ]
+        sizes = self.unknowns[1]
+        return BlockDiagonal(self.saddle_inverses(compliance), sizes, [1] * len(sizes))
+
+    def inverse(self, b: Vector) -> Vector:
+        """Apply K̃⁺ to a torn vector (N,)."""
+        domains, C, R = self.domains, self.averages, self.domains.kernel
+        order = self.unknowns[0]
+        t = np.concatenate([C @ domains.inverse(b), R.T @ b])
+        y = np.empty_like(t)
+        y[order] = self._saddle_inverse(t[order])
+        mu, alpha = np.split(y, [C.shape[0]])
+        return np.asarray(domains.inverse(b - C.T @ mu) - R @ alpha)
+
+    def restrict(
+        self, subdomains: Nodes, classes: Nodes, domains: Subdomains
+    ) -> Clusters:
+        """Return whole clusters only.
+
+        subdomains, classes : ascending; the subdomains of some clusters, their classes
+        domains : these subdomains
+        """
+        columns = np.concatenate(
+            [np.arange(*self.coordinates[[s, s + 1]]) for s in subdomains]
+        )
+        touched = np.isin(self.joints.indices[self.joints.indptr[:-1]], columns)
+        return Clusters(
+            domains=domains,
+            cluster=np.unique(self.cluster[subdomains], return_inverse=True)[1],
+            faces=tuple(self.faces[k] for k in classes),
+            joints=csr_array(self.joints[touched][:, columns]),
+        )
+
+
+class _Joined(NamedTuple):
+    """Joints of one cluster, with c rows of C."""
+
+    parts: list[tuple[int, Dense]]  #: class and C (c, q_k), for each subdomain
+    CR: Dense  #: (c, r)
+    N: Dense  #: (r, r̃) orthonormal basis of ker CR
+    independent: Dense  #: (c, c') orthonormal basis of range C
+    dependent: Dense  #: (c, c − c') orthonormal basis of ker Cᵀ
+
+    def product(self, coordinates: Sequence[Dense]) -> Dense:
+        """Return CACᵀ (c, c), from ΦᵀAΦ of each class."""
+        total = np.zeros((self.CR.shape[0],) * 2)
+        for k, J in self.parts:
+            total += J @ coordinates[k] @ J.T
+        return total
+
+    def gram_inverse(self, grams: Sequence[Dense]) -> Dense:
+        """Return (CWCᵀ)⁺ on the range of C, from ΦᵀWΦ of each class."""
+        U = self.independent
+        return _symmetric(U @ np.linalg.inv(U.T @ self.product(grams) @ U) @ U.T)
+
+    def saddle_inverse(self, compliance: Sequence[Dense]) -> Dense:
+        """Return M⁺ of this cluster, from ΦᵀK⁺Φ of each class."""
+        S, (c, r) = self.product(compliance), self.CR.shape
+        # in units in which CK⁺Cᵀ is of order one, as CR is
+        unit = float(np.trace(S)) / c if c else 1.0
+        M = np.block([[S / unit, self.CR], [self.CR.T, np.zeros((r, r))]])
+        Z = block_diagonal(self.dependent, self.N)  # ker M
+        inverse = np.linalg.inv(M + Z @ Z.T) - Z @ Z.T
+        scale = np.append(np.full(c, unit**-0.5), np.full(r, unit**0.5))
+        return _symmetric(scale[:, None] * inverse * scale)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DecomposedBodies:
     """A contact problem on decomposed bodies, in nondimensional form.
@@ -254,6 +468,12 @@ class DecomposedBodies:
     scale: Vector  #: positive factors of the contact rows, which come last
     f: Vector  #: (N,) Tᵀf is the load of the undivided bodies
     equalities: int  #: number of rows of supports and gluing, which come first
+    clusters: Clusters | None = None  #: None if no subdomains are joined by averages
+
+    @property
+    def units(self) -> Subdomains | Clusters:
+        """The floating units that B glues: clusters, or the subdomains themselves."""
+        return self.clusters or self.domains
 
     @property
     def start(self) -> NDArray[np.int64]:
@@ -264,6 +484,11 @@ class DecomposedBodies:
     def domains(self) -> Subdomains:
         """The subdomains without B; factors are cached here."""
         return Subdomains(self.classes, self.class_of)
+
+
+def upper_triangle(M: Dense) -> Vector:
+    """Return the upper triangle of a symmetric matrix, column by column."""
+    return np.asarray(lapack.dtrttp(M)[0])
 
 
 def _symmetric(M: Dense) -> Dense:

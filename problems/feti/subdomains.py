@@ -37,11 +37,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import bsr_array, coo_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csr_array, hstack
 
-from mortarbench.harness import Vector
+from mortarbench.harness import InputError, Vector
 from mortarbench.harness.distributed.vectors import Ranks, single_process
-from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.mesh import Nodes, dofs_of
 from mortarbench.problems.feti.distributed import balanced_partition
 from mortarbench.problems.feti.subdivision import (
     Integers,
@@ -50,7 +50,9 @@ from mortarbench.problems.feti.subdivision import (
     SubdomainNodes,
 )
 from mortarbench.problems.feti.subdomain_classes import (
+    Clusters,
     DecomposedBodies,
+    Dense,
     SubdomainClass,
     Subdomains,
 )
@@ -90,6 +92,7 @@ class Contact(NamedTuple):
     rows: csr_array  #: (m_I, n) in components of the undivided bodies
     c: Vector  #: (m_I,)
     bound: Vector  #: (k,) friction bounds of the last rows
+    tangents: int = 1  #: number of friction rows of each tangential vector
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -114,10 +117,45 @@ class DecomposedProblem:
     eliminated: bool = False
     contact: Contact
     glue: str  #: name of the gluing, one of `GLUE`
+    cluster: int = 0  #: subdomains along a side of a cluster; 0: no clusters
+
+    @cached_property
+    def clusters(self) -> NDArray[np.int64] | None:
+        """Cluster of each subdomain (S,), numbered from 0 body by body; or None.
+
+        Raises
+        ------
+        InputError
+            If the subdomains of a body do not form a grid.
+
+        """
+        if not self.cluster:
+            return None
+        if (positions := self.layout.positions) is None:
+            raise InputError(
+                f"cluster={self.cluster} is not built for subdomains that do not form "
+                "a grid; expected no cluster, or a family with structured meshes"
+            )
+        places = np.column_stack([self.layout.body, positions // self.cluster])
+        return np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+
+    def joined_pairs(self) -> tuple[Nodes, Nodes]:
+        """Return the pairs (k,) of subdomains of one cluster with a common face."""
+        one, other, _ = self.layout.shared_node_counts()
+        clusters, positions = self.clusters, self.layout.positions
+        assert clusters is not None
+        assert positions is not None
+        apart = np.abs(positions[one] - positions[other]).sum(axis=1)
+        joined = (clusters[one] == clusters[other]) & (apart == 1)
+        return one[joined], other[joined]
 
     @cached_property
     def contact_scale(self) -> Vector:
-        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches."""
+        """√(E/‖B_i‖²) of each contact row (m,), E of the softest body it touches.
+
+        That of the first row of a tangential vector applies to all of them: in exact
+        arithmetic they are equal.
+        """
         rows, of = self.contact.rows, self.layout
         if not rows.shape[0]:
             return np.zeros(0)
@@ -126,7 +164,10 @@ class DecomposedProblem:
         # an entry b at a node of m copies becomes m entries b/m of B: m(b/m)² = b²/m
         norm2 = np.add.reduceat(rows.data**2 / of.multiplicity(node), rows.indptr[:-1])
         softest = np.minimum.reduceat(E, rows.indptr[:-1])
-        return np.asarray(np.sqrt(softest / norm2))
+        scale = np.sqrt(softest / norm2)
+        first, d = scale.size - self.contact.bound.size, self.contact.tangents
+        scale[first:] = np.repeat(scale[first::d], d)
+        return np.asarray(scale)
 
 
 class Entries(NamedTuple):
@@ -322,6 +363,33 @@ class LocalSubdomains:
             counts[number] = count
         return np.concatenate([[0], np.cumsum(counts)])
 
+    @cached_property
+    def clusters(self) -> Clusters | None:
+        """The local clusters; None if the problem has no clusters."""
+        return None if self.problem.clusters is None else _local_clusters(self)
+
+    @property
+    def units(self) -> Subdomains | Clusters:
+        """The local floating units: clusters, or the subdomains themselves."""
+        return self.clusters or self.domains
+
+    @property
+    def local_unit_motions(self) -> NDArray[np.int64]:
+        """Global numbers of the rigid motions of the local units."""
+        if (clusters := self.problem.clusters) is None:
+            return self.local_motions
+        # all units float and have equally many motions
+        per_unit = self.unit_motions // (clusters.max() + 1)
+        local = np.unique(clusters[self.number])
+        return np.asarray((local[:, None] * per_unit + np.arange(per_unit)).ravel())
+
+    @property
+    def unit_motions(self) -> int:
+        """Number of rigid motions of all units, the size of the coarse problem."""
+        if (clusters := self.problem.clusters) is None:
+            return self.coarse_size
+        return (int(clusters.max()) + 1) * int(self.motions[1])
+
     @property
     def local_motions(self) -> NDArray[np.int64]:
         """Global numbers of the rigid motions of the local subdomains."""
@@ -330,7 +398,7 @@ class LocalSubdomains:
 
     @property
     def coarse_size(self) -> int:
-        """Number of rigid motions of all subdomains (coarse problem)."""
+        """Number of rigid motions of all subdomains."""
         return int(self.motions[-1])
 
     @cached_property
@@ -347,7 +415,7 @@ class LocalSubdomains:
         return np.asarray(load[self.free])
 
     def resultants(self, unknown: Nodes, value: Vector) -> csr_array:
-        """Return the resultants (k, r) of single forces along all r rigid motions.
+        """Return the resultants (k, r) of single forces along the motions of all units.
 
         unknown, value : torn unknowns and the forces there, (k,)
         """
@@ -361,9 +429,15 @@ class LocalSubdomains:
         along = np.arange(ends[-1]) - np.repeat(ends[:-1], modes)
         entries = R[np.repeat(at, modes) + along] * np.repeat(value, modes)
         column = np.repeat(self.motions[self.number[of]], modes) + along
-        return csr_array(
+        resultants = csr_array(
             (entries, column, ends), shape=(unknown.size, self.coarse_size)
         )
+        if self.clusters is None:
+            return resultants
+        N = self.clusters.motions.tocoo()
+        places = self.local_motions[N.row], self.local_unit_motions[N.col]
+        shape = self.coarse_size, self.unit_motions
+        return csr_array(resultants @ csr_array((N.data, places), shape=shape))
 
     @cached_property
     def _shape(self) -> Callable[[Nodes, Nodes, bool], Vector] | None:
@@ -394,6 +468,7 @@ class LocalSubdomains:
             classes=domains.classes, class_of=domains.class_of,
             spread=self.spread, B=rows.B, c=rows.c,
             scale=self.problem.contact_scale, f=self.f, equalities=rows.equalities,
+            clusters=self.clusters,
         )  # fmt: skip
 
     def with_bound(self, bound: Vector) -> LocalSubdomains:
@@ -410,7 +485,7 @@ class LocalSubdomains:
         The classes of subdomains, the expensive part, are kept.
         """
         copy = replace(self, problem=problem)
-        same = ("number", "nodes", "_classified", "_distinct")
+        same = ("number", "nodes", "_classified", "_distinct", "clusters")
         vars(copy).update({k: v for k, v in vars(self).items() if k in same})
         return copy
 
@@ -455,7 +530,84 @@ def subdomains_of(problem: DecomposedProblem, ranks: int) -> NDArray[np.int64]:
     )
     touches.data[:] = 1
     graph = csr_array(graph + graph.T) + csr_array(touches.T @ touches)
-    return balanced_partition(csr_array(graph), (d * touched) ** 2, of.sizes, ranks)
+    work = (d * touched) ** 2
+    return balanced_partition(csr_array(graph), work, of.sizes, ranks, problem.clusters)
+
+
+def _local_clusters(local: LocalSubdomains) -> Clusters:
+    """Return the local clusters, with averages over the faces inside them.
+
+    A face consists of all common nodes of two adjacent subdomains, clamped nodes
+    included. Its modes are the rigid motions of a subdomain there, orthonormalised. In
+    global axes those of both subdomains span the same space, Q_1Φ_1 = Q_2Φ_2Tᵀ, so that
+    Φ_1ᵀv_1 − TΦ_2ᵀv_2 = 0 equates the averages.
+    """
+    nodes, domains, d = local.nodes, local.domains, local.problem.components
+    r = domains.classes[0].R.shape[1]
+    faces = [dict[bytes, tuple[int, Dense]]() for _ in domains.classes]
+
+    def side(s: int, node: Nodes) -> tuple[int, Dense]:
+        """Return the number of a face in its class, and its modes in global axes."""
+        k = domains.class_of[s]
+        if (key := node.tobytes()) not in faces[k]:
+            modes = np.linalg.qr(domains.classes[k].R[dofs_of(node, d)])[0]
+            faces[k][key] = len(faces[k]), modes
+        number, modes = faces[k][key]
+        if d == 1:
+            return number, modes
+        turned = local.rotation[s] @ modes.reshape(node.size, d, r)
+        return number, turned.reshape(modes.shape)
+
+    ends, turns = [], []
+    pairs = np.stack(local.problem.joined_pairs(), axis=1)
+    pairs = np.searchsorted(
+        local.number, pairs[local.rank[pairs[:, 0]] == local.ranks.rank]
+    )
+    labels = np.asarray(local.problem.clusters)[local.number]
+    for pair in pairs[np.argsort(labels[pairs[:, 0]], kind="stable")].tolist():
+        a, b = (nodes.number[slice(*nodes.start[[s, s + 1]])] for s in pair)
+        places = np.intersect1d(a, b, assume_unique=True, return_indices=True)[1:]
+        (i, one), (j, other) = map(side, pair, places)
+        ends.append([pair[0], i, pair[1], j])
+        turns.append(one.T @ other)
+
+    first = np.cumsum([0, *(r * len(faces[k]) for k in domains.class_of)])
+    joined = np.array(ends, dtype=np.int64).reshape(-1, 2, 2)
+    start = first[joined[:, :, 0]] + r * joined[:, :, 1]
+    column, other_column = (one[:, None] + np.arange(r) for one in start.T)
+    row = np.arange(column.size).reshape(-1, r)
+    T = np.reshape(turns, (-1, r, r))
+    joints = csr_array(
+        (
+            np.append(np.ones(row.size), -T.ravel()),
+            (
+                np.append(row.ravel(), np.repeat(row, r, axis=1).ravel()),
+                np.append(column.ravel(), np.repeat(other_column, r, axis=0).ravel()),
+            ),
+        ),
+        shape=(row.size, first[-1]),
+    )
+    return Clusters(
+        domains=domains, cluster=np.unique(labels, return_inverse=True)[1],
+        faces=tuple(
+            _columns(of_class, template.R.shape[0], d)
+            for of_class, template in zip(faces, domains.classes, strict=True)
+        ),
+        joints=joints,
+    )  # fmt: skip
+
+
+def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_array:
+    """Return the modes of faces (n, q), named by the bytes of their nodes."""
+    columns = [csr_array((n, 0))]
+    for key, (_, modes) in faces.items():
+        at = dofs_of(np.frombuffer(key, dtype=np.int64), d)
+        places = (
+            np.repeat(at, modes.shape[1]),
+            np.tile(np.arange(modes.shape[1]), at.size),
+        )
+        columns.append(csr_array((modes.ravel(), places), (n, modes.shape[1])))
+    return csr_array(hstack(columns))
 
 
 def _local_rows(local: LocalSubdomains) -> _Rows:

@@ -9,8 +9,8 @@ and multipliers l; a global one also contains the velocities v of the bodies::
 with û = u + (μ‖u_T‖, 0) in the dual of the friction cones K, and r ∈ K orthogonal to û.
 A matrix is a group  nzmax, m, n, nz, p, i, x:  nz = −1 by columns, −2 by rows, and the
 number of triplets otherwise. The documentation of FCLIB says that p holds the rows of
-triplets, but files that Siconos wrote have CSparse's order, p for columns. Both are
-read; where both fit, the second.
+triplets, but files that Siconos wrote have CSparse's order, p for columns. Both orders
+are read; if both fit, the second is used.
 
 Reference: V. Acary et al., FCLIB: a library of frictional contact problems,
 https://frictionalcontactlibrary.github.io.
@@ -50,8 +50,10 @@ class FclibFile:
 
     contact: FrictionalContact
     is_local: bool
-    stored: Vector | None  #: (n,) forces of /solution; None without one
-    multipliers: Vector  #: (p,) of /solution; zeros without
+    stored: Vector | None  #: (n,) forces of /solution; None if the file has no solution
+    multipliers: (
+        Vector  #: (p,) multipliers of /solution; zeros if the file has no solution
+    )
 
 
 def read_datasets(path: Path) -> Datasets:
@@ -63,7 +65,7 @@ def read_datasets(path: Path) -> Datasets:
         If the file cannot be read, is not HDF5, or is too large.
 
     """
-    import h5py  # late: workers of solvers need no HDF5
+    import h5py  # workers of solvers do not need HDF5
 
     arrays: dict[str, NDArray[Any]] = {}
 

@@ -13,7 +13,7 @@ convex quadratic programming problems", Optim. Methods Softw. 11/12:
   ½xᵀPx + qᵀx, so diagonal entries are as in P, not halved.
 
 Undefined names and malformed numbers raise an error with their line. (The reader of
-HiGHS 1.15 ignores the former and reads the latter as 0.)
+HiGHS 1.15 ignores undefined names, and reads malformed numbers as 0.)
 
 A QP that is written and read again is the same to the last digit of every number. If P
 is symmetric only up to rounding, its symmetric part is written: the objective depends
@@ -158,7 +158,7 @@ def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _column_lines(A: csc_array, q: Vector, rows: list[str]) -> Iterator[str]:
-    """Write each column; one without entries is named all the same."""
+    """Write each column, also those without entries."""
     for j, cost in enumerate(q):
         part = slice(A.indptr[j], A.indptr[j + 1])
         if cost or part.start == part.stop:

@@ -22,7 +22,8 @@ from mortarbench.problems.files.file_digest import format_of
 from mortarbench.problems.files.qps import parse_qps
 from mortarbench.problems.files.two_sided import TwoSidedQP, one_sided
 
-#: (QP, scale, constant): the objective of the file is scale·(of the QP) + constant
+#: (QP, scale, constant): the objective of the file is scale·(objective of the QP) +
+#: constant
 Loaded = tuple[QP, float, float]
 
 _COPIES = 16  #: memory of a parsed QPS text relative to the file, as Python objects

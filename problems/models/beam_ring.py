@@ -48,6 +48,7 @@ from mortarbench.problems.fem.mesh import (
     extruded,
     half_ring_grid,
     nodal_lengths,
+    nodes_of_side,
     rectangle_grid,
 )
 
@@ -113,7 +114,7 @@ def bodies(
     by_name = shape.sides
     # in the plane m_E = 2(Nr + 1) + 4(radial + 1) prescribed components
     clamped = [
-        dofs_of(_nodes(by_name[b]), shape.dim)
+        dofs_of(nodes_of_side(by_name[b]), shape.dim)
         for b in ("left", "left_foot", "right_foot")
     ]
     if sides == "plane-strain":
@@ -158,11 +159,6 @@ def _tip(shape: Shape) -> tuple[Nodes, Vector]:
     if shape.dim == 3:
         share = nodal_lengths(shape.mesh.points[nodes]) / THICKNESS
     return dofs_of(nodes, shape.dim), share
-
-
-def _nodes(side: Nodes) -> Nodes:
-    """Return the nodes of a chain, in its order, or of faces."""
-    return side if side.ndim == 1 else np.unique(side)
 
 
 @lru_cache(maxsize=4)

@@ -1,4 +1,4 @@
-"""Reader of contact problems described by a TOML file next to a mesh from gmsh.
+"""Reader of contact problems described by a TOML file next to a mesh.
 
 ::
 
@@ -33,9 +33,23 @@
     friction = "coulomb"       # or "tresca" with a bound in Pa; this pair's own law
     mu = 0.3
 
+    [[contacts]]
+    slave = "foot"             # its nodes must not enter a rigid body, in m:
+    rigid = { shape = "plane", point = [0, -1], normal = [0, 1] }
+    # or { shape = "cylinder", centre = [0, -1], radius = 0.5 }; in space also
+    # { shape = "cylinder", centre = [0, 0, -1], axis = [0, 1, 0], radius = 0.5 } or
+    # { shape = "sphere", centre = [0, 0, -1], radius = 0.5 }
 
 Whatever the length unit of the mesh is, this file and all results are in SI units: E
-and tractions in Pa, forces in N/m, units.length in m.
+and tractions in Pa, forces in N/m, units.length and rigid bodies in m.
+
+A rigid body does not move. The normal of a plane points towards the slave; normals and
+axes may have any length. The centre of a cylinder is any point of its axis. Nodes whose
+components are all fixed have no row. Contact with a rigid body has nodal rows also with
+``contact = "mortar"``.
+
+In .inp and .med files, bodies are sets of elements and groups of cells, boundaries are
+surfaces, sets or groups of facets or of nodes, and points are sets of nodes.
 
 If the mesh has physical volumes, these are the bodies, and boundaries are physical
 surfaces. Vectors then have three components, forces are in N, and a force on a boundary
@@ -52,7 +66,7 @@ top-level key ``loading = "static"`` measures slip from the undeformed state.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,15 +83,22 @@ from mortarbench.problems.contact.bodies import (
     support_rows,
 )
 from mortarbench.problems.contact.friction import FrictionLaw, law_of
+from mortarbench.problems.contact.rigid import (
+    RigidBody,
+    RigidCylinder,
+    RigidPlane,
+    RigidSphere,
+)
+from mortarbench.problems.contact.surface import current_surface
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.gmsh_mesh import (
-    BODY,
-    BOUNDARY,
+from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh_files.named import (
+    FileMesh,
     NamedMesh,
-    read_msh,
+    named_mesh,
     refine,
 )
-from mortarbench.problems.fem.mesh import Mesh, Nodes, dofs_of, nodal_areas
+from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
 from mortarbench.problems.ranges import (
     CONTACT_STIFFNESS,
     LAW_PARAMETERS,
@@ -94,6 +115,15 @@ _SIDES = ("slave", "master")
 _PLACES = ("boundary", "point")
 _LOADS = ("force", "traction")
 _AXES = ("x", "y", "z")
+#: keys of the shapes of rigid bodies, by dimension; those but radius are vectors
+_RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
+    2: {"plane": ("point", "normal"), "cylinder": ("centre", "radius")},
+    3: {
+        "plane": ("point", "normal"),
+        "cylinder": ("centre", "axis", "radius"),
+        "sphere": ("centre", "radius"),
+    },
+}
 #: units of length by name, m
 LENGTH_UNITS = {
     "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
@@ -157,11 +187,14 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     """
     table = read_description(path)
     mesh_path = path.parent / table["mesh"]
-    named = read_msh(mesh_path)
+    file = read_mesh_file(mesh_path)
+    with located(str(path)):
+        materials = _materials(table["bodies"], file)
+    named = named_mesh(file, materials)
     if named.dim == 3 and halvings:
         raise InputError(
             f"{mesh_path}: halvings={halvings} with volumes is not built; expected "
-            "halvings=0, and a finer mesh from gmsh"
+            "halvings=0, and a finer mesh file"
         )
     refined = 2 * len(named.cells) * 4**halvings  # checked before refining
     check_memory(str(path), refined if named.dim == 2 else named.points.size)
@@ -170,11 +203,14 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     unit = LENGTH_UNITS[table.get("length_unit", "m")]
     named = named._replace(points=named.points * unit)
     with located(str(path)):
-        materials = _materials(table["bodies"], named)
+        for name in named.surfaces:
+            if name not in materials:
+                raise InputError(f"bodies: {named.words.body} {name!r} has no entry")
         fixed = _each(table, "supports", lambda entry: _support(entry, named))
         loads = _each(table, "loads", lambda entry: _load(entry, named))
-        _check_loads_act(table["loads"], loads, np.concatenate(fixed))
-        pairs = _each(table, "contacts", lambda entry: _pair(entry, named))
+        held = np.unique(np.concatenate(fixed))
+        _check_loads_act(table["loads"], loads, held)
+        pairs = _each(table, "contacts", lambda entry: _pair(entry, named, held))
         _check_unique(table["contacts"])
         load: NDArray[np.float64] = np.sum(loads, axis=0)
         length, force = _units(table.get("units", {}), named, load)
@@ -187,7 +223,7 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
         materials=tuple(materials[name] for name in named.surfaces),
         plane=plane if named.dim == 2 else None, length=length, force=force,
         f=load.ravel() / force, pairs=tuple(pairs),
-        B_D=support_rows(mesh, np.unique(np.concatenate(fixed))),
+        B_D=support_rows(mesh, held),
     )  # fmt: skip
 
 
@@ -226,12 +262,12 @@ def _each(
     return values
 
 
-def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
+def _materials(entries: object, file: FileMesh) -> dict[str, Material]:
     materials: dict[str, Material] = {}
 
     def read(entry: dict[str, Any]) -> None:
         _keys(entry, ("name", "E", "nu"))
-        name = _one_of(named.surfaces, f"physical {BODY[named.dim]}", entry, "name")
+        name = _one_of(file.body_names, file.words.body, entry, "name")
         if name in materials:
             raise InputError(f"body {name!r} is described twice; expected once")
         E, nu = physical("E", checked.positive("E", entry["E"])), entry["nu"]
@@ -240,10 +276,6 @@ def _materials(entries: object, named: NamedMesh) -> dict[str, Material]:
         materials[name] = Material(E=E, nu=float(nu))
 
     _each({"bodies": entries}, "bodies", read)
-    if missing := [name for name in named.surfaces if name not in materials]:
-        raise InputError(
-            f"bodies: physical {BODY[named.dim]} {missing[0]!r} has no entry"
-        )
     return materials
 
 
@@ -263,16 +295,10 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     """Return the nodal forces (N, dim) of a load: N/m in the plane, N in space."""
     checked.only_keys(entry, (*_PLACES, *_LOADS))
     kinds = [kind for kind in _LOADS if kind in entry]
-    form = f"[{', '.join(_AXES[: named.dim])}]"
     if len(kinds) != 1:
-        raise InputError(f"expected either force or traction, {form}")
-    vector = checked.filled_list(kinds[0], entry[kinds[0]])
-    if len(vector) != named.dim or not all(map(checked.is_number, vector)):
-        count = {2: "two", 3: "three"}[named.dim]
-        raise InputError(
-            f"{kinds[0]} = {shown(vector)}; expected {count} numbers, {form}"
-        )
-    vector = [physical(kinds[0], component) for component in vector]
+        form = ", ".join(_AXES[: named.dim])
+        raise InputError(f"expected either force or traction, [{form}]")
+    vector = _vector(kinds[0], entry[kinds[0]], named.dim)
     nodes, facets = _place(entry, named, tuple(kinds))
     weights = np.zeros(len(named.points))
     if facets.size and named.dim == 3:  # ∫N over the boundary, m²
@@ -287,6 +313,15 @@ def _load(entry: dict[str, Any], named: NamedMesh) -> NDArray[np.float64]:
     if kinds == ["force"]:
         weights /= weights.sum()
     return np.outer(weights, vector)
+
+
+def _vector(key: str, value: object, dim: int) -> list[float]:
+    """Return a vector of physical values."""
+    vector = checked.filled_list(key, value)
+    if len(vector) != dim or not all(map(checked.is_number, vector)):
+        count, form = {2: "two", 3: "three"}[dim], ", ".join(_AXES[:dim])
+        raise InputError(f"{key} = {shown(vector)}; expected {count} numbers, [{form}]")
+    return [physical(key, component) for component in vector]
 
 
 def _check_loads_act(
@@ -360,22 +395,82 @@ def _law(entry: Mapping[str, Any], params: Mapping[str, Any]) -> FrictionLaw:
     return law_of(keys)
 
 
-def _pair(entry: dict[str, Any], named: NamedMesh) -> ContactPair:
-    checked.only_keys(entry, ("slave", "master", "friction", *LAW_PARAMETERS))
-    _keys({k: v for k, v in entry.items() if k in _SIDES}, _SIDES)
+def _pair(entry: dict[str, Any], named: NamedMesh, held: Nodes) -> ContactPair:
+    """Return the pair of an entry; held : prescribed components."""
+    checked.only_keys(entry, (*_SIDES, "rigid", "friction", *LAW_PARAMETERS))
+    if ("master" in entry) == ("rigid" in entry):
+        raise InputError(f"expected either master, a {named.words.boundary}, or rigid")
+    names = [side for side in _SIDES if side in entry]
+    _keys({k: v for k, v in entry.items() if k in _SIDES}, tuple(names))
     sides = {}
-    for side in _SIDES:
-        name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, side)
+    for side in names:
+        name = _one_of(named.curves, named.words.boundary, entry, side)
         facets = named.curves[name]
         sides[side] = _chain(f"{side} {name!r}", facets) if named.dim == 2 else facets
-    if np.intersect1d(sides["slave"], sides["master"]).size:
+    slave = sides["slave"]
+    if "rigid" in entry:
+        with located("rigid"):
+            rigid = _rigid(checked.table("rigid", entry["rigid"]), named.dim)
+            _check_faces(named.points, slave, entry["slave"], rigid)
+        components = dofs_of(np.unique(slave), named.dim).reshape(-1, named.dim)
+        clamped = np.unique(slave)[np.isin(components, held).all(axis=1)]
+        return ContactPair(slave, slave[:0], rigid, clamped)
+    if np.intersect1d(slave, sides["master"]).size:
         raise InputError("slave and master share nodes; expected sides that are apart")
-    return ContactPair(**sides)
+    return ContactPair(slave, sides["master"])
 
 
-def _sides(entries: list[dict[str, str]]) -> list[tuple[str, str]]:
-    """Return the names of slave and master of each contact."""
-    return [(entry["slave"], entry["master"]) for entry in entries]
+def _rigid(entry: dict[str, Any], dim: int) -> RigidBody:
+    """Return the rigid body of an entry."""
+    shapes = _RIGID[dim]
+    if "shape" not in entry:
+        raise InputError(f"shape is missing; expected {' or '.join(sorted(shapes))}")
+    shape = checked.text("shape", entry["shape"])
+    if shape not in shapes:
+        raise unknown("shape", shape, shapes)
+    _keys(entry, ("shape", *shapes[shape]))
+    vectors = {
+        key: tuple(_vector(key, entry[key], dim))
+        for key in shapes[shape]
+        if key != "radius"
+    }
+    for key in ("normal", "axis"):
+        if key in vectors:
+            size = float(np.linalg.norm(vectors[key]))
+            if not size:
+                raise InputError(f"{key} is zero; expected a direction")
+            vectors[key] = tuple(x / size for x in vectors[key])
+    if shape == "plane":
+        return RigidPlane(vectors["point"], vectors["normal"])
+    radius = physical("radius", checked.positive("radius", entry["radius"]))
+    if "axis" in vectors:
+        return RigidCylinder(vectors["centre"], vectors["axis"], radius)
+    return RigidSphere(vectors["centre"], radius)  # in the plane a cylinder
+
+
+def _check_faces(
+    points: NDArray[np.float64], slave: Nodes, name: str, rigid: RigidBody
+) -> None:
+    """Raise InputError for a slave that looks away from a rigid body or is far away."""
+    side = current_surface(points, np.zeros(points.size), slave, "slave")
+    gap, normal = rigid.gap(side.x[side.facets].mean(axis=1))
+    if not (np.einsum("fx,fx->f", normal, side.normal) < 0).any():
+        raise InputError(
+            f"no part of slave {name!r} faces the rigid body; expected a plane whose "
+            "normal points towards the slave, or a centre on its other side"
+        )
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    if gap.min() > extent:
+        raise InputError(
+            f"the rigid body is {gap.min():.3g} m from slave {name!r}, farther than "
+            f"the size {extent:.3g} m of the mesh; expected lengths in m, whatever "
+            "length_unit is"
+        )
+
+
+def _sides(entries: list[dict[str, Any]]) -> list[tuple[str, str]]:
+    """Return the names of slave and master of each contact; a rigid one as text."""
+    return [(e["slave"], e.get("master") or f"{e['rigid']}") for e in entries]
 
 
 def _check_unique(entries: list[dict[str, str]]) -> None:
@@ -424,19 +519,18 @@ def _place(
     """Return the nodes of an entry's boundary or point, and the boundary's facets."""
     where = [key for key in _PLACES if key in entry]
     if len(where) != 1:
-        raise InputError("expected either boundary or point, a physical name")
+        raise InputError("expected either boundary or point, a name of the mesh")
     _keys(entry, (*where, *others))
     if where == ["point"]:
-        what = "physical point" if named.dim == 2 else "physical point or curve"
-        name = _one_of(named.spots, what, entry, "point")
+        name = _one_of(named.spots, named.words.point, entry, "point")
         return named.spots[name], np.zeros((0, 2), dtype=np.int64)
-    name = _one_of(named.curves, f"physical {BOUNDARY[named.dim]}", entry, "boundary")
+    name = _one_of(named.curves, named.words.boundary, entry, "boundary")
     facets = named.curves[name]
     return np.unique(facets), facets
 
 
 def _one_of(
-    names: Mapping[str, Any], what: str, entry: Mapping[str, Any], key: str
+    names: Collection[str], what: str, entry: Mapping[str, Any], key: str
 ) -> str:
     name = checked.text(key, entry[key])
     if name not in names:

@@ -108,6 +108,11 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
                 "no friction, or kinematics=linear"
             )
         check_dimension(bodies(*source), p)
+        if any(pair.rigid is not None for pair in bodies(*source).pairs):
+            raise InputError(
+                "contact with a rigid body and kinematics=finite is not built; "
+                "expected a master, or kinematics=linear"
+            )
         path = _newton_path(
             source, (p["contact"], p["basis"]), p["steps"], p["material"],
             p["contact_stiffness"], reference,
@@ -117,15 +122,8 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
 
 def check_dimension(elastic: ElasticBodies, params: Mapping[str, Value]) -> None:
     """Raise InputError for bodies in space with keys that only plane bodies support."""
-    if elastic.shape.dim == 2:
-        return
-    check_plane_only("bodies", params, "volumes")
-    for i, law in enumerate(laws_of(params)):
-        if law.kind != "none":
-            raise InputError(
-                f"{params['path']}: contacts[{i}]: friction {law.kind!r} with volumes "
-                "is not built; expected no friction, or a plane problem"
-            )
+    if elastic.shape.dim > 2:
+        check_plane_only("bodies", params, "volumes")
 
 
 def laws_of(params: Mapping[str, Value]) -> tuple[FrictionLaw, ...]:
@@ -144,7 +142,7 @@ def has_arcs(params: Mapping[str, Value]) -> bool:
     """Return True if a contact side is curved: edges meet below MAX_ARC_ANGLE."""
     p: Any = params
     elastic = bodies(p["path"], p["sha256"], p["plane"], p["halvings"])
-    for side in (chain for pair in elastic.pairs for chain in pair):
+    for side in (chain for pair in elastic.pairs for chain in pair.sides):
         edges = np.diff(elastic.shape.mesh.points[side], axis=0)
         angles = np.unwrap(np.arctan2(edges[:, 1], edges[:, 0]))
         bends = np.abs(np.diff(angles))

@@ -9,17 +9,25 @@ with u_y = 0 at the corner (40 mm, 0), which has no contact row. The left end li
 the middle slips and the right end sticks. Published are the tangential displacements of
 five points of the contact side, ±5 %, and the normal force at 38.75 mm for 32 cells per
 side (GRECO working group on friction; collected in Code_Aster's document V6.04.128).
+
+In space (dim=3) the square is extruded along z in cubes. Its end faces have u_z = 0, so
+that the solution is that of plane strain in every layer of nodes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from mortarbench.harness import QP, Friction, Solution, Value, Vector
-from mortarbench.problems.contact.bodies import Bodies, ContactPair, ContactSides
+from mortarbench.problems.contact.bodies import (
+    Bodies,
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
 from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
 from mortarbench.problems.contact.stepping import Forces, load_steps
@@ -27,72 +35,136 @@ from mortarbench.problems.duality.problem import (
     ContactProblem,
     ElasticBodies,
     StructuredGrids,
+    StructuredSolids,
     cached_problem,
 )
 from mortarbench.problems.fem.elasticity import Material
-from mortarbench.problems.fem.mesh import dofs_of, nodal_lengths, rectangle_grid
+from mortarbench.problems.fem.mesh import (
+    Nodes,
+    box,
+    dofs_of,
+    nodal_areas,
+    nodal_lengths,
+    rectangle_grid,
+)
 
 SIDE = 0.04  #: m
 MATERIAL = Material(E=1.3e11, nu=0.2)
 TOP, LEFT = 5e7, 15e7  #: pressures on the sides, Pa
 FORCE = TOP * SIDE  #: F₀, N/m
-GROUND = RigidPlane((0.0, 0.0), (0.0, 1.0))
 PLACES = np.array([0.0, 1.25e-3, 5e-3, 7.5e-3, 11.25e-3])  #: x of published points, m
 PUBLISHED = np.array([2.86e-5, 2.72e-5, 2.28e-5, 1.98e-5, 1.50e-5])  #: u_x there, m
 FORCE_AT = 38.75e-3  #: x of the published normal force, m
 
 
+class Plate(NamedTuple):
+    """The plate with its sides as nodes, and the areas of those under pressure."""
+
+    shape: StructuredGrids | StructuredSolids
+    ground: Nodes  #: side y = 0, without its nodes on x = 40 mm
+    top: tuple[Nodes, Vector]  #: nodes of y = 40 mm and their shares, m; m² in space
+    left: tuple[Nodes, Vector]  #: the same of x = 0
+    right: Nodes  #: nodes of x = 40 mm
+    corner: Nodes  #: those of y = 0 among them
+    ends: Nodes  #: nodes of the end faces, on which u_z = 0; none in the plane
+    thickness: float  #: 1 in the plane
+
+
+def plate(n: int) -> Plate:
+    """Return the plate with n × n quadrilaterals."""
+    grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (n, n))
+    sides = grid.sides
+    top, left = (
+        (sides[name], nodal_lengths(grid.side(name))) for name in ("top", "left")
+    )
+    corner = sides["bottom"][-1:]
+    return Plate(
+        shape=StructuredGrids((grid,)), ground=sides["bottom"][:-1], top=top, left=left,
+        right=sides["right"], corner=corner, ends=np.zeros(0, dtype=np.int64),
+        thickness=1.0,
+    )  # fmt: skip
+
+
+def extruded_plate(n: int, depth: int) -> Plate:
+    """Return the plate with n × n × depth cubes between its end faces."""
+    thickness, divisions = SIDE * depth / n, (n, n, depth)
+    mesh = box((0.0, 0.0, 0.0), (SIDE, SIDE, thickness), divisions)
+    sides = mesh.boundaries
+    ground, right = sides["front"], np.unique(sides["right"])
+    top, left = (nodal_areas(mesh.points, sides[name]) for name in ("back", "left"))
+    return Plate(
+        shape=StructuredSolids((mesh,), (divisions,)), ground=ground, top=top,
+        left=left, right=right, corner=np.intersect1d(ground, right),
+        ends=np.unique(np.concatenate([sides["bottom"], sides["top"]])),
+        thickness=thickness,
+    )  # fmt: skip
+
+
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the plate with n × n cells."""
+    """Return the plate with n × n cells, in space with `depth` layers along z."""
     p: Any = params
-    grid = rectangle_grid((0.0, 0.0), (SIDE, SIDE), (p["n"], p["n"]))
-    sides = grid.sides
+    dim, n = p["dim"], p["n"]
+    body = plate(n) if dim == 2 else extruded_plate(n, p["depth"])
+    unit = FORCE * body.thickness
+    (top, top_shares), (left, left_shares) = body.top, body.left
     forces = Forces(
-        np.concatenate(
-            [dofs_of(sides["top"], 2, 1), dofs_of(sides["left"], 2, 0)]
-        ),
-        np.concatenate([
-            -TOP * nodal_lengths(grid.side("top")) / FORCE,
-            LEFT * nodal_lengths(grid.side("left")) / FORCE,
-        ]),
-    )  # fmt: skip
-    right, corner = sides["right"], sides["bottom"][-1]
-    fixed = np.append(dofs_of(right, 2, 0), dofs_of(corner, 2, 1))
-    on_rigid = ContactPair(sides["bottom"][:-1], np.zeros(0, dtype=np.int64))
+        np.concatenate([dofs_of(top, dim, 1), dofs_of(left, dim, 0)]),
+        np.concatenate([-TOP * top_shares / unit, LEFT * left_shares / unit]),
+    )
+    fixed = np.concatenate([
+        dofs_of(body.right, dim, 0), dofs_of(body.corner, dim, 1),
+        dofs_of(body.ends, dim, dim - 1),
+    ])  # fmt: skip
+    on_rigid = ContactPair(body.ground, body.ground[:0])
+    normal = (0.0, 1.0, 0.0)[:dim]
+    rigid = RigidPlane((0.0,) * dim, normal)
     return ContactProblem(
         bodies=ElasticBodies(
-            shape=StructuredGrids((grid,)), names=("plate",), materials=(MATERIAL,),
-            plane="strain", length=SIDE, force=FORCE, fixed=fixed, forces=forces,
-            pairs=(on_rigid,),
+            shape=body.shape, names=("plate",), materials=(MATERIAL,),
+            plane="strain" if dim == 2 else None, length=SIDE, force=unit,
+            fixed=fixed, forces=forces, pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
         linearise=lambda bodies, _: lambda u: rigid_rows(
-            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND,
-            tangential=True,
+            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, rigid,
+            clamped=_corner(bodies), tangential=True,
         ),
         results=lambda answer: {
-            **published_quantities(*answer.sides), "tresca_problems": answer.problems,
+            **published_quantities(*answer.sides, thickness=body.thickness),
+            "tresca_problems": answer.problems,
         },
     )  # fmt: skip
 
 
+def _corner(bodies: UnassembledBodies | ContactSides) -> Nodes:
+    """Return the nodes of the contact side on x = 40 mm, which have no row."""
+    nodes: Nodes = bodies.pairs[0].slave_nodes
+    return np.asarray(nodes[bodies.mesh.points[nodes, 0] > SIDE * (1 - 1e-9)])
+
+
 def published_quantities(
-    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction
-) -> dict[str, Any]:
+    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction,
+    thickness: float,
+) -> dict[str, Any]:  # fmt: skip
     """Return the published quantities, interpolated linearly between nodes.
 
-    displacement: u_x at `PLACES`, m. published_error: the largest relative deviation
-    from the published values. normal_force: nodal force at 38.75 mm, N/m.
+    In space, displacements are means over z, and forces are sums over z divided by the
+    thickness. displacement: u_x at `PLACES`, m. published_error: the largest relative
+    deviation from the published values. normal_force: nodal force at 38.75 mm, N/m.
     tangential_sum: magnitude of the sum over all nodes, N/m.
     """
-    nodes = bodies.pairs[0].slave
-    x, u = bodies.mesh.points[nodes, 0], s.x[dofs_of(nodes, 2, 0)] * bodies.length
-    normal, tangential = np.split(s.z * bodies.force, [primal.h.size])
-    at_places: Vector = np.interp(PLACES, x, u)
+    dim, corner = bodies.mesh.dim, _corner(bodies)
+    nodes = np.setdiff1d(bodies.pairs[0].slave_nodes, corner)  # those with rows
+    x, column = np.unique(bodies.mesh.points[nodes, 0], return_inverse=True)
+    u = s.x[dofs_of(nodes, dim, 0)] * bodies.length
+    normal = np.bincount(column, s.z[: primal.h.size]) * bodies.force / thickness
+    mean = np.bincount(column, u) / np.bincount(column)
+    at_places: Vector = np.interp(PLACES, x, mean)
+    force = friction.T.T @ s.z[primal.h.size :] * bodies.force / thickness
     return {
         "displacement": at_places.tolist(),
         "published_error": float(np.abs(at_places / PUBLISHED - 1).max()),
         "normal_force": float(np.interp(FORCE_AT, x, normal)),
-        "tangential_sum": float(abs(tangential.sum())),
+        "tangential_sum": float(abs(force[dofs_of(nodes, dim, 0)].sum())),
     }

@@ -70,7 +70,7 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         new = primal_form(pair.qp)
     else:
         start = perf_counter()
-        own = on_one_process(pair.in_subdomains(p["glue"]))
+        own = on_one_process(pair.in_subdomains(p["glue"], p["cluster"]))
         pieces, certify_by_subdomains = own.decomposed, certifier(own, pair.qp.P)
         new = feti_dual(pieces, pair.qp)
         seconds = perf_counter() - start
@@ -151,7 +151,7 @@ class Membranes:
         along = hat_integrals(self.side, 0.0, 1.0)
         return np.asarray(f[body] * (heights[body, row] * along[column]))
 
-    def in_subdomains(self, rows: str) -> DecomposedProblem:
+    def in_subdomains(self, rows: str, cluster: int = 0) -> DecomposedProblem:
         """Return the decomposed problem, with gluing rows `rows`, one of `GLUE`."""
         layout = Layout.of(self.grids, self.n)
         sides = joined_sides(self.grids)
@@ -159,7 +159,7 @@ class Membranes:
         return DecomposedProblem(
             layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
             assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
-            glue=rows, fixed=np.sort(sides["left left"]),
+            glue=rows, cluster=cluster, fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
         )  # fmt: skip
 
@@ -204,7 +204,7 @@ class Membranes:
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Return the decomposed problem of complete keys."""
     p: Any = params
-    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"])
+    return Membranes(p["S"], p["n"]).in_subdomains(p["glue"], p["cluster"])
 
 
 def results(params: Mapping[str, Value], dual: LocalDual) -> Results:

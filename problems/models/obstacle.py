@@ -126,7 +126,7 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Return the decomposed problem; every interior node has a contact row."""
     p: Any = params
     if p["dim"] == 1:
-        return _string_in_subdomains(p["n"], p["feti"], p["glue"])
+        return _string_in_subdomains(p)
     n, shape, all_ = p["n"], p["shape"], slice(None)
     grid = _grid(n, shape)
     layout = Layout.of((grid,), p["feti"])
@@ -140,20 +140,23 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
         assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
         names=("membrane",), load=partial(_load, grid, shape), fixed=boundary,
         contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
+        cluster=p["cluster"],
     )  # fmt: skip
 
 
-def _string_in_subdomains(n: int, most: int, glue: str) -> DecomposedProblem:
+def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
     """Return the decomposed problem of a string, from its whole mesh."""
+    n = p["n"]
     problem = obstacle_problem(1, n)
     mesh, body = Mesh(problem.x, cells(1, n), {}), np.zeros(n, dtype=np.int64)
-    layout = mesh_in_subdomains(mesh, blocks((n,), most), body, np.arange(n + 1))
+    layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, np.arange(n + 1))
     qp = problem.qp
     return DecomposedProblem(
         layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
         assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
         names=("string",), load=lambda node: -qp.q[node], fixed=qp.A.indices,
-        contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=glue,
+        contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=p["glue"],
+        cluster=p["cluster"],
     )  # fmt: skip
 
 

@@ -12,6 +12,10 @@ edge (``edge``), or in equal parts on the nodes of that edge (``nodal``).
 
 Supports are rows of B as in all families (Total FETI), or ``eliminated``: subdomains at
 the clamped edge then do not float, as in FETI-1 (Farhat and Roux 1991).
+
+In space (dim=3) the plate is a box of Sx × Sy × Sz subdomains with n cells along z. It
+is clamped at x = 0 and pulled along −z by 1 MN on the face at the largest x, or
+at its corner of largest y and z (``point``).
 """
 
 from __future__ import annotations
@@ -44,6 +48,7 @@ from mortarbench.problems.duality.feti_dual import (
     feti_dual,
     feti_matrices,
 )
+from mortarbench.problems.duality.problem import StructuredGrids, StructuredSolids
 from mortarbench.problems.fem.elasticity import (
     Material,
     elasticity_matrix,
@@ -54,10 +59,12 @@ from mortarbench.problems.fem.inverse import GeneralisedInverse, regular_inverse
 from mortarbench.problems.fem.mesh import (
     Mesh,
     Nodes,
-    StructuredGrid,
     as_vectors,
+    box,
     dofs_of,
+    nodal_areas,
     nodal_lengths,
+    nodes_of_side,
     rectangle_grid,
 )
 from mortarbench.problems.feti.distributed_dual import LocalDual
@@ -67,6 +74,7 @@ from mortarbench.problems.feti.spectrum import (
     spectra_over_ranks,
 )
 from mortarbench.problems.feti.structured import Layout
+from mortarbench.problems.feti.subdivision import Subdivision, mesh_in_subdomains
 from mortarbench.problems.feti.subdomain_classes import DecomposedBodies
 from mortarbench.problems.feti.subdomains import (
     Contact,
@@ -74,10 +82,10 @@ from mortarbench.problems.feti.subdomains import (
     LocalSubdomains,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import blocks
+from mortarbench.problems.feti.tearing import blocks, grid_positions
 
 LENGTH = 1.0  #: l, unit of length, m
-LOAD = 1e6  #: F₀, the load, N/m
+LOAD = 1e6  #: F₀, the load, N/m, in space N
 STEEL = Material(E=210e9, nu=0.3)
 #: preconditioner and scaling by the name of the spectrum; None: no preconditioner
 PRECONDITIONERS: Mapping[str, tuple[str, str] | None] = {
@@ -111,7 +119,7 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
             primal=plate.primal, to_primal=new.recover, factorise=plate.factorise,
-            mesh_size=float(np.sqrt(np.prod(plate.size) / len(mesh.cells)) / LENGTH),
+            mesh_size=(plate.volume / len(mesh.cells)) ** (1 / mesh.dim) / LENGTH,
             rigid=rigid_modes(mesh.points), names=("plate",),
             scale=LOAD * LENGTH, grid=Grid(
                 mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
@@ -128,12 +136,12 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
 class Plate:
     """Plate of one set of keys; K, f and moduli are non-dimensional, by l and F₀."""
 
-    size: tuple[float, float]  #: width and height, m
+    volume: float  #: width × height, m²; in space also × Sz, m³
     mesh: Mesh
     subdomain: NDArray[np.int64]  #: (E,) subdomain of each cell
     material: NDArray[np.int64]  #: (E,) material of each cell, an index into `moduli`
     moduli: Vector  #: (k,) moduli of the materials, that of steel first
-    D: NDArray[np.float64]  #: (k, 3, 3) elasticity matrices of the materials
+    D: NDArray[np.float64]  #: (k, v, v) elasticity matrices of the materials
     primal: QP
     parts: DecomposedProblem
 
@@ -160,7 +168,7 @@ class Plate:
     @property
     def clamped(self) -> NDArray[np.int64]:
         """Displacement components at the clamped edge."""
-        return dofs_of(self.mesh.boundaries["left"], 2)
+        return _clamped(self.mesh.boundaries, self.mesh.dim)
 
     def factorise(self) -> GeneralisedInverse:
         """Factorise K without the prescribed components."""
@@ -184,122 +192,161 @@ def _spectra(moduli: Vector, dual: LocalDual) -> Mapping[str, Spectrum]:
 def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     """Mesh and assemble the plate of complete keys as one body."""
     p: Any = dict(params)
-    grid, side = _grid(p), _side(p)
-    mesh = grid.mesh()
-    subdomain = blocks(grid.divisions, side)
-    material = _material(p, subdomain % p["Sx"], subdomain // p["Sx"])
+    parts, shape = in_subdomains(p), _shape(p)
+    mesh, subdomain = shape.mesh, parts.layout.label
+    material = np.asarray(parts.material[subdomain], dtype=np.int64)
     moduli, D = _stiffness(p)
     n = mesh.dofs
     one = csr_array(eye_array(n, format="csr"))
-    clamped = dofs_of(mesh.boundaries["left"], 2)
+    clamped = _clamped(mesh.boundaries, mesh.dim)
     primal = QP(
-        P=stiffness(mesh, D, material), q=-load(grid, p["load"]),
+        P=stiffness(mesh, D, material), q=-parts.load(np.arange(n)),
         A=one[clamped], b=np.zeros(clamped.size), G=no_rows(n), h=np.zeros(0),
         lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
     )  # fmt: skip
     return Plate(
-        size=_size(p), mesh=mesh, subdomain=subdomain, material=material, moduli=moduli,
-        D=D, primal=primal, parts=in_subdomains(p),
+        volume=float(np.prod(_size(p))), mesh=mesh, subdomain=subdomain,
+        material=material, moduli=moduli, D=D, primal=primal, parts=parts,
     )  # fmt: skip
 
 
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     """Return the decomposed problem of complete keys."""
     p: Any = params
-    grid, (moduli, D) = _grid(p), _stiffness(p)
-    layout = Layout.of((grid,), _side(p))
-    column, row = (x.astype(np.int64) for x in layout.block[1:])
+    shape, (moduli, D) = _shape(p), _stiffness(p)
+    layout = _layout(shape, _side(p))
     # no contact rows, but the interface of problems with contact
     none = np.zeros(0)
     return DecomposedProblem(
-        layout=layout, components=2, E=moduli[:1], names=("plate",), glue=p["glue"],
-        material=_material(p, column, row),
+        layout=layout, components=shape.dim, E=moduli[:1], names=("plate",),
+        glue=p["glue"], cluster=p["cluster"], material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
-        load=force_lookup(Forces(*_pull(grid, p["load"]))),
-        fixed=dofs_of(grid.sides["left"], 2),
+        load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
+        fixed=_clamped(shape.sides, shape.dim),
         eliminated=p["supports"] == "eliminated",
-        contact=Contact(no_rows(2 * grid.nodes), none, none),
+        contact=Contact(no_rows(shape.dim * layout.nodes), none, none),
     )  # fmt: skip
 
 
 def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
     """Return the function that evaluates `quantities` on ranks."""
-    return partial(_rank_quantities, _grid(params), _stiffness(params)[0], dual)
+    p: Any = params
+    elements = int(np.prod(_divisions(p)))
+    return partial(_rank_quantities, elements, _stiffness(p)[0], dual)
 
 
 def _rank_quantities(
-    grid: StructuredGrid, moduli: Vector, dual: LocalDual, answer: LocalSolution
+    elements: int, moduli: Vector, dual: LocalDual, answer: LocalSolution
 ) -> dict[str, Any]:
     """Return `quantities` and condition numbers from all ranks; collective."""
-    own = answer.subdomains
-    tip = dofs_of(np.intersect1d(grid.sides["top"], grid.sides["right"]), 2)
+    problem = answer.subdomains.problem
+    nodes, dim = problem.layout.nodes, problem.components
     values = {
-        "nodes": grid.nodes,
-        "elements": int(np.prod(grid.divisions)),
-        "dofs": 2 * grid.nodes,
-        "equality_rows": own.problem.fixed.size,
+        "nodes": nodes,
+        "elements": elements,
+        "dofs": dim * nodes,
+        "equality_rows": problem.fixed.size,
         "energy": answer.energy * LOAD * LENGTH,
-        "tip": (answer.at(tip) * LENGTH).tolist(),
+        "tip": (answer.at(_tip(nodes, dim)) * LENGTH).tolist(),
     }
     return values | conditions(_spectra(moduli, dual))
 
 
-def _size(p: Mapping[str, Any]) -> tuple[float, float]:
-    return p["width"] or float(p["Sx"]), p["height"] or float(p["Sy"])
+def _counts(p: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the numbers of subdomains along the axes."""
+    return (p["Sx"], p["Sy"], p["Sz"])[: p["dim"]]
 
 
-def _side(p: Mapping[str, Any]) -> tuple[int, int]:
+def _size(p: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the lengths of the plate along the axes, m."""
+    lengths = p["width"] or p["Sx"], p["height"] or p["Sy"], p["Sz"]
+    return tuple(map(float, lengths[: p["dim"]]))
+
+
+def _side(p: Mapping[str, Any]) -> tuple[int, ...]:
     """Return the numbers of cells along the sides of a subdomain."""
-    return p["n"], p["ny"] or p["n"]
+    return (p["n"], p["ny"] or p["n"], p["n"])[: p["dim"]]
 
 
-def _grid(p: Mapping[str, Any]) -> StructuredGrid:
-    n, ny = _side(p)
-    return rectangle_grid((0.0, 0.0), _size(p), (n * p["Sx"], ny * p["Sy"]))
+def _divisions(p: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return the numbers of cells along the axes."""
+    return tuple(n * S for n, S in zip(_side(p), _counts(p), strict=True))
 
 
-def _material(
-    p: Mapping[str, Any], column: NDArray[np.int64], row: NDArray[np.int64]
-) -> NDArray[np.int64]:
-    """Return the materials of subdomains by their columns and rows."""
+def _shape(p: Mapping[str, Any]) -> StructuredGrids | StructuredSolids:
+    size, divisions = _size(p), _divisions(p)
+    if p["dim"] == 3:
+        x, y, z = divisions
+        return StructuredSolids((box((0.0,) * 3, size, divisions),), ((x, y, z),))
+    (width, height), (nx, ny) = size, divisions
+    return StructuredGrids((rectangle_grid((0.0, 0.0), (width, height), (nx, ny)),))
+
+
+def _layout(
+    shape: StructuredGrids | StructuredSolids, side: tuple[int, ...]
+) -> Subdivision:
+    """Cut the plate into subdomains with the same numbers of cells along each axis."""
+    if isinstance(shape, StructuredGrids):
+        return Layout.of(shape.parts, side)
+    named = np.unique(np.concatenate(list(shape.sides.values())))
+    label = blocks(shape.divisions[0], side)
+    positions = grid_positions(label, shape.divisions[0])
+    return mesh_in_subdomains(shape.mesh, label, shape.body, named, positions)
+
+
+def _material(p: Mapping[str, Any]) -> NDArray[np.int64]:
+    """Return the material of each subdomain, (S,)."""
+    counts = _counts(p)[::-1]
+    place = np.array(np.unravel_index(np.arange(np.prod(counts)), counts))
     patterns: dict[str, NDArray[np.int64]] = {
-        "uniform": np.zeros_like(column),
-        "checkerboard": (column + row) % 2,
-        "column": (column == 0).astype(np.int64),
+        "uniform": np.zeros_like(place[0]),
+        "checkerboard": place.sum(axis=0) % 2,
+        "column": (place[-1] == 0).astype(np.int64),
     }
     return patterns[p["pattern"]]
 
 
 def _stiffness(p: Mapping[str, Any]) -> tuple[Vector, NDArray[np.float64]]:
-    """Return non-dimensional moduli (2,) and elasticity matrices (2, 3, 3)."""
+    """Return non-dimensional moduli (2,) and elasticity matrices (2, v, v)."""
     moduli = np.array([1.0, p["jump"]]) * STEEL.E * LENGTH / LOAD
+    plane = p["plane"] if p["dim"] == 2 else None
     materials = [Material(E, STEEL.nu) for E in moduli]
-    return moduli, np.stack([elasticity_matrix(m, p["plane"]) for m in materials])
+    return moduli, np.stack([elasticity_matrix(m, plane) for m in materials])
 
 
-def load(grid: StructuredGrid, kind: str) -> Vector:
-    """Return the non-dimensional nodal forces (2N,) of the load F₀."""
-    component, force = _pull(grid, kind)
-    f = np.zeros(2 * grid.nodes)
-    f[component] = force
-    return f
+def _clamped(sides: Mapping[str, Nodes], dim: int) -> Nodes:
+    """Return the displacement components at the clamped side."""
+    return dofs_of(nodes_of_side(sides["left"]), dim)
 
 
-def _pull(grid: StructuredGrid, kind: str) -> tuple[Nodes, Vector]:
-    """Return the loaded components and their forces."""
-    right = grid.sides["right"]
-    share = {
-        "point": (right == np.intersect1d(right, grid.sides["top"])).astype(float),
-        "edge": nodal_lengths(grid.side("right")),
-        "nodal": np.ones(right.size),
-    }[kind]
-    return dofs_of(right, 2, 1), -share / share.sum()
+def _pull(layout: Subdivision, side: Nodes, kind: str) -> Forces:
+    """Return the load, distributed over a side as the key `load` requires."""
+    nodes = nodes_of_side(side)
+    points = layout.position(nodes)
+    dim = points.shape[1]
+    if kind == "point":
+        share = (nodes == nodes.max()).astype(float)
+    elif kind == "nodal":
+        share = np.ones(nodes.size)
+    elif dim == 3:
+        share = nodal_areas(points, np.searchsorted(nodes, side))[1]
+    else:
+        share = nodal_lengths(points)
+    return Forces(dofs_of(nodes, dim, dim - 1), -share / share.sum())
+
+
+def _tip(nodes: int, dim: int) -> Nodes:
+    """Return the components of the last node, the corner of largest coordinates."""
+    return dofs_of(np.array([nodes - 1]), dim)
 
 
 def quantities(plate: Plate, s: Solution) -> dict[str, Any]:
-    """Return counts, energy, J/m, and the tip [u_x, u_y] (upper right corner), m."""
+    """Return counts, energy, J/m, and the displacement of the upper right corner, m.
+
+    In space, the energy is in J and the corner that of the largest x, y and z.
+    """
     mesh = plate.mesh
-    tip = dofs_of(np.intersect1d(mesh.boundaries["top"], mesh.boundaries["right"]), 2)
+    tip = _tip(len(mesh.points), mesh.dim)
     return {
         "nodes": len(mesh.points),
         "elements": len(mesh.cells),

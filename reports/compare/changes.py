@@ -21,7 +21,7 @@ from mortarbench.reports.data.evidence import FROM_FILE, SEVERITY, Evidence, Out
 from mortarbench.reports.document.grouping import grouped
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-DRAWS = 2000
+DRAWS = 2000  #: bootstrap resamples; a tail of 2.5 % then consists of 50 of them
 ALIKE = 1.5  #: an interval within [1/ALIKE, ALIKE] around 1 counts as "no change seen"
 FEWEST = 3  #: minimum number of cells for an interval over cells
 _NEGLIGIBLE = 1e-12  #: smaller differences of energies (data of order 1) are rounding
@@ -90,10 +90,10 @@ class Pair:
 
     @cached_property
     def answers(self) -> tuple[float, float, float] | None:
-        """Energy (objective, if there is none) before and after, and their difference.
+        """Energy (or the objective) before and after, and their relative difference.
 
-        The difference is relative to the larger. None where one answer is not verified,
-        or has no such value.
+        The difference is relative to the larger value. None if an answer is not
+        verified or has no such value.
         """
         pairs = (
             (self.before.energy, self.after.energy),
@@ -156,7 +156,7 @@ class Comparison:
         return tuple(p for p in self.pairs if p.ratio is not None)
 
     def of(self, solver: str) -> tuple[Pair, ...]:
-        """All pairs of one solver."""
+        """Return all pairs of one solver."""
         return tuple(p for p in self.pairs if p.after.solver == solver)
 
 
@@ -194,8 +194,9 @@ def mean_ratio(pairs: Sequence[Pair]) -> Mean | None:
 def relative_ratio(c: Comparison, solver: str) -> Mean | None:
     """Average the ratios of a solver relative to those of the other solvers.
 
-    On each case and tolerance, its ratio is divided by the geometric mean of theirs,
-    which cancels a slowdown of the whole run. None if no other solver has times there.
+    For each case and tolerance, the ratio of the solver is divided by the geometric
+    mean of the ratios of the others, which cancels a slowdown of the whole run. Return
+    None if no other solver has times.
     """
     competing = (p for p in c.pairs if p.after.solver != solver)
     rivals = grouped(
@@ -236,9 +237,10 @@ def mean_of(logs: Sequence[float], names: Sequence[str]) -> Mean | None:
     """Average logarithms of ratios over cells, with a bootstrap interval over cells.
 
     A cell is resampled as a pair, before with after. Percentile intervals of n values
-    are too narrow, by √((n−1)/n) and by normal instead of Student's tails; their
-    distances from the mean are multiplied by both factors [1]_. The names of the cells
-    seed the generator. Below three cells the interval is unbounded.
+    are too narrow by the factor √((n−1)/n), and because they have normal instead of
+    Student's tails; the distances of their ends from the mean are multiplied by both
+    factors [1]_. The names of the cells seed the generator. Below three cells the
+    interval is unbounded.
 
     References
     ----------

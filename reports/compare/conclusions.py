@@ -21,7 +21,7 @@ from mortarbench.reports.document.formatting import VERDICTS, fixed, plural
 from mortarbench.reports.document.templates import Sentences
 from mortarbench.reports.statistics.intervals import COVERAGE
 
-NAMED = 8  #: changes named in the text; the tables list all
+NAMED = 8  #: largest number of changes named in the text; the tables list all
 WORDS = ("slower", "faster", "no change seen", "not resolved")
 
 
@@ -64,7 +64,7 @@ def sentences(c: Comparison) -> tuple[str, ...]:
 
 
 def _named_sentences(c: Comparison) -> dict[str, str]:
-    """Return all sentences on a comparison by name; empty strings do not apply."""
+    """Return all sentences by name; a sentence that does not apply is empty."""
     keys = [key for key, *_ in environments(c.before, c.after)]
     schemas = [sorted({r.schema for r in e.records}) for e in (c.before, c.after)]
     loads = [

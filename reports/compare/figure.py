@@ -25,7 +25,7 @@ from mortarbench.reports.document.figure import (
 from mortarbench.reports.figures.style import legible, look, run_ids
 
 _ROW = 0.42  #: height of a solver's row, inches
-_SHIFT = 0.16  #: of cells above the row's middle, and of the mean below
+_SHIFT = 0.16  #: offset of cells above the middle of a row, and of the mean below it
 
 
 def ratios_figure(c: Comparison) -> Figure:

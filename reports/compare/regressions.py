@@ -8,12 +8,13 @@ unpaired between the folders, which are different sessions.
 
 - Solver: mean of the logarithms over its cases, at least three, with Student's interval
   over them. Their scatter includes the differences between runs on one case.
-- Single cell: its error is the larger of Welch's over the repeats and of the scatter of
-  the cells about the means of their solvers (1.4826 times the median distance, the
-  standard deviation of a normal law). That scatter needs `CELLS` cells.
+- Single cell: its error is the larger of two: Welch's error over the repeats, and the
+  scatter of the cells about the means of their solvers (1.4826 times the median
+  distance, which is the standard deviation of a normal law). At least `CELLS` cells are
+  needed to estimate the scatter.
 
-All intervals hold jointly with 95 %: half of the 5 % is for the solvers, half for the
-cells, and each half is divided evenly (Bonferroni) [1]_.
+All intervals hold jointly with 95 %: half of the error probability of 5 % is assigned
+to the solvers and half to the cells, and each half is divided evenly (Bonferroni) [1]_.
 
 References
 ----------
@@ -50,13 +51,13 @@ class Slower:
     solver: str
     case: str = ""  #: empty for a solver over its cases
     tol: float | None = None
-    ratio: Ratio  #: of times, after over before; the interval is corrected
+    ratio: Ratio  #: ratio of times, after over before, with a corrected interval
     relative: Ratio  #: `ratio` over that of the other solvers in the same blocks
 
 
 @dataclass(frozen=True, kw_only=True)
 class Regressions:
-    """Slowdowns, and the number of tests behind them."""
+    """Slowdowns, and the number of statistical tests from which they result."""
 
     slower: tuple[Slower, ...]
     solvers: int  #: number of solvers judged over their cases
@@ -66,7 +67,7 @@ class Regressions:
 
 
 class _Change(NamedTuple):
-    """Logarithms of the times of one cell, and the same relative to other solvers."""
+    """Logarithms of the times of one cell, absolute and relative to other solvers."""
 
     outcome: Outcome
     own: tuple[Floats, Floats]  #: after, before
@@ -185,7 +186,7 @@ def _of_solver(
 ) -> Slower:
     """Average logarithms of ratios over cases, with Student's interval.
 
-    miss : probability that the mean is outside the interval, on either side
+    miss : probability, on each side, that the mean is outside the interval
     """
 
     def student(x: Floats) -> Ratio:

@@ -75,7 +75,8 @@ def write_comparisons(
 
     Returns
     -------
-    the comparisons, the verdicts in a few lines of text, and the files, that page first
+    the comparisons, the verdicts in a few lines of text, and the files with that page
+    first
 
     Raises
     ------

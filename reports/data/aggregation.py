@@ -24,9 +24,10 @@ GATES = ("verified", "claimed")
 class Convention:
     """Choices in the averaging of times over cases."""
 
-    shift: float = 1.0  #: in units of the shift of the group
+    shift: float = 1.0  #: shift of times, in units of the shift of the group
     penalty: float = 3.0  #: charge for an unsolved case, in time limits
-    gate: str = "verified"  #: or "claimed", which accepts the solver's claim
+    #: "verified", or "claimed", which accepts the solver's claim
+    gate: str = "verified"
     common: bool = False  #: use only cases solved by all, see `common_cases`
 
 
@@ -142,7 +143,7 @@ class Ranking:
     def spans(self) -> list[tuple[int, int]]:
         """Rank intervals: after all significantly faster solvers, before all slower.
 
-        They jointly contain the true ranks with 95 % [1]_.
+        They jointly contain the true ranks with 95 % confidence [1]_.
 
         References
         ----------

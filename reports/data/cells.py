@@ -23,7 +23,7 @@ def source(*outcomes: Outcome) -> str:
 def verdict_cell(outcome: Outcome, after: str = "", message: str = "") -> Cell:
     """Return a cell of a verdict, with the number of repeats that have it.
 
-    message : of the solver, shown on hovering
+    message : message of the solver, shown on hovering
     """
     symbol, words = VERDICTS[outcome.verdict]
     if outcome.against_residuals:

@@ -28,7 +28,7 @@ _LATE = {v for v in Verdict if v is Verdict.TIME_LIMIT or v.is_verified}
 
 Times = NDArray[np.float64]
 Pairs = NDArray[np.bool_]
-Row = Mapping[str, Outcome]  #: by solver
+Row = Mapping[str, Outcome]  #: outcomes by solver
 Cells = dict[str, dict[str, list[Outcome]]]  #: outcomes by case and solver
 
 
@@ -61,7 +61,7 @@ class GroupKey(NamedTuple):
         return ", ".join(filter(None, (self.subject, self.accuracy)))
 
 
-Answers = Mapping[GroupKey, Mapping[str, Row]]  #: by group and case
+Answers = Mapping[GroupKey, Mapping[str, Row]]  #: outcomes by group and case
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

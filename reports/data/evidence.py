@@ -28,7 +28,7 @@ RESIDUALS = ("primal", "dual", "complementarity", "gap")
 
 _AS_WRITTEN = "the file that the run wrote; restore it"
 
-#: Verdicts, worst first: several repeats get the worst of their verdicts.
+#: Verdicts, worst first; an outcome of several repeats has the worst of their verdicts.
 SEVERITY = (
     Verdict.WRONG,
     Verdict.INACCURATE,
@@ -59,7 +59,7 @@ def _median(seconds: Iterable[float | None]) -> Interval | None:
 class Outcome:
     """All repeats of one solver on one case at one tolerance."""
 
-    records: tuple[Record, ...]  #: at least one
+    records: tuple[Record, ...]  #: records of all repeats; at least one
     factor: float = VERIFIED_FACTOR  #: verified means every residual ≤ factor·tol
 
     @property
@@ -302,7 +302,9 @@ def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
         united[digest] = digest
         try:
             environment = environment_of(directory, digest)
-        except InputError:  # not stored: comparable with itself only
+        except (
+            InputError
+        ):  # an environment that is not stored is comparable with itself only
             continue
         united[digest] = next(
             (d for d, e in representatives.items() if times_compare(e, environment)),

@@ -62,13 +62,15 @@ class Competitor:
     """A solver of a comparison, and its times relative to those of the first."""
 
     solver: str
-    outcomes: Mapping[str, Outcome]  #: by case
+    outcomes: Mapping[str, Outcome]  #: outcomes by case
     compared: tuple[str, ...] = ()  #: cases solved by it and the first
     slower: bool = False  #: significantly slower than the first
-    ratio: Ratio | None = None  #: over the cases, or within the blocks of a single one
-    by_case: Mapping[str, Ratio] = field(default_factory=dict)  #: within blocks
-    form: str = ""  #: of the QPs, in comparisons of forms
-    apart: bool = False  #: on some case not measured in the blocks of the first
+    #: ratio over the cases, or within the blocks of a single case
+    ratio: Ratio | None = None
+    #: ratios within blocks, by case
+    by_case: Mapping[str, Ratio] = field(default_factory=dict)
+    form: str = ""  #: form of the QPs, in comparisons of forms
+    apart: bool = False  #: not measured in the blocks of the first on some case
 
     @property
     def verified(self) -> tuple[str, ...]:
@@ -113,7 +115,7 @@ class FastestSolver:
 
     @property
     def following(self) -> Competitor | None:
-        """The next significantly slower competitor; None if there is none."""
+        """The next significantly slower competitor, or None."""
         return next((c for c in self.competitors[1:] if c.slower), None)
 
     def fronts(self) -> dict[str, tuple[Competitor, ...]]:
@@ -209,8 +211,9 @@ def _compared(
     """Compare with the first on the cases that both solved, in one environment.
 
     On each case, the ratio is that of the blocks in which both were measured. Over
-    cases, Student's interval is widened to that of flipped signs. Student's assumes
-    normal logarithms, the other one symmetric ones; neither assumption is safe for six
+    cases, Student's interval is widened to the interval of the sign-flip test if that
+    is wider. Student's interval assumes that logarithms are normally distributed, the
+    other that their distribution is symmetric. Neither assumption is safe for six
     cases, so both intervals must exclude 1 for a significant difference.
     """
     both = [case for case in c.verified if not _mixed(c, first, case)]

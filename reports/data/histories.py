@@ -32,7 +32,7 @@ class SolverRun:
 
     outcome: Outcome
     record: Record  #: the repeat with this history
-    history: History  #: at least one row
+    history: History  #: history with at least one row
 
     @property
     def rows(self) -> int:
@@ -54,7 +54,7 @@ class SolverRun:
 
     @cached_property
     def gradient(self) -> Vector | None:
-        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over the first one."""
+        """(rows,) norm √(‖φ‖² + ‖β‖²) of the projected gradient over its first one."""
         phi, beta = self.numbers("free_gradient"), self.numbers("chopped_gradient")
         if phi is None or beta is None:
             return None
@@ -91,7 +91,7 @@ class SolverRun:
 class CaseHistories:
     """Histories on one case at one tolerance, with a common axis of work."""
 
-    runs: tuple[SolverRun, ...]  #: at least one, in the order of the suite
+    runs: tuple[SolverRun, ...]  #: runs in the order of the suite; at least one
     solvers: tuple[str, ...]  #: all of the report, in the order of their looks
 
     @property

@@ -15,7 +15,8 @@ from mortarbench.reports.document.formatting import clean, significant, span
 from mortarbench.reports.document.layout import Cell
 
 SIZES = ("nodes", "elements", "dofs", "equality_rows", "contact_rows")
-_CONTACTS, _PRESSURE = "contacts", "largest_pressure"  #: per pair, and its scalar
+#: key of the contact pairs, and the scalar that tables show for each pair
+_CONTACTS, _PRESSURE = "contacts", "largest_pressure"
 _UNITS = {
     "energy": "J/m",
     "tip": "m",
@@ -29,7 +30,7 @@ _UNITS = {
     "approach": "m",
     _CONTACTS: "Pa",  # tables show the largest pressure of each pair
 }
-_STRESS = "max_von_mises"  #: only elastic bodies have it
+_STRESS = "max_von_mises"  #: quantity that only elastic bodies have
 MOST_DIGITS = {"energy": 12, _STRESS: 3}  #: stresses depend strongly on the mesh
 _MOST = 7  #: most digits of other quantities
 _COMPONENTS = "xyz"
@@ -39,10 +40,10 @@ class Leaf(NamedTuple):
     """One scalar of the quantities."""
 
     value: Any
-    scale: float  #: its absolute value; for a component, the largest of its vector
+    scale: float  #: absolute value; for a component, the largest one of its vector
 
 
-Leaves = dict[tuple[str, ...], Leaf]  #: by path
+Leaves = dict[tuple[str, ...], Leaf]  #: scalars by path
 
 
 def elastic(outcome: Outcome) -> bool:
@@ -143,7 +144,7 @@ def _rounded(leaf: Leaf, digits: int) -> str:
 class Spread(NamedTuple):
     """Energies of the verified answers to one physical case, and their differences."""
 
-    answers: tuple[Outcome, ...]  #: of every solver and form; at least one
+    answers: tuple[Outcome, ...]  #: answers of every solver and form; at least one
     relative: float | None  #: largest pairwise |E − E'|/max(|E|, |E'|); None if alone
     pair: tuple[Outcome, Outcome] | None  #: where it occurs
 

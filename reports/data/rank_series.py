@@ -36,7 +36,7 @@ ALIKE = 0.05  #: largest relative difference of the dofs of a rank in weak scali
 class Part(NamedTuple):
     """Seconds, counts or memory of ranks: medians over the repeats."""
 
-    mean: float  #: over the ranks
+    mean: float  #: mean over the ranks
     largest: float
 
 
@@ -44,7 +44,7 @@ class Part(NamedTuple):
 class _Scaling:
     """Verified answers of one solver on several numbers of ranks."""
 
-    solver: str  #: its label on one rank
+    solver: str  #: label of the solver on one rank
     copies: Mapping[int, Outcome]  #: simultaneous independent solves, by their number
     cpus: int | None  #: number of CPUs of the machine, if known
 
@@ -59,7 +59,8 @@ class StrongSeries(_Scaling):
 
     case: str
     tol: float
-    answers: Mapping[int, Outcome]  #: by ranks, ascending; the first is one
+    #: answers by ranks, ascending; the first is on one rank
+    answers: Mapping[int, Outcome]
 
     @property
     def title(self) -> str:
@@ -111,7 +112,7 @@ class StrongSeries(_Scaling):
 
     @property
     def most(self) -> int | None:
-        """Number of subdomains, the most ranks that can share them; None if unknown."""
+        """Number of subdomains, which limits the number of ranks; None if unknown."""
         return self.answers[1].size("subdomains")
 
 
@@ -135,7 +136,8 @@ class WeakSeries(_Scaling):
     """
 
     title: str  #: family, fixed parameters, solver, tolerance
-    members: tuple[Member, ...]  #: by ranks, ascending; the first has one
+    #: members by ranks, ascending; the first is on one rank
+    members: tuple[Member, ...]
 
     def efficiency(self, member: Member, phase: str) -> Interval | None:
         """Return the efficiency t(1)/t(N) relative to the first case; ideally 1."""

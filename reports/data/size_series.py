@@ -131,7 +131,7 @@ def fixed_keys(
 def size_series(evidence: Evidence) -> list[SizeSeries]:
     """Return the series of at least three sizes.
 
-    n is the number of dofs, m that of the rows of equalities and contact.
+    n is the number of dofs, and m is the number of equality and contact rows.
     """
     series = []
     answers = [(n, o) for n, o in sized(evidence) if o.first.role != COPIES]
@@ -158,7 +158,7 @@ class Sweep:
 
     title: str  #: family, other parameters, form, tolerance
     solver: str
-    answers: tuple[Sized, ...]  #: by the value of the key
+    answers: tuple[Sized, ...]  #: answers by the value of the key
 
 
 def sweeps(evidence: Evidence, key: str) -> list[Sweep]:

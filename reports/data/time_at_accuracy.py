@@ -1,8 +1,9 @@
 """Time at equal error: the time of a solver for an answer of given certified accuracy.
 
-A sweep of its tolerance gives a solver's points (certified error, time). Between them
-the time is interpolated linearly in the logarithms, after isotonic regression, because
-a better answer does not take less time [1]_. Nothing is extrapolated.
+The solves of a solver at several tolerances yield points (certified error, time).
+Between these points the time is interpolated linearly in the logarithms, after isotonic
+regression, because a better answer does not take less time [1]_. Nothing is
+extrapolated.
 
 A point counts if the solver claimed success and a certificate bounds its error. The
 claim is not trusted; it shows that the solver's own test ended the solve, not a limit.
@@ -29,7 +30,7 @@ from mortarbench.reports.data.evidence import Outcome
 from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.resampling import limits
 
-RESAMPLES = 400
+RESAMPLES = 400  #: bootstrap resamples; a tail of 2.5 % then consists of 10 of them
 SMALLEST = 1e-17  #: lower bound of errors, so that zero has a logarithm
 
 Floats = NDArray[np.float64]
@@ -60,7 +61,7 @@ def time_at_accuracy(outcomes: Sequence[Outcome], error: float) -> TimeAtAccurac
     and widened for few repeats (see `resampling.limits`). A single repeat has no
     interval.
 
-    outcomes : of one solver on one case, at all tolerances
+    outcomes : outcomes of one solver on one case, at all tolerances
     """
     points = [o for o in outcomes if counts(o)]
     if not points:

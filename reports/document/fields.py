@@ -28,7 +28,7 @@ class ColourScale:
     label: str = ""
     unit: float = 1.0  #: value labelled 1 on the bar
     beyond: Literal["neither", "max", "both"] = "neither"  #: ends with clipped values
-    names: tuple[str, ...] = ()  #: of kinds, at the bar
+    names: tuple[str, ...] = ()  #: names of the kinds, shown at the colour bar
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -66,9 +66,9 @@ class Polygons:
 
     corners: tuple[Points, ...]
     fill: str = "none"
-    opacity: float = 1.0  #: of the fill
+    opacity: float = 1.0  #: opacity of the fill
     edge: str = "none"
-    width: float = 0.0  #: of the edge, points
+    width: float = 0.0  #: width of the edge, points
     hatch: str = ""
     cased: bool = False  #: True for a white outline around the edge
 
@@ -99,7 +99,7 @@ class Vectors:
     feet: Points
     vectors: Points
     colour: str
-    width: float  #: of the shafts, relative to the panel
+    width: float  #: width of the shafts, relative to the panel
     cased: bool = False
 
 
@@ -112,8 +112,8 @@ class Arrow:
     head: Literal["->", "<->", "-|>", "-"] = "->"
     colour: str = INK
     width: float = 0.7
-    size: float = 9.5  #: of the head
-    gap: float = 0.0  #: between the start and the line, points
+    size: float = 9.5  #: size of the head
+    gap: float = 0.0  #: distance between the start and the line, points
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -159,7 +159,8 @@ class FieldFigure:
     width: float = WIDTH
     columns: int = 1
     heights: Numbers = (1.0,)  #: relative heights of the rows
-    scale: ColourScale | None = None  #: of all panels, shown as a bar beside them
+    #: colours of all panels, shown as a bar beside them
+    scale: ColourScale | None = None
 
 
 def box(*bodies: Points) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -21,11 +21,12 @@ Runs = tuple[tuple[str, ...], ...]
 Direction = Literal["x", "y"]
 
 INK = "#20242a"  #: colour of text and axes; a page replaces it by its text colour
-WIDTH = 6.9  #: of a figure, inches
+WIDTH = 6.9  #: width of a figure, inches
 #: Smallest ratio of the ends of an automatic logarithmic axis: on a shorter axis, 19 to
 #: 22 iterations would look like growth.
 SPAN = 10.0
-MARGIN = 0.05  #: between points and ends of an axis, relative to the range of points
+#: distance between the points and the ends of an axis, relative to the range of points
+MARGIN = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,7 +37,7 @@ class Look:
     marker: str = ""  #: one of "o s ^ D v P X < > x + * _ |", or empty for none
     dash: Numbers | None = ()  #: dashes and gaps in line widths; None for no line
     width: float = 1.1
-    size: float = 4.5  #: of marks
+    size: float = 4.5  #: size of the marks
     edge: float = 1.0  #: width of the outline of marks
     fill: str = ""  #: colour within marks, "none" for hollow ones, empty for `colour`
     opacity: float = 1.0
@@ -120,14 +121,14 @@ class Rule:
 class Text:
     """A remark within a panel."""
 
-    text: str  #: with mathtext formulas of matplotlib: $n^2$
+    text: str  #: text, possibly with mathtext formulas of matplotlib: $n^2$
     place: tuple[float, float]
     inside: tuple[bool, bool] = (
         False,
         False,
     )  #: True if `place` is relative to the panel, for x and y
     offset: tuple[float, float] = (0.0, 0.0)  #: points
-    align: tuple[str, str] = ("left", "center")  #: as matplotlib names it
+    align: tuple[str, str] = ("left", "center")  #: alignment in the words of matplotlib
     size: float = 8.5
 
 
@@ -139,7 +140,8 @@ class Axis:
     log: bool = False
     low: float | None = None  #: ends; None for slightly beyond the points
     high: float | None = None
-    ticks: tuple[tuple[float, str], ...] | None = None  #: with labels; None: automatic
+    #: positions and labels; None: automatic
+    ticks: tuple[tuple[float, str], ...] | None = None
     most: int | None = None  #: approximate number of automatic ticks
     integers: bool = False  #: ticks are integers
     plain: bool = False  #: tick labels without powers of ten

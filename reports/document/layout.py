@@ -27,7 +27,7 @@ class Cell:
     """One entry of a table: plain text with its meaning, without markup."""
 
     text: str = ABSENT
-    symbol: str = ""  #: before the text, if the format supports it
+    symbol: str = ""  #: symbol before the text, if the format supports it
     after: str = ""  #: small print behind the text
     kind: str = ""  #: a verdict, "best", "tied", "void" (not comparable) or "total"
     title: str = ""  #: shown on hovering; run_ids in the form of `source` become links
@@ -91,7 +91,7 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
     text_columns: int = 1  #: number of leading columns with names instead of numbers
     notes: tuple[str, ...] = ()  #: explanations, printed after the caption
-    solver: str = ""  #: for tables on one solver, which are hidden with it
+    solver: str = ""  #: name of the solver, for tables that are hidden with it
 
     @classmethod
     def of(

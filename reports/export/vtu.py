@@ -23,7 +23,8 @@ from mortarbench.harness.plugin import SLIDING
 #: a node is in contact if its force exceeds this times the largest force or, with
 #: friction, if it sticks or slips
 IN_CONTACT = 1e-6
-STATES = ("open", "stick", "slip", SLIDING)  #: of friction, numbered in VTU files
+#: states of friction, numbered in VTU files
+STATES = ("open", "stick", "slip", SLIDING)
 #: by increasing priority, for nodes on several contact sides
 _BY_WEIGHT = ("open", SLIDING, "stick", "slip")
 
@@ -88,9 +89,9 @@ def _named(path: Path) -> Iterator[None]:
 
 
 def _along_sides(sides: Sequence[ContactSide], nodes: int) -> dict[str, Vector]:
-    """Return pressure and gap at the nodes (N,); on several sides, the tightest one.
+    """Return the largest pressure and the smallest gap of all sides at the nodes (N,).
 
-    With friction also the shear traction and the index of each state in `STATES`.
+    With friction, add the shear traction and the index of each state in `STATES`.
     """
     if not sides:
         return {}

@@ -28,6 +28,7 @@ from mortarbench.reports.document.fields import (
 from mortarbench.reports.document.figure import INK, Look
 from mortarbench.reports.figures.projection import (
     Camera,
+    camera_above,
     camera_seeing,
     camera_towards,
     crease_edges,
@@ -66,6 +67,7 @@ _NUMBERED = {9.5: 16, 6.5: 100}
 _SUBDOMAIN = Look(colour="white", width=0.9)  #: borders of subdomains
 #: arrows of open nodes that carry a share of their neighbours' forces
 _OPEN = "#6b7480"
+_STATES = FRICTION | {"open": (_OPEN, "grey")}
 _OUTLINE = Look(colour=INK, width=0.7)
 _ALONG = 0.9  #: cosine of the angle from an axis, above which normals count as parallel
 _CREASE = np.radians(40)  #: least angle between faces whose edge is outlined
@@ -198,7 +200,11 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
 
 
 def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
-    """Show the surface of bodies in space, and the pressure on each contact side."""
+    """Show the surface of bodies in space, and the pressure on each contact side.
+
+    Sides between bodies are hidden from everywhere, so that the camera stands above; a
+    single body shows its side that touches a rigid one.
+    """
     faces = boundary_facets(fields.cells, 3)
     sides = [
         (side, faces[np.isin(faces, side.nodes).all(axis=1)])
@@ -207,7 +213,9 @@ def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     sides = [(side, own) for side, own in sides if len(own)]
     normals = [face_normals(fields.points, own).sum(axis=0) for _, own in sides]
     normals = [normal / np.linalg.norm(normal) for normal in normals]
-    camera = camera_seeing(normals[0] if normals else np.zeros(3))
+    is_single = np.unique(fields.bodies).size == 1
+    towards = camera_seeing if is_single else camera_above
+    camera = towards(normals[0] if normals else np.zeros(3))
     points = moved(fields, scale)
     span = float(np.ptp(np.vstack([fields.points, points]), axis=0).max())
     colours = _scale(fields)
@@ -225,7 +233,7 @@ def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     panels = [
         FieldPanel(
             low=_pair(low), high=_pair(high), axes="none", scale=colours,
-            marks=(shown, *outlines, *_triad(camera, low, high)),
+            marks=(*outlines, shown, *_triad(camera, low, high)),
             title=f"({next(letters)}) displacement × {scale:g}; dashed: undeformed",
         )
     ]  # fmt: skip
@@ -244,7 +252,8 @@ def _pressure_panel(
 ) -> FieldPanel:  # fmt: skip
     """Show the pressure on the undeformed faces of a side, along its mean normal.
 
-    If that is about an axis, the view is along it, with positive axes to the right.
+    If this normal is nearly parallel to an axis, the view is along the axis, and
+    positive axes point to the right.
     """
     camera = camera_towards(
         np.where(np.abs(normal).max() > _ALONG, np.rint(normal), normal)
@@ -272,10 +281,40 @@ def _pressure_panel(
     high = np.minimum(middle + half, corners.max(axis=0))
     unit, name = length_unit(float((high - low).max()))
     labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
+    arrows, key = _friction_arrows(fields, side, camera, float((high - low).max()))
     return FieldPanel(
-        low=_pair(low), high=_pair(high), marks=(shown,), scale=colours, unit=unit,
-        xlabel=labels[0], ylabel=labels[1], title=f"({letter}) {side.name}",
+        low=_pair(low), high=_pair(high), marks=(shown, *arrows), scale=colours,
+        unit=unit, xlabel=labels[0], ylabel=labels[1],
+        title=f"({letter}) {side.name}{key}",
     )  # fmt: skip
+
+
+def _friction_arrows(
+    fields: Fields, side: ContactSide, camera: Camera, span: float
+) -> tuple[list[FieldMark], str]:
+    """Draw the shear traction on the slave nodes, and count their states.
+
+    span : size of the panel, m
+    """
+    if side.friction is None or side.friction_force is None:
+        return [], ""
+    area = np.where(side.length > 0, side.length, np.inf)[:, None]
+    traction = side.friction_force / area
+    sizes = np.linalg.norm(traction, axis=1)
+    largest = float(sizes.max(initial=0.0))
+    drawn = 0.12 * span / (largest or 1.0) * camera.project(traction)
+    feet, acts = camera.project(fields.points[side.nodes]), sizes > _ACTIVE * largest
+    arrows: list[FieldMark] = [
+        Vectors(feet=feet[of], vectors=drawn[of], colour=colour, width=0.006,
+                cased=True)
+        for state, (colour, _) in FRICTION.items()
+        if (of := acts & (side.friction == state)).any()
+    ]  # fmt: skip
+    factor, prefix = prefixed(largest)
+    return arrows, (
+        f"\narrows: friction on the slave, at most {largest / factor:.3g} {prefix}Pa"
+        f"\n{_states(side.friction)}"
+    )
 
 
 def _axis_name(direction: Vector, unit: str) -> str:
@@ -483,7 +522,7 @@ def _enlarged(
     shown = closed | ((tips >= low) & (tips <= high)).all(axis=1)
     largest = float(np.hypot(*forces.T).max())
     drawn = 0.4 * (high - low)[1] / largest * forces
-    colours = FRICTION | {"open": (_OPEN, "grey"), "": (_ARROW, "dark")}
+    colours = _STATES | {"": (_ARROW, "dark")}
     thick = 0.0032 if closed.sum() < 25 else 0.002
     arrows = [
         Vectors(
@@ -495,13 +534,7 @@ def _enlarged(
         for state in sorted(set(contact.friction), key=lambda s: (s in _TOUCHING, s))
         if (of := shown & (contact.friction == state)).any()
     ]  # fmt: skip
-    counts = [
-        f"{state}: {name} ({count})"
-        for state, (_, name) in colours.items()
-        if (count := int((contact.friction == state).sum())) or state in _TOUCHING
-        if state
-    ]
-    key = f"\n{', '.join(counts)}" if contact.friction.any() else ""
+    key = f"\n{_states(contact.friction)}" if contact.friction.any() else ""
     factor, prefix = prefixed(largest)
     return FieldPanel(
         low=_pair(low), high=_pair(high), marks=(*bodies, *arrows), axes="frame",
@@ -509,3 +542,13 @@ def _enlarged(
         f"{largest / factor:.3g} {prefix}N/m{key}",
         **_axes(span),
     )  # fmt: skip
+
+
+def _states(friction: NDArray[np.str_]) -> str:
+    """Count the nodes in each friction state, with the colour of their arrows."""
+    counts = {state: int((friction == state).sum()) for state in _STATES}
+    return ", ".join(
+        f"{state}: {_STATES[state][1]} ({count})"
+        for state, count in counts.items()
+        if count or state in _TOUCHING
+    )

@@ -34,7 +34,10 @@ _NAME = 28  #: characters of a name beside an axis
 _ROW = 0.3  #: height of a row, inches
 _BESIDE = 0.24  #: distance between a mean and the ratios of its cases, rows
 _TALL = 0.38  #: height of rows with ratios and a verdict, inches
-_RAISED, _BELOW = 0.16, 0.32  #: offsets of ratios above and of a verdict below, rows
+_RAISED, _BELOW = (
+    0.16,
+    0.32,
+)  #: offset of the ratios above the middle of a row, and of a verdict below it, in rows
 _BARS = {"cap": 0.0, "width": 1.1}
 _ALIKE = Look(colour=INK, width=0.8)  #: line of equal times
 

@@ -26,14 +26,14 @@ _KINDS = ColourScale(
     label="state",
 )
 _EXACT = Look(colour=INK, width=0.8, dash=(4, 2.5))
-_ARROWS = 13  #: across the contact
-_CLOSED = 1e-6  #: of the largest pressure: cells with less are open
-_MARGIN = 0.06  #: around the contact, relative to its size
+_ARROWS = 13  #: number of arrows across the contact
+_CLOSED = 1e-6  #: fraction of the largest pressure below which a cell counts as open
+_MARGIN = 0.06  #: margin around the contact, relative to its size
 _CIRCLE = np.linspace(0, 2 * np.pi, 181)
 
 
 def traction_maps(fields: Fields) -> FieldFigure | None:
-    """Show the tractions on the surface of half-spaces; None without any.
+    """Show the tractions on the surface of half-spaces; None if there are no tractions.
 
     With friction, arrows are the direction in which the upper body slips, opposite to
     the shear traction on it. Circles are the exact contact and the exact stick zone.

@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 _STANDARD = np.array([0.62, -0.64, 0.45])
 #: tiles of the visible surface; fewer show steps of the colours
 _TILES = 12_000
-_MAX_TILES = 20  #: along an edge of a face
+_MAX_TILES = 20  #: largest number of tiles along an edge of a face
 
 
 class Camera(NamedTuple):
@@ -25,7 +25,7 @@ class Camera(NamedTuple):
 
     right: Vector
     up: Vector
-    towards: Vector  #: from the bodies to the camera
+    towards: Vector  #: direction from the bodies to the camera
 
     def project(self, points: Points) -> NDArray[np.float64]:
         """Return positions in the picture (…, 2)."""
@@ -47,6 +47,11 @@ def camera_seeing(normal: Vector) -> Camera:
     return camera_towards(np.where(away, -_STANDARD, _STANDARD))
 
 
+def camera_above(normal: Vector) -> Camera:
+    """Return a camera that looks down, from where a horizontal normal points."""
+    return camera_seeing(normal * [1, 1, 0])
+
+
 def face_normals(points: Points, faces: Integers) -> Points:
     """Return normals (k, 3) of faces (k, 4), their lengths twice the areas."""
     a, b, c, d = np.moveaxis(points[faces], 1, 0)
@@ -57,14 +62,15 @@ def visible_faces(
     camera: Camera, points: Points, faces: Integers, values: Vector,
     scale: ColourScale, *, mesh: bool,
 ) -> Faces:  # fmt: skip
-    """Return the faces (k, 4) towards the camera, back to front.
+    """Return the faces (k, 4) towards the camera in tiles, back to front.
+
+    Faces may be large compared with the distance between bodies, tiles are not: the
+    order of faces would draw the part of one that lies behind another body over it.
 
     values : (N,) colours at the nodes, bilinear within faces
     mesh : also outline each face
     """
     visible = faces[face_normals(points, faces) @ camera.towards > 0]
-    depth = (points[visible] @ camera.towards).mean(axis=1)
-    visible = visible[np.argsort(depth, kind="stable")]
     tiles = int(np.clip(np.sqrt(_TILES / max(len(visible), 1)), 1, _MAX_TILES))
     ends = np.linspace(0, 1, tiles + 1)
     corners, middles = _bilinear(ends, ends), _bilinear(ends[:-1] + 0.5 / tiles)
@@ -72,13 +78,26 @@ def visible_faces(
     around = np.stack(
         [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]], axis=-1
     ).reshape(-1, 4)
-    flat = camera.project(points)[visible]  # (k, 4, 2)
-    at = np.einsum("ta,kax->ktx", corners, flat)[:, around]  # (k, tiles², 4, 2)
-    colours = np.einsum("ta,ka->kt", middles, values[visible])
-    if mesh:  # the outline of a face follows its tiles, so that nearer faces cover it
-        at = np.concatenate([at, flat[:, None]], axis=1)
-        colours = np.column_stack([colours, np.full(len(visible), np.nan)])
-    return Faces(corners=at.reshape(-1, 4, 2), values=colours.ravel(), scale=scale)
+    grid = np.einsum("ta,kax->ktx", corners, points[visible])  # (k, (tiles + 1)², 3)
+    at = grid[:, around].reshape(-1, 4, 3)
+    colours = np.einsum("ta,ka->kt", middles, values[visible]).ravel()
+    depth = (at @ camera.towards).mean(axis=1)
+    if mesh:
+        # pieces of the outline of a face, each with the depth of the tile beside it, so
+        # that nearer tiles of other faces cover it
+        sides = np.stack([number[:, 0], number[-1], number[::-1, -1], number[0, ::-1]])
+        start, end = sides[:, :-1].ravel(), sides[:, 1:].ravel()
+        pieces = grid[:, np.stack([start, end, end, start], axis=-1)].reshape(-1, 4, 3)
+        edge = np.arange(tiles)
+        beside = np.concatenate([
+            edge * tiles, (tiles - 1) * tiles + edge, edge[::-1] * tiles + tiles - 1,
+            edge[::-1],
+        ])  # fmt: skip
+        after = depth.reshape(len(visible), -1)[:, beside].ravel()
+        at, depth = np.concatenate([at, pieces]), np.append(depth, after)
+        colours = np.append(colours, np.full(len(pieces), np.nan))
+    order = np.argsort(depth, kind="stable")  # outlines after their tiles
+    return Faces(corners=camera.project(at[order]), values=colours[order], scale=scale)
 
 
 def _bilinear(x: Vector, y: Vector | None = None) -> NDArray[np.float64]:

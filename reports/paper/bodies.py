@@ -33,7 +33,7 @@ from mortarbench.reports.figures.deformed import (
 )
 from mortarbench.reports.figures.style import COLOURS
 
-ACTIVE = 1e-6  #: of the largest force: nodes with larger forces are in contact
+ACTIVE = 1e-6  #: fraction of the largest force above which a node counts as in contact
 STRESSES = {
     "sxx": r"normal stress $\sigma_x$",
     "syy": r"normal stress $\sigma_y$",

@@ -369,7 +369,8 @@ def timings(experiment: Experiment) -> Table:
 def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
     """Return the tables of all figures (in seconds), Table 1 and the published times.
 
-    The column `kind` is measured, or fitted beyond the measured sizes.
+    The column `kind` distinguishes measured times from those fitted beyond the measured
+    sizes.
     """
     frames = {"table1": pd.DataFrame(list(experiment.tables["table1"]))}
     for name, columns in KEYS.items():

@@ -95,7 +95,8 @@ STYLE: Any = {
     "pdf.fonttype": 42,
 }
 _VAST = 100.0  #: decades of an axis, reached only by diverged answers
-_GAP = 0.03  #: between a legend and the curves below it, relative to the axes height
+#: distance between a legend and the curves below it, relative to the axes height
+_GAP = 0.03
 _FRONT = 2.0  #: zorder of the first mark; each further one is slightly higher
 _PLACES: dict[str, Any] = {
     "below": "outside lower center",
@@ -104,7 +105,9 @@ _PLACES: dict[str, Any] = {
 }
 
 _CASING = 1.6  #: width of the white around arrows and frames, points
-_LETTER_CASING = 3.2  #: the same around letters, wide enough to fill their inside
+_LETTER_CASING = (
+    3.2  #: width of the white around letters, wide enough to fill their inside
+)
 
 
 def draw_curves(figure: Figure) -> Canvas:

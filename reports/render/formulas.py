@@ -23,7 +23,7 @@ def mathml(tex: str, *, display: bool = False) -> str:
     Parameters
     ----------
     tex : LaTeX without delimiters; ``\tag{1}`` numbers a displayed formula
-    display : on a line of its own
+    display : True for a formula on its own line
 
     Raises
     ------

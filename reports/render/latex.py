@@ -34,12 +34,12 @@ def latex(
 ) -> str:
     r"""Render statements as a list, then tables; the first line names the packages.
 
-    Tables of more than `ROWS` rows need \usepackage{longtable}, all need booktabs.
-    Times carry their unit and interval; all other numbers are plain (1.2e-09), as
-    siunitx reads them.
+    All tables need booktabs; tables of more than `ROWS` rows also need longtable. Times
+    carry their unit and interval; all other numbers are plain (1.2e-09), as siunitx
+    reads them.
 
-    name : of the section; the k-th table has the label tab:NAME-k, a single one
-        tab:NAME
+    name : name of the section; the k-th table has the label tab:NAME-k, a single table
+        has tab:NAME
     """
     long = any(len(table.rows) > ROWS for table in tables)
     packages = rf"% \usepackage{{booktabs{',longtable' * long}}}" + "\n"

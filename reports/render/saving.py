@@ -20,7 +20,7 @@ from mortarbench.reports.render.svg import PAPER, Svg
 
 ENDINGS = (".pdf", ".svg", ".png")  #: formats of figures
 _METADATA: dict[str, dict[str, Any]] = {".pdf": {"CreationDate": None}}
-#: style for printing a figure that is laid out: without a layout engine
+#: style without a layout engine, for printing a figure that is already laid out
 _LAID_OUT: Any = STYLE | {"figure.constrained_layout.use": False}
 
 

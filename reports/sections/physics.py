@@ -137,22 +137,30 @@ def _quantities(
     "Deformed bodies: no verified answer has bodies to draw.",
 )  # fmt: skip
 def deformed(a: Analysis) -> Iterator[Part]:
-    """Draw the largest verified case; empty where no deformed state was stored."""
+    """Draw the largest verified cases in the plane and in space, if there are any."""
     directory = a.evidence.directory
-    chosen = max(_drawable(a), key=_importance, default=None)
-    if chosen is None:
-        return
-    try:
-        fields = load_fields(directory, chosen.first.fields or "")
-        if len(fields.cells):  # rigid half planes alone have no cells
+    largest = [
+        max(mine, key=_importance)
+        for mine in grouped(_drawable(a), lambda o: o.first.family).values()
+    ]
+    drawn: set[int] = set()  # dimensions
+    for chosen in sorted(largest, key=_importance, reverse=True):
+        try:
+            fields = load_fields(directory, chosen.first.fields or "")
+            # rigid half planes alone have no cells
+            if not len(fields.cells) or fields.dim in drawn:
+                continue
             figure = deformed_figure(fields)
-            scale, limits = automatic_scale(fields), clipped_at(fields)
-            unit = prefixed(limits[0]) if limits else None
-            caption = TEXT("deformed", chosen, scale, limits, unit)
-            yield Picture(name="deformed", caption=caption, figure=figure)
-    except InputError as e:  # vectors/ may be missing: the journal suffices
-        missing = str(e).removeprefix(f"{directory}{os.sep}")
-        yield TEXT("missing", chosen.case, missing)
+        except InputError as e:  # vectors/ may be missing: the journal suffices
+            missing = str(e).removeprefix(f"{directory}{os.sep}")
+            yield TEXT("missing", chosen.case, missing)
+            return
+        scale, limits = automatic_scale(fields), clipped_at(fields)
+        unit = prefixed(limits[0]) if limits else None
+        caption = TEXT("deformed", chosen, fields.dim, scale, limits, unit)
+        name = "deformed-in-space" if fields.dim == 3 and drawn else "deformed"
+        yield Picture(name=name, caption=caption, figure=figure)
+        drawn.add(fields.dim)
 
 
 @section(

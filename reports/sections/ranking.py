@@ -43,7 +43,8 @@ from mortarbench.reports.statistics.intervals import COVERAGE, Interval
 from mortarbench.reports.statistics.profiles import performance_ratios, solved_within
 
 DRAWN = 4  #: groups whose profiles are drawn; all are tabulated
-FACTORS = (1.0, 2.0, 5.0, 10.0)  #: of the best time, columns of the table of profiles
+#: multiples of the best time; columns of the table of profiles
+FACTORS = (1.0, 2.0, 5.0, 10.0)
 TEXT = Sentences(
     __name__, CASES=CASES, EVERY=EVERY, LARGEST_SHIFT=LARGEST_SHIFT,
     PENALTIES=PENALTIES, SHIFTS=SHIFTS, USUAL=USUAL,

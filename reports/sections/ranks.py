@@ -242,7 +242,7 @@ def _model_tables(
 
 
 def predicted(s: StrongSeries) -> tuple[int, ...]:
-    """Return the numbers of ranks, beyond the measured ones, to predict.
+    """Return the numbers of ranks, beyond the measured ones, for which to predict.
 
     Empty if the model misfits the measured times by more than `MISFIT`.
     """

@@ -54,12 +54,12 @@ Array = NDArray[np.float64]
 class Communication:
     """Messages of a rank in one solve on `ranks` ranks, and their costs."""
 
-    ranks: int  #: at least two
-    reductions: float  #: over all ranks
-    messages: float  #: to neighbours
+    ranks: int  #: number of ranks, at least two
+    reductions: float  #: number of reductions over all ranks
+    messages: float  #: number of messages to neighbours
     sent: float  #: bytes
-    reduction_seconds: float  #: for one number, over all ranks
-    message_seconds: float  #: for the shortest message
+    reduction_seconds: float  #: time to reduce one number over all ranks
+    message_seconds: float  #: time of the shortest message
     seconds_per_byte: float
 
     @property
@@ -93,8 +93,8 @@ class CostModel:
     communication: tuple[float, float, float]
     measured: tuple[int, ...]  #: ranks, ascending
     misfit: float  #: largest |t/t_measured − 1|
-    #: W, C, s and communication of every draw, (draws, 6); empty if some number of
-    #: ranks was measured once
+    #: (draws, 6) W, C, s and communication of every draw; empty if some number of ranks
+    #: was measured only once
     draws: Array
     samples: int  #: smallest number of repeats
 

@@ -28,7 +28,7 @@ from mortarbench.reports.statistics.intervals import (
 
 SIZES = 4  #: minimum number of sizes, which leaves two degrees of freedom
 PRACTICAL = 0.10  #: relative change per decade of n below which growth is irrelevant
-_ROUNDING = 1e-12  #: scatter of logarithms below this is rounding
+_ROUNDING = 1e-12  #: smaller scatter of logarithms counts as rounding
 
 
 class Trend(Enum):

@@ -1,1 +1,1 @@
-"""One solver, one file: other people's solvers behind our protocol."""
+"""Adapters of solver libraries to our protocol, one file for each library."""

@@ -70,7 +70,7 @@ CLAIMS = {
 
 @dataclass(frozen=True)
 class CVXPY:
-    """One backend of cvxpy; compilation is preparing, the backend's setup solving.
+    """One backend of cvxpy; compilation counts as preparing, its setup as solving.
 
     The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
     where a test adds an absolute and a relative tolerance. A backend that is not listed
@@ -91,10 +91,11 @@ class CVXPY:
         phases="preparing compiles the model to the backend's data; solving is the "
         "backend's setup and solve",
         limits=(
-            "CVXOPT and ECOS get a cone program, which costs half of the digits (dual "
-            "residuals of 1e-5 at tol 1e-6, by the conformance suite): declined.",
-            "PROXQP without its gap test claims a complementarity of 2e-6 at tol 1e-9 "
-            "(conformance, shape 'bounds'): declined.",
+            "CVXOPT and ECOS are declined: they would receive a cone program, which "
+            "costs half of the digits (dual residuals of 1e-5 at tol 1e-6, by the "
+            "conformance suite).",
+            "PROXQP is declined: without its gap test it claims a complementarity of "
+            "2e-6 at tol 1e-9 (conformance, shape 'bounds').",
         ),
     )
 

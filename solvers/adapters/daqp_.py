@@ -36,7 +36,7 @@ MESSAGES = {
 }  # fmt: skip
 INFINITE = 1e30  #: DAQP's value for an absent bound
 EQUALITY = 5  #: DAQP's flag of an equality
-TOL_FACTOR = 1e-3  #: tolerances of DAQP relative to tol
+TOL_FACTOR = 1e-3  #: tolerances of DAQP, relative to tol
 #: smallest tolerance for DAQP: with 1e-12 its proximal iterations stop early or cycle
 MIN_TOLERANCE = 1e-11
 
@@ -48,7 +48,7 @@ class DAQP:
     An active-set method ends with an active set for which the KKT conditions hold to
     rounding; primal_tol and dual_tol only decide which violations and multiplier signs
     count. Both are absolute, so the objective is scaled to ‖q‖∞ = 1, and both are
-    tol/1000, at least 1e-11. A looser tol saves no steps.
+    tol/1000, at least 1e-11. A larger tol would not save steps.
 
     If the Cholesky factorisation of the Hessian breaks down, DAQP runs its own
     proximal-point iterations (eps_prox < 0, its automatic choice).

@@ -29,7 +29,7 @@ CLAIMS = {
     1: Status.INFEASIBLE,
     2: Status.INFEASIBLE,  # unbounded
     -1: Status.ITERATION_LIMIT,
-}  #: of exit flags; anything else is FAILED
+}  #: claims by exit flag; anything else is FAILED
 PRIMAL = 1  #: the exit flag that has a certificate
 #: Eigenvalues of P below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-14
@@ -44,8 +44,8 @@ CLAIM_FACTOR = 10.0
 class ECOS:
     """https://github.com/embotech/ecos.
 
-    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L by eigenvalues. A gap of tol
-    permits errors of √tol in x, so ECOS solves again for corrections.
+    ½xᵀPx = ½‖Lᵀx‖² becomes a second-order cone, with L from the eigenvalues of P. A gap
+    of tol permits errors of √tol in x, so ECOS solves again for corrections.
     """
 
     max_iter: int = 200

@@ -42,13 +42,15 @@ class HiGHS:
 
     HiGHS tests violations and multiplier signs in absolute terms. So the objective is
     scaled to ‖q‖∞ = 1, and all tolerances are tol/100, at least 1e-10, the smallest
-    that HiGHS accepts. An active-set method takes few more steps for that.
+    that HiGHS accepts. The smaller tolerances cost an active-set method few additional
+    steps.
 
     Three properties of HiGHS are worked around. qpasm claims an optimum after 0
-    iterations on QPs with bounds only, so these get one free row. HiGHS adds 1e-7 to
-    the diagonal of the Hessian (qp_regularization_value), which leaves residuals of
-    1e-6 on a singular QP of order one at any tolerance; this is set to 0. Entries below
-    1e-9 would be dropped (small_matrix_value); the threshold is lowered to 1e-12.
+    iterations on QPs with bounds only, so one free row is added to them. HiGHS adds
+    1e-7 to the diagonal of the Hessian (qp_regularization_value), which leaves
+    residuals of 1e-6 on a singular QP of order one at any tolerance; this is set to 0.
+    Entries below 1e-9 would be dropped (small_matrix_value); the threshold is lowered
+    to 1e-12.
     """
 
     method: str = "qpasm"  #: "qpasm" (active set) or "hipo" (interior point)
@@ -71,13 +73,13 @@ class HiGHS:
             "entries 1e6 times larger (tests/solvers/test_solvers.py), and on "
             "hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual, with an F of condition "
             "260 (suites/friction.toml).",
-            "On QPs with bounds only and without the free row, HiGHS 1.15.1 claims an "
-            "optimum after 0 iterations: a membrane of 225 nodes has a residual of 1 "
-            "(conformance check 'finds where a membrane of 400 nodes touches').",
-            "Without highspy-extras HiGHS runs qpasm in place of hipo without notice; "
-            "the adapter reports a failure.",
+            "Without the free row, the answer for a membrane of 225 nodes has a "
+            "residual of 1 (HiGHS 1.15.1; conformance check 'finds where a membrane of "
+            "400 nodes touches').",
+            "Without highspy-extras HiGHS silently runs qpasm in place of hipo; the "
+            "adapter reports a failure.",
             "qpasm stores a dense Hessian on the null space of active rows; a QP is "
-            "declined if that would not fit.",
+            "declined if it would not fit into memory.",
         ),
     )
 

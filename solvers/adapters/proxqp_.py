@@ -45,11 +45,11 @@ class ProxQP:
 
     ProxQP stops when the max norms of the primal and dual residuals are below
     eps_abs + eps_rel·(their largest term), hence eps_rel = tol and a negligible
-    eps_abs. The test of the duality gap, off by default, is on. ProxQP does not test
-    the sign of multipliers, and its default start, which takes every row as an
-    equality, often passes all tests with negative ones (primal forms, tol ≥ 1e-4). So
-    it starts from zero: negative multipliers become rare, if not impossible, and fewer
-    iterations are needed.
+    eps_abs. The test of the duality gap is off by default and turned on here. ProxQP
+    does not test the sign of multipliers, and its default start, which takes every row
+    as an equality, often passes all tests with negative ones (primal forms, tol ≥
+    1e-4). Here it therefore starts from zero: negative multipliers become rare, and
+    fewer iterations are needed.
 
     Certificates of infeasibility are tested in absolute terms: at the default 1e-4,
     feasible QPs with multipliers of that size are claimed infeasible. At 1e-8 they are

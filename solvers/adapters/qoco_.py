@@ -55,8 +55,8 @@ class QOCO:
         sequence="`update_vector_data` keeps the analysis; the Python module of 0.3.2 "
         "takes no starting point",
         limits=(
-            "No certificates of infeasibility; unbounded QPs are claimed solved with "
-            "‖x‖∞ of 1e16 (conformance check 'unbounded'), which the adapter catches.",
+            "No certificates of infeasibility (conformance check 'unbounded': claimed "
+            "solved with ‖x‖∞ = 1e16).",
         ),
     )
 

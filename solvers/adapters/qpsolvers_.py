@@ -73,8 +73,7 @@ CALLS: Mapping[str, Call] = {
 
 #: backends that take dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")
-#: backends for which qpsolvers solves unconstrained QPs by code of its own, which is
-#: wrong
+#: backends for which qpsolvers solves unconstrained QPs by its own code, which is wrong
 NEEDS_CONSTRAINT = ("clarabel", "qtqp", "scs")
 NEEDS_INDEPENDENT_ROWS = ("cvxopt", "quadprog")
 
@@ -89,14 +88,14 @@ STATUS_PATTERNS = (
 
 @dataclass(frozen=True)
 class QPSolvers:
-    """One backend of qpsolvers; everything but the conversion is timed as solving.
+    """One backend of qpsolvers; all work except the conversion is timed as solving.
 
     The tolerance is passed in the backend's own keywords (`CALLS`), as the relative one
     where a test adds an absolute and a relative tolerance. A backend that is not listed
     there runs with its defaults. As in the native adapters, the objective is scaled to
     ‖q‖∞ = 1e4, or to 1 if the backend's test is absolute (highs, daqp). Backends that
     accept both dense and sparse matrices get dense ones if P is dense. qpsolvers
-    reports the iterations of some backends only.
+    reports iterations only for some backends.
     """
 
     backend: str = ""  #: the NAME in qpsolvers:NAME
@@ -110,10 +109,10 @@ class QPSolvers:
         phases="preparing converts only; the backend's setup and factorisation count "
         "as solving",
         limits=(
-            "For clarabel, qtqp and scs qpsolvers solves unconstrained QPs by code of "
-            "its own, which claims that a strictly convex one is unbounded "
-            "(conformance, shape 'unconstrained'); they are declined.",
-            "No iterations from clarabel, cvxopt, daqp, highs, quadprog and sip.",
+            "For clarabel, qtqp and scs, qpsolvers solves unconstrained QPs by its own "
+            "code, which claims that strictly convex ones are unbounded (conformance, "
+            "shape 'unconstrained'); such QPs are declined.",
+            "clarabel, cvxopt, daqp, highs, quadprog and sip do not report iterations.",
             "ecos reaches half of the digits (use our adapter `ecos`), and pyqpmad, "
             "not installed, gives wrong multipliers for fixed variables.",
         ),

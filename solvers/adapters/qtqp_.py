@@ -60,10 +60,10 @@ class QTQP:
             "At tol 1e-9 it stagnates with a relative gap of 1.1e-9 on beam-ring/"
             "Nr=30/Nh=15/primal and ends at its iteration limit, close to the answer; "
             "on hertz-cylinder/friction=coulomb/mu=0.3/Q=0.5/dual the complementarity "
-            "of what it claims is 2.0e-8, twice what is verified.",
-            "At its own test the complementarity may be more than ten times tol: on "
-            "beam-ring/Nr=12/Nh=6/dual 1.3e-5 at tol 1e-6 (step 4 of a sequence) and "
-            "1.7e-7 at 1e-8 (step 5, cold).",
+            "of the claimed point is 2.0e-8, twice the limit of a verified one.",
+            "When its own test is met, the complementarity may exceed 10·tol: on "
+            "beam-ring/Nr=12/Nh=6/dual it is 1.3e-5 at tol 1e-6 (step 4 of a sequence) "
+            "and 1.7e-7 at 1e-8 (step 5, cold).",
         ),
     )
 

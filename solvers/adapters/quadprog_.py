@@ -34,8 +34,9 @@ class Quadprog:
     active set the KKT conditions hold to rounding.
 
     A Hessian that is not positive definite, or whose smallest Cholesky pivot is below
-    1e-12 of the largest, is declined after its factorisation. Dependent equality rows
-    are declined before: quadprog claims that they are inconsistent.
+    1e-12 of the largest, is declined after its factorisation. QPs with dependent
+    equality rows are declined as well, because quadprog claims that such rows are
+    inconsistent.
     """
 
     about: ClassVar[About] = About(

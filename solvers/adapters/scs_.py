@@ -57,7 +57,7 @@ class SCS:
         "of scale",
         phases="preparing equilibrates and factorises; solving iterates",
         sequence="`update` of vectors keeps the factor; starts from the last point",
-        limits=("Needs a row or a bound: its cone must not be empty.",),
+        limits=("Needs a row or a bound, because its cone must not be empty.",),
     )
 
     def __post_init__(self) -> None:

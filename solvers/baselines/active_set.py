@@ -25,7 +25,7 @@ class Active(NamedTuple):
     """Active set: the constraints that the Newton system takes as equations."""
 
     side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 free
-    rows: NDArray[np.bool_]  #: (p,) of G
+    rows: NDArray[np.bool_]  #: (p,) active rows of G
 
 
 class Point(NamedTuple):
@@ -54,8 +54,8 @@ class Problem:
     A: Matrix
     G: Matrix
     D: Vector  #: (n,) diag P, with a typical value in place of zeros
-    rho: Vector  #: (m,) of A
-    sigma: Vector  #: (p,) of G
+    rho: Vector  #: (m,) weights of the rows of A
+    sigma: Vector  #: (p,) weights of the rows of G
     factorise: Factorise
     faces: Faces
     counts: Counter[str]
@@ -179,7 +179,7 @@ def _predict(problem: Problem, active: Active, at: Point, slack: float) -> Activ
 def _exchange(active: Active, new: Active, index: int) -> Active:
     """Return `active` with the constraint of this index taken from `new`.
 
-    index : below n, of a variable's bounds; n + i, of row i of G
+    index : i for the bounds of variable i < n; n + i for row i of G
     """
     side, rows = active.side.copy(), active.rows.copy()
     if index < side.size:

@@ -24,7 +24,7 @@ from mortarbench.harness import QP, About, Box, Cones, Discs, Solution, Vector
 from mortarbench.solvers.baselines.natural_map import Problem
 from mortarbench.solvers.common.conversion import check_positive
 
-ROUNDING = 1e-12  #: of a curvature, relative
+ROUNDING = 1e-12  #: relative rounding error of a curvature
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
 """Bounded-variable least squares of scipy, on a Cholesky factor.
 
 With P = LLᵀ,  ½xᵀPx + qᵀx = ½‖Lᵀx + L⁻¹q‖² − ½‖L⁻¹q‖²,  so that a strictly convex QP
-with bounds is a least-squares problem. Lower bounds only go to the active-set method of
-Lawson and Hanson (Solving Least Squares Problems, 1974, Chapter 23), others to its
-extension by Stark and Parker (Comput. Stat. 10, 1995).
+with bounds is a least-squares problem. Problems with lower bounds only are solved by
+the active-set method of Lawson and Hanson (Solving Least Squares Problems, 1974,
+Chapter 23), others by its extension of Stark and Parker (Comput. Stat. 10, 1995).
 """
 
 from __future__ import annotations

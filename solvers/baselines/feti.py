@@ -52,7 +52,9 @@ CLAIM_FACTOR = (
     5.0  #: a point is claimed solved if its KKT residuals are ≤ this times tol
 )
 MIN_TOL_FACTOR = 1e-4  #: smallest factor of tol before the solve gives up
-PATIENCE = 100  #: steps in a row without halving ‖w‖ before the solve gives up
+PATIENCE = (
+    100  #: number of steps in a row without halving ‖w‖, after which the solve gives up
+)
 STAGNATED = "no further progress: rounding, or the objective is unbounded below"
 #: pivots of GQGᵀ below this, relative to the largest, mean dependent rows
 MIN_PIVOT = 1e-13
@@ -68,7 +70,9 @@ class FETI:
     solved. Iterations are CG steps; all products with P are counted.
     """
 
-    preconditioner: Kind = "auto"  #: "auto": Dirichlet's if P has one, else none
+    preconditioner: Kind = (
+        "auto"  #: "auto": the Dirichlet preconditioner if P offers it, else none
+    )
     scaling: Scaling = "stiffness"  #: weights of copies of a node in the preconditioner
     Q: Weight = "identity"  #: weight of the projector
     max_iter: int = 2000
@@ -79,7 +83,7 @@ class FETI:
         linear_solver="products with P; a Cholesky factor of the coarse problem",
         phases="preparing factorises the coarse problem and sets up the preconditioner",
         limits=(
-            "for linear problems: bounds and inequality rows are declined",
+            "for linear problems only: bounds and inequality rows are declined",
             "stores two vectors per iteration",
         ),
     )  # fmt: skip

@@ -56,7 +56,7 @@ class GaussSeidel:
         method="minimises over one disc, cone or variable after the other (NSGS)",
         linear_solver="none (columns of P)",
         phases="everything happens in solving",
-        limits=("a loop in Python over the blocks: for comparisons of sweeps",),
+        limits=("its loop over blocks is in Python: compare sweeps, not times",),
     )  # fmt: skip
 
     def __post_init__(self) -> None:
@@ -174,7 +174,7 @@ def _sweep(
 
 
 def _local_change(block: _Block, x: Point, g: Point) -> Point:
-    """Return the d that minimises gᵀd + ½dᵀAd, x + d in the set of the block."""
+    """Return the d that minimises gᵀd + ½dᵀAd with x + d in the set of the block."""
     A, length, size = block.A, block.length, range(len(x))
     at, first = x, 0.0
     for _ in range(MAX_LOCAL):

@@ -87,10 +87,10 @@ class PDAS:
     """In-house primal-dual active set method, by Cholesky factors of the faces.
 
     `tol` bounds the KKT residuals of the original QP, as the harness measures them; if
-    rounding ends the progress, up to 5·tol is claimed solved. Iterations are linear
-    solves. Counts are factorisations (one per face, plus one if unbounded variables are
-    condensed), changes of single constraints, one-at-a-time exchanges, moves of the
-    proximal centre, and products with P.
+    rounding ends the progress, a point with residuals of up to 5·tol is claimed solved.
+    Iterations are linear solves. Counts are factorisations (one per face, plus one if
+    unbounded variables are condensed), changes of single constraints, one-at-a-time
+    exchanges, moves of the proximal centre, and products with P.
 
     It starts from the point of the box nearest to zero, which means no contact in the
     primal and in the dual. (On the duals of contact problems, a start with all
@@ -106,10 +106,10 @@ class PDAS:
         phases="preparing assembles the penalised matrix; solving factorises faces",
         sequence="active set and point",
         limits=(
-            "on one-dimensional obstacles the contact front moves by one node a step: "
-            "323 solves for 1000 nodes",
+            "on one-dimensional obstacles the contact front moves by one node per "
+            "step: 323 solves for 1000 nodes",
             "the symbolic analysis is repeated for every sparse face: 97 instead of 60 "
-            "ms a factor at Nr = 30, Nh = 15",
+            "ms per factor at Nr = 30, Nh = 15",
         ),
     )  # fmt: skip
 
@@ -129,7 +129,7 @@ class PDAS:
         return factoriser
 
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
-        """Return the `prepare` of a sequence, started at the last point and set."""
+        """Return the `prepare` of a sequence that reuses the last point and set."""
         carry: Carry | None = None
 
         def prepare(qp: QP) -> Callable[[], Solution]:

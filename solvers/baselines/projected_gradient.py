@@ -52,8 +52,8 @@ class ProjectedGradient:
 
     `tol` bounds the natural map, relative to ‖q‖. If the KKT residuals on the QP are
     then not within 5·tol, this bound is lowered; no other point is claimed solved. The
-    start is the feasible point nearest to zero, the first α that of the exact line
-    search. Iterations are steps; all products with P are counted.
+    start is the feasible point nearest to zero, and the first α is that of the exact
+    line search. Iterations are steps; all products with P are counted.
     """
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs, Cones)
@@ -66,7 +66,7 @@ class ProjectedGradient:
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
         phases="everything happens in solving",
-        limits=("irregular: 45 to 546 products over the load steps of the benchmark",),
+        limits=("irregular: the load steps of the benchmark take 45 to 546 products",),
     )  # fmt: skip
 
     def __post_init__(self) -> None:

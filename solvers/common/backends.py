@@ -59,7 +59,8 @@ def reason_unavailable(
 ) -> str | None:
     """Return the reason why a backend cannot be used, or None.
 
-    None also if the library itself is not installed: its import raises in `prepare`.
+    The result is also None if the library itself is not installed, because its import
+    raises in `prepare`.
 
     files : result of `adapter_files`
     """

@@ -2,7 +2,7 @@
 
 Libraries take a QP in one of two forms, for which multipliers are converted back:
 `two_sided`, low ≤ Rx ≤ high, and `to_cone`, Rx + s = r with s in a product of cones.
-Bounds only, the latter is Rx = r (first rows) and Rx ≤ r.
+Without discs and cones, the second form is Rx = r (first rows) and Rx ≤ r.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from mortarbench.harness.sets.cones import Cones
 from mortarbench.harness.sets.convex import ConvexSet, admissible
 from mortarbench.harness.sets.discs import Discs
 
-#: absolute tolerance for solvers whose test is ≤ absolute + relative·size, so that the
-#: relative one decides
+#: absolute tolerance for solvers that test a residual against absolute + relative·size,
+#: so small that the relative tolerance decides
 NEGLIGIBLE = 1e-14
 #: convex sets that have rows in second-order cones
 CONIC_SETS: tuple[type, ...] = (Box, Discs, Cones)
@@ -264,8 +264,8 @@ def objective_factor(qp: QP, size: float = OBJECTIVE_SIZE) -> float:
 def on_present_bounds(qp: QP, z_box: Vector) -> Vector:
     """Return z_box (n,) with zeros for multipliers of absent bounds.
 
-    Solvers leave rounding there. If it is more than rounding, the harness sees it as a
-    residual of stationarity.
+    Solvers may return rounding errors there. Larger values appear as a residual of
+    stationarity in the harness.
     """
     return admissible(qp.sets, z_box)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-#: those that adapters call, and those behind them: backends and factorisations
+#: packages that adapters call, and packages that these use: backends and factorisations
 PACKAGES = (
     "clarabel", "cvxopt", "cvxpy", "daqp", "ecos", "highspy", "highspy-extras", "osqp",
     "piqp", "proxsuite", "py-mkl-pardiso", "pyamg", "qoco", "qpalm", "qpsolvers",

@@ -19,13 +19,13 @@ LEAST_SIDES, MOST_SIDES = 3, 10_000
 
 @dataclass(frozen=True, eq=False)
 class PolygonalQP:
-    """A QP with polygons in place of circles, which differs from the original."""
+    """Approximation of a QP by another one, with polygons in place of circles."""
 
-    qp: QP  #: with rows of G for the sides of polygons, and without discs and cones
+    qp: QP  #: QP with rows of G for the sides of polygons, and without discs and cones
     #: 1 − cos(π/k): a polygon bounds a vector by at least (1 − error)·radius
     error: float
-    #: map a point of `qp` to the original; `z_box` there is normal to the polygons, not
-    #: to the circles, and residuals show the error
+    #: maps a point of `qp` to the original QP; `z_box` is then normal to the polygons,
+    #: not to the circles, and the residuals show the error
     recover: Callable[[Solution], Solution]
 
 

@@ -35,12 +35,13 @@ def chain(
 def tightening(
     begin: Callable[[QP, float], Session],
 ) -> Callable[[QP, float], Callable[[], Solution]]:
-    """Return the `prepare` of a sequence whose QPs have a tolerance each.
+    """Return the `prepare` of a sequence in which each QP has its own tolerance.
 
-    If only vectors changed since the last QP, the session is updated; libraries that
-    can then start from the point where they ended. Otherwise `begin` builds a new
-    session, which starts from the last point if it takes starts and the point has the
-    right shape. A new tolerance also needs a new session, unless it has `tighten`.
+    If only vectors changed since the last QP, the session is updated, and libraries
+    that support it start from their last point. Otherwise `begin` creates a new
+    session, which starts from the last point if the library accepts a start and the
+    point has the right shape. A new tolerance also requires a new session, unless the
+    session has `tighten`.
     """
     session: Session | None = None
     session_qp: QP

@@ -41,7 +41,7 @@ SIGN_ROUNDING = 4 * float(np.finfo(float).eps)
 
 class _Active(NamedTuple):
     side: NDArray[np.int8]  #: (n,) −1 at lb, 1 at ub, 0 between
-    rows: NDArray[np.bool_]  #: (p,) of G
+    rows: NDArray[np.bool_]  #: (p,) active rows of G
 
 
 class _Point(NamedTuple):
@@ -69,10 +69,10 @@ class _Problem:
 def polish(qp: QP, start: Solution, delta: float = DELTA) -> Iterator[Solution]:
     """Yield a refined point for each active set that is tried; often there is one.
 
-    qp : largest entries about one; P, A and G all dense or all sparse
+    qp : QP whose largest entries are about one, with P, A and G all dense or all sparse
     start : point near a solution, such as that of an interior-point method
-    delta : δ; a smaller one resolves weaker curvature and more nearly parallel rows,
-        but the matrix is closer to singular
+    delta : δ; a smaller value resolves weaker curvature and more nearly parallel rows,
+        but brings the matrix closer to singularity
     """
     problem = _Problem(qp, *(M.astype(np.longdouble) for M in (qp.P, qp.A, qp.G)))
     at = _Point(*(v.astype(np.longdouble) for v in (start.x, start.y, start.z)))

@@ -26,8 +26,8 @@ from scipy.linalg import lu_factor, lu_solve
 from mortarbench.harness import QP, Solution, Status, Vector
 
 ROUNDS = 12  #: rounds of ADMM and Newton's method, each with another penalty
-ADMM_STEPS = 400  #: in the first round; as many more in each further round
-NEWTON_STEPS = 30  #: at most, per round
+ADMM_STEPS = 400  #: ADMM steps in the first round; each further round adds as many
+NEWTON_STEPS = 30  #: largest number of Newton steps per round
 MEMORY = 10  #: iterates that an acceleration combines, and between two of them
 #: shift of the normal equations of an acceleration, relative to their trace
 GRAM_SHIFT = 1e-10

@@ -32,11 +32,12 @@ from mortarbench.solvers.reference.interior import interior_point
 from mortarbench.solvers.reference.polish import polish
 from mortarbench.solvers.reference.projection import projection_iterates
 
-#: largest KKT residual of a start for refinement. From a worse one, refinement of a QP
-#: with many solutions ended at one of size 1e10, whose rounding hid errors of the
-#: optimal value; so other starts are tried too
+#: largest KKT residual of a start for refinement. From a start with a larger residual,
+#: refinement of a QP with many solutions ended at a solution of size 1e10, whose
+#: rounding hid errors of the optimal value; therefore other starts are tried as well
 MAX_START_RESIDUAL = 1e-3
-MAX_IDLE_ROUNDS = 1  #: of projections, without a smaller residual, before they end
+#: rounds of projections without a smaller residual, after which they end
+MAX_IDLE_ROUNDS = 1
 MAX_REFERENCE_RESIDUAL = 1e-9  #: largest KKT residual of a reference solution
 #: data of a scaled QP larger than this times their median are first left out
 OUTLIER_FACTOR = 1e4
@@ -158,7 +159,7 @@ def _outlier_size(qp: QP) -> float:
 
 
 def _without_outliers(qp: QP, near: NDArray[np.bool_]) -> QP:
-    """Drop or clip data of a scaled QP that dwarf all others, to find a start.
+    """Drop or clip data of a scaled QP that far exceed all others, for a start.
 
     Bounds and rows so far away are assumed inactive, and an objective coefficient so
     large is assumed to push its variable to a bound even after clipping. The residual

@@ -1,1 +1,1 @@
-"""SMALBE: the algorithm as it is written, and compiled."""
+"""SMALBE: options, transformations of the QP, and the compiled loop."""

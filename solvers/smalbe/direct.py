@@ -165,7 +165,7 @@ def _solved(task: _Task, tol: float, most: int) -> Solution:
 
 
 def _penalised(faces: Faces, most: float) -> float:
-    """Raise ρ a hundredfold if rounding allows; returns the new limit of ρ."""
+    """Increase ρ a hundredfold if rounding permits; return the new limit of ρ."""
     rho = faces.rho
     try:
         faces.penalise(100 * rho)

@@ -43,25 +43,27 @@ STEPS = {
 }  # fmt: skip
 #: "solved" is claimed if the KKT residuals are within this factor of the tolerance
 CLAIM_FACTOR = 5.0
-#: Factors of the tolerance, less than a residual demands, for one that exceeds it. The
-#: first is enough on four in five of the bodies where it does: the residual falls with
-#: ‖g^P‖, though not in proportion.
+#: Factors by which the tolerance is tightened if a residual exceeds it, smaller than
+#: the excess suggests. The first one suffices for four of five bodies whose residual
+#: exceeds the tolerance: the residual decreases with ‖g^P‖, though not in proportion.
 IMPROVEMENTS = (0.8, 0.1)
 EPS = float(np.finfo(float).eps)
 #: rounding of ‖x_I‖, relative to the radius and x̃; twice that of feasible_set.pxi.
 #: With 16 EPS times the radius, `test_small_discs_beside_large_shifts` fails
 DISC_ROUNDING = 32 * EPS
-MIN_LANCZOS_STEPS = 5  #: for problems of few unknowns
+MIN_LANCZOS_STEPS = 5  #: number of Lanczos steps for problems of few unknowns
 #: default penalty. The models contain ρQ exactly, so that a large ρ costs no products;
 #: with 1e4 two or three outer iterations suffice
 RHO = 1e4
 #: default penalty if P offers a preconditioner. Each multiplier step restarts CG on the
 #: thousands of rows of decomposed bodies, so that fewer outer iterations pay there
 PRECONDITIONED_RHO = 1e6
-#: default penalty with discs. Spectral steps know no model, and a larger ρ would make H
-#: worse conditioned
+#: default penalty with discs. Spectral steps do not use the model, and a larger ρ would
+#: worsen the conditioning of H
 RHO_ON_DISCS = 1.0
-MAX_IDLE_TIGHTENINGS = 3  #: tightenings in a row that may fail to halve the residuals
+MAX_IDLE_TIGHTENINGS = (
+    3  #: number of tightenings in a row that may fail to halve the residuals
+)
 #: preconditioners that need no data of the eliminated variables
 ELIMINATION_PRECONDITIONERS = ("model", "none")
 
@@ -141,7 +143,8 @@ def prepared(
 def _on_discs(qp: QP, options: Options) -> Options:
     """Replace the options that are for bounds alone.
 
-    Models are minimised over boxes only, and −β leaves a disc that it is tangent to.
+    Models can be minimised only over boxes, and a step along −β leaves a disc to which
+    it is tangent.
     """
     kind = resolved_preconditioner(qp, options.preconditioner)
     return replace(
@@ -178,7 +181,7 @@ def _projected(
 ) -> Projected:
     """Homogenise, project and normalise the QP; estimate the spectrum.
 
-    steps : of the Lanczos process
+    steps : number of steps of the Lanczos process
     """
     find = partial(_estimated_spectrum, options, steps, carry)
     if options.expansion == "spectral" and not qp.b.size and qp.q.any():
@@ -231,13 +234,14 @@ def _estimated_spectrum(
 def _lanczos_steps(options: Options, qp: QP, *, in_sequence: bool) -> int:
     """Return the number of Lanczos steps.
 
-    Few steps suffice for few unknowns, where more would cost as much as the CG steps;
-    and if P offers a preconditioner, since the spectrum of decomposed bodies is flat
-    and only its norm is used. With bounds alone fewer are enough: seven or eight for 73
-    to 85 unknowns save as many products as they cost, of which CG takes about ten.
-    Seven for all would save up to a fifth on dense duals with bounds alone, but cost up
-    to 1.9 times as many on dense matrices whose spectrum falls slowly. A sequence
-    reuses the spectrum, so that further steps pay there: with fewer, the 24 problems of
+    Few steps suffice for few unknowns, where more steps would cost as much as CG. They
+    also suffice if P offers a preconditioner, since the spectrum of decomposed bodies
+    is flat and only its norm is used. With bounds alone fewer steps are enough: for 73
+    to 85 unknowns, where CG takes about ten products, the steps beyond seven or eight
+    save no more products than they cost. Seven steps for all sizes would save up to a
+    fifth of the products on dense duals with bounds alone, but take up to 1.9 times as
+    many on dense matrices whose spectrum decays slowly. A sequence reuses the spectrum,
+    so that further steps are worthwhile: with fewer steps, the 24 problems of
     greco/n=32/dual-bounds take 170 products instead of 152.
     """
     if preconditioned_operator(qp) or options.expansion == "spectral":
@@ -309,7 +313,7 @@ def outer_loop(
     problem: Projected, qp: QP, options: Options, history: History | None = None
 ) -> OuterLoop:
     """Prepare the outer loop with the preconditioner of the options."""
-    if problem.factor is not None:  # never for a subclass with steps of its own
+    if problem.factor is not None:  # never for a subclass that overrides the steps
         solver = compiled.SMALBE(problem, options, False)
     else:
         own = options.preconditioner_for(qp)
@@ -332,8 +336,8 @@ def _solve_to_tolerance(
 ) -> tuple[Solution, Callable[[], Carry | None]]:
     """Return a point whose KKT residuals on the original problem are within `tol`.
 
-    They may be CLAIM_FACTOR times that; where they exceed it at all, the tolerance is
-    tightened once or twice more, and the best of the points is returned.
+    Residuals of up to CLAIM_FACTOR·tol are accepted; if they exceed tol, the tolerance
+    is tightened once or twice more, and the best of the points is returned.
     """
     result, worst, at, tighter = _claimed(task, tol)
     if at is None or task.options.expansion != "model":

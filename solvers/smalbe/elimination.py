@@ -31,9 +31,9 @@ from scipy.sparse import csr_array
 from mortarbench.harness import QP, Matrix, Solution, Vector, no_rows
 from mortarbench.solvers.smalbe.rows import orthonormal_rows
 
-#: Singular values of orthonormal rows, restricted to E: zero below the first, accepted
-#: above the second. Those between would enter the reduced matrix with their
-#: reciprocals, and its rounding would exceed the tolerance
+#: Singular values of orthonormal rows, restricted to E: values below the first count as
+#: zero, values above the second are accepted. Values between them would enter the
+#: reduced matrix by their reciprocals, and its rounding would exceed the tolerance
 RANK_ZERO, RANK_GOOD = 1e-12, 1e-2
 
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ class Eliminated(NamedTuple):
     qp: QP  #: P is dense
     recover: Callable[[Solution], Solution]
     G: Array  #: (m, n) equality rows of the original QP
-    block: FreeBlock  #: for later QPs with the same P_EE
+    block: FreeBlock  #: factor for later QPs with the same P_EE
     columns: int  #: columns of P_EE factorised here; 0 if a stored factor was used
 
 
@@ -60,10 +60,10 @@ class Eliminated(NamedTuple):
 class _Saddle:
     """Solution operator of the saddle point system for x_E and y."""
 
-    factor: Array  #: (k, k) of P_EE, in the upper triangle
-    G_E: Array  #: (r, k) of full rank
+    factor: Array  #: (k, k) Cholesky factor of P_EE, in the upper triangle
+    G_E: Array  #: (r, k) rows of full rank
     PG: Array  #: P_EE⁻¹G_Eᵀ (k, r)
-    schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, likewise
+    schur: Array  #: (r, r) Cholesky factor of G_E P_EE⁻¹ G_Eᵀ, in the upper triangle
 
     def __call__(self, top: Vector, bottom: Vector) -> tuple[Vector, Vector]:
         w = dpotrs(self.factor, top)[0]

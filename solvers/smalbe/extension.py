@@ -1,4 +1,4 @@
-"""Protocol for a preconditioner and a step rule of one's own in SMALBE.
+"""Protocol for user-defined preconditioners and step rules in SMALBE.
 
 A subclass of `solvers.smalbe.solver.SMALBE` overrides `preconditioner_for`,
 `step_rule_for`, or both. Each is called once per QP, while that is prepared, and
@@ -7,8 +7,8 @@ subclass are options like those of SMALBE.
 
 Neither function can make SMALBE return a wrong answer: a preconditioner changes the
 directions of conjugate gradients alone, and a trial point of a step rule is projected
-onto the bounds and accepted only if the cost falls enough (`Step`). The KKT residuals
-are measured by the harness in any case.
+onto the bounds and accepted only if the cost decreases sufficiently (`Step`). The KKT
+residuals are measured by the harness in any case.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class Step(NamedTuple):
     """State of MPRGP where the CG step x − αp would leave the box.
 
     Costs, gradients and lengths are those of the augmented Lagrangian
-    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span those
-    of the equality constraints; without these, of the QP itself.
+    ½xᵀPx + qᵀx + aᵀC(x − x̃) + ρ/2‖C(x − x̃)‖², with orthonormal rows C that span the
+    equality rows; without equality rows, they are those of the QP itself.
     """
 
     x: Vector  #: (n,) iterate, within the bounds
@@ -43,15 +43,15 @@ class Step(NamedTuple):
 
 
 #: Step → trial point (n,). It is projected onto the bounds, and accepted if the cost
-#: falls by at least φ̃ᵀφ/(2‖H‖), the decrease that the rate of MPRGP rests on (Dostál
-#: and Schöberl 2005); else the standard expansion is taken instead.
+#: decreases by at least φ̃ᵀφ/(2‖H‖), on which the convergence rate of MPRGP is based
+#: (Dostál and Schöberl 2005); otherwise the standard expansion is taken.
 StepRule: TypeAlias = Callable[[Step], Vector]
 
 
 def checked(M: Operator) -> Operator:
     """Return M with a test of each product: vᵀMv must be positive.
 
-    Along a direction for which it is not, conjugate gradients would climb.
+    Along a direction for which it is not, conjugate gradients would increase the cost.
 
     Raises
     ------

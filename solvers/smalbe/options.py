@@ -19,10 +19,10 @@ from mortarbench.solvers.smalbe.preconditioner import PRECONDITIONERS, Precondit
 #: model: the CG point, projected in the metric of the model (ours; 2, or 1 if the step
 #: to the boundary is the whole step; plus 1 per CG step beyond the box, plus 1 if the
 #: decrease is below that of gradient projection)
-#: spectral: to the boundary, and unless that is most of the CG step, a projected
-#: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps replace
-#: every proportioning, too, and CG where it would leave the set at once (1).
-#: With discs, model, whose steps are for bounds, stands for spectral
+#: spectral: a step to the boundary and, unless it is most of the CG step, a projected
+#: Barzilai-Borwein step with a nonmonotone line search (1 or 2). Such steps also
+#: replace every proportioning, and CG where it would leave the set at once (1). With
+#: discs, model, whose steps are for bounds, stands for spectral
 Expansion = Literal["std", "projcg", "mixed", "model", "spectral"]
 #: Rule of the proportioning step; each takes 1 product.
 #: cg: minimise along −β, as far as feasible (textbook); with discs, where −β is not
@@ -56,7 +56,7 @@ class Options:
     alpha: float = 1.9  #: ᾱ‖H‖ of gradient projection steps; relaxation of the model's
     norm: Norm = "lanczos"  #: method that estimates ‖𝒫F𝒫‖
     # n/10 where there are bounds alone
-    lanczos_steps: int = 12  #: its products; at most n/6 or n/10, but at least 5
+    lanczos_steps: int = 12  #: Lanczos products; at most n/6 or n/10, but at least 5
     # only with the preconditioners model and none: the others need all of P
     eliminate: Eliminate = "sequences"  #: when to eliminate free variables by Cholesky
     energy: float = 50.0  #: limit of the estimated energy error, times tol; 0: no limit

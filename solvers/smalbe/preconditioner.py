@@ -20,9 +20,9 @@ M replaces the identity on the range of that projector:
     P (‖𝒫F𝒫‖ M_FF − I) P + P
 
 This is positive definite (0 < P ≤ I), and accurate even where C_F C_Fᵀ has small
-eigenvalues, such as those of motions that contact rows resist and gluing rows hardly
-do. The projector 𝒫 of all components in its place would mix free components with active
-ones and undo the effect of a large ρ.
+eigenvalues, such as those of motions that contact rows resist but gluing rows hardly
+resist. The projector 𝒫 of all components, in place of P, would mix free components with
+active ones and undo the effect of a large ρ.
 """
 
 from __future__ import annotations
@@ -44,28 +44,28 @@ Preconditioner = Literal[
     "auto", "model", "incomplete", "diagonal", "lumped", "dirichlet", "none"
 ]
 PRECONDITIONERS = get_args(Preconditioner)
-#: those with a matrix M of their own
+#: preconditioners with a matrix M of their own
 STRUCTURAL = ("diagonal", "lumped", "dirichlet")
 #: Pairs of entries in the columns of an incomplete factor, per entry of P: elimination
-#: takes them one by one. More than 24³ trilinear elements have more than two, and their
-#: factors cost twice the time that they save; with a limit of 1.5, two of 1800 runs on
-#: random AᵀA give up at 1e-12 that are solved with 2.
+#: takes them one by one. Meshes of more than 24³ trilinear elements have more than two,
+#: and their factors cost twice the time that they save; with a limit of 1.5, two of
+#: 1800 runs on random AᵀA give up at 1e-12 that are solved with 2.
 MAX_PAIRS = 2.0
 #: Least levels·spread^¼ for which a factor is used. On thirty strings, obstacles,
-#: bearings and torsions of 20 to 20 000 unknowns: below, it costs up to 2.8 times the
-#: time of `model`, and saves at most 0.2 ms; above, it costs at most a quarter more (a
-#: flat obstacle, n = 110) and saves up to 97 %.
+#: bearings and torsions of 20 to 20 000 unknowns: below this value, a factor takes up
+#: to 2.8 times as long as `model` and saves at most 0.2 ms; above it, a factor takes at
+#: most a quarter longer (a flat obstacle, n = 110) and saves up to 97 %.
 MIN_DIFFICULTY = 50.0
 #: Least spread for which a factor is used in any order of the unknowns: bearings with
 #: an eccentricity of 0.9 have 2000 to 7000
 MIN_SPREAD = 1000.0
-#: Largest spread for which variables are not scaled before they are factorised: that
+#: Largest spread for which variables are not scaled before a factorisation: scaling
 #: takes as long as some products
 MAX_UNSCALED = 2.0
-#: Least spread·n for which variables are scaled if no factor is used: with less, as in
-#: bearings of 100 to 400 unknowns, it takes longer than the products that it saves
+#: Least spread·n for which variables are scaled if no factor is used: below it, as in
+#: bearings of 100 to 400 unknowns, scaling takes longer than the products that it saves
 MIN_SCALED = 1e5
-DEPENDENT = 1e-10  #: added to diag(BWBᵀ), relatively: B may repeat rows
+DEPENDENT = 1e-10  #: relative addition to diag(BWBᵀ), since B may contain repeated rows
 
 
 def preconditioned_operator(qp: QP) -> Preconditioned | None:
@@ -81,9 +81,10 @@ class Sparsity(NamedTuple):
     #: pairs of entries below the diagonal in its columns: steps of an incomplete
     #: factorisation. inf if a diagonal entry is not a positive number
     pairs: float
-    #: n over twice the mean distance of its entries from the diagonal: levels into
-    #: which a graph with so near neighbours is divided. n/2 for a string, about √n for
-    #: a grid in its natural order, less than 2 in a random one; 0 for a diagonal P
+    #: n divided by twice the mean distance of the entries from the diagonal: the number
+    #: of levels into which a graph with neighbours at this distance is divided. n/2 for
+    #: a string, about √n for a grid in its natural order, less than 2 in a random one;
+    #: 0 for a diagonal P
     levels: float
     spread: float  #: largest over least diagonal entry
 
@@ -97,8 +98,8 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
     """Return the preconditioner that `kind` stands for, and whether to scale variables.
 
     A step with an incomplete factor costs four to seven times as much as one without:
-    it pays where CG without it takes more than about 150 steps. Their number grows with
-    the `Sparsity.levels` and with the root of the root of the `spread`.
+    it saves time if CG without it takes more than about 150 steps. The number of these
+    steps grows with the `Sparsity.levels` and with the fourth root of the `spread`.
     """
     if kind not in ("auto", "incomplete"):
         return kind, False
@@ -119,9 +120,9 @@ def resolved(qp: QP, kind: Preconditioner) -> tuple[Preconditioner, bool]:
 def has_sparse_factor(qp: QP) -> bool:
     """Return whether an incomplete factor of the free part of P costs little.
 
-    P is a sparse matrix with a positive diagonal, held by this process, and there are
-    bounds only: a factor of P would have to know the penalty of rows. Its columns have
-    so few entries that a factor costs no more than some products.
+    This requires a sparse P with a positive diagonal, stored by this process, and
+    bounds only, since a factor of P would not include the penalty of rows. The columns
+    of P must have so few entries that a factor costs no more than some products.
     """
     return _is_sparse(qp) and _sparsity(qp).pairs <= MAX_PAIRS * qp.P.nnz
 
@@ -177,7 +178,7 @@ def _of_stiffness(
     """Return v ↦ B_D S B_Dᵀ v with the stiffness S of the interface."""
     from sksparse.cholmod import (
         cholesky,
-    )  # late: the other preconditioners need no CHOLMOD
+    )  # the other preconditioners do not need CHOLMOD
 
     acting = np.ones(structure.K.shape[0], dtype=bool)
     acting[structure.fixed] = False

@@ -50,18 +50,18 @@ class Projected:
     C: compiled.Rows  #: `rows` as the compiled loop takes them
     spectrum: Spectrum
     b: Vector
-    bounds: tuple[Vector, Vector]  #: of ν = x − x̃
-    q: Vector  #: of the original QP
-    diagonal: Vector  #: of F; empty for an operator without one
+    bounds: tuple[Vector, Vector]  #: bounds of ν = x − x̃
+    q: Vector  #: q of the original QP
+    diagonal: Vector  #: diagonal of F; empty for an operator without one
     #: counts other than products with F
     counts: dict[str, int] = field(default_factory=partial(defaultdict, int))
-    #: in the face; None for that of the options
+    #: preconditioner on the face; None for that of the options
     preconditioner: Preconditioner | None = None
-    #: of the free part of a sparse F in scaled variables; None for none
+    #: incomplete factor of the free part of a sparse F in scaled variables, if any
     factor: compiled.IncompleteFactor | None = None
-    #: of KKT residuals of the QP as given; None where ‖g^P‖ decides when to stop
+    #: test of KKT residuals of the given QP; None where ‖g^P‖ decides when to stop
     judge: compiled.Judge | None = None
-    discs: tuple[Discs, ...] = ()  #: of x
+    discs: tuple[Discs, ...] = ()  #: discs of x
 
     @property
     def hull(self) -> tuple[Vector, Vector]:
@@ -143,7 +143,7 @@ def by_lanczos(
 ) -> Spectrum:
     """Estimate the norm and the upper Ritz pairs by `steps` products.
 
-    start : (n,), by default random
+    start : (n,) start vector; default: random
     """
     start = random_start(C.n) if start is None else start
     ritz = Ritz(*compiled.lanczos(F, C, start, steps))

@@ -9,8 +9,8 @@ subdomains, are only divided by their norms, and
 are applied by products with G and solves with L (`SparseRows`); the rows must be
 independent. A model of the penalty ρCᵀC (model.pxi) needs solves with G_F G_Fᵀ + κGGᵀ
 on a face F. These matrices differ from (1 + κ)GGᵀ only in rows with entries in bounded
-components, and in contact problems few subdomains have any: with those rows c ordered
-last, each face only needs a factorisation of the Schur complement on c
+components. In contact problems only few subdomains have such rows c; if they are
+ordered last, each face needs only a factorisation of the Schur complement on c
 (`harness.distributed.sparse.BorderedFactor`).
 
 On several ranks this is the *coarse problem*, with a row for each rigid mode of every
@@ -121,7 +121,7 @@ class SparseRows(Rows):
     """Sparse, independent equality rows with a Cholesky factor of GGᵀ."""
 
     unit: SparseColumns  #: (r, n) rows of G divided by their norms
-    gram: GramFactor  #: of `unit`
+    gram: GramFactor  #: Cholesky factor of the Gram matrix of `unit`
     bounded: NDArray[np.int64]  #: (b,) components with a bound
     of_bounded: SparseColumns  #: (r, b) columns of `unit` at these
 
@@ -216,12 +216,14 @@ class WholeGram:
             try:
                 return bordered_factor(of_free + shift * self.matrix, none)
             except DependentRowsError:
-                shift = min(100 * shift, 1.0)  # ends at 1, as GGᵀ has a factor
+                shift = min(
+                    100 * shift, 1.0
+                )  # ends at 1 at the latest, since GGᵀ has a factor
 
 
 @dataclass(frozen=True, eq=False)
 class _OverRanks:
-    """Factor over ranks: each has the rows with entries in its columns.
+    """Factor over ranks; each rank has the rows with entries in its columns.
 
     See `harness.distributed.factor`. The *changing* rows are those with entries in
     bounded components; active bounds of a face change their block of GGᵀ.

@@ -3,7 +3,7 @@
 With D = diag(P) and y = D¹ᐟ²x the QP in y has the matrix D⁻¹ᐟ²PD⁻¹ᐟ², whose diagonal is
 one (Jacobi scaling, van der Sluis, Numer. Math. 14, 1969, 14-23: among all diagonal
 scalings it has nearly the least condition number). Bounds stay bounds. KKT residuals
-are those of the QP as given (`compiled.Judge`).
+are those of the original QP (`compiled.Judge`).
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ class Scaled:
     """A QP in scaled variables, factors of its matrix, and the way back."""
 
     given: QP
-    P: Matrix  #: of that, sorted, by rows or columns
-    diagonal: Vector  #: (n,) of that
-    qp: QP  #: in y = D¹ᐟ²x; the given one if its diagonal is nearly constant
+    P: Matrix  #: P of `given`, sorted, by rows or columns
+    diagonal: Vector  #: (n,) diagonal of this P
+    qp: QP  #: QP in y = D¹ᐟ²x; `given` if its diagonal is nearly constant
     root: Vector  #: (n,) D¹ᐟ², or ones
-    norm: float  #: an upper bound for the norm of its matrix, by sums Σⱼ|Hᵢⱼ| of rows
+    norm: float  #: upper bound of the norm of its matrix: the largest row sum Σⱼ|Hᵢⱼ|
     weights: Vector  #: (n,) w > 0 with Pw ≥ 0 in P's units, if `has_weights`
     has_weights: bool
     with_factor: bool  #: whether to precondition by a factor
@@ -69,7 +69,7 @@ class Scaled:
         return IncompleteFactor(self.P, self.weights, scale, self.has_weights)
 
     def recovered(self, s: Solution) -> Solution:
-        """Return the point of the QP as given; where y is at a bound, x is."""
+        """Return the point of the original QP; where y is at a bound, so is x."""
         if self.qp is self.given:
             return s
         x = np.clip(s.x / self.root, self.given.lb, self.given.ub)
@@ -79,7 +79,7 @@ class Scaled:
 
 
 def _canonical(P: Matrix) -> Matrix:
-    """Return a symmetric P by rows or columns, sorted and without repetitions."""
+    """Return a symmetric sparse P with sorted indices and without duplicate entries."""
     if P.format not in ("csc", "csr"):
         P = csr_array(P)
     if not P.has_canonical_format:

@@ -35,7 +35,7 @@ from mortarbench.solvers.smalbe.preconditioner import missing_data
 class SMALBE(Options):
     """In-house SMALBE with MPRGP for bounds and equalities; needs only products with P.
 
-    Discs, which bound friction in space, are taken as well.
+    Discs, which bound friction in space, are accepted as well.
 
     `tol` bounds ‖g^P‖/‖b‖ and ‖Gx − e‖/‖e‖ of the projected problem. The solver claims
     success only if the KKT residuals of the original QP are within 5·tol as well.
@@ -103,16 +103,16 @@ PERMON = SMALBE(
     recycle=False,
 )  # fmt: skip
 
-#: those of ESPRESO: projected CG steps with a check of the cost, gradient projection as
-#: proportioning, all constants relative to ‖𝒫F𝒫‖
+#: constants and step rules of ESPRESO: projected CG steps with a check of the cost,
+#: gradient projection as proportioning, all constants relative to ‖𝒫F𝒫‖
 ESPRESO = SMALBE(
     expansion="mixed", proportioning="model", preconditioner="none", rho=1.0,
     beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never", energy=0.0,
     recycle=False,
 )  # fmt: skip
 
-#: those of the textbook (the paper's reference [3]): Γ = 1, reduced free gradient,
-#: fixed ᾱ
+#: constants and step rules of the textbook (the paper's reference [3]): Γ = 1, reduced
+#: free gradient, fixed ᾱ
 PAPER = SMALBE(
     expansion="std", proportioning="cg", preconditioner="none", rho=1.0,
     eliminate="never", energy=0.0, recycle=False,

@@ -36,10 +36,10 @@ def random_start(n: int) -> Vector:
 
 
 def power_method(H: Callable[[Vector], Vector], n: int) -> float:
-    """Estimate ‖H‖ by PERMON's power method: from ones, to 1e-4, at most 50 products.
+    """Estimate ‖H‖ to 1e-4 by PERMON's power method, with at most 50 products.
 
-    The Rayleigh quotient is a lower bound of ‖H‖; like PERMON, no safety factor is
-    used.
+    The iteration starts from a vector of ones. Its Rayleigh quotient is a lower bound
+    of ‖H‖ and is used without a safety factor, as in PERMON.
     """
     v = np.full(n, 1 / np.sqrt(n))
     estimate = 0.0

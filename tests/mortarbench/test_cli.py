@@ -842,7 +842,7 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
         "accuracy", "crossval", "demo", "discs", "finite-strain", "fixed-point",
         "fleet", "friction", "large", "paper", "paper-accuracy", "paper-fleet", "path",
-        "ranks", "scaling", "scaling-feti", "smoke",
+        "ranks", "scaling", "scaling-feti", "smoke", "solids",
     ]  # fmt: skip
 
 

@@ -10,6 +10,7 @@ import pytest
 from mortarbench.harness import Fields, InputError, Record, Verdict
 from mortarbench.harness.files.store import save_fields
 from mortarbench.harness.results.journal import Journal
+from mortarbench.problems.fem.mesh import box
 from mortarbench.reports import write_report
 from mortarbench.reports.data.evidence import Evidence, arrange
 from mortarbench.reports.data.quantities import spreads
@@ -498,6 +499,28 @@ def test_the_largest_verified_case_is_drawn(measured, square, tmp_path):
     assert picture.caption.startswith("beam-ring/size=30/dual")
     assert "2.98 GPa" in picture.caption  # 99.5 % quantile of 0, 1, 2, 3
     assert "factor 1" in picture.caption
+
+
+def test_the_largest_cases_in_plane_and_space_are_drawn(measured, square, tmp_path):
+    cube = box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (1, 1, 1))
+    solid = Fields(
+        points=cube.points, cells=cube.cells, displacement=0 * cube.points,
+        bodies=np.zeros(1, dtype=int),
+    )  # fmt: skip
+    plane, space = save_fields(tmp_path, square), save_fields(tmp_path, solid)
+    records = [
+        measured("a", 10, fields=space, family="cube-wall"),
+        measured("a", 30, fields=plane),
+        measured("a", 20, fields=plane, family="hertz-plane"),
+        measured("a", 5, fields=space, family="hertz-sphere"),
+    ]
+    page = compose(Evidence(directory=tmp_path, records=arrange(records)))
+    pictures = [p for s in page.sections if s.name == "deformed" for p in s.pictures]
+
+    assert [p.name for p in pictures] == ["deformed", "deformed-in-space"]
+    assert "the largest verified case in the plane" in pictures[0].caption
+    assert "the largest verified case in space" in pictures[1].caption
+    assert [len(p.figure.panels) for p in pictures] == [1, 1]
 
 
 def test_csv_holds_full_precision_and_every_time_with_its_interval(measured, tmp_path):

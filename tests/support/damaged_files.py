@@ -15,8 +15,9 @@ from mortarbench.harness.files.matfile import save_mat
 from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import save_qp
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.fem.gmsh_mesh import read_msh
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from tests.support.bounded import bounded
+from tests.support.mesh_formats import write_inp, write_med
 
 EXTREMES = (
     0, 1, -1, 2**15, 2**31 - 1, -(2**31), 2**32 - 1, 2**40, 2**63 - 1, -(2**63),
@@ -69,7 +70,7 @@ def tiny_qp(dense=False):
 def seeds(folder):
     """Return intact files of every kind, by the ending of their names."""
     qp, meta = tiny_qp(), {"name": "tiny", "scale": 2.0, "constant": 1.0}
-    found = {kind: [] for kind in ("npz", "mat", "parquet", "qps", "msh")}
+    found = {kind: [] for kind in ("npz", "mat", "parquet", "qps")}
 
     def written(kind, write):
         path = folder / f"seed.{kind}"
@@ -97,6 +98,11 @@ def seeds(folder):
         written("parquet", lambda path, c=compression: repacked(path, c))
     found["qps"] = [QPS]
     found["msh"] = [msh_22(), *meshes(folder)]
+    (folder / "text.msh").write_bytes(msh_22())
+    for kind, write in (("inp", write_inp), ("med", write_med)):
+        write(folder / "text.msh", folder / f"seed.{kind}")
+        found[kind] = [(folder / f"seed.{kind}").read_bytes()]
+    found["inp"].append(INP)
     return found
 
 
@@ -182,6 +188,24 @@ $Elements
 $EndElements
 """
 
+INP = b"""*NODE, NSET=all
+1, 0, 0, 0
+2, 1, 0, 0
+3, 0, 1, 0
+4, 0, 0, 1
+5, 0, 0, -1
+*ELEMENT, TYPE=C3D4, ELSET=one
+7, 1, 2, 3, 4
+9, 1, 3, 2, 5
+*NSET, NSET=low, GENERATE
+1, 3, 1
+*ELSET, ELSET=both
+one, 9
+*SURFACE, NAME=side, TYPE=ELEMENT
+7, S2
+both, S3
+"""
+
 
 def flipped(rng, data, at, others):
     """Flip a bit."""
@@ -251,7 +275,7 @@ def damaged(rng, data, others):
 def read(path):
     """Read a file as cases do; return whether it was read, which needs a valid QP."""
     try:
-        if path.suffix == ".msh":
+        if path.suffix in (".msh", ".inp", ".med"):
             mesh = read_msh(path)
             assert mesh.cells.max() < len(mesh.points)
             assert np.isfinite(mesh.points).all()

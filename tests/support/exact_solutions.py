@@ -21,6 +21,7 @@ from scipy.sparse import csr_array
 
 from mortarbench.harness import Mechanics, Solution, Status
 from mortarbench.harness.mechanics import Real
+from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.active_set_refinement import (
     CLOSED,
     LOWER,
@@ -172,10 +173,9 @@ def _given(
     """Solve with equality on the closed rows."""
     exact, primal = mechanics.exact, mechanics.primal
     K, B = primal.P.toarray(), mechanics.rows.toarray()
+    lower, upper = hull(exact.forces.sets, exact.c.size)
     free, closed = np.setdiff1d(np.arange(len(K)), exact.fixed), states == CLOSED
-    lam = np.where(
-        states == LOWER, exact.lower, np.where(states == UPPER, exact.upper, 0)
-    )
+    lam = np.where(states == LOWER, lower, np.where(states == UPPER, upper, 0))
     rows = B[closed][:, free]
     kernel = mechanics.kernel.toarray().astype(np.float64)[free]
     loose = _loose(rows, kernel)
@@ -205,9 +205,10 @@ def _exchanged(
     v = Rows(mechanics.rows) @ u - integers(exact.c)
     zero_v = max(abs(x) for x in u) >> (FINE - 60) if u.size else 0
     zero = max((abs(x) for x in lam), default=0) >> (FINE - 60)
-    lower, upper = integers(exact.lower), np.zeros(lam.size, dtype=object)
     bounded = ~exact.contact
-    upper[bounded] = integers(exact.upper[bounded])
+    least, most = hull(exact.forces.sets, lam.size)
+    lower, upper = integers(least), np.zeros(lam.size, dtype=object)
+    upper[bounded] = integers(most[bounded])
     found = states.copy()
     for i, state in enumerate(states):
         if state == CLOSED:

@@ -1,45 +1,71 @@
-"""An elastic sphere pressed onto a rigid plane, and Hertz's exact solution.
+"""Elastic spheres in contact, and Hertz's exact solution.
 
-The body is the part of the sphere around the contact, a quarter of a block of half
-width and height EXTENT·a with the sphere as its lower side. The planes x = 0 and y = 0
-are planes of symmetry. The tractions on its other sides are those of a point force P at
-the origin of a half-space (Boussinesq; Johnson 1985, Section 3.2), from which those of
-Hertz's pressure differ by O((a/ρ)²), relatively. A whole sphere is not suitable: its
-overall compression, which the theory neglects, is of order a/R, 6 % of the approach at
-0.08.
+A sphere is pressed onto a rigid plane, or onto an equal sphere. Each body is the part
+of a sphere around the contact, a quarter of a block of half width and height EXTENT·a
+with the sphere as its contact side. The planes x = 0 and y = 0 are planes of symmetry.
+The tractions on its other sides are those of a point force P at the origin of a
+half-space (Boussinesq; Johnson 1985, Section 3.2), from which those of Hertz's pressure
+differ by O((a/ρ)²), relatively. A whole sphere is not suitable: its overall
+compression, which the theory neglects, is of order a/R, 6 % of the approach at 0.08.
 
-The body is supported by contact alone, so that the form ``dual-bounds`` does not exist.
-The displacement far from the contact is that of the half-space minus the approach δ of
-distant points, which is measured at the top.
+The upper body is supported by contact alone, so that the form ``dual-bounds`` does not
+exist. A support of the lower one along z has no reaction. The displacement far from the
+contact is that of the half-space minus the approach of distant points to the plane
+z = 0. It is measured at the side opposite the contact, and summed over the bodies.
 
-Errors at R = 8, E = 200, ν = 0.3, P = 10: 0.1 % in a and p₀ and 0.3 % in δ with 8 cells
-per a.
+The meshes of two spheres do not match: the lower one has n + 1 cells per a. Contact is
+linearised at the undeformed state, along normals that differ from the vertical by up to
+a/R, which changes the results by O(a²/R²).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mortarbench.harness import InputError, Value, Vector
-from mortarbench.problems.contact.bodies import ContactPair
+from mortarbench.problems.contact.bodies import (
+    ContactPair,
+    ContactSides,
+    UnassembledBodies,
+)
+from mortarbench.problems.contact.friction import FrictionLaw
 from mortarbench.problems.contact.results import pair_results
-from mortarbench.problems.contact.rigid import RigidPlane, rigid_rows
-from mortarbench.problems.contact.stepping import Forces, load_steps
+from mortarbench.problems.contact.rigid import RigidPlane
+from mortarbench.problems.contact.sides import contact_sides
+from mortarbench.problems.contact.stepping import (
+    Forces,
+    Stage,
+    load_steps,
+    restart_slip,
+)
 from mortarbench.problems.duality.problem import (
     ContactProblem,
     ContactSolution,
     ElasticBodies,
+    Linearise,
     StructuredSolids,
     cached_problem,
+    keyed_linearisation,
 )
 from mortarbench.problems.fem.elasticity import Material
 from mortarbench.problems.fem.elements import QUAD
-from mortarbench.problems.fem.mesh import Mesh, box_grid, dofs_of, nodal_areas
-from mortarbench.problems.models.half_space.point_contact import PointContact
+from mortarbench.problems.fem.mesh import (
+    Mesh,
+    Nodes,
+    box_grid,
+    dofs_of,
+    nodal_areas,
+    prefixed,
+)
+from mortarbench.problems.models.half_space.point_contact import (
+    PointContact,
+    ShearedPointContact,
+)
 from mortarbench.problems.models.hertz import graded_points
 
 #: size of the block over a; 6 and 10 change a and p₀ by 0.1 %
@@ -48,11 +74,54 @@ UNIFORM = 1.25  #: half width of the uniformly meshed part, in a
 #: largest a/R: the corner of the block is then at 0.71 R from the axis
 MAX_RATIO = 1 / 8
 GROUND = RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+#: names of the bodies by the key `against`
+NAMES: Mapping[str, tuple[str, ...]] = {
+    "plane": ("sphere",), "sphere": ("upper", "lower"),
+}  # fmt: skip
+
+
+class _Block(NamedTuple):
+    """A body between its contact side and the rest of its half space."""
+
+    mesh: Mesh
+    cells: tuple[int, int, int]
+    up: int  #: 1 above the plane z = 0, −1 below
+    copies: int  #: number of such blocks around the axis: 4, or 2 of double width
+
+    @property
+    def contact(self) -> Nodes:
+        """Faces of the sphere."""
+        return self.mesh.boundaries["bottom" if self.up > 0 else "top"]
+
+    @property
+    def opposite(self) -> Nodes:
+        """Faces opposite the contact."""
+        return self.mesh.boundaries["top" if self.up > 0 else "bottom"]
+
+    @property
+    def far(self) -> Nodes:
+        """Faces on which the rest of the half space acts."""
+        names = ("right", "back") if self.copies == 4 else ("right", "back", "left")
+        sides = [self.mesh.boundaries[name] for name in names]
+        return np.concatenate([*sides, self.opposite])
+
+    @property
+    def symmetric(self) -> Nodes:
+        """Components that vanish on planes of symmetry."""
+        planes = (("front", 1), ("left", 0))[: 2 if self.copies == 4 else 1]
+        return np.concatenate(
+            [dofs_of(np.unique(self.mesh.boundaries[k]), 3, axis) for k, axis in planes]
+        )
+
+    @property
+    def axis(self) -> Nodes:
+        """Nodes on the axis, upwards."""
+        return np.flatnonzero((self.mesh.points[:, :2] == 0).all(axis=1))
 
 
 @cached_problem
 def problem(params: Mapping[str, Value]) -> ContactProblem:
-    """Return the sphere on a plane, with n cells per contact radius a.
+    """Return the spheres, with n cells per contact radius a.
 
     Raises
     ------
@@ -61,80 +130,185 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
     """
     p: Any = params
-    material = Material(E=p["E"], nu=p["nu"])
-    exact = PointContact(p["load"], p["R"], p["E"] / (1 - p["nu"] ** 2))
-    if exact.a > MAX_RATIO * exact.R:
+    material, exact = Material(E=p["E"], nu=p["nu"]), _exact(p)
+    if exact.a > MAX_RATIO * p["R"]:
         raise InputError(
             f"hertz-sphere: the contact radius {exact.a:.4g} is more than R/8 = "
-            f"{MAX_RATIO * exact.R:.4g}; expected a smaller load, or a larger E or R"
+            f"{MAX_RATIO * p['R']:.4g}; expected a smaller load, or a larger E or R"
         )
-    shape = _block(exact, p["n"])
-    mesh, sides = shape.mesh, shape.sides
-    loaded = np.unique(np.concatenate([sides[name] for name in _CUT]))
-    forces = _far_forces(mesh, material.nu)[loaded]
-    forces /= -4 * forces[:, 2].sum()  # the quarter of P, also with quadrature
-    symmetric = (("left", 0), ("front", 1))
-    fixed = np.concatenate(
-        [dofs_of(np.unique(sides[name]), 3, axis) for name, axis in symmetric]
+    names, copies = NAMES[p["against"]], 2 if p["Q"] else 4
+    blocks = [
+        _block(exact.a, p["R"], p["n"] + k, 1 - 2 * k, copies)
+        for k in range(len(names))
+    ]
+    first = np.cumsum([0, *(len(b.mesh.points) for b in blocks)])
+    parts = list(zip(blocks, first.tolist(), strict=False))
+    sides = [_near(block, UNIFORM * exact.a) + start for block, start in parts]
+    fixed = [block.symmetric + 3 * start for block, start in parts]
+    pair = ContactPair(sides[0], sides[0][:0], GROUND)
+    if len(blocks) == 2:
+        pair = ContactPair(*sides)
+        # supports of the lower block without reactions: along z, and for a block of
+        # double width also along x and about y
+        axis = blocks[1].axis + first[1]
+        fixed.append(dofs_of(axis[:1], 3, 2))
+        if p["Q"]:
+            fixed.append(dofs_of(axis[[0, -1]], 3, 0))
+    held = np.concatenate(fixed)
+    pressing = _joined_forces(
+        [_far_forces(b, partial(point_force_stress, nu=p["nu"]), 2) for b in blocks],
+        first,
     )
-    half_width = UNIFORM * exact.a + 1e-9 * exact.R
-    near = mesh.points[sides["bottom"]][..., :2] <= half_width
-    slave = sides["bottom"][near.all(axis=(1, 2))]
-    top, shares = nodal_areas(mesh.points, sides["top"])
-    # where a point force on a half space moves the top, relative to distant points
-    moved = exact.P * _settlement(mesh.points[top], material)
+    stages, force = load_steps(1, 1, pressing, held), pressing
+    if p["Q"]:
+        shearing = _joined_forces(
+            [
+                _far_forces(b, partial(tangential_force_stress, nu=p["nu"]), 0)
+                for b in blocks
+            ],
+            first,
+        )
+        force = Forces(
+            pressing.component, pressing.value + p["Q"] * p["mu"] * shearing.value
+        )
+        stages = _programme(pressing, force, held, blocks[0].axis, p["mu"])
 
     def results(solution: ContactSolution) -> dict[str, Any]:
-        u = solution.at(dofs_of(top, 3, 2)) * exact.R
-        approach = float(shares @ (moved - u) / shares.sum())
+        """Compare with Hertz; the approach is that of distant points, m."""
+        approach = sum(
+            _approach(block, solution, start, exact.P, material, p["R"])
+            for block, start in parts
+        )
+        values = _quantities(solution, exact, copies)
+        if p["Q"]:
+            sheared = ShearedPointContact(exact, p["mu"], p["nu"], p["Q"])
+            values |= _shear_quantities(solution, sheared, copies)
         return {
-            **_quantities(solution, exact),
+            **values,
             "approach": approach, "approach_error": approach / exact.approach - 1,
         }  # fmt: skip
 
-    whole = Forces(dofs_of(loaded, 3), forces.ravel())
+    def linearise(
+        bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
+    ) -> Linearise:
+        rows = keyed_linearisation(p)(bodies, laws)
+        return lambda u: rows(np.zeros_like(u))
+
+    shape = StructuredSolids(
+        tuple(prefixed(b.mesh, name) for b, name in zip(blocks, names, strict=True)),
+        tuple(b.cells for b in blocks),
+    )
     return ContactProblem(
         bodies=ElasticBodies(
-            shape=shape, names=("sphere",), materials=(material,), plane=None,
-            length=exact.R, force=exact.P, fixed=fixed, forces=whole,
-            pairs=(ContactPair(slave, np.zeros((0, 4), dtype=np.int64)),),
+            shape=shape, names=names, materials=(material,) * len(names), plane=None,
+            length=p["R"], force=exact.P, fixed=held, forces=force, pairs=(pair,),
         ),
-        stages=load_steps(1, 1, whole, fixed),
-        linearise=lambda bodies, _: lambda u: rigid_rows(
-            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND
-        ),
-        results=results,
+        stages=stages, linearise=linearise, results=results,
     )  # fmt: skip
 
 
-_CUT = ("right", "back", "top")  #: sides on which the rest of the half space acts
+def _exact(params: Mapping[str, Value]) -> PointContact:
+    """Return Hertz's solution: 1/R and 1/E* are sums over the elastic bodies."""
+    p: Any = params
+    bodies = len(NAMES[p["against"]])
+    modulus = p["E"] / (1 - p["nu"] ** 2)
+    return PointContact(p["load"], p["R"] / bodies, modulus / bodies)
 
 
-def _block(exact: PointContact, n: int) -> StructuredSolids:
-    """Return a quarter of the block, whose lower side is the sphere about (0, 0, R)."""
-    size, h = EXTENT * exact.a, exact.a / n
-    x, z = graded_points(h, UNIFORM * exact.a, size), graded_points(h, 0.0, size)
-    grid = box_grid(x, x, z)
+def _programme(
+    pressing: Forces, both: Forces, held: Nodes, axis: Nodes, mu: float
+) -> tuple[Stage, ...]:
+    """Return the stages of a tangential load: P without friction, then P and Q.
+
+    In the first stage, supports on the axis of the upper block keep it from sliding and
+    rolling; by symmetry they have no reactions. Slip is measured from its end.
+    """
+    upright = dofs_of(axis[[0, -1]], 3, 0)
+    return (
+        Stage(step=1, part=1.0, forces=pressing, fixed=np.append(held, upright)),
+        Stage(
+            step=1, part=1.0, forces=both, fixed=held,
+            laws=(FrictionLaw("coulomb", mu=mu),), begin=restart_slip,
+        ),
+    )  # fmt: skip
+
+
+def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
+    """Return a block with n cells per a and a sphere about (0, 0, ±R)."""
+    size = EXTENT * a
+    y, z = graded_points(a / n, UNIFORM * a, size), graded_points(a / n, 0.0, size)
+    x = y if copies == 4 else np.append(-y[:0:-1], y)
+    grid = box_grid(x, y, z if up > 0 else -z[::-1])
     points = grid.points.copy()
-    depth = exact.R - np.sqrt(exact.R**2 - (points[:, :2] ** 2).sum(axis=1))
-    points[:, 2] += (1 - points[:, 2] / size) * depth
-    cells = x.size - 1, x.size - 1, z.size - 1
-    mesh = Mesh(points, grid.cells, grid.boundaries)
-    return StructuredSolids((mesh,), (cells,))
+    depth = R - np.sqrt(R**2 - (points[:, :2] ** 2).sum(axis=1))
+    points[:, 2] += up * (1 - np.abs(points[:, 2]) / size) * depth
+    cells = x.size - 1, y.size - 1, z.size - 1
+    return _Block(Mesh(points, grid.cells, grid.boundaries), cells, up, copies)
 
 
-def _far_forces(mesh: Mesh, nu: float) -> NDArray[np.float64]:
-    """Return the nodal forces (N, 3) of a unit point force on the sides `_CUT`."""
-    forces = np.zeros_like(mesh.points)
-    faces = np.concatenate([mesh.boundaries[name] for name in _CUT])
+def _near(block: _Block, half_width: float) -> Nodes:
+    """Return the faces of the sphere that may touch, within a half width.
+
+    Those below the slave also contain the faces at the edge of this region.
+    """
+    reach = np.abs(block.mesh.points[block.contact][..., :2])
+    within = reach <= half_width * (1 + 1e-9)
+    corners = within.all(axis=1) if block.up > 0 else within.any(axis=1)
+    return block.contact[np.asarray(corners).all(axis=1)]
+
+
+def _far_forces(
+    block: _Block, stress: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    axis: int,
+) -> Forces:  # fmt: skip
+    """Return the nodal forces of the rest of the half space that balance a point force.
+
+    The point force on the block at the origin is 1 along z, away from the contact, or
+    along x, on the upper block towards −x. The forces on the far sides are the
+    tractions of its stress. They are scaled, and forces along z on the opposite side
+    are added, so that the resultant and the moment about y vanish also with quadrature
+    and with the curved side.
+    """
+    mesh, mirror = block.mesh, np.array([1, 1, block.up])
+    forces, faces = np.zeros_like(mesh.points), block.far
     corners = mesh.points[faces]
     for xi, weight in zip(QUAD.points, QUAD.weights, strict=True):
         N, slopes = QUAD.shapes(xi), QUAD.gradients(xi)
         normal = np.cross(*np.einsum("ar,fax->rfx", slopes, corners))  # times area
-        stress = point_force_stress(np.einsum("a,fax->fx", N, corners), nu)
-        traction = np.einsum("fij,fj->fi", stress, normal)
+        at = mirror * np.einsum("a,fax->fx", N, corners)
+        traction = mirror * np.einsum("fij,fj->fi", stress(at), mirror * normal)
         np.add.at(forces, faces, weight * N[:, None] * traction[:, None])
-    return forces
+    total = -block.up if axis == 2 else block.up
+    forces *= total / (block.copies * forces[:, axis].sum())
+    if axis == 0:
+        nodes, shares = nodal_areas(mesh.points, block.opposite)
+        x, z = mesh.points[:, 0], mesh.points[:, 2]
+        moment = z @ forces[:, 0] - x @ forces[:, 2]
+        forces[nodes, 2] += moment * shares * x[nodes] / (shares @ x[nodes] ** 2)
+    nodes = np.unique(faces)
+    return Forces(dofs_of(nodes, 3), forces[nodes].ravel())
+
+
+def _joined_forces(forces: Sequence[Forces], first: Nodes) -> Forces:
+    """Return the forces on all bodies, whose nodes start at `first`."""
+    components = [f.component + 3 * k for f, k in zip(forces, first, strict=False)]
+    return Forces(np.concatenate(components), np.concatenate([f.value for f in forces]))
+
+
+def _approach(
+    block: _Block, solution: ContactSolution, start: int, P: float,
+    material: Material, length: float,
+) -> float:  # fmt: skip
+    """Return the approach of distant points of a body to z = 0, m.
+
+    It is the mean over the side opposite the contact.
+    """
+    nodes, shares = nodal_areas(block.mesh.points, block.opposite)
+    # displacement under a point force on a half space, relative to distant points
+    mirrored = block.mesh.points[nodes] * [1, 1, block.up]
+    expected = P * _settlement(mirrored, material)
+    u = solution.at(dofs_of(nodes + start, 3, 2)) * (block.up * length)
+    return float(shares @ (expected - u) / shares.sum())
 
 
 def point_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
@@ -158,6 +332,24 @@ def point_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]
     return np.asarray(np.sum(terms, axis=0) / (2 * np.pi))
 
 
+def tangential_force_stress(x: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
+    """Return the stress (k, 3, 3) at x (k, 3) under a unit force along x at the origin.
+
+    The half space is z ≥ 0 (Cerruti; Johnson, 3.75 and 3.76).
+    """
+    (X, Y, z), rho = x.T, np.linalg.norm(x, axis=1)
+    s = rho + z
+    near = (1 - 2 * nu) / rho
+    # ∂²/∂X∂(X, Y) of the potential that vanishes for ν = ½
+    curved = 1 / (rho**2 * s**2) + 2 / (rho * s**3)
+    xx = -3 * X**3 / rho**5 + near * X * (1 / rho**2 - 3 / s**2 + X**2 * curved)
+    yy = -3 * X * Y**2 / rho**5 + near * X * (1 / rho**2 - 1 / s**2 + Y**2 * curved)
+    xy = -3 * X**2 * Y / rho**5 + near * Y * (-1 / s**2 + X**2 * curved)
+    zz, yz, xz = (-3 * X * z * k / rho**5 for k in (z, Y, X))
+    rows = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return np.asarray(np.moveaxis(rows, -1, 0) / (2 * np.pi))
+
+
 def _settlement(x: NDArray[np.float64], material: Material) -> Vector:
     """Return u_z (k,) under a unit point force, m/N; see `point_force_stress`."""
     rho = np.linalg.norm(x, axis=1)
@@ -165,25 +357,50 @@ def _settlement(x: NDArray[np.float64], material: Material) -> Vector:
     return np.asarray(factor * (x[:, 2] ** 2 / rho**3 + 2 * (1 - material.nu) / rho))
 
 
-def _quantities(solution: ContactSolution, exact: PointContact) -> dict[str, Any]:
+def _quantities(
+    solution: ContactSolution, exact: PointContact, copies: int
+) -> dict[str, Any]:
     """Compare the pressure with Hertz's; forces and areas are of the full sphere.
 
     contact_radius: √(5∫pr²dA/2P), exact for Hertz's pressure, m. Errors are relative.
     """
     bodies, primal, s, _ = solution.sides
-    nodes, areas = nodal_areas(bodies.mesh.points, bodies.pairs[0].slave)
-    force = 4 * s.z[: primal.h.size] * bodies.force
-    r2 = (bodies.mesh.points[nodes, :2] ** 2).sum(axis=1)
-    a, total = np.sqrt(2.5 * (force @ r2) / exact.P), float(force.sum())
-    largest = float((force / (4 * areas)).max())
+    (side,) = contact_sides(*solution.sides)
+    points, force = bodies.mesh.points[side.nodes], copies * side.force
+    normal = force[:, 2]
+    a = np.sqrt(2.5 * (normal @ (points[:, :2] ** 2).sum(axis=1)) / exact.P)
+    # the images of a block cancel components normal to planes of symmetry
+    on_slave = force.sum(axis=0) * [copies == 2, 0, 1] + 0.0
+    largest = float((normal / (copies * side.length)).max())
+    both = on_slave.tolist(), (0.0 - on_slave).tolist()
+    forces = dict(zip(bodies.names, both, strict=False))
     ((name, pair),) = pair_results(*solution.sides).items()
-    pair |= {
-        "force": {bodies.names[0]: [0.0, 0.0, total]},
-        "pressed_area": 4 * pair["pressed_area"],
-    }
+    pair |= {"force": forces, "pressed_area": copies * pair["pressed_area"]}
     return {
-        "contact_force": [0.0, 0.0, total], "multiplier_sum": total,
-        "contacts": {name: pair}, "force_error": total / exact.P - 1,
+        # the force on the master, on the slave if the master is rigid
+        "contact_force": list(forces.values())[-1],
+        "multiplier_sum": float(copies * s.z[: primal.h.size].sum() * bodies.force),
+        "contacts": {name: pair}, "force_error": float(on_slave[2] / exact.P - 1),
         "contact_radius": float(a), "contact_radius_error": float(a / exact.a - 1),
         "p_max": largest, "p_max_error": largest / exact.p0 - 1,
+    }  # fmt: skip
+
+
+def _shear_quantities(
+    solution: ContactSolution, exact: ShearedPointContact, copies: int
+) -> dict[str, Any]:
+    """Compare stick and tangential force with Cattaneo and Mindlin's; full sphere.
+
+    tangential_force: along x on the lower sphere, N. stick_radius: of a disc with the
+    area of the sticking nodes, m. c_over_a: over the exact contact radius.
+    """
+    (side,) = contact_sides(*solution.sides)
+    area = copies * side.length[side.friction == "stick"].sum()
+    radius, total = np.sqrt(area / np.pi), -copies * side.force[:, 0].sum()
+    limit = exact.mu * exact.normal.P
+    return {
+        "tangential_force": float(total),
+        "tangential_force_error": float(total / (exact.Q * limit) - 1),
+        "stick_radius": float(radius), "c_over_a": float(radius / exact.normal.a),
+        "c_over_a_error": float(radius / exact.c - 1),
     }  # fmt: skip

@@ -208,7 +208,7 @@ def test_what_grows_is_not_said_to_fall():
     found = estimate_error("box", levels(0.1, 0.1 * 2**1.45))
 
     assert (found.kind, found.error) == ("change", found.change)
-    assert "does not fall" in found.note
+    assert "does not decrease" in found.note
     assert "2.73 times" in found.note
     assert "slowly" not in str(found)
 

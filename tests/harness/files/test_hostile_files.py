@@ -25,7 +25,7 @@ from mortarbench.harness.files.parquetfile import save_parquet
 from mortarbench.harness.files.qpfile import load_qp, save_qp
 from mortarbench.harness.operators import SerialisableOperator
 from mortarbench.problems import PROBLEMS
-from mortarbench.problems.fem.gmsh_mesh import read_msh
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.registries import Registries
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -130,7 +130,9 @@ def test_the_worker_runs_no_maker_of_a_file_that_nobody_vouches_for(tmp_path):
 # what is no regular file
 
 
-@pytest.mark.parametrize("suffix", ["", ".npz", ".mat", ".parquet", ".qps", ".msh"])
+@pytest.mark.parametrize(
+    "suffix", ["", ".npz", ".mat", ".parquet", ".qps", ".msh", ".inp", ".med"]
+)
 @pytest.mark.parametrize("kind", ["zero", "pipe", "folder", "link to zero"])
 def test_what_is_no_regular_file_is_refused_at_once(tmp_path, kind, suffix):
     path = tmp_path / f"a{suffix}"
@@ -143,7 +145,7 @@ def test_what_is_no_regular_file_is_refused_at_once(tmp_path, kind, suffix):
             path.symlink_to("/dev/zero")
         case "zero":
             path = "/dev/zero"
-    read = read_msh if suffix == ".msh" and kind != "zero" else build
+    read = read_msh if suffix in (".msh", ".inp", ".med") and kind != "zero" else build
 
     with pytest.raises(InputError, match=r": a (device|folder).*expected"):
         read(path)
@@ -557,7 +559,7 @@ def test_many_sections_of_a_constraint_take_no_longer_than_their_lines(tmp_path)
         (b"2 3 6 5", b"2 2 2 2", "no area"),
         (b"$Elements\n3", b"$Elements\n999999999999", "not a .msh"),
         (b"3 3 2 2 1", b"3 3 0", "not a .msh|not every cell"),
-        (b"$EndNodes", b"", "no named surface"),
+        (b"$EndNodes", b"", "no physical surface"),
         (b"2.2 0 8", b"2.2 1 8", "not a .msh"),
         (b"2.2 0 8", b"\xff", "not a .msh"),
     ],
@@ -585,7 +587,7 @@ def test_the_mesh_that_these_are_made_of_is_read(tmp_path):
 
 # damaged at random
 
-KINDS = ("npz", "mat", "qps", "msh", "parquet")
+KINDS = ("npz", "mat", "qps", "msh", "inp", "med", "parquet")
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -19,7 +19,9 @@ from mortarbench.harness.errors import InputError
 from mortarbench.harness.record import Record
 from mortarbench.registries import Registries
 from tests.support import ROOT, SUPPORT
+from tests.support.hexahedra import TETRAHEDRA
 from tests.support.press import described
+from tests.support.solid_blocks import solid_blocks
 from tests.support.waiting import soon
 
 pytestmark = pytest.mark.together
@@ -113,6 +115,30 @@ def test_faces_of_a_body_with_tiny_stiffness_have_a_factor_on_ranks():
     assert answer.record.claimed in ("solved", "iteration_limit")
     # No rank has the assembled K, so the bound holds for every rounding of it.
     assert answer.energy_bound <= 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    [
+        "cube-wall/n=24/feti=8/dual",  # 46 875 components
+        "contact-patch/lower=8/upper=6/feti=4/dim=3/distort=0.2/dual",
+        "beam-ring/Nr=2/Nh=1/steps=1/feti=2/depth=4/dual",
+        "bodies/parts=12/dual",
+    ],
+)
+def test_bodies_in_space_take_the_same_steps_on_all_numbers_of_ranks(name, tmp_path):
+    if name.startswith("bodies"):
+        description = solid_blocks(tmp_path, TETRAHEDRA)
+        name = name.replace("bodies", f"bodies:{description}")
+    case = mb.build(name)
+    alone, *several = (mb.solve(case, "smalbe", tol=1e-7, ranks=n) for n in (1, 2, 4))
+    for answer in several:
+        assert answer.verdict == "verified"
+        assert answer.energy_bound <= 1e-6
+        assert answer.record.counts == alone.record.counts
+        objective = alone.record.objective
+        assert answer.record.objective == pytest.approx(objective, rel=1e-9)
 
 
 @pytest.mark.parametrize("parts", [6, 20])

@@ -376,7 +376,7 @@ def test_a_contradictory_override_is_refused(narrowed, changes, message):
 
 @pytest.mark.parametrize(
     ("name", "cases"),
-    [("demo", 12), ("smoke", 3), ("scaling", 12), ("large", 6)],
+    [("demo", 14), ("smoke", 3), ("scaling", 12), ("large", 6)],
 )
 def test_the_suites_of_the_checkout_keep_their_promises(name, cases):
     path = ROOT / "suites" / f"{name}.toml"

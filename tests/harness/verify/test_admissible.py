@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from mortarbench.harness.mechanics import Exact, Real
+from mortarbench.harness.mechanics import NO_FRICTION, AdmissibleForces, Exact, Real
 from mortarbench.harness.verify import admissible as module
 from mortarbench.harness.verify.admissible import admissible, feasible_at_rows
 from tests.support.supported_by_contact import disc_between_plates
@@ -15,8 +15,9 @@ def moved(B, c, u, *, R=None, softness=None, closed=None):
     B, c, u = (np.array(v, dtype=Real) for v in (B, c, u))
     m, n = B.shape
     exact = Exact(
-        f=np.zeros(n, dtype=Real), B=csr_array(B), c=c, lower=np.zeros(m, dtype=Real),
-        upper=np.full(m, np.inf, dtype=Real), fixed=np.zeros(0, dtype=np.int64),
+        f=np.zeros(n, dtype=Real), B=csr_array(B), c=c,
+        forces=AdmissibleForces(m, NO_FRICTION.discs(m)),
+        fixed=np.zeros(0, dtype=np.int64),
         compliance=np.ones(m, dtype=Real),
     )  # fmt: skip
     R = np.zeros((n, 0)) if R is None else np.array(R, dtype=float)

@@ -267,12 +267,14 @@ def test_a_stored_reference_is_a_guess_and_never_believed(tmp_path):
     fresh = reference_point(mechanics, reference_solution, tmp_path)
     (stored,) = tmp_path.iterdir()
     wrong = (-1 - fresh.states).astype(np.int8)
-    for content in (
-        {"states": wrong}, {"states": wrong[:3]}, {"states": wrong * 1.0},
-        {"states": 5 + wrong}, {"states": 1 + 0 * wrong}, {"u": wrong},
+    forces = fresh.multipliers.astype(float)
+    for states, multipliers in (
+        (wrong, forces), (wrong[:3], forces), (wrong * 1.0, forces),
+        (5 + wrong, forces), (1 + 0 * wrong, forces), (fresh.states, -forces),
+        (fresh.states, 1e300 * forces), (fresh.states, forces * np.nan),
     ):  # fmt: skip
         with stored.open("wb") as file:
-            np.savez(file, **content)
+            np.savez(file, states=states, multipliers=multipliers)
         again = reference_point(mechanics, reference_solution, tmp_path)
         assert (again.active == fresh.active).all()
         assert again.bound < 1e-8

@@ -21,7 +21,7 @@ from mortarbench.harness import (
     certify,
     kkt_residuals,
 )
-from mortarbench.harness.mechanics import Extended, Real
+from mortarbench.harness.mechanics import AdmissibleForces, Extended, Real
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify import certificate
 from mortarbench.harness.verify.active_set_refinement import CLOSED, LOWER, UPPER
@@ -98,10 +98,17 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
         np.hypot(of_u, of_equilibrium) <= ROUNDED * found.pair + 2 * slack
         and max(of_u, of_equilibrium, of_answer)
         <= ROUNDED * min(found.error, found.bound * problem.exact.norm) + slack
-        and (found.multipliers >= exact.lower).all()
-        and (found.multipliers <= exact.upper).all()
+        and is_admissible(exact.forces, found.multipliers)
         and (exact.motion(found.u)[exact.contact] <= 0).all()
     )
+
+
+def is_admissible(forces: AdmissibleForces, multipliers: Extended) -> bool:
+    """Return whether multipliers are in Λ, but for extended rounding of circles."""
+    size = np.sqrt((multipliers[forces.discs.index] ** 2).sum(axis=1))
+    pressing = (multipliers[forces.contact] >= 0).all()
+    rounding = 8 * np.finfo(Real).eps
+    return bool(pressing and (size <= forces.discs.radius * (1 + rounding)).all())
 
 
 def _noise(s: Solution, size: float, rng: np.random.Generator, m: int) -> Solution:

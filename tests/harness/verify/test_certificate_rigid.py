@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from mortarbench.harness import Case, Solution, Status, UncertifiableError, certify
-from mortarbench.harness.mechanics import Extended, Mechanics, Real, cancelling
+from mortarbench.harness.mechanics import (
+    NO_FRICTION,
+    AdmissibleForces,
+    Extended,
+    Mechanics,
+    Real,
+    cancelling,
+)
 from mortarbench.harness.names import parse
 from mortarbench.harness.verify import certificate
 from mortarbench.harness.verify.admissible import (
@@ -335,9 +342,8 @@ def test_balance_is_not_sought_beyond_what_rounding_allows():
     """Sums of terms that cancel are known to the rounding of the terms only."""
     G, load = np.array([[1.0], [-1.0]], dtype=Real), np.array([1e-21], dtype=Real)
     lam = np.ones(2, dtype=Real)
-    found = _newton(
-        lam, lam, G, load, (0 * lam, np.inf * lam), lambda lam: np.abs(G).T @ lam
-    )
+    forces = AdmissibleForces(2, NO_FRICTION.discs(2))
+    found = _newton(forces, lam, lam, G, load, lambda lam: np.abs(G).T @ lam)
     assert found is not None
     assert (found == lam).all()
 

@@ -19,6 +19,7 @@ from scipy.sparse import block_diag
 from mortarbench.harness import Mechanics, Solution, Status, UncertifiableError, certify
 from mortarbench.harness.mechanics import Extended, Real
 from mortarbench.harness.names import parse
+from mortarbench.harness.sets.convex import hull
 from mortarbench.harness.verify.certificate import Certificate
 from mortarbench.harness.verify.over_ranks import (
     LocalBodies,
@@ -130,10 +131,11 @@ def holds(problem: Known, s: Solution, found: Certificate) -> bool:
     worst = max(problem.error(found.u), problem.error(s.x.astype(Real)))
     within = min(found.error, found.bound * problem.exact.norm)
     motion, lam = exact.motion(found.u), found.multipliers
+    lower, upper = hull(exact.forces.sets, lam.size)
     return bool(
         problem.pair_error(found) <= ROUNDED * found.pair + 2 * slack
         and worst <= ROUNDED * within + slack
-        and (lam >= exact.lower).all() and (lam <= exact.upper).all()
+        and (lam >= lower).all() and (lam <= upper).all()
         and (motion[exact.contact] <= 0).all()
         and (found.u[exact.fixed] == 0).all()
     )  # fmt: skip

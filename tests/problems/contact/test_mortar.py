@@ -330,7 +330,7 @@ def test_before_loading_no_weighted_gap_of_the_paper_is_negative(mesh, basis):
     """Beam and ring are 0.01 m apart; a chord of the arc is farther, never nearer."""
     bodies = model(*mesh, "strain")
     points, (pair,) = bodies.mesh.points, bodies.pairs
-    B, c, *_ = mortar(points, np.zeros(points.size), *pair, basis=basis)
+    B, c, *_ = mortar(points, np.zeros(points.size), *pair.sides, basis=basis)
 
     assert 0 < B.shape[0] < len(pair.slave)  # the flanks face nothing
     assert c.min() > (0.0099 if mesh[1] > 1 else 0.0098)

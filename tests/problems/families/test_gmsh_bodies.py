@@ -13,8 +13,8 @@ from mortarbench.harness import InputError
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
 from mortarbench.problems.contact.bodies import assemble_stiffness
-from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.problems.fem.mesh import Mesh, nodal_lengths
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.problems.models.beam_ring import model
 from mortarbench.problems.models.description import read_bodies
 from mortarbench.solvers import SOLVERS
@@ -630,18 +630,18 @@ def bent(points):
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3] * 2]}, {}, {}, 16),
          "cells of type quad8; expected cells of first order: Mesh.ElementOrder = 1"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0]]}, {}, {}, 7), "cells of type "
-         "pyramid; expected no pyramids: volumes of tetrahedra alone, gmsh -3"),
+         "pyramid; expected no pyramids: volumes of tetrahedra alone"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 2, 3, 0] * 2]}, {}, {}, 11), "cells of type"
          " tetra10; expected cells of first order: Mesh.ElementOrder = 1 in the .geo "
          "file, or gmsh -3 -order 1"),
         (lambda p, c: (p, {"a": c[:, [0, 1, 1]]}, {}, {}, 2), "has no area; expected"),
-        (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected each in a"
-         ' named surface: Physical Surface("NAME") in the .geo file'),
+        (lambda p, c: (p, {"": c}, {}, {}), "4 cells without a name; expected a name "
+         'for each: Physical Surface("NAME") in the .geo file'),
         # the file has no cells of a surface that has no physical name
         (lambda p, c: (p, {"a": c[:1]}, {"m": [[7, 8]]}, {}), "curve 'm' has an edge "
-         "that bounds no body in the file: gmsh leaves out surfaces without a physical "
-         'name; expected Physical Surface("NAME") in the .geo file'),
-        (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no named surface with cells"),
+         "that bounds no body in the file; expected every body to have a name: "
+         'Physical Surface("NAME") in the .geo file'),
+        (lambda p, c: (p, {}, {"b": c[:, :2]}, {}), "no physical surface with cells"),
         (lambda p, c: (p, {"a": c[:2], "b": c[2:]}, {}, {}), "bodies 'a' and 'b'"),
         (lambda p, c: (p, {"a": c[[0, 0]]}, {"m": c[3:, 1:3]}, {}), "curve 'm' has an"),
         (lambda p, c: (p, {"a": c}, {"m": [[1, 4]]}, {}), "curve 'm' has an edge that"),
@@ -701,7 +701,7 @@ def test_cells_that_are_saved_without_a_name_have_two_remedies(tmp_path, writer)
         read_msh(tmp_path / "m.msh")
 
     assert str(e.value).endswith(
-        "m.msh: 3 cells without a name; expected each in a named surface: "
+        "m.msh: 3 cells without a name; expected a name for each: "
         'Physical Surface("NAME") in the .geo file; or, if they are of no body, save '
         "only physical groups: Mesh.SaveAll = 0"
     )

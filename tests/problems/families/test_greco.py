@@ -119,3 +119,38 @@ def test_values_out_of_range_are_refused(name, message):
 def test_an_iterate_beyond_the_last_is_refused():
     with pytest.raises(InputError, match="iterate=99: the fixed point of step 1 has"):
         solved(2, iterate=99)
+
+
+@pytest.mark.parametrize(
+    ("n", "depth"), [(4, 2), pytest.param(8, 2, marks=pytest.mark.slow)]
+)
+@pytest.mark.parametrize("form", ["primal", "dual", "dual-bounds"])
+def test_every_layer_of_the_extruded_plate_is_the_plane_one(n, depth, form):
+    points, states, u = [], [], []
+    for keys in ({}, {"dim": 3, "depth": depth}):
+        params = FAMILY.complete({"n": n, **keys})
+        case = FAMILY.build(form, params, reference_solution)
+        s = reference_solution(case.qp)
+        fields, values = case.fields(s), case.quantities(s)
+        (side,) = fields.contacts
+        points.append((fields.points, fields.points[side.nodes]))
+        states.append((side.friction, values))
+        u.append(fields.displacement)
+    (plane, ground), (space, layers) = points
+    # of each node in space, the plane node below it
+    below = np.array([np.abs(plane - x[:2]).sum(axis=1).argmin() for x in space])
+
+    assert abs(u[1][:, :2] - u[0][below]).max() < 1e-8 * abs(u[0]).max()
+    assert abs(u[1][:, 2]).max() < 1e-8 * abs(u[0]).max()
+    for z in np.unique(layers[:, 2]):
+        x = layers[layers[:, 2] == z]
+        order = np.argsort(x[:, 0])[: len(ground)]  # the corner has no row
+        layer = states[1][0][layers[:, 2] == z][order]
+        assert layer.tolist() == states[0][0][np.argsort(ground[:, 0])].tolist()
+    for name in ("normal_force", "tangential_sum", "published_error"):
+        assert states[1][1][name] == pytest.approx(states[0][1][name], rel=1e-8)
+
+
+def test_layers_in_the_plane_are_refused():
+    with pytest.raises(InputError, match="depth=2 is not used by dim=2"):
+        FAMILY.check(FAMILY.complete({"depth": 2}))

@@ -1,4 +1,4 @@
-"""A sphere on a rigid plane: Hertz's digits, scaling, equilibrium of the far field."""
+"""Spheres in contact: Hertz's digits, scaling, equilibrium of the far field."""
 
 from functools import cache
 
@@ -8,6 +8,7 @@ import pytest
 from mortarbench.harness import InputError, certify
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
+from mortarbench.problems.models.half_space.point_contact import PointContact
 from mortarbench.problems.models.solids.hertz_sphere import point_force_stress
 from mortarbench.solvers import SOLVERS
 from mortarbench.solvers.reference.solve import reference_solution
@@ -41,12 +42,81 @@ def test_radius_pressure_and_approach_are_those_of_hertz():
     assert r[touching].max() == pytest.approx(0.648715, abs=1.5 * 0.648715 / 8)
 
 
+#: two spheres of steel-like numbers, with which MOOSE is verified: a/R = 0.05
+MOOSE = "against=sphere/R=2/E=1.40625e7/nu=0.25/load=10000"
+
+
+#: a, p₀ and the approach of these spheres, and of two with the default keys: half the
+#: modulus and half the radius of the sphere on a plane, hence the same a and p₀
+OF_MOOSE, OF_TWO = (0.1, 15000 / np.pi / 0.01, 0.01), (0.648715, 11.345743, 0.105208)
+
+
+@pytest.mark.parametrize(
+    ("keys", "exact", "limit"),
+    [
+        pytest.param("n=8/against=sphere", OF_TWO, 0.01, marks=pytest.mark.slow),
+        pytest.param(f"n=8/{MOOSE}", OF_MOOSE, 0.01, marks=pytest.mark.slow),
+        ("n=3/against=sphere", OF_TWO, 0.03),
+        (f"n=4/{MOOSE}/basis=standard", OF_MOOSE, 0.03),
+        (f"n=4/{MOOSE}/contact=nts", OF_MOOSE, 0.03),
+    ],
+)
+def test_two_spheres_on_meshes_that_do_not_match_touch_as_hertz_says(
+    keys, exact, limit
+):
+    values = solved(f"{keys}/dual")[2]
+    a, p0, approach = exact
+    P = p0 * 2 / 3 * np.pi * a**2
+
+    assert values["contact_radius"] == pytest.approx(a, rel=limit)
+    assert values["p_max"] == pytest.approx(p0, rel=limit)
+    assert values["approach"] == pytest.approx(approach, rel=limit)
+    assert values["contact_force"] == [0, 0, pytest.approx(-P, rel=1e-5)]
+    assert abs(values["force_error"]) < 1e-9
+    force = values["contacts"]["upper on lower"]["force"]
+    assert force["lower"] == values["contact_force"]
+    assert force["upper"] == [0, 0, -force["lower"][2]]
+
+
+def test_the_support_of_the_lower_sphere_along_z_has_no_reaction():
+    case, s, _ = solved("n=3/against=sphere/dual")
+    primal, point = case.mechanics.primal, case.mechanics.to_primal(s)
+    points = case.fields(s).points
+    on_axis = (points[:, :2] == 0).all(axis=1)
+    (node,) = np.flatnonzero(on_axis & (points[:, 2] == points[:, 2].min()))
+    reaction = (primal.P @ point.x + primal.q)[3 * node + 2]
+
+    assert 3 * node + 2 in primal.A.indices
+    assert abs(point.x[3 * node + 2]) <= 1e-12
+    assert abs(reaction) <= 1e-10
+
+
+def test_formulae_have_the_digits_of_two_larger_spheres():
+    """R = 50, E = 2e4, ν = 0.3, approach 4: a = 10 is beyond this family's a/R."""
+    modulus = 2e4 / (1 - 0.3**2) / 2
+    exact = PointContact(4 / 3 * modulus * 10**3 / 25, 25, modulus)
+
+    assert exact.a == pytest.approx(10, rel=1e-12)
+    assert exact.approach == pytest.approx(4, rel=1e-12)
+    assert exact.p0 == pytest.approx(2798.329, abs=5e-4)
+    keys = f"against=sphere/R=50/E=2e4/nu=0.3/load={exact.P}/dual"
+    with pytest.raises(InputError, match="the contact radius 10 is more than R/8 = 6"):
+        parse(f"hertz-sphere/{keys}", PROBLEMS).build(reference_solution)
+
+
 @pytest.mark.parametrize(
     ("keys", "solver"),
-    [("n=3/primal", "piqp"), ("n=3/dual", "clarabel"), ("n=3/feti=4/dual", "smalbe")],
+    [
+        ("n=3/primal", "piqp"),
+        ("n=3/dual", "clarabel"),
+        ("n=3/feti=4/dual", "smalbe"),
+        ("n=2/against=sphere/primal", "piqp"),
+        ("n=2/against=sphere/feti=4/dual", "smalbe"),
+    ],
 )
 def test_every_form_has_the_same_contact(keys, solver):
-    expected, found = solved("n=3/dual")[2], solved(keys, solver)[2]
+    form = keys.replace("/feti=4", "").replace("primal", "dual")
+    expected, found = solved(form)[2], solved(keys, solver)[2]
 
     for name in ("contact_radius", "p_max", "approach", "energy", "active"):
         assert found[name] == pytest.approx(expected[name], rel=1e-7)
@@ -102,7 +172,9 @@ def test_the_far_field_is_in_equilibrium_with_the_force():
     [
         ("load=100/dual", "the contact radius 1.398 is more than R/8 = 1"),
         ("nu=0.5/dual", "nu=0.5 must be between -1 and 0.5"),
-        ("against=sphere/dual", "against='sphere' is unknown, expected 'plane'"),
+        ("against=spher/dual", "against='spher' is unknown, expected 'plane' or 'sph"),
+        ("contact=nts/dual", "contact=nts is not used by against=plane; expected aga"),
+        ("basis=standard/dual", "basis=standard is not used by against=plane"),
         ("dual-bounds", "dual-bounds"),
         ("n=0/dual", "n=0 must be at least 1"),
     ],

@@ -174,7 +174,6 @@ def test_the_displacement_in_space_is_the_exact_linear_one(form):
             dict(dim=3, plane="stress"),
             "plane=stress with dim=3 is not built; expected plane",
         ),
-        (dict(dim=3, friction="tresca", bound=1.0), "friction=tresca with dim=3 is"),
         (dict(dim=3, kinematics="finite"), "kinematics=finite with dim=3 is not built"),
     ],
 )

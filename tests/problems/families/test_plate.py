@@ -18,12 +18,15 @@ CANTILEVER = (
     "plate/Sy=2/n=5/ny=10/width=3.0/height=1.5/pattern=column/jump=0.001/load=nodal/"
     "plane=stress/supports=eliminated/glue=redundant"
 )
+CUBES = {"dim": 3, "Sx": 2, "Sy": 2, "Sz": 2}
 #: κ(PFP), ‖PFP‖, κ lumped, κ Dirichlet; n multipliers
 PUBLISHED = [
     ({"Sx": 2, "Sy": 2}, 56, (9.9829, 5.63810, 2.9140, 1.8597)),
     ({"Sx": 2, "Sy": 2, "n": 8}, 104, (19.4934, 10.92276, 5.5564, 2.7512)),
     ({}, 256, (10.7836, 5.96542, 3.0658, 1.8299)),
     ({"Sx": 16, "Sy": 2, "n": 8}, 832, (19.5099, 10.93137, 5.7382, 2.7958)),
+    ({**CUBES, "n": 2}, 348, (15.7460, 21.79912, 2.0329, 1.9021)),
+    ({**CUBES, "n": 4}, 1056, (27.3018, 65.02473, 3.7288, 3.0151)),
 ]
 
 
@@ -81,6 +84,9 @@ def test_the_cantilever_of_msolve_has_its_sizes():
           for glue in ("orthonormal", "chain", "redundant")),
         "plate/Sx=3/Sy=2/n=3/load=point/supports=eliminated",
         CANTILEVER,
+        *(f"plate/Sx=2/Sy=3/n=2/ny=1/pattern=checkerboard/jump=100.0/glue={glue}/dim=3"
+          "/Sz=2" for glue in ("orthonormal", "chain", "redundant")),
+        "plate/Sx=2/Sy=2/n=2/load=point/supports=eliminated/dim=3/Sz=2",
     ],
 )  # fmt: skip
 def test_the_dual_has_the_displacement_of_the_plate(name):
@@ -99,10 +105,12 @@ def test_the_dual_has_the_displacement_of_the_plate(name):
 
 
 @pytest.mark.parametrize("load", ["point", "edge", "nodal"])
-def test_every_load_pulls_with_one_meganewton(load):
-    f = -model(tuple(FAMILY.complete({"load": load}).items())).primal.q
-    assert f[1::2].sum() == pytest.approx(-1.0)
-    assert not f[0::2].any()
+@pytest.mark.parametrize("keys", [{}, {**CUBES, "n": 2}])
+def test_every_load_pulls_with_one_meganewton(load, keys):
+    params = FAMILY.complete({"load": load, **keys})
+    f = -model(tuple(params.items())).primal.q.reshape(-1, params["dim"])
+    assert f[:, -1].sum() == pytest.approx(-1.0)
+    assert not f[:, :-1].any()
 
 
 @pytest.mark.parametrize(
@@ -114,6 +122,8 @@ def test_every_load_pulls_with_one_meganewton(load):
         ({"Sx": 0}, "Sx=0 must be at least 1"),
         ({"width": -1.0}, "width=-1.0 must be positive"),
         ({"Sx": 1, "Sy": 1, "supports": "eliminated"}, "without any row"),
+        ({"Sz": 2}, "Sz=2 is not used by dim=2"),
+        ({"dim": 3, "plane": "stress"}, "plane=stress with dim=3 is not built"),
     ],
 )
 def test_keys_that_do_not_fit_are_refused(keys, message):

@@ -127,12 +127,9 @@ def test_pressure_picture_and_grid_are_written(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("old", "new", "keys", "message"),
     [
-        ("", "", "/friction=coulomb/mu=0.3", "friction=coulomb with volumes is not"),
         ("", "", "/kinematics=finite", "kinematics=finite with volumes is not built"),
         ("", "", "/plane=stress", "plane=stress with volumes is not built; expected"),
         ("", "", "/halvings=1", "halvings=1 with volumes is not built; expected halvi"),
-        ('master = "table"', 'master = "table"\nfriction = "coulomb"\nmu = 0.3', "",
-         "contacts[0]: friction 'coulomb' with volumes is not built; expected no fric"),
         ('name = "lower"', 'name = "lowr"', "",
          "bodies[0]: name: unknown physical volume 'lowr'; did you mean 'lower'?"),
         ('boundary = "base"', 'boundary = "bass"', "",

@@ -29,6 +29,8 @@ CASES = [
     ("cube-wall/n=4", "feti=2"),
     ("cube-wall/n=3", "feti=2"),
     ("hertz-sphere/n=1", "feti=3"),
+    ("contact-patch/lower=4/upper=3/dim=3/distort=0.2", "feti=2"),
+    ("beam-ring/Nr=1/Nh=1/steps=2/depth=2", "feti=2"),
     ("obstacle/n=8", "feti=3"),
     ("obstacle/dim=1/n=12", "feti=4"),
 ]

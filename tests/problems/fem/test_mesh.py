@@ -3,7 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mortarbench.problems.fem.gmsh_mesh import read_msh, refine
 from mortarbench.problems.fem.mesh import (
     half_disc,
     half_ring,
@@ -12,6 +11,8 @@ from mortarbench.problems.fem.mesh import (
     prefixed,
     rectangle,
 )
+from mortarbench.problems.fem.mesh_files.named import refine
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.problems.models.beam_ring import model
 from tests.support import ROOT
 

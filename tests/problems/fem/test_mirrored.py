@@ -51,7 +51,9 @@ def mirrored(bodies, about):
     return again(
         bodies, mesh=type(mesh)(points, mesh.cells[:, ::-1], sides),
         load=flip * bodies.f * bodies.force,
-        pairs=tuple(ContactPair(*(side[::-1] for side in p)) for p in bodies.pairs),
+        pairs=tuple(
+            ContactPair(*(side[::-1] for side in p.sides)) for p in bodies.pairs
+        ),
     )  # fmt: skip
 
 

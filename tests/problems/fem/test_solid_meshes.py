@@ -6,8 +6,8 @@ import pytest
 
 from mortarbench.harness import Fields, InputError
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix, stiffness
-from mortarbench.problems.fem.gmsh_mesh import read_msh
 from mortarbench.problems.fem.mesh import Mesh, box
+from mortarbench.problems.fem.mesh_files.reading import read_msh
 from mortarbench.reports.export.vtu import write_vtu
 from tests.support.hexahedra import TETRAHEDRA, WEDGES, divided
 
@@ -134,8 +134,8 @@ def test_mirrored_cells_are_turned(tmp_path, kind):
         (lambda b: b.cells[:, [0, 2, 1, 3, 4, 5, 6, 7]], "the hexahedron around "
          "(0.25, 0.25, 0.25) has no volume or folds over; expected distinct corners"),
         (lambda b: b.cells[[0, 1, 2, 7]], "surface 'block_top' has a face that bounds "
-         "no body in the file: gmsh leaves out volumes without a physical name; "
-         'expected Physical Volume("NAME") in the .geo file'),
+         "no body in the file; expected every body to have a name: "
+         'Physical Volume("NAME") in the .geo file'),
         (lambda b: np.hstack([b.cells, b.cells, b.cells[:, :4]]), "cells of type "
          "hexahedron20; expected cells of first order: Mesh.ElementOrder = 1 in the "
          ".geo file, or gmsh -3 -order 1"),
@@ -164,6 +164,6 @@ def test_what_cannot_be_read_is_refused_in_one_line(tmp_path, change, message):
 def test_volumes_without_a_name_are_refused(tmp_path):
     path = write(tmp_path / "a.msh", {"block": CUBE})
     path.write_text(path.read_text().replace('3 1 "block"', '3 77 "block"'))
-    with pytest.raises(InputError, match="8 cells without a name; expected each in a "
-                       r'named volume: Physical Volume\("NAME"\)'):  # fmt: skip
+    with pytest.raises(InputError, match="8 cells without a name; expected a name for "
+                       r'each: Physical Volume\("NAME"\)'):  # fmt: skip
         read_msh(path)

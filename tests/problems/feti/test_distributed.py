@@ -279,7 +279,7 @@ def test_a_row_reaches_the_ranks_of_its_subdomains_and_one_of_them_owns_it(torn)
 def test_subdomains_are_weighed_by_dense_blocks_and_joined_by_rows(torn, monkeypatch):
     seen = {}
 
-    def noted(graph, work, size, ranks):
+    def noted(graph, work, size, ranks, cluster):
         seen.update(graph=graph.toarray(), work=work, size=size)
         return np.arange(size.size) % ranks
 

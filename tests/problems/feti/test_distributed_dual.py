@@ -8,9 +8,12 @@ import sys
 import numpy as np
 import pytest
 
+from mortarbench.harness import InputError
 from mortarbench.harness.distributed import mpi
+from mortarbench.harness.distributed.vectors import single_process
 from mortarbench.harness.names import parse
 from mortarbench.problems import PROBLEMS
+from mortarbench.solvers.reference.over_ranks import reference_over_ranks
 from tests.support import ROOT, SUPPORT, press
 
 pytestmark = pytest.mark.together
@@ -28,6 +31,8 @@ CASES = (
     "obstacle/n=11/shape=hemisphere/feti=4/dual",
     "hertz-cylinder/n=2/m=3/feti=5/friction=tresca/bound=1e5/slave=lower/dual",
     "cube-wall/n=4/feti=2/dual",
+    "plate/Sx=2/Sy=2/n=2/pattern=checkerboard/jump=10/dim=3/Sz=2/dual",
+    "contact-patch/lower=3/upper=2/feti=2/dim=3/distort=0.2/dual",
 )
 #: that solutions come before, by number of cells the smallest there are: contact is
 #: linearised there, or the bound of Coulomb's law is theirs
@@ -128,6 +133,15 @@ def test_what_follows_solutions_is_what_one_process_poses(ranks):
         assert of["sizes"][0] == of["sizes"][1]
         assert of["entries"][0] == of["entries"][1]
         assert max(*of["errors"].values(), *of["bounds"]) < SOLVED, (name, of)
+
+
+def test_friction_in_space_is_refused_on_ranks():
+    """Its multipliers are in discs, not between bounds."""
+    name = "contact-patch/lower=2/upper=2/friction=tresca/bound=1e5/feti=1/dim=3/dual"
+    case = parse(name, PROBLEMS)
+    emit = case.family.emission("dual", case.params)
+    with pytest.raises(InputError, match="friction in space on MPI ranks is not built"):
+        emit(single_process(), reference_over_ranks).share()
 
 
 @pytest.mark.parametrize("ranks", [1, pytest.param(2, marks=pytest.mark.slow)])

@@ -29,7 +29,9 @@ def box() -> Mesh:
     return Mesh((mesh.points + bump[:, None]) @ shear, mesh.cells, {})
 
 
-def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> LocalSubdomains:
+def torn(
+    mesh: Mesh, fixed: np.ndarray, parts: int = 4, glue: str = "orthonormal"
+) -> LocalSubdomains:
     """Cut a body by METIS, under gravity."""
     down = dofs_of(np.arange(len(mesh.points)), 3, 2)
     forces = Forces(down, np.full(down.size, -1.0))
@@ -41,7 +43,7 @@ def torn(mesh: Mesh, fixed: np.ndarray, parts: int = 4) -> LocalSubdomains:
     (stage,) = load_steps(1, 1, forces, fixed)
     none = Contact(csr_array((0, mesh.dofs)), np.zeros(0), np.zeros(0))
     layout = of.shape.layout(parts)
-    return on_one_process(decompose(of, layout, "orthonormal", stage, none))
+    return on_one_process(decompose(of, layout, glue, stage, none))
 
 
 def stored(own: LocalSubdomains) -> csr_array:
@@ -77,6 +79,28 @@ def test_a_floating_body_has_six_orthonormal_motions_that_cost_nothing():
     assert_allclose(R.T @ R, np.eye(6), atol=1e-14)
     assert abs(stored(own) @ R).max() <= 1e-13 * abs(stored(own)).max()
     assert_allclose(floating.combinations, np.eye(6))
+
+
+@pytest.mark.parametrize("parts", [6, 12])
+@pytest.mark.parametrize("glue", ["orthonormal", "chain", "redundant"])
+def test_rows_hold_copies_together_at_faces_edges_and_corners_and_nothing_else(
+    glue, parts
+):
+    """Up to 8 copies of a node: B_E v = 0 for v = T u with u = 0 at supports only."""
+    mesh = box()
+    fixed = dofs_of(np.flatnonzero(mesh.points[:, 2] == 0), 3)
+    own = torn(mesh, fixed, parts, glue)
+    B, T = own.rows.B.toarray(), own.spread.toarray()
+    free = np.setdiff1d(np.arange(mesh.dofs), fixed)
+    sizes = np.linalg.svd(B, compute_uv=False)
+    rank = int((sizes > 1e-10 * sizes[0]).sum())
+
+    assert own.nodes.multiplicity.max() >= 3
+    assert rank == B.shape[1] - free.size
+    assert abs(B @ T[:, free]).max() <= 1e-14
+    if glue == "orthonormal":
+        assert_allclose(B @ B.T, np.eye(rank), atol=1e-14)
+    assert (rank == len(B)) == (glue != "redundant")
 
 
 #: motions that a face across x leaves that is held along some axes

@@ -11,14 +11,19 @@ from scipy.sparse import block_diag, csr_array, eye_array
 from mortarbench.problems.contact.stepping import Forces
 from mortarbench.problems.duality.decomposed import elastic_class, force_lookup
 from mortarbench.problems.fem.elasticity import Material, elasticity_matrix
-from mortarbench.problems.fem.mesh import rectangle
+from mortarbench.problems.fem.mesh import box_grid, rectangle
 from mortarbench.problems.feti.subdivision import mesh_in_subdomains
 from mortarbench.problems.feti.subdomains import (
     Contact,
     DecomposedProblem,
     on_one_process,
 )
-from mortarbench.problems.feti.tearing import blocks, compact_blocks, label_blocks
+from mortarbench.problems.feti.tearing import (
+    blocks,
+    compact_blocks,
+    compact_boxes,
+    label_blocks,
+)
 from tests.support.decomposed_bodies import decomposed_pair
 from tests.support.glued import decompose, glue, structured_bodies
 
@@ -90,6 +95,53 @@ def test_a_compact_block_as_long_as_wide_is_cut_between_rows() -> None:
     found = compact_blocks(sides(np.full(3, 4.0), np.full(4, 3.0)), 3)
 
     assert found == [(slice(0, 2), slice(0, 3)), (slice(2, 4), slice(0, 3))]
+
+
+def boxed(*axes):
+    """Points of a box between coordinates x, y and z, an axis per direction."""
+    sizes = [len(axis) for axis in axes[::-1]]
+    return box_grid(*map(np.asarray, axes)).points.reshape(*sizes, 3)
+
+
+@pytest.mark.parametrize("cells", [(8, 4, 4), (9, 6, 3), (4, 1, 2), (13, 10, 7)])
+@pytest.mark.parametrize("most", [1, 2, 3, 4])
+def test_boxes_of_cubes_are_cut_as_evenly_as_whole_numbers_allow(cells, most):
+    label = compact_boxes(boxed(*(np.arange(n + 1.0) for n in cells)), most)
+    even = blocks(cells, most)
+
+    assert sorted(np.bincount(label)) == sorted(np.bincount(even))
+    if all(n % most == 0 for n in cells):
+        assert (label == even).all()
+
+
+@pytest.mark.parametrize(
+    ("thickness", "layers"), [(4.0, 1), (2.0, 2), (1.0, 4), (0.5, 4)]
+)
+def test_boxes_of_slender_cells_have_fewer_cells_along_the_longer_sides(
+    thickness, layers
+):
+    x, z = np.arange(9.0), thickness * np.arange(9.0)
+    label = compact_boxes(boxed(x, x, z), 4).reshape(8, 8, 8)
+    in_plane = 4 if thickness >= 1 else 2
+
+    assert len(set(label[:, 0, 0])) == 8 // layers
+    assert len(set(label[0, :, 0])) == len(set(label[0, 0])) == 8 // in_plane
+
+
+def test_boxes_of_graded_cells_are_compact_everywhere():
+    fine = np.array([0, 1, 2, 3, 4, 6, 9, 14, 22, 34.0])
+    points = boxed(fine, fine, fine)
+    label = compact_boxes(points, 4).reshape(9, 9, 9)
+
+    for part in range(label.max() + 1):
+        cells = np.argwhere(label == part)
+        low, high = cells.min(axis=0), cells.max(axis=0) + 1
+        assert len(cells) == np.prod(high - low)  # a box
+        length = fine[high] - fine[low]
+        h = length / (high - low)
+        assert (high - low <= 4).all()
+        # half a cell by rounding their number; a single cell cannot be cut
+        assert ((length <= 4 * h.min() + h / 2) | (high - low == 1)).all()
 
 
 @pytest.mark.parametrize("seed", range(5))

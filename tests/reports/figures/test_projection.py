@@ -6,9 +6,10 @@ import pytest
 from mortarbench.harness import ContactSide, Fields
 from mortarbench.harness.mechanics import boundary_facets
 from mortarbench.problems.fem.mesh import Mesh, box, join
-from mortarbench.reports.document.fields import ColourScale, Faces, Label, Path
+from mortarbench.reports.document.fields import ColourScale, Faces, Label, Path, Vectors
 from mortarbench.reports.figures.deformed import deformed_figure
 from mortarbench.reports.figures.projection import (
+    camera_above,
     camera_seeing,
     camera_towards,
     crease_edges,
@@ -61,11 +62,16 @@ def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
     )
     outlines = np.isnan(faces.values)
 
-    assert outlines.sum() == 12  # of the 24 faces
     assert (face_normals(CUBE.points, facets) @ camera.towards > 0).sum() == 12
-    tiles = (len(outlines) - 12) / 12
-    last = (np.arange(1, 13) * (tiles + 1) - 1).astype(int)
-    assert (np.flatnonzero(outlines) == last).all()
+    tiles = (~outlines).sum() / 12  # of the 24 faces
+    # outlines consist of straight pieces, as long as the edges of the faces in all
+    pieces = faces.corners[outlines]
+    assert len(pieces) == 12 * 4 * np.sqrt(tiles)
+    assert (pieces[:, 0] == pieces[:, 3]).all()
+    assert (pieces[:, 1] == pieces[:, 2]).all()
+    edges = camera.project(0.5 * np.eye(3))
+    length = np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1).sum()
+    assert length == pytest.approx(16 * np.linalg.norm(edges, axis=1).sum())
     # the silhouette of a cube is covered once
     x, y = np.moveaxis(faces.corners[~outlines], -1, 0)
     area = (x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1) / 2
@@ -75,6 +81,55 @@ def test_faces_towards_the_camera_are_drawn_with_their_values_back_to_front():
     assert np.nanmax(faces.values) == pytest.approx(1)
     tops = (faces.values[~outlines] > 1 - 1e-9).sum()
     assert tops == 4 * tiles
+
+
+def test_a_large_face_is_not_drawn_over_a_small_body_on_it():
+    """The middle of the table is nearer to the camera than the back of the block."""
+    table, block = box((-9, -1, -1), (20, 9, 1), (1, 1, 1)), box((0, 5, 0), (1, 1, 1),
+                                                                 (1, 1, 1))  # fmt: skip
+    mesh, _ = join((table, block))
+    camera = camera_above(np.array([0.0, 0.0, -1.0]))
+    values = np.repeat([0.25, 0.75], 8)
+    facets = boundary_facets(mesh.cells, 3)
+    drawn = visible_faces(camera, mesh.points, facets, values, SCALE, mesh=False)
+    front = camera.project(np.array([0.5, 5.0, 0.6]))  # on the front of the block
+    middles = drawn.corners.mean(axis=1)
+    around = np.abs(middles - front).max(axis=1) < 0.15
+
+    assert drawn.values[around][-1] == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize("normal", [*np.eye(3), *-np.eye(3)])
+def test_a_camera_above_looks_down_at_vertical_sides(normal):
+    camera = camera_above(normal)
+
+    assert camera.towards[2] > 0.3
+    assert normal[2] or normal @ camera.towards > 0.3
+
+
+def test_friction_is_drawn_as_arrows_by_state_along_the_tractions():
+    top = np.flatnonzero(CUBE.points[:, 2] == 1)
+    force = np.zeros((9, 3))
+    force[:3] = [[0, 2, 0], [1, 0, 0], [0, 0, 0]]
+    area = np.full(9, 0.25)
+    side = ContactSide(
+        name="cube on wall", nodes=top, length=area, force=force, pressure=area,
+        gap=0 * area, friction=np.array(["slip", "stick", "stick", *["open"] * 6]),
+        friction_force=force,
+    )  # fmt: skip
+    panel = deformed_figure(state(CUBE, (side,))).panels[1]
+    slip, stick = sorted(
+        (m for m in panel.marks if isinstance(m, Vectors)), key=lambda m: m.colour
+    )[::-1]
+
+    assert panel.title.splitlines()[1:] == [
+        "arrows: friction on the slave, at most 8 Pa",
+        "stick: blue (2), slip: red (1), open: grey (6)",
+    ]
+    assert slip.colour != stick.colour
+    np.testing.assert_allclose(slip.feet, CUBE.points[top[:1], :2])
+    np.testing.assert_allclose(slip.vectors[0] / stick.vectors[0, 0], [0, 2])
+    assert stick.vectors[0, 1] == 0 < stick.vectors[0, 0]
 
 
 def test_a_body_behind_another_is_drawn_first():

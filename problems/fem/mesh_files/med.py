@@ -1,0 +1,134 @@
+"""Reader of MED files of Salome, gmsh and code_aster (.med): HDF5.
+
+::
+
+    ENS_MAA/MESH[/STEP]/NOE/COO         coordinates, one component after the other
+    ENS_MAA/MESH[/STEP]/MAI/TYPE/NOD    first corners of all cells, second corners, …
+    …/FAM                               family of each node or cell; 0: none
+    FAS/MESH/(NOEUD|ELEME)/FAMILY       attribute NUM, GRO/NOM: groups of the family
+
+meshio's reader is not used: it refuses files in which one kind of cells has no families
+(edges of Salome), reads results with the mesh, and follows links to other files.
+
+Reference: EDF, CEA, Open Cascade, MED-file 4.1, https://docs.salome-platform.org.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mortarbench.harness import InputError
+from mortarbench.harness.files.datafile import check_size, opened, parsing
+from mortarbench.problems.fem.mesh import Nodes
+from mortarbench.problems.fem.mesh_files.named import DIMENSION, FileMesh, Words
+
+_EXPECTED = "a .med file"
+_KINDS = {
+    "PO1": "vertex", "SE2": "line", "TR3": "triangle", "QU4": "quad", "TE4": "tetra",
+    "PE6": "wedge", "HE8": "hexahedron", "PY5": "pyramid", "SE3": "line3",
+    "TR6": "triangle6", "TR7": "triangle7", "QU8": "quad8", "QU9": "quad9",
+    "T10": "tetra10", "P15": "wedge15", "H20": "hexahedron20", "H27": "hexahedron27",
+}  # fmt: skip
+_LINEAR = "in Salome, Modification, Convert to/from quadratic; in gmsh, -order 1"
+_WORDS = {
+    2: Words("group of faces", "group of edges", "group of nodes",
+             "a group of its faces", _LINEAR),
+    3: Words("group of volumes", "group of faces", "group of nodes or edges",
+             "a group of its volumes", _LINEAR),
+}  # fmt: skip
+#: memory of the tables made from an array, as a multiple of its size
+_PARSER_FACTOR = 8
+
+
+def read_med(path: Path) -> FileMesh:
+    """Read the nodes, cells and groups of the mesh of a file.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged or too large, contains several meshes or time steps, or
+        refers to other files.
+
+    """
+    import h5py  # late: workers of solvers need no HDF5
+
+    nodes: dict[str, Any] = {}
+    with opened(path, _EXPECTED) as stream:
+        with parsing(path, "not a .med file (HDF5), or damaged", 0):
+            file = h5py.File(stream, "r")
+            # visits neither soft nor external links, which may lead to other files
+            file.visititems(nodes.__setitem__)
+            arrays = {k: v for k, v in nodes.items() if isinstance(v, h5py.Dataset)}
+            sizes = [v.size * v.dtype.itemsize for v in arrays.values()]
+            if any(v.external or v.is_virtual for v in arrays.values()):
+                raise InputError(
+                    f"{path}: arrays in other files, which are not opened; expected "
+                    "all data in this file"
+                )
+        check_size(f"{path}: its arrays", _PARSER_FACTOR * sum(sizes))
+        room = _PARSER_FACTOR * sum(sizes)
+        with parsing(path, "not a mesh in MED format, or damaged", room), file:
+            return _mesh(path, nodes)
+
+
+def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
+    names = [k.split("/")[1] for k in nodes if k.count("/") == 1 and k[:7] == "ENS_MAA"]
+    grids = [k[: -len("/NOE/COO")] for k in nodes if k.endswith("/NOE/COO")]
+    if len(names) != 1 or len(grids) != 1:
+        raise InputError(
+            f"{path}: {len(names)} meshes with {len(grids)} time steps; expected one "
+            "mesh with one step"
+        )
+    (name,), (grid,) = names, grids
+    coordinates = np.asarray(nodes[f"{grid}/NOE/COO"][()], dtype=float)
+    dim = int(nodes[f"ENS_MAA/{name}"].attrs["ESP"])
+    blocks: list[tuple[str, Nodes]] = []
+    families = []
+    for key in [k for k in nodes if k.startswith(f"{grid}/MAI/") and k[-4:] == "/NOD"]:
+        numbers = np.asarray(nodes[key][()], dtype=np.int64)
+        kind = _KINDS.get(key.split("/")[-2], key.split("/")[-2])
+        count = int(nodes[key].attrs["NBR"])
+        # a view: cells are stored by corner
+        blocks.append((kind, numbers.reshape(-1, count).T - 1))
+        families.append(_families(nodes, key[:-3], count))
+    cell_sets: dict[int, dict[str, list[Nodes]]] = {}
+    for group, ids in _groups(nodes, f"FAS/{name}/ELEME/").items():
+        for k, ((kind, _), family) in enumerate(zip(blocks, families, strict=True)):
+            if (rows := np.flatnonzero(np.isin(family, ids))).size:
+                sets = cell_sets.setdefault(DIMENSION.get(kind, -1), {})
+                none = np.zeros(0, dtype=np.int64)
+                sets.setdefault(group, [none] * len(blocks))[k] = rows
+    at = _families(nodes, f"{grid}/NOE/", coordinates.size // dim)
+    return FileMesh(
+        path=path, points=coordinates.reshape(dim, -1).T, blocks=blocks,
+        cell_sets=cell_sets,
+        node_sets={
+            group: np.flatnonzero(np.isin(at, ids))
+            for group, ids in _groups(nodes, f"FAS/{name}/NOEUD/").items()
+        },
+        vocabulary=_WORDS,
+    )  # fmt: skip
+
+
+def _families(nodes: Mapping[str, Any], place: str, count: int) -> NDArray[np.int64]:
+    """Return the family of each node or cell; without the array, 0."""
+    if f"{place}FAM" not in nodes:
+        return np.zeros(count, dtype=np.int64)
+    return np.asarray(nodes[f"{place}FAM"][()], dtype=np.int64).reshape(count)
+
+
+def _groups(nodes: Mapping[str, Any], place: str) -> dict[str, list[int]]:
+    """Return the numbers of the families of each group."""
+    groups: dict[str, list[int]] = {}
+    for key in nodes:
+        if key.startswith(place) and key.endswith("/GRO/NOM"):
+            family = int(nodes[key[: -len("/GRO/NOM")]].attrs["NUM"])
+            for letters in np.asarray(nodes[key][()]):
+                text = bytes(np.asarray(letters, dtype=np.uint8)).decode()
+                groups.setdefault(text.split("\0")[0].strip(), []).append(family)
+    return groups

@@ -1,0 +1,47 @@
+"""Reading of a mesh file by the ending of its name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mortarbench.problems.fem.mesh_files.gmsh import read_msh_sets
+from mortarbench.problems.fem.mesh_files.inp import read_inp
+from mortarbench.problems.fem.mesh_files.med import read_med
+from mortarbench.problems.fem.mesh_files.named import (
+    FileMesh,
+    NamedMesh,
+    check_numbers,
+    named_mesh,
+)
+
+_READERS = {".inp": read_inp, ".med": read_med}
+
+
+def read_mesh_file(path: Path) -> FileMesh:
+    """Read cells and sets of a file: .inp, .med, or otherwise a .msh file of gmsh.
+
+    Raises
+    ------
+    InputError
+        When the file is damaged, too large or of another format, or contains cells
+        that are not of first order, or pyramids.
+
+    """
+    file = _READERS.get(path.suffix.lower(), read_msh_sets)(path)
+    check_numbers(file)
+    return file
+
+
+def read_msh(path: Path) -> NamedMesh:
+    """Read bodies and boundaries of a mesh file; all named sets of cells are bodies.
+
+    The file is a .msh file of gmsh with physical groups (format 2.2 or 4.1), an .inp
+    file of Abaqus or CalculiX, or a .med file.
+
+    Raises
+    ------
+    InputError
+        See `read_mesh_file` and `named_mesh`.
+
+    """
+    return named_mesh(read_mesh_file(path))

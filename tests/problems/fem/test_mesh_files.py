@@ -1,0 +1,310 @@
+"""Meshes of Abaqus, CalculiX and Salome: the bodies and sides of the same .msh file."""
+
+import h5py
+import numpy as np
+import pytest
+
+from mortarbench.harness import InputError
+from mortarbench.harness.names import parse
+from mortarbench.problems import PROBLEMS
+from mortarbench.problems.fem.mesh_files.reading import read_msh
+from mortarbench.solvers.reference.solve import reference_solution
+from tests.support.hexahedra import TETRAHEDRA, WEDGES
+from tests.support.mesh_formats import write_inp, write_med
+from tests.support.solid_blocks import TOML, solid_blocks
+
+KINDS = {"tetra": TETRAHEDRA, "wedge": WEDGES, "hexahedron": None}
+WRITERS = {
+    "elements.inp": write_inp,
+    "nodes.inp": lambda source, path: write_inp(source, path, sides="nodes"),
+    "groups.med": write_med,
+}
+
+
+def facets(named, name):
+    """Corners of the facets of a side by their coordinates, in any order."""
+    places = named.points.round(12).tolist()
+    return {frozenset(tuple(places[n]) for n in facet)
+            for facet in named.curves[name].tolist()}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", WRITERS)
+def test_a_mesh_has_the_bodies_and_sides_of_the_msh_file(tmp_path, kind, name):
+    path = solid_blocks(tmp_path, KINDS[kind])
+    expected = read_msh(tmp_path / "blocks.msh")
+    WRITERS[name](tmp_path / "blocks.msh", tmp_path / name)
+    path.write_text(TOML.replace("blocks.msh", name))
+    energies = []
+    for mesh in ("blocks.msh", name):
+        path.write_text(TOML.replace("blocks.msh", mesh))
+        case = parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+        energies.append(case.quantities(reference_solution(case.qp))["energy"])
+    chosen = named_like(tmp_path / name, expected)
+
+    assert energies[1] == pytest.approx(energies[0], rel=1e-12)
+    for side in expected.curves:
+        assert facets(chosen, side) == facets(expected, side)
+        # from outside the corners are anticlockwise
+        for one in (chosen, expected):
+            a, b, c, d = np.moveaxis(one.points[one.curves[side]], 1, 0)
+            one.spots[f"area {side}"] = np.cross(c - a, d - b).sum(axis=0)
+        np.testing.assert_allclose(
+            chosen.spots[f"area {side}"], expected.spots[f"area {side}"], atol=1e-12
+        )
+
+
+def named_like(path, expected):
+    from mortarbench.problems.fem.mesh_files.named import named_mesh
+    from mortarbench.problems.fem.mesh_files.reading import read_mesh_file
+
+    return named_mesh(read_mesh_file(path), expected.surfaces)
+
+
+#: the corners of one element, and the plane of each face S1, S2, …: axis and position,
+#: or None for the oblique face
+ONE = {
+    "C3D8": (
+        [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0),
+         (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)],
+        [(2, 0), (2, 1), (1, 0), (0, 1), (1, 1), (0, 0)],
+    ),
+    "C3D6": (
+        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (0, 1, 1)],
+        [(2, 0), (2, 1), (1, 0), None, (0, 0)],
+    ),
+    "C3D4": (
+        [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
+        [(2, 0), (1, 0), None, (0, 0)],
+    ),
+    "CPE4": ([(0, 0), (1, 0), (1, 1), (0, 1)], [(1, 0), (0, 1), (1, 1), (0, 0)]),
+    "CPS3": ([(0, 0), (1, 0), (0, 1)], [(1, 0), None, (0, 0)]),
+}  # fmt: skip
+
+
+def one_element(kind, more=""):
+    corners, _ = ONE[kind]
+    nodes = "\n".join(
+        f"{i}, {', '.join(map(str, x))}" for i, x in enumerate(corners, 1)
+    )
+    numbers = ", ".join(str(i) for i in range(1, len(corners) + 1))
+    return f"*Node\n{nodes}\n*Element, type={kind}, elset=Body\n5, {numbers}\n{more}"
+
+
+@pytest.mark.parametrize("kind", ONE)
+def test_faces_of_elements_have_the_numbers_of_the_manual(tmp_path, kind):
+    planes = ONE[kind][1]
+    surfaces = "".join(
+        f"*Surface, name=F{i}, type=ELEMENT\n{of}, S{i}\n"
+        for i, of in zip(range(1, len(planes) + 1), ["Body", "5", "BODY", "body"] * 2,
+                         strict=False)
+    )  # fmt: skip
+    (tmp_path / "a.inp").write_text(one_element(kind, surfaces))
+    named = read_msh(tmp_path / "a.inp")
+
+    assert list(named.surfaces) == ["Body"]
+    for i, plane in enumerate(planes, 1):
+        points = named.points[named.curves[f"F{i}"]].reshape(-1, named.dim)
+        if plane is None:
+            in_plane = (
+                points.sum(axis=1) if kind != "C3D6" else points[:, :2].sum(axis=1)
+            )
+            assert (in_plane == 1).all()
+        else:
+            assert (points[:, plane[0]] == plane[1]).all()
+
+
+def test_sets_may_be_generated_nested_continued_and_in_any_case(tmp_path):
+    sets = (
+        "*NSET, NSET=low, GENERATE\n1, 4, 1\n*nset, nset=Odd\n1, 3,\n5, 7\n"
+        '*NSET, NSET="all"\nlow, ODD, 2\n*NSET, NSET=all\n8\n'
+        "*SURFACE, NAME=under, TYPE=NODE\nlow, 1.0\n"
+    )
+    (tmp_path / "a.inp").write_text(one_element("C3D8", sets))
+    named = read_msh(tmp_path / "a.inp")
+    at = {name: set(named.points[nodes][:, 2]) for name, nodes in named.spots.items()}
+
+    assert {k: len(v) for k, v in named.spots.items()} == {
+        "low": 4, "Odd": 4, "all": 7, "under": 4,
+    }  # fmt: skip
+    assert at["low"] == at["under"] == {0}
+    # a set of nodes is a boundary if it contains all corners of a facet
+    assert {k: len(v) for k, v in named.curves.items()} == {
+        "low": 1, "all": 3, "under": 1,
+    }  # fmt: skip
+
+
+def test_nodes_may_come_in_several_blocks_and_lines_may_end_in_a_comma(tmp_path):
+    """meshio keeps the last block of nodes only."""
+    text = one_element("C3D8").replace("\n5, 0, 0, 1", ",\n*NODE\n5, 0, 0, 1,")
+    (tmp_path / "a.inp").write_text(text.replace("*Element, ", "*Element,\n"))
+
+    assert len(read_msh(tmp_path / "a.inp").points) == 8
+
+
+def test_sets_that_overlap_the_described_bodies_are_not_needed(tmp_path):
+    path = solid_blocks(tmp_path)
+    write_inp(tmp_path / "blocks.msh", tmp_path / "blocks.inp")
+    path.write_text(TOML.replace("blocks.msh", "blocks.inp"))
+    inp = (tmp_path / "blocks.inp").read_text()
+    (tmp_path / "blocks.inp").write_text(inp + "*ELSET, ELSET=both\nlower, upper\n")
+    case = parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+
+    assert case.fields(reference_solution(case.qp)).bodies.max() == 1
+    for old, new, message in (
+        ('"lower"', '"lowr"', "unknown element set 'lowr'; did you mean 'lower'?"),
+        ('"lower"', '"both"', "element set 'both' shares 8 cells with another body"),
+        ('boundary = "top"', 'boundary = "topp"', "boundary: unknown surface, element "
+         "set or node set 'topp'; did you mean 'top'?"),
+        ('boundary = "top"', 'point = "Body"', "point: unknown node set 'Body'"),
+    ):  # fmt: skip
+        path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(old, new))
+        with pytest.raises(InputError) as e:
+            parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+        assert message in str(e.value)
+    body = TOML[TOML.index('[[bodies]]\nname = "upper"') : TOML.index("[[supports]]")]
+    path.write_text(TOML.replace("blocks.msh", "blocks.inp").replace(body, ""))
+    with pytest.raises(InputError, match=r"bodies: element set '.*' has no entry"):
+        parse(f"bodies:{path}/dual", PROBLEMS).build(reference_solution)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("type=C3D8", "type=C3D20", "elements of type C3D20; expected elements of first"
+         " order: C3D4, C3D6, C3D8, or CPE3, CPE4 in the plane; choose linear (first "
+         "order) elements in the program that wrote the file, in gmsh -order 1"),
+        ("type=C3D8", "type=C3D10", "elements of type C3D10; expected elements of"),
+        ("type=C3D8", "type=MASS", "elements of type MASS; expected elements of first"),
+        ("*Node", "*INCLUDE, INPUT=/etc/passwd\n*Node", "*INCLUDE: other files are not "
+         "opened; expected all data in this file"),
+        ("*Node", "*Node, input=/etc/passwd\n*Node", "*NODE: other files are not open"),
+        ("*Node", "*Part, name=p\n*Node", "*PART: expected a file of *NODE, *ELEMENT, "
+         "*NSET, *ELSET and *SURFACE alone: in Abaqus/CAE, Model, Edit Attributes, Do "
+         "not use parts and assemblies in input files"),
+        ("*Node", "*System\n0,0,1\n*Node", "*SYSTEM: expected a file of *NODE"),
+        ("5, 1,", "5, 99,", "element 5 with node 99, which is not in the file"),
+        ("\n3, 1", "\n2, 1", "node 2 is defined 2 times; expected every number once"),
+        ("*Element", "*Nset, nset=a\n1, 77\n*Element", "set 'a' contains 77, which is"),
+        ("*Element", "*Nset, nset=a\nb\n*Element", "set 'a': unknown set 'b'; known: "),
+        ("*Element", "*Nset\n1\n*Element", "*NSET without a name; expected NSET=NAME"),
+        ("*Element", "*Surface, name=s\nBody, S7\n*Element", "surface 's': unknown "
+         "face of a hexahedron 'S7'; known: S1, S2, S3, S4, S5, S6"),
+        ("*Element", "*Surface, name=s\nBody\n*Element", "surface 's': unknown face"),
+        (", elset=Body", "", "1 cells without a name; expected a name for each: "
+         "*ELEMENT, ELSET=NAME or *ELSET, ELSET=NAME"),
+        ("1, 0, 0, 0", "1, nan, 0, 0", "coordinates are missing or not below 1e+100"),
+        ("1, 0, 0, 0", "1, 0, 0", "not an .inp file of Abaqus or CalculiX, or damaged"),
+        ("*Node", "*Nodes", "no nodes; expected *NODE and *ELEMENT"),
+        ("*Element", "*Elements", "no elements; expected *NODE and *ELEMENT"),
+    ],
+)  # fmt: skip
+def test_an_inp_file_that_cannot_be_read_is_refused_in_one_line(
+    tmp_path, old, new, message
+):
+    path = tmp_path / "a.inp"
+    path.write_text(one_element("C3D8").replace(old, new, 1))
+    with pytest.raises(InputError) as e:
+        read_msh(path)
+
+    assert str(e.value).startswith(f"{path}: ")
+    assert message in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_sets_of_sets_without_end_are_refused(tmp_path):
+    more = "*NSET, NSET=a, GENERATE\n1, 2000000000\n" + "*NSET, NSET=a\na\n" * 4000
+    (tmp_path / "a.inp").write_text(one_element("C3D8", more))
+    read_msh(tmp_path / "a.inp")
+    nodes = "*NODE\n" + "".join(f"{i}, 0, 0, {i}\n" for i in range(100, 2000))
+    (tmp_path / "a.inp").write_text(one_element("C3D8", nodes + more))
+    with pytest.raises(InputError, match="sets repeat their members too often"):
+        read_msh(tmp_path / "a.inp")
+
+
+def med(tmp_path, change):
+    """Write the blocks as a MED file and change it by h5py."""
+    solid_blocks(tmp_path)
+    write_med(tmp_path / "blocks.msh", tmp_path / "a.med")
+    with h5py.File(tmp_path / "a.med", "r+") as file:
+        change(file, next(iter(file["ENS_MAA/mesh"].values())))
+    return tmp_path / "a.med"
+
+
+def test_groups_of_nodes_are_boundaries_and_a_kind_may_have_no_families(tmp_path):
+    """meshio refuses files in which some kinds of cells have no families."""
+
+    def change(file, step):
+        del step["MAI/QU4/FAM"]
+        z = step["NOE/COO"][()].reshape(3, -1)[2]
+        step["NOE"]["FAM"] = np.where(z == 0, 3, np.where(z == 2, 8, 0))
+        for number, names in ((3, [b"under", b"ends"]), (8, [b"ends"])):
+            family = file.create_group(f"FAS/mesh/NOEUD/F{number}")
+            family.attrs["NUM"] = number
+            text = [np.frombuffer(n.ljust(80, b"\0"), dtype=np.int8) for n in names]
+            family["GRO/NOM"] = np.array(text)
+
+    named = read_msh(med(tmp_path, change))
+
+    assert sorted(named.surfaces) == ["lower", "upper"]
+    assert {name: len(at) for name, at in named.curves.items()} == {
+        "under": 9, "ends": 13,
+    }  # fmt: skip
+
+
+def renamed(file, step):
+    step.move("MAI/HE8", "MAI/H20")
+
+
+def second(file, step):
+    file.copy("ENS_MAA/mesh", "ENS_MAA/other")
+
+
+def elsewhere(file, step):
+    del step["NOE/COO"]
+    step["NOE"].create_dataset("COO", (99,), dtype="f8", external="/etc/passwd")
+
+
+def linked(file, step):
+    del step["NOE"]
+    step["NOE"] = h5py.ExternalLink("/etc/other.med", "/NOE")
+
+
+def huge(file, step):
+    del step["NOE/COO"]
+    step["NOE"].create_dataset("COO", (3, 10**12), dtype="f8", chunks=(3, 1024))
+
+
+def outside(file, step):
+    step["MAI/HE8/NOD"][0] = 10**6
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (renamed, "cells of type hexahedron20; expected cells of first order: in "
+         "Salome, Modification, Convert to/from quadratic; in gmsh, -order 1"),
+        (second, "2 meshes with 2 time steps; expected one mesh with one step"),
+        (elsewhere, "arrays in other files, which are not opened; expected all data"),
+        (linked, "1 meshes with 0 time steps; expected one mesh with one step"),
+        (huge, "its arrays would take 183105468 MiB of memory; expected at most"),
+        (outside, "cells with nodes that are not in the file; expected nodes that it"),
+        (lambda file, step: step["MAI/HE8/NOD"].attrs.modify("NBR", 7),
+         "not a mesh in MED format, or damaged"),
+    ],
+)  # fmt: skip
+def test_a_med_file_that_cannot_be_read_is_refused_in_one_line(
+    tmp_path, change, message
+):
+    with pytest.raises(InputError) as e:
+        read_msh(med(tmp_path, change))
+
+    assert message in str(e.value)
+    assert "\n" not in str(e.value)
+
+
+def test_other_content_is_no_med_file(tmp_path):
+    for content in (b"", b"hello", b"\x89HDF\r\n\x1a\n" + bytes(200)):
+        (tmp_path / "a.med").write_bytes(content)
+        with pytest.raises(InputError, match=r"a\.med: not a \.med file \(HDF5\)"):
+            read_msh(tmp_path / "a.med")
