@@ -12,6 +12,7 @@ SOLVERS: Registry[Solver] = Registry(
         "smalbe-espreso": entry("mortarbench.solvers.smalbe.solver", "ESPRESO"),
         "smalbe-paper": entry("mortarbench.solvers.smalbe.solver", "PAPER"),
         "pdas": entry("mortarbench.solvers.baselines.pdas", "PDAS"),
+        "pdas-amg": entry("mortarbench.solvers.baselines.pdas_amg", "PDASAMG"),
         "feti": entry("mortarbench.solvers.baselines.feti", "FETI"),
         "projected-gradient": entry(
             "mortarbench.solvers.baselines.projected_gradient", "ProjectedGradient"

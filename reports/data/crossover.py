@@ -80,7 +80,7 @@ class Map:
             for n in common
         }
         pays = None
-        for n in reversed(common):
+        for n in reversed([n for n in common if ratios[n].pairs > 1]):
             if ratios[n].low <= 1:
                 break
             pays = n

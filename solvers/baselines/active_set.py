@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import diags_array
 
 from mortarbench.harness import QP, Matrix, Vector
-from mortarbench.solvers.baselines.face import Faces, Solve, factoriser
+from mortarbench.solvers.baselines.face import Faces, Factorise, Solve
 from mortarbench.solvers.common.conversion import csc, dense
 
 DELTA = 1e-9  #: δᵢ/Pᵢᵢ, proximal weight relative to the curvature
@@ -56,6 +56,7 @@ class Problem:
     D: Vector  #: (n,) diag P, with a typical value in place of zeros
     rho: Vector  #: (m,) weights of the rows of A
     sigma: Vector  #: (p,) weights of the rows of G
+    factorise: Factorise
     faces: Faces
     counts: Counter[str]
 
@@ -66,7 +67,9 @@ class Problem:
         return np.asarray(force + self.qp.q + DELTA * self.D * (at.x - centre.x))
 
 
-def penalise(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
+def penalise(
+    qp: QP, counts: Counter[str], factorise: Factorise, kappa: float = KAPPA
+) -> Problem:
     """Weight each row a by ρ = κ/(a D⁻¹aᵀ); factorise the part that faces share.
 
     Raises
@@ -86,7 +89,8 @@ def penalise(qp: QP, counts: Counter[str], kappa: float = KAPPA) -> Problem:
     unbounded = np.isinf(qp.lb) & np.isinf(qp.ub)
     if store is dense and unbounded.any() and not qp.h.size:
         counts["factorisations"] += 1
-    return Problem(qp, A, G, D, rho, sigma, factoriser(M, G, sigma, unbounded), counts)
+    faces = factorise(M, G, sigma, unbounded)
+    return Problem(qp, A, G, D, rho, sigma, factorise, faces, counts)
 
 
 def row_norms(M: Matrix, D: Vector) -> Vector:

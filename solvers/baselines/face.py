@@ -28,6 +28,12 @@ Mask = NDArray[np.bool_]
 Solve = Callable[[Vector], Vector]  #: r (n,) ↦ dx (n,), zero outside F; uses r_F only
 #: free components (n,), active rows (p,) ↦ solve of that face
 Faces = Callable[[Mask, Mask], Solve]
+#: M, G, ρ and the mask of components without bounds ↦ faces; see `factoriser`
+Factorise = Callable[[Matrix, Matrix, Vector, Mask], Faces]
+
+
+class InnerSolveError(ArithmeticError):
+    """An iterative solve of a face that did not converge."""
 
 
 def factoriser(M: Matrix, G: Matrix, rho: Vector, always_free: Mask) -> Faces:

@@ -57,6 +57,7 @@ from mortarbench.solvers.baselines.active_set import (
     penalise,
     solve_subproblem,
 )
+from mortarbench.solvers.baselines.face import Factorise, InnerSolveError, factoriser
 from mortarbench.solvers.baselines.infeasibility_certificate import (
     proves_infeasible,
     proves_unbounded,
@@ -122,6 +123,11 @@ class PDAS:
         run = self._set_up(qp, tol, None)
         return lambda: run()[0]
 
+    def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
+        """Return the function that prepares the linear systems of all faces."""
+        del qp, tol, counts
+        return factoriser
+
     def chain(self, tol: float) -> Callable[[QP], Callable[[], Solution]]:
         """Return the `prepare` of a sequence that reuses the last point and set."""
         carry: Carry | None = None
@@ -144,7 +150,8 @@ class PDAS:
         message = "P is not positive semidefinite"
         indefinite = Solution.without_point(qp, Status.FAILED, message)
         try:
-            problem = penalise(qp, Counter())
+            counts = Counter[str]()
+            problem = penalise(qp, counts, self.faces(qp, tol, counts))
         except NOT_POSITIVE:
             return lambda: (indefinite, None)
 
@@ -153,6 +160,8 @@ class PDAS:
                 return _proximal(problem, tol, _start(qp, carry), self.max_iter)
             except NOT_POSITIVE:
                 return indefinite, None
+            except InnerSolveError as e:
+                return Solution.without_point(qp, Status.FAILED, f"{e}"), None
 
         return run
 
@@ -197,7 +206,7 @@ def _proximal(
         stalled = 0 if worst < best / 2 else stalled + 1
         if stalled and stalled % 2 == 0 and kappa < MAX_KAPPA:
             kappa, solve = RHO_GROWTH * kappa, None
-            problem = penalise(qp, counts, kappa)
+            problem = penalise(qp, counts, problem.factorise, kappa)
         centre, best, slack = run.at, min(best, worst), slack / 10
     if worst <= CLAIM_FACTOR * tol:
         return point, Carry(active, Point(point.x, point.y, point.z))

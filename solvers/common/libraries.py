@@ -5,6 +5,6 @@ from __future__ import annotations
 #: packages that adapters call, and packages that these use: backends and factorisations
 PACKAGES = (
     "clarabel", "cvxopt", "cvxpy", "daqp", "ecos", "highspy", "highspy-extras", "osqp",
-    "piqp", "proxsuite", "py-mkl-pardiso", "qoco", "qpalm", "qpsolvers", "qtqp",
-    "quadprog", "scs", "sip-qp-python",
+    "piqp", "proxsuite", "py-mkl-pardiso", "pyamg", "qoco", "qpalm", "qpsolvers",
+    "qtqp", "quadprog", "scs", "sip-qp-python",
 )  # fmt: skip

@@ -84,6 +84,14 @@ def test_the_crossover_is_the_size_from_which_on_the_dual_is_faster(evidence):
     assert at.ratio.value == pytest.approx((79**2 + 2) / (7.9 + 21), rel=0.02)
 
 
+def test_a_size_with_a_single_run_does_not_decide(evidence):
+    records = [r for r in measured() if r.params["n"] < SIZES[-1] or not r.repeat]
+    (one,) = crossover_maps(evidence(records))
+
+    at = one.crossover(DUAL, PRIMAL)
+    assert (at.pays, at.largest, at.ratio.pairs) == (2000, 8000, 1)
+
+
 def test_single_runs_are_never_called_faster(evidence):
     (one,) = crossover_maps(evidence(measured(repeats=1)))
     assert one.crossover(DUAL, PRIMAL).pays is None
