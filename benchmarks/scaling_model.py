@@ -19,7 +19,11 @@ from scipy.linalg.blas import dgemm, dspmv
 import mortarbench as mb
 from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import Ranks
-from mortarbench.problems.experiments.scaling_model import Machine, Setting, predict
+from mortarbench.problems.experiments.scaling_model import (
+    Machine,
+    Distribution,
+    predict,
+)
 
 CASE, SUBDOMAINS, CELLS = "cube-wall/n=32/feti=8/dual", 64, 8
 RANKS = (1, 2, 4)
@@ -42,7 +46,7 @@ def measured() -> Machine:
     One triangle of 64 MiB passes through memory; the block of a subdomain multiplies
     the vectors of 32 congruent ones.
     """
-    n, m = 4096, Setting(cores=1, cells=CELLS).block
+    n, m = 4096, Distribution(cores=1, cells=CELLS).block
     packed, x = np.ones(n * (n + 1) // 2), np.ones(n)
     block, columns = np.ones((m, m), order="F"), np.ones((m, 32), order="F")
     bandwidth = packed.nbytes / smallest(lambda: dspmv(n, 1.0, packed, x))
@@ -78,11 +82,11 @@ def main() -> None:
     local = world.reduce(min(times), MPI.MAX)
     sent = world.reduce(ranks.counts["bytes"], MPI.MAX)
     if world.rank == 0:
-        setting = Setting(
+        shared = Distribution(
             cores=world.size, per_core=SUBDOMAINS / world.size, cells=CELLS,
             congruent=True,
         )  # fmt: skip
-        model = predict(setting, machine)
+        model = predict(shared, machine)
         print(
             f"{world.size} | {1e3 * local:.1f} | {1e3 * model.local:.1f} | "
             f"{sent / 1e3:.1f} | {model.sent / 1e3:.1f} | "

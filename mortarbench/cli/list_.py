@@ -100,10 +100,9 @@ def solvers_pages(solvers: Mapping[str, Solver]) -> dict[str, str]:
         "solvers-libraries.md": [LIBRARIES],
     }
     for kind, section in _sections(solvers).items():
-        facts = listing.about(next(s for s in solvers.values() if type(s) is kind))
         if any(f.name == "backend" and f.default == "" for f in fields(kind)):
             pages["solvers.md"].append(section)
-        elif facts and facts.package:
+        elif ".adapters." in kind.__module__:
             pages["solvers-libraries.md"].append(section)
         else:
             pages["solvers-own.md"].append(section)

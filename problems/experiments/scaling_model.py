@@ -50,7 +50,7 @@ PAPER = Machine(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Setting:
+class Distribution:
     """Distribution of a cube of subdomains over cores."""
 
     cores: int
@@ -120,9 +120,9 @@ def factor_entries(unknowns: float, modes: int) -> float:
     return entries
 
 
-def predict(setting: Setting, machine: Machine) -> Prediction:
+def predict(run: Distribution, machine: Machine) -> Prediction:
     """Predict the cost of a product with F."""
-    s, n = setting, setting.coarse
+    s, n = run, run.coarse
     triangle = BYTES * s.block * (s.block + 1) / 2
     distinct = 1.0 if s.congruent else s.per_core
     flops = 2.0 * s.block**2 * s.per_core

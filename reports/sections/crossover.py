@@ -69,11 +69,11 @@ def crossover(a: Analysis) -> Iterator[Part]:
 def _pays_table(one: Map) -> Table:
     """Compare every dual route with every primal one."""
     pairs = [
-        (dual, primal, found)
+        (dual, primal, compared)
         for primal in one.routes
         for dual in one.routes
         if primal.kind in PRIMAL and dual.kind not in PRIMAL
-        if (found := one.crossover(dual, primal)) is not None
+        if (compared := one.crossover(dual, primal)) is not None
     ]
 
     def pays(pair: tuple[Route, Route, Crossover]) -> Cell:
@@ -164,8 +164,9 @@ def _stops_table(one: Map) -> Table:
 
     def reasons(route: Route) -> Cell:
         ends = [
-            f"{clean(o.solver, 24)}: {clean(o.first.message or o.verdict.words, 60)}"
+            f"{clean(o.solver, 24)}: {clean(r.message or o.verdict.words, 60)}"
             for o in one.stops[route].outcomes
+            for r in [next(r for r in o.records if r.verdict == o.verdict)]
             if not o.verified
         ]
         return Cell.words("; ".join(ends) or "–")
@@ -193,5 +194,5 @@ def _stops_table(one: Map) -> Table:
 
 def _why(stop: Stop) -> str:
     if stop.dofs is None:
-        return "largest size of the suite"
+        return "largest measured size"
     return "not measured" if stop.verdict is None else VERDICTS[stop.verdict][1]

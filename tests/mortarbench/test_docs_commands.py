@@ -41,6 +41,10 @@ SHORTER = {
         "mortarbench run suites/crossval.toml --out out/crossval "
         "--case 'contact-patch/*' --solver smalbe --solver clarabel"
     ),
+    "mortarbench run suites/crossover.toml --out out/crossover": (
+        "mortarbench run suites/crossover.toml --out out/crossover --repeats 1 "
+        "--case 'cube-wall/n=6/dual' --solver smalbe"
+    ),
     "mortarbench run suites/accuracy.toml": (
         "mortarbench run suites/accuracy.toml --repeats 1 --case 'obstacle/*'"
     ),

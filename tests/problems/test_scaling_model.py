@@ -9,7 +9,7 @@ from sksparse.cholmod import cholesky
 
 from mortarbench.problems.experiments.scaling_model import (
     PAPER,
-    Setting,
+    Distribution,
     factor_entries,
     predict,
 )
@@ -26,7 +26,7 @@ CELLS = [
 
 @pytest.mark.parametrize(("cores", "m", "milliseconds"), CELLS)
 def test_the_model_agrees_with_an_independent_prototype(cores, m, milliseconds):
-    one = predict(Setting(cores=cores, cluster=m), PAPER)
+    one = predict(Distribution(cores=cores, cluster=m), PAPER)
     assert 1e3 * one.effective == pytest.approx(milliseconds, rel=0.05)
 
 
@@ -36,7 +36,9 @@ def test_the_page_contains_the_predictions_of_the_code():
     assert [int(row[0]) for row in rows] == list(PROTOTYPE)
     for cores, dofs, cells in rows:
         shown = [cell.split()[0] for cell in cells.split("|") if cell.strip()]
-        settings = [Setting(cores=int(cores), cluster=2**k) for k in range(len(shown))]
+        settings = [
+            Distribution(cores=int(cores), cluster=2**k) for k in range(len(shown))
+        ]
         assert f"{settings[0].dofs:.2e}" == dofs
         effective = [1e3 * predict(s, PAPER).effective for s in settings]
         assert shown == [f"{t:.1f}" for t in effective]
@@ -57,11 +59,13 @@ def test_the_entries_of_a_coarse_factor_follow_the_measured_law():
 
 
 def test_one_core_sends_nothing_and_congruent_subdomains_share_a_block():
-    alone = predict(Setting(cores=1, congruent=True), PAPER)
-    different = predict(Setting(cores=1), PAPER)
+    alone = predict(Distribution(cores=1, congruent=True), PAPER)
+    different = predict(Distribution(cores=1), PAPER)
     assert (alone.sent, alone.messages, alone.reductions) == (0.0, 0.0, 0.0)
     assert different.blocks == pytest.approx(8 * alone.blocks)
 
 
 def test_a_block_contains_the_surface_of_a_subdomain():
-    assert Setting(cores=1, cells=2).block == 3 * 26  # 27 nodes, one of them inside
+    assert (
+        Distribution(cores=1, cells=2).block == 3 * 26
+    )  # 27 nodes, one of them inside
