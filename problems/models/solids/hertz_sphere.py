@@ -400,7 +400,7 @@ def _shear_quantities(
     """Compare stick and tangential force with Cattaneo and Mindlin's; full sphere.
 
     tangential_force: along x on the lower sphere, N. stick_radius: of a disc with the
-    area of the sticking nodes, m, too large by up to half a cell. c_over_a: over the
+    area of the sticking nodes, m; nodes stick as a whole. c_over_a: over the
     exact contact radius. c_over_a_moment: from ∫qr²dA = ⅖μPa²(1 − (c/a)⁵), exact for
     Cattaneo and Mindlin's q.
     """
