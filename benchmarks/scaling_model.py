@@ -20,8 +20,8 @@ import mortarbench as mb
 from mortarbench.harness.distributed.network import network
 from mortarbench.harness.distributed.vectors import Ranks
 from mortarbench.problems.experiments.scaling_model import (
-    Machine,
     Distribution,
+    Machine,
     predict,
 )
 
