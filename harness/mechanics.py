@@ -170,9 +170,13 @@ def friction_discs(bound: Vector, tangents: int, first: int) -> Discs:
 
 _EMPTY = np.zeros(0)
 NO_FRICTION = Friction(
-    T=no_rows(0), bound=_EMPTY, start=_EMPTY, row=np.zeros(0, dtype=np.int64),
-    cohesion=_EMPTY, mu=_EMPTY,
-)  # fmt: skip
+    T=no_rows(0),
+    bound=_EMPTY,
+    start=_EMPTY,
+    row=np.zeros(0, dtype=np.int64),
+    cohesion=_EMPTY,
+    mu=_EMPTY,
+)
 
 
 def contact_rows(primal: QP, friction: Friction) -> tuple[csr_array, Vector]:
@@ -553,13 +557,15 @@ class Mechanics:
         softness = 1 / np.where(diagonal > 0, diagonal, np.inf)
         softness[fixed] = 0
         return Exact(
-            f=-self.primal.q.astype(Real), B=B.astype(Real),
-            c=c.astype(Real), fixed=fixed,
+            f=-self.primal.q.astype(Real),
+            B=B.astype(Real),
+            c=c.astype(Real),
+            fixed=fixed,
             forces=AdmissibleForces(
                 c.size, self._active_friction.discs(self.primal.h.size)
             ),
             compliance=(B.multiply(B) @ softness).astype(Real),
-        )  # fmt: skip
+        )
 
     @cached_property
     def stiffness(self) -> Any:
@@ -601,9 +607,12 @@ class Mechanics:
             KR = cancelling(csr_array(self.primal.P), np.asarray(felt.toarray()))
             KR[exact.fixed] = 0
         return RigidMotions(
-            felt=felt, free=turned[:, p:], G=np.asarray((exact.B @ felt).toarray()),
-            largest=_largest(felt), KR=KR,
-        )  # fmt: skip
+            felt=felt,
+            free=turned[:, p:],
+            G=np.asarray((exact.B @ felt).toarray()),
+            largest=_largest(felt),
+            KR=KR,
+        )
 
     def without_rigid_motion(self, v: Extended) -> Extended:
         """Return v − R Rᵀv (n,), without rigid motion."""

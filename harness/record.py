@@ -293,10 +293,24 @@ def _journal() -> dict[str, Field[Any]]:
 #: fields of a record by their journal names, in the order of a line
 JOURNAL: Mapping[str, Field[Any]] = _journal()
 _NOT_NEGATIVE = (
-    "repeat", "block", *MEASURED, "build_seconds", "dualise_seconds",
-    "build_peak_mib", "recover_seconds", "certify_seconds", "canary_seconds", "threads",
-    "cpu", "primal", "dual", "complementarity", "gap", "energy_bound", "optimum_error",
-)  # fmt: skip
+    "repeat",
+    "block",
+    *MEASURED,
+    "build_seconds",
+    "dualise_seconds",
+    "build_peak_mib",
+    "recover_seconds",
+    "certify_seconds",
+    "canary_seconds",
+    "threads",
+    "cpu",
+    "primal",
+    "dual",
+    "complementarity",
+    "gap",
+    "energy_bound",
+    "optimum_error",
+)
 _SECONDS = tuple(name for name in _NOT_NEGATIVE if name.endswith("_seconds"))
 _texts, _tables = attrgetter(*_TEXTS), attrgetter(*_TABLES)
 _not_negative = attrgetter(*_NOT_NEGATIVE)
@@ -363,8 +377,10 @@ def _check(r: Record) -> None:
     if not r.run_id:
         raise ValueError("run_id is empty; expected a string")
     for name, at in (
-        ("tol", r.tol), ("accuracy", r.accuracy), ("step_tol", r.step_tol)
-    ):  # fmt: skip
+        ("tol", r.tol),
+        ("accuracy", r.accuracy),
+        ("step_tol", r.step_tol),
+    ):
         if at is not None and not 0 < at <= 1:
             raise ValueError(f"{name} = {at!r}; expected a number above 0, at most 1")
     theta = r.mode.removeprefix(TIGHTENING)

@@ -112,9 +112,13 @@ class Solution:
         """
         n, m, p = (np.full(v.size, np.nan) for v in (qp.q, qp.b, qp.h))
         return cls(
-            status=status, message=message, x=n, y=m if y is None else y,
-            z=p if z is None else z, z_box=n if z_box is None else z_box,
-        )  # fmt: skip
+            status=status,
+            message=message,
+            x=n,
+            y=m if y is None else y,
+            z=p if z is None else z,
+            z_box=n if z_box is None else z_box,
+        )
 
     def mismatch(self, qp: QP) -> str | None:
         """Return a message if a vector has the wrong shape for `qp`, else None."""

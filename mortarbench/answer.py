@@ -198,8 +198,9 @@ class Answer:
         drawn = None if scale is None else check_scale(scale)
         figure = (
             deformed_figure(fields, drawn)
-            if len(fields.cells) else traction_figure(fields) or traction_maps(fields)
-        )  # fmt: skip
+            if len(fields.cells)
+            else traction_figure(fields) or traction_maps(fields)
+        )
         if figure is None:
             raise InputError("no picture: the case has neither bodies nor tractions")
         if path is not None:
@@ -446,13 +447,21 @@ def solver_session(
         # a family may print; standard output is for the answer
         with one_thread(), redirect_stdout(stderr):
             record, solution = measure_once(
-                worker, lambda: case.family_case, record, registries.reference,
+                worker,
+                lambda: case.family_case,
+                record,
+                registries.reference,
                 source=source,
-            )  # fmt: skip
+            )
         return Answer(
-            case=case, record=record, solution=solution, spec=spec, solver=solver,
-            defaults=defaults, remarks=remarks(case, record, solution),
-        )  # fmt: skip
+            case=case,
+            record=record,
+            solution=solution,
+            spec=spec,
+            solver=solver,
+            defaults=defaults,
+            remarks=remarks(case, record, solution),
+        )
 
     work = None
     if forks and ranks == 1:

@@ -43,9 +43,14 @@ def worker(registries: Registries, arguments: Sequence[str]) -> int:
         return emission(ranks, reference_over_ranks)
 
     serve(
-        solver, int(request_fd), int(reply_fd), registries.operators, ranks, emit,
+        solver,
+        int(request_fd),
+        int(reply_fd),
+        registries.operators,
+        ranks,
+        emit,
         copies=request.get("copies", False),
-    )  # fmt: skip
+    )
     return 0
 
 

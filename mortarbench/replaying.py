@@ -189,14 +189,18 @@ def _verdicts(c: Replay) -> Iterable[list[str]]:
     then, now = c.then, c.now
     yield ["status", then.verdict, now.verdict, _same(then.verdict is now.verdict)]
     yield [
-        "claimed", _text(then.claimed), _text(now.claimed),
+        "claimed",
+        _text(then.claimed),
+        _text(now.claimed),
         _same(then.claimed == now.claimed),
-    ]  # fmt: skip
+    ]
     if then.message or now.message:
         yield [
-            "message", _short(then.message), _short(now.message),
+            "message",
+            _short(then.message),
+            _short(now.message),
             _same(then.message == now.message),
-        ]  # fmt: skip
+        ]
     verdict = "not recorded" if c.same_qp is None else _same(c.same_qp)
     yield ["QP", _text(then.qp), _text(now.qp), verdict]
     yield ["options", "", "", _same(c.same_options)]
@@ -211,8 +215,12 @@ def _numbers(c: Replay) -> Iterable[list[str]]:
         if (a, b) != (None, None):
             yield [name, _text(a), _text(b), _same(a == b)]
     if c.then.schema != c.now.schema:
-        yield ["residuals", f"schema {c.then.schema}", f"schema {c.now.schema}",
-               "defined differently"]  # fmt: skip
+        yield [
+            "residuals",
+            f"schema {c.then.schema}",
+            f"schema {c.now.schema}",
+            "defined differently",
+        ]
     for name in (*_RESIDUALS, "objective"):
         a, b = getattr(c.then, name), getattr(c.now, name)
         if (a, b) != (None, None):
@@ -229,8 +237,11 @@ def _times(c: Replay) -> Iterable[list[str]]:
             continue
         row = _ratio_text(ratio, c.stored[name])
         yield [
-            name.removesuffix("_seconds") + ", s", _text(a, ".3g"), _text(b, ".3g"), row
-        ]  # fmt: skip
+            name.removesuffix("_seconds") + ", s",
+            _text(a, ".3g"),
+            _text(b, ".3g"),
+            row,
+        ]
 
 
 def _ratio_text(ratio: tuple[float, float, float], stored: Sequence[float]) -> str:

@@ -226,10 +226,11 @@ def load(folder: str | Path, *, warn: Callable[[str], None] = ignore) -> Results
     if not records:
         raise InputError(f"{path}: no measurements; expected a result folder of `run`")
     return Results(
-        folder=path, records=tuple(records),
+        folder=path,
+        records=tuple(records),
         solvers=tuple(dict.fromkeys(r.solver for r in records)),
         cases=frozenset(r.case for r in records),
-    )  # fmt: skip
+    )
 
 
 def merge(

@@ -41,9 +41,13 @@ _CONTACT_UNITS = {
 
 
 _HEADS = {
-    "free_gradient": "‖φ‖", "chopped_gradient": "‖β‖", "infeasibility": "‖Ax−b‖",
-    "active": "at bound", "two_sided": "of two", "cost": "own cost",
-}  # fmt: skip
+    "free_gradient": "‖φ‖",
+    "chopped_gradient": "‖β‖",
+    "infeasibility": "‖Ax−b‖",
+    "active": "at bound",
+    "two_sided": "of two",
+    "cost": "own cost",
+}
 _LEGEND = {
     "step": "step: c conjugate gradients, e expansion, f fallback, p proportioning",
     "outer": "outer: number of the outer iteration",
@@ -115,9 +119,14 @@ def summary_rows(records: Iterable[Record], solvers: Sequence[str]) -> list[list
     """
     latest = {r.run_id: r for r in records}.values()
     header = [
-        "solver", "measured", "claimed solved", "verified", "refuted", "declined",
+        "solver",
+        "measured",
+        "claimed solved",
+        "verified",
+        "refuted",
+        "declined",
         "other",
-    ]  # fmt: skip
+    ]
     rows = [header]
     present = {r.solver for r in latest}
     for solver in dict.fromkeys([*solvers, *sorted(present)]):

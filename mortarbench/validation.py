@@ -187,10 +187,13 @@ def as_text(data: Mapping[str, Any], meshes: Sequence[Discretisation] = ()) -> s
 def _solvers(rows: Sequence[Mapping[str, Any]]) -> str:
     """Return the table of solvers, a row for each solver and tolerance."""
     columns = {
-        "error_median": "error: median", "error_worst": "worst",
-        "penetration": "penetration/h", "balance": "balance",
-        "primal_dual": "primal-dual", "from_ours": "from smalbe",
-    }  # fmt: skip
+        "error_median": "error: median",
+        "error_worst": "worst",
+        "penetration": "penetration/h",
+        "balance": "balance",
+        "primal_dual": "primal-dual",
+        "from_ours": "from smalbe",
+    }
     if all(row["from_ours"] is None for row in rows):
         del columns["from_ours"]  # smalbe has no answers here
     head = ["solver", "tol", "answers", "refuted", "unanswered", *columns.values()]

@@ -146,7 +146,7 @@ def one_step(
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, laws),
         # first bound of Coulomb's law: large enough to support bodies by friction
         initial_force=float(np.abs(elastic.forces.value).sum()),
-    )  # fmt: skip
+    )
     choice = Choice(size=parts, glue=glue)
     return case_of(problem, form, choice, reference or _no_reference)
 

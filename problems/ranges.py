@@ -124,8 +124,12 @@ KINEMATICS = schema(
 CONTACT_STIFFNESS = schema(contact_stiffness=choice("none", "geometric"))
 #: keys that finite strain does not support, with the only value it allows
 LINEAR_ONLY: Mapping[str, Value] = {
-    "feti": 0, "parts": 0, "friction": "none", "plane": "strain", "relin": 1
-}  # fmt: skip
+    "feti": 0,
+    "parts": 0,
+    "friction": "none",
+    "plane": "strain",
+    "relin": 1,
+}
 #: keys that the name of a case of bodies may set, with the defaults of its file
 SETTINGS = schema(
     **METHODS,

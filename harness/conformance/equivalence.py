@@ -183,6 +183,7 @@ def changes_of(form: str) -> list[str]:
     Changes of rows do not apply to forms without such rows.
     """
     return [
-        name for name in CHANGES
+        name
+        for name in CHANGES
         if "rows" not in name or any(name.startswith(f"{r} ") for r in _ROWS[form])
-    ]  # fmt: skip
+    ]

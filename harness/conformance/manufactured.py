@@ -76,11 +76,15 @@ def _plant(
     lb = np.where(lower & bounded, np.where(at_lb, x, x - 1), -np.inf)
     ub = np.where(upper & bounded, np.where(at_ub, x, x + 1), np.inf)
     qp = QP(
-        P=store(P), q=-(P @ x + A.T @ y + G.T @ z + z_box),
-        A=store(A), b=A @ x,
-        G=store(G), h=G @ x + np.where(z > 0, 0.0, 1.0),
-        lb=lb, ub=np.where(fixed, lb, ub),
-    )  # fmt: skip
+        P=store(P),
+        q=-(P @ x + A.T @ y + G.T @ z + z_box),
+        A=store(A),
+        b=A @ x,
+        G=store(G),
+        h=G @ x + np.where(z > 0, 0.0, 1.0),
+        lb=lb,
+        ub=np.where(fixed, lb, ub),
+    )
     return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
@@ -138,14 +142,19 @@ def manufactured_over_sets(shape: str, *, seed: int = 271828) -> tuple[QP, Solut
     z = np.where(np.arange(rows) == 0, 0.7, 0.0)
     P = M @ M.T / n + 0.1 * np.eye(n)
     qp = QP(
-        P=csr_array(P), q=-(P @ x + A.T @ y + G.T @ z + z_box),
-        A=csr_array(A), b=A @ x, G=csr_array(G), h=G @ x + (z == 0),
-        lb=lb, ub=np.full(n, np.inf),
+        P=csr_array(P),
+        q=-(P @ x + A.T @ y + G.T @ z + z_box),
+        A=csr_array(A),
+        b=A @ x,
+        G=csr_array(G),
+        h=G @ x + (z == 0),
+        lb=lb,
+        ub=np.full(n, np.inf),
         sets=(
             Discs(on_discs.reshape(discs, 2), sizes[:discs]),
             Cones(on_cones.reshape(cones, 3), slopes),
         ),
-    )  # fmt: skip
+    )
     return qp, Solution(status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box)
 
 
@@ -156,10 +165,14 @@ def degenerate_cone() -> tuple[QP, Vector]:
     is of the order of the square root of an error in complementarity.
     """
     qp = QP(
-        P=csr_array(np.eye(3)), q=np.array([-4.0, -4.0, 0.0]), A=no_rows(3),
-        b=np.zeros(0), G=no_rows(3), h=np.zeros(0),
+        P=csr_array(np.eye(3)),
+        q=np.array([-4.0, -4.0, 0.0]),
+        A=no_rows(3),
+        b=np.zeros(0),
+        G=no_rows(3),
+        h=np.zeros(0),
         sets=(Cones(np.arange(3)[None], np.ones(1)),),
-    )  # fmt: skip
+    )
     return qp, np.array([4.0, 4.0, 0.0])
 
 
@@ -170,11 +183,15 @@ def one_of_each() -> tuple[QP, dict[str, Vector]]:
     """
     inf = np.inf
     qp = QP(
-        P=csr_array(np.eye(4)), q=np.array([-3.0, 4.0, -5.0, -9.0]),
-        A=csr_array([[0.0, 0, 0, 2]]), b=np.array([2.0]),
-        G=csr_array([[0.0, 0, 2, 0]]), h=np.array([2.0]),
-        lb=np.array([-inf, -1, -inf, -inf]), ub=np.array([1, inf, inf, inf]),
-    )  # fmt: skip
+        P=csr_array(np.eye(4)),
+        q=np.array([-3.0, 4.0, -5.0, -9.0]),
+        A=csr_array([[0.0, 0, 0, 2]]),
+        b=np.array([2.0]),
+        G=csr_array([[0.0, 0, 2, 0]]),
+        h=np.array([2.0]),
+        lb=np.array([-inf, -1, -inf, -inf]),
+        ub=np.array([1, inf, inf, inf]),
+    )
     vectors = dict(x=[1.0, -1, 1, 1], y=[4.0], z=[2.0], z_box=[2.0, -3, 0, 0])
     return qp, {name: np.array(v) for name, v in vectors.items()}
 
@@ -193,10 +210,13 @@ def membrane(k: int) -> QP:
     return QP(
         P=csr_array(kron(second, eye) + kron(eye, second)),
         q=np.full(n, 8 / (k + 1) ** 2),
-        A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
+        A=no_rows(n),
+        b=np.zeros(0),
+        G=no_rows(n),
+        h=np.zeros(0),
         lb=(-0.1 - 0.3 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)).ravel(),
         ub=np.full(n, np.inf),
-    )  # fmt: skip
+    )
 
 
 FORMS = ("primal", "dual", "dual-bounds")  #: forms of `strings`
@@ -224,9 +244,15 @@ def strings(form: str) -> QP:
     A, no_box = np.eye(42)[ends], np.full(42, np.inf)
     if form == "primal":
         return QP(
-            P=csr_array(K), q=-f, A=csr_array(A), b=np.zeros(4), G=csr_array(G), h=h,
-            lb=-no_box, ub=no_box,
-        )  # fmt: skip
+            P=csr_array(K),
+            q=-f,
+            A=csr_array(A),
+            b=np.zeros(4),
+            G=csr_array(G),
+            h=h,
+            lb=-no_box,
+            ub=no_box,
+        )
     free = np.setdiff1d(np.arange(42), ends)
     if form == "dual":
         B, c, fixed = np.vstack([A, G]), np.append(np.zeros(4), h), ends[:0]
@@ -237,11 +263,16 @@ def strings(form: str) -> QP:
         R = R[:, :0]
     F, m = B @ inverse @ B.T, c.size
     return QP(
-        P=(F + F.T) / 2, q=c - B @ inverse @ f, A=R.T @ B.T, b=R.T @ f,
-        G=no_rows(m), h=np.zeros(0),
-        lb=np.where(np.arange(m) < m - h.size, -np.inf, 0), ub=np.full(m, np.inf),
+        P=(F + F.T) / 2,
+        q=c - B @ inverse @ f,
+        A=R.T @ B.T,
+        b=R.T @ f,
+        G=no_rows(m),
+        h=np.zeros(0),
+        lb=np.where(np.arange(m) < m - h.size, -np.inf, 0),
+        ub=np.full(m, np.inf),
         structure=Structure(K=csr_array(K), B=csr_array(B), fixed=fixed),
-    )  # fmt: skip
+    )
 
 
 def _two_strings() -> tuple[Vector, Vector, Vector]:
@@ -262,16 +293,26 @@ def infeasible() -> QP:
     """Return a QP with the contradicting rows x₀ − x₁ ≤ −1 and x₁ − x₀ ≤ −1."""
     rows = np.eye(2, 20) - np.eye(2, 20)[::-1]
     return QP(
-        P=csr_array(np.eye(20)), q=np.ones(20), A=no_rows(20), b=np.zeros(0),
-        G=csr_array(rows), h=-np.ones(2),
-        lb=np.full(20, -np.inf), ub=np.full(20, np.inf),
-    )  # fmt: skip
+        P=csr_array(np.eye(20)),
+        q=np.ones(20),
+        A=no_rows(20),
+        b=np.zeros(0),
+        G=csr_array(rows),
+        h=-np.ones(2),
+        lb=np.full(20, -np.inf),
+        ub=np.full(20, np.inf),
+    )
 
 
 def unbounded() -> QP:
     """Return a QP that decreases along x₀ without curvature and without upper bound."""
     return QP(
-        P=csr_array(np.diag([0.0] + [1.0] * 19)), q=-np.ones(20),
-        A=no_rows(20), b=np.zeros(0), G=no_rows(20), h=np.zeros(0),
-        lb=np.full(20, -1.0), ub=np.full(20, np.inf),
-    )  # fmt: skip
+        P=csr_array(np.diag([0.0] + [1.0] * 19)),
+        q=-np.ones(20),
+        A=no_rows(20),
+        b=np.zeros(0),
+        G=no_rows(20),
+        h=np.zeros(0),
+        lb=np.full(20, -1.0),
+        ub=np.full(20, np.inf),
+    )

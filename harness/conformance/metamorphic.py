@@ -145,12 +145,16 @@ def _unknowns(
     a = np.zeros(qp.q.size) if origin is None else origin
     Pa = qp.P @ a
     new = replace(
-        qp, P=_sorted(T.T @ qp.P @ T * t), q=T.T @ (Pa + qp.q) * t,
-        A=_sorted(qp.A @ T), b=qp.b - qp.A @ a,
-        G=_sorted(qp.G @ T), h=qp.h - qp.G @ a,
+        qp,
+        P=_sorted(T.T @ qp.P @ T * t),
+        q=T.T @ (Pa + qp.q) * t,
+        A=_sorted(qp.A @ T),
+        b=qp.b - qp.A @ a,
+        G=_sorted(qp.G @ T),
+        h=qp.h - qp.G @ a,
         sets=tuple(one.substituted(T, a) for one in qp.sets),
         structure=_structure(qp.structure, T, t),
-    )  # fmt: skip
+    )
 
     def recover(s: Solution) -> Solution:
         z_box = U @ s.z_box / t
@@ -168,9 +172,7 @@ def _structure(old: Structure | None, T: Matrix, t: float) -> Structure | None:
 def _rows(qp: QP, M: Matrix, N: Matrix) -> Equivalent:
     """Multiply the equality rows by M and the inequality rows by N."""
     M, N = csr_array(M), csr_array(N)
-    new = replace(
-        qp, A=_sorted(M @ qp.A), b=M @ qp.b, G=_sorted(N @ qp.G), h=N @ qp.h
-    )  # fmt: skip
+    new = replace(qp, A=_sorted(M @ qp.A), b=M @ qp.b, G=_sorted(N @ qp.G), h=N @ qp.h)
     return Equivalent(new, lambda s: replace(s, y=M.T @ s.y, z=N.T @ s.z))
 
 

@@ -120,8 +120,10 @@ def assess_point(qp: QP, truth: Solution, s: Solution) -> tuple[Assessment, Devi
         error=_over(float(np.sqrt(max(off @ P_off, 0.0))), norm),
         equilibrium_error=None,
         energy=_over(energy, 0.5 * norm**2),
-        penetration=None, balance=None, active=None,
-    )  # fmt: skip
+        penetration=None,
+        balance=None,
+        active=None,
+    )
     return assessment, Deviation(off / (norm or 1.0), None)
 
 

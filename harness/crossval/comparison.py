@@ -125,9 +125,15 @@ def compare_answers(
     if isinstance(truth, str):
         unassessed = tuple(_answer(g, None, None, prove) for g in answers)
         return Problem(
-            name=name, truth="", doubt=None, closed=None, answers=unassessed, pairs=(),
-            unresolved=(), note=truth,
-        )  # fmt: skip
+            name=name,
+            truth="",
+            doubt=None,
+            closed=None,
+            answers=unassessed,
+            pairs=(),
+            unresolved=(),
+            note=truth,
+        )
     judged, deviations = [], []
     for g in answers:
         try:
@@ -149,10 +155,15 @@ def compare_answers(
         )
     ]
     return Problem(
-        name=name, truth=truth.name, doubt=truth.doubt, closed=truth.closed,
-        answers=tuple(_outliers(judged)), pairs=tuple(pairs),
-        unresolved=tuple(unresolved), note=truth.note,
-    )  # fmt: skip
+        name=name,
+        truth=truth.name,
+        doubt=truth.doubt,
+        closed=truth.closed,
+        answers=tuple(_outliers(judged)),
+        pairs=tuple(pairs),
+        unresolved=tuple(unresolved),
+        note=truth.note,
+    )
 
 
 def _answer(
@@ -162,13 +173,24 @@ def _answer(
     r, residuals, tol = g.record, residuals_of(g), g.record.asked_tol
     error = decided(g.case.qp, g.solution, residuals, tol, prove)
     answer = Answer(
-        run_id=r.run_id, repeats=g.repeats, solver=g.label, case=r.case, form=r.form,
-        tol=tol, claimed=r.claimed or "", stored=r.verdict,
+        run_id=r.run_id,
+        repeats=g.repeats,
+        solver=g.label,
+        case=r.case,
+        form=r.form,
+        tol=tol,
+        claimed=r.claimed or "",
+        stored=r.verdict,
         verdict=verdict(g.solution.status, residuals, tol, error=error),
-        residuals=residuals._asdict(), optimum_error=error, allowed=allowed(tol),
-        energy_allowed=energy_allowed(tol), energy_bound=r.energy_bound,
-        doubt=doubt, assessment=assessment, remarks=g.remarks,
-    )  # fmt: skip
+        residuals=residuals._asdict(),
+        optimum_error=error,
+        allowed=allowed(tol),
+        energy_allowed=energy_allowed(tol),
+        energy_bound=r.energy_bound,
+        doubt=doubt,
+        assessment=assessment,
+        remarks=g.remarks,
+    )
     refuted = tuple(_refutations(answer))
     twin = (f"the very point that it gave for {g.twin}",) if g.twin and refuted else ()
     return replace(

@@ -304,10 +304,13 @@ class _Halving:
             return None
         root = sqrt(abs(mechanics.scale))
         return Level(
-            case=text, unknowns=unknowns, energy=mechanics.energy(point.u),
-            norm=point.norm * root, bound=point.bound,
+            case=text,
+            unknowns=unknowns,
+            energy=mechanics.energy(point.u),
+            norm=point.norm * root,
+            bound=point.bound,
             distance=None if distance is None else distance * root,
-        )  # fmt: skip
+        )
 
     def _distance(self, mechanics: Mechanics, grid: Grid, u: Extended) -> float | None:
         """Return ‖u − u_{2h}‖ on this mesh, None on the first; store u for the next."""

@@ -96,9 +96,11 @@ def ground_truth_of(
 
 
 def _elastic_truth(
-    mechanics: Mechanics, answers: Sequence[StoredAnswer], solve: Reference,
+    mechanics: Mechanics,
+    answers: Sequence[StoredAnswer],
+    solve: Reference,
     references: Path | None,
-) -> tuple[ReferencePoint, str, str] | str:  # fmt: skip
+) -> tuple[ReferencePoint, str, str] | str:
     """Return a point, its name and, if it is not the reference, the reason for that."""
     try:
         return reference_point(mechanics, solve, references), "reference", ""
@@ -126,10 +128,13 @@ def _best_certified(
         return None
     c, g = min(certified, key=lambda pair: pair[0].bound)
     point = ReferencePoint(
-        u=c.u, multipliers=c.multipliers, equilibrium=c.equilibrium,
+        u=c.u,
+        multipliers=c.multipliers,
+        equilibrium=c.equilibrium,
         states=suggested(mechanics.exact, c.u, c.multipliers).states,
-        norm=c.norm, bound=c.bound,
-    )  # fmt: skip
+        norm=c.norm,
+        bound=c.bound,
+    )
     return point, _origin(g)
 
 

@@ -218,8 +218,12 @@ def _without_point(x: Listed) -> dict[str, Any]:
         "stored": None,
         "verdict": "infeasible_claim" if infeasible else "wrong",
         "reasons": [x.text],
-        "residual": None, "error": None, "energy": None, "rows": [], "pulls": [],
-    }  # fmt: skip
+        "residual": None,
+        "error": None,
+        "energy": None,
+        "rows": [],
+        "pulls": [],
+    }
 
 
 def _about(x: Answer | Listed) -> dict[str, Any]:
@@ -247,7 +251,10 @@ def _problem(p: Problem) -> dict[str, Any]:
     """Return a problem as plain data; pairs refer to answers by their index."""
     answers = [asdict(a) | {"error": a.error} for a in p.answers]
     data = {
-        "name": p.name, "truth": p.truth, "doubt": p.doubt, "closed": p.closed,
+        "name": p.name,
+        "truth": p.truth,
+        "doubt": p.doubt,
+        "closed": p.closed,
         "note": p.note,
-    }  # fmt: skip
+    }
     return data | {"answers": answers, "pairs": [pair._asdict() for pair in p.pairs]}

@@ -273,10 +273,14 @@ def _stored_answers(
             lost.append(_listed(r, str(e)))
             continue
         answers[key] = StoredAnswer(
-            record=r, label=r.solver, repeats=1, case=case, solution=s,
+            record=r,
+            label=r.solver,
+            repeats=1,
+            case=case,
+            solution=s,
             remarks=() if digest_of(point_arrays(s)) == r.vectors else (_CHANGED,),
             twin=min(folder.twins[r.solver, r.vectors] - {r.case}, default=""),
-        )  # fmt: skip
+        )
     return list(answers.values()), lost
 
 

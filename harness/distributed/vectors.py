@@ -385,9 +385,11 @@ class DistributedQP(NamedTuple):
     def sizes(self) -> dict[str, int]:
         """Sizes of the whole QP, as in `harness.qp.QP.sizes`."""
         return {
-            "variables": self.variables, "equalities": self.equality_rows,
-            "inequalities": 0, "bounds": self.bounds,
-        }  # fmt: skip
+            "variables": self.variables,
+            "equalities": self.equality_rows,
+            "inequalities": 0,
+            "bounds": self.bounds,
+        }
 
 
 #: Assembles a case, given by family, params and form, on all ranks. Collective.

@@ -18,8 +18,9 @@ _FORMULA = frozenset("=+-@＝＋－＠")
 _HIDDEN = frozenset({"Cc", "Cf", "Zl", "Zp", "Zs"})  #: categories that programs skip
 _CONTROL = frozenset({"Cc", "Cs", "Zl", "Zp"})
 #: direction controls; other characters of Cf join letters and symbols
-_DIRECTIONS = frozenset("\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e"
-                        "\u2066\u2067\u2068\u2069")  # fmt: skip
+_DIRECTIONS = frozenset(
+    "\u061c\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069"
+)
 
 
 def csv_text(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:

@@ -37,9 +37,19 @@ _WRONG = "not a .mat file; expected one saved with -v7 or older"
 _HEADER, _TAG = 128, 8  #: bytes of the header of a version 5 file, and of an element
 _COMPRESSED, _MATRIX, _UTF_8 = 15, 14, 16  #: types of elements, and of their parts
 _TYPES = {
-    1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8",
-    13: "u8", 17: "u2", 18: "u4",
-}  # fmt: skip
+    1: "i1",
+    2: "u1",
+    3: "i2",
+    4: "u2",
+    5: "i4",
+    6: "u4",
+    7: "f4",
+    9: "f8",
+    12: "i8",
+    13: "u8",
+    17: "u2",
+    18: "u4",
+}
 _TEXT, _SPARSE = 4, 5  #: classes of variables
 _CLASSES = frozenset(
     (_TEXT, _SPARSE, *range(6, 16))
@@ -244,8 +254,10 @@ def matrix(arrays: Mapping[str, Any], name: str) -> Matrix:
     array = arrays[name]
     if array.ndim > 2:
         raise InputError(f"{name} has {array.ndim} dimensions; expected at most two")
-    check_size(f"{name}, {max(array.shape, default=1)} wide or high,",
-               8 * max(array.shape, default=1))  # fmt: skip
+    check_size(
+        f"{name}, {max(array.shape, default=1)} wide or high,",
+        8 * max(array.shape, default=1),
+    )
     try:
         with np.errstate(over="ignore"):
             M = csc_array(array, dtype=float)

@@ -90,9 +90,14 @@ def _look_up(folder: Path, key: str) -> StoredCase | None:
             return None
         return StoredCase(qp=path, digest=index["digest"], meta=index["meta"])
     except (
-        InputError, OSError, ValueError, KeyError, TypeError, AttributeError,
+        InputError,
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
         RecursionError,
-    ):  # fmt: skip
+    ):
         return None
 
 

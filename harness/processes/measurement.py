@@ -152,8 +152,9 @@ def measure_and_judge(
         sizes=sizes, **{k: _as_tuples(v) for k, v in reply.answer["record"].items()}
     )
     is_incomplete = evaluation is None or None in (
-        evaluation["quantities"], evaluation["bounds"]
-    )  # fmt: skip
+        evaluation["quantities"],
+        evaluation["bounds"],
+    )
     return JudgedMeasurement(record, solution, is_incomplete and not is_pointless)
 
 
@@ -180,9 +181,7 @@ def _with_cost(
 
 def case_request(record: Record) -> dict[str, Any]:
     """Return the entry of a request that names the case to ranks that emit its QP."""
-    case = {
-        "family": record.family, "params": dict(record.params), "form": record.form
-    }  # fmt: skip
+    case = {"family": record.family, "params": dict(record.params), "form": record.form}
     return {"case": case}
 
 
@@ -327,9 +326,15 @@ def measure_once(
             if not source.is_shared:
                 request |= {"qp": str(qp_file), "digest": content_digest(qp_file)}
         once = partial(
-            measure_and_judge, worker, lambda: case().qp, record, request,
-            time_limit=inf, memory_limit=inf, prove=proves(reference),
-        )  # fmt: skip
+            measure_and_judge,
+            worker,
+            lambda: case().qp,
+            record,
+            request,
+            time_limit=inf,
+            memory_limit=inf,
+            prove=proves(reference),
+        )
         try:
             record, solution, needs_evaluation = once()
         except FaultError:

@@ -92,9 +92,11 @@ def launch(ranks: int, command: Sequence[str]) -> int:
     read, write = os.pipe()
     above = [sys.executable, "-I", "-S", reaper.__file__, "rank", str(write)]
     process = subprocess.Popen(
-        [start, "-n", str(ranks), *above, *command], stdin=subprocess.DEVNULL,
-        pass_fds=(*fds, write), env=os.environ | {RECORD: str(write)},
-    )  # fmt: skip
+        [start, "-n", str(ranks), *above, *command],
+        stdin=subprocess.DEVNULL,
+        pass_fds=(*fds, write),
+        env=os.environ | {RECORD: str(write)},
+    )
     # An end kept open here would hide that the ranks, or the parent, closed theirs.
     for fd in (*fds, write):
         os.close(fd)
@@ -334,9 +336,7 @@ class ParallelSolver:
             self._emitted, emission = _emit_on_ranks(self._emit, case, self._ranks)
         except (InputError, RankFailedError) as e:
             self._emission_error = e
-            return qp_of_sizes(0, 0), {
-                "sizes": {}, "digest": "", "build_seconds": None
-            }  # fmt: skip
+            return qp_of_sizes(0, 0), {"sizes": {}, "digest": "", "build_seconds": None}
         sizes = self._emitted.variables, self._emitted.equality_rows
         return qp_of_sizes(*sizes), emission
 
@@ -398,9 +398,11 @@ class ParallelSolver:
             share = self._emitted.share()
         else:
             order = {
-                "qp": str(self._path), "tol": tol, "memory_limit": self._memory_limit,
+                "qp": str(self._path),
+                "tol": tol,
+                "memory_limit": self._memory_limit,
                 "copies": self._copies,
-            }  # fmt: skip
+            }
             self._order(order)
             share = _share(qp, self._ranks, copies=self._copies)
         run = self._solver.prepare(share.qp, tol)
@@ -458,9 +460,14 @@ def qp_of_sizes(variables: int, equality_rows: int) -> QP:
     zeros = np.broadcast_to(0.0, n)
     return QP(
         P=LinearOperator((n, n), matvec=lambda x: 0 * x, dtype=float),
-        q=zeros, lb=zeros, ub=zeros, G=no_rows(n), h=np.zeros(0),
-        A=csr_array((m, n)), b=np.zeros(m),
-    )  # fmt: skip
+        q=zeros,
+        lb=zeros,
+        ub=zeros,
+        G=no_rows(n),
+        h=np.zeros(0),
+        A=csr_array((m, n)),
+        b=np.zeros(m),
+    )
 
 
 def _share(qp: QP, ranks: Ranks, *, copies: bool) -> Share:
@@ -493,10 +500,11 @@ def _solve_on_ranks(
         return s, None
     *tables, peaks = zip(*costs, strict=True)
     reported = {
-        **solution.reported, "ranks": ranks.size,
+        **solution.reported,
+        "ranks": ranks.size,
         "rank_peak_mib_largest": max(peaks),
         "rank_peak_mib_mean": sum(peaks) / ranks.size,
-    }  # fmt: skip
+    }
     spent = RankCosts(*map(_mean_and_largest, tables))
     return s, (replace(solution, reported=reported), spent)
 

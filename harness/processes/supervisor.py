@@ -76,8 +76,12 @@ _CPUCLOCK_SCHED = 2  #: part of the id of a process's CPU clock, see clock_getcp
 #: Signals by which solvers do not end themselves. A worker that one of them ends before
 #: a solve was killed by somebody else.
 _EXTERNAL_SIGNALS = {
-    signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP, signal.SIGQUIT,
-}  # fmt: skip
+    signal.SIGKILL,
+    signal.SIGTERM,
+    signal.SIGINT,
+    signal.SIGHUP,
+    signal.SIGQUIT,
+}
 #: last lines of processes that failed before a solve because of the machine
 _MACHINE_FAILURE = re.compile(
     r"No space left on device|Disk quota exceeded|Too many open files"
@@ -351,14 +355,22 @@ class WorkerProcess:
             with self._log.open("ab") as log:
                 if serve is not None:
                     self._process = fork(
-                        serve, cpu=self._cpu, pipes=pipes, log=log.fileno(),
+                        serve,
+                        cpu=self._cpu,
+                        pipes=pipes,
+                        log=log.fileno(),
                         environment=environment,
-                    )  # fmt: skip
+                    )
                 else:
                     self._process = subprocess.Popen(
                         [
-                            sys.executable, "-I", "-S", reaper.__file__, str(self._cpu),
-                            *map(str, pipes), *self._command,
+                            sys.executable,
+                            "-I",
+                            "-S",
+                            reaper.__file__,
+                            str(self._cpu),
+                            *map(str, pipes),
+                            *self._command,
                         ],
                         # closed by the kernel when this process dies; ends the tree
                         stdin=subprocess.PIPE,
@@ -367,7 +379,7 @@ class WorkerProcess:
                         env=os.environ | environment,
                         pass_fds=pipes,
                         start_new_session=True,
-                    )  # fmt: skip
+                    )
         finally:
             os.close(their_requests)
             os.close(their_replies)
@@ -673,9 +685,7 @@ class _WorkerEndError(Exception):
 def _facts(reply: Mapping[str, Any]) -> dict[str, Any]:
     """Return the fields that a worker reports once, after its warm-up."""
     cpus = reply.get("cpus", ())
-    return {
-        "threads": reply.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None
-    }  # fmt: skip
+    return {"threads": reply.get("threads"), "cpu": cpus[0] if len(cpus) == 1 else None}
 
 
 def _oom_kills() -> int:

@@ -286,9 +286,13 @@ def _limit_memory(mib: float | None) -> None:
 
 
 def _measure_in_process(
-    solver: Solver, qp: QP, tol: float, *, ends: Callable[[], None] = lambda: None,
+    solver: Solver,
+    qp: QP,
+    tol: float,
+    *,
+    ends: Callable[[], None] = lambda: None,
     **how: Any,
-) -> Timed:  # fmt: skip
+) -> Timed:
     """Measure in this process, and end any fork of it that returns from the solver.
 
     A solver may fork and let the child return from its call. That child would answer

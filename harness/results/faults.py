@@ -20,9 +20,13 @@ from mortarbench.harness.files.lines import read_lines
 FAULTS = "faults.jsonl"
 
 _TYPES: dict[str, type] = {
-    "time": str, "run_id": str, "case": str, "solver": str, "what": str,
+    "time": str,
+    "run_id": str,
+    "case": str,
+    "solver": str,
+    "what": str,
     "tried_again": bool,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True, kw_only=True)

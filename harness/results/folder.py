@@ -46,8 +46,13 @@ _DIGEST = re.compile(r"[\w.-]{1,64}")
 _SCRATCH = ".scratch"
 #: beginnings of the names of files that are written beside the folders
 _FILE_PREFIXES = (
-    _LOCK, FAULTS, "environment.", "suite.", "validation.", "discretisation.",
-)  # fmt: skip
+    _LOCK,
+    FAULTS,
+    "environment.",
+    "suite.",
+    "validation.",
+    "discretisation.",
+)
 
 
 def refuse_links(folder: Path) -> None:

@@ -163,10 +163,14 @@ class Executor:
                 return self._optimum(self._entries[step], qp)
 
             record, solution, needs_evaluation = measure_and_judge(
-                self._worker(turn[0].solver), whole, record, request,
-                time_limit=block.time_limit, memory_limit=block.memory_limit,
+                self._worker(turn[0].solver),
+                whole,
+                record,
+                request,
+                time_limit=block.time_limit,
+                memory_limit=block.memory_limit,
                 prove=proven,
-            )  # fmt: skip
+            )
             if record.verdict in (Verdict.CRASHED, Verdict.FAILED):
                 refuse_full_disk(self.scratch, "")  # the likely cause, if it is full
             is_pointless = solution is None or not has_point(solution)

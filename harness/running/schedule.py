@@ -222,9 +222,11 @@ def _by_block(records: Iterable[Record]) -> dict[Block, float]:
 def _fields(case: CaseId) -> dict[str, Any]:
     """Return the name of a case for `harness.processes.case_worker`."""
     return {
-        "family": case.family.name, "params": dict(case.params),
-        "form": case.form, "name": case.name,
-    }  # fmt: skip
+        "family": case.family.name,
+        "params": dict(case.params),
+        "form": case.form,
+        "name": case.name,
+    }
 
 
 def _cell(record: Record) -> Cell:

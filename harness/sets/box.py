@@ -69,10 +69,12 @@ class Box:
                 at = bound[is_finite]
                 limits.append(
                     Limits(
-                        sign * (x[is_finite] - at), np.abs(at), size[is_finite],
+                        sign * (x[is_finite] - at),
+                        np.abs(at),
+                        size[is_finite],
                         partial(_selected, is_finite),
                     )
-                )  # fmt: skip
+                )
         return limits
 
     def admissible(self, z: Vector) -> Vector:

@@ -174,11 +174,17 @@ def parse_suite(
         specs = _on_ranks(specs, table, solvers, sequences)
         every = frozenset(case.name for group in (cases, *sequences) for case in group)
         return Suite(
-            name=table["name"], tolerances=_tolerances(table["tolerances"]), text=text,
-            solvers=_with_null(specs, table["null_arm"]), cases=cases, every=every,
-            sequences=sequences, growing=problems.growing,
-            tighten=_tightening(table, sequences), **numbers,
-        )  # fmt: skip
+            name=table["name"],
+            tolerances=_tolerances(table["tolerances"]),
+            text=text,
+            solvers=_with_null(specs, table["null_arm"]),
+            cases=cases,
+            every=every,
+            sequences=sequences,
+            growing=problems.growing,
+            tighten=_tightening(table, sequences),
+            **numbers,
+        )
 
 
 def name_in(text: str) -> str:

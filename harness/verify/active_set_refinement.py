@@ -114,9 +114,10 @@ def predicted(
     slips = size >= discs.radius[:, None] * soft
     # without any push, the direction is that of λ
     limits[discs.index] = np.where(
-        size > 0, push / np.where(size > 0, size, 1) * discs.radius[:, None],
+        size > 0,
+        push / np.where(size > 0, size, 1) * discs.radius[:, None],
         multipliers[discs.index],
-    )  # fmt: skip
+    )
     states[discs.index] = np.where(slips, _sides(limits[discs.index]), CLOSED)
     return ActiveSet(states.astype(np.int8), limits)
 

@@ -83,9 +83,11 @@ class FeasiblePoint(NamedTuple):
 
 
 def _feasible_near(
-    rows: _Rows, u: Extended, closed: NDArray[np.bool_],
+    rows: _Rows,
+    u: Extended,
+    closed: NDArray[np.bool_],
     nearest: Callable[[NDArray[np.bool_]], Callable[[Vector], Vector]],
-) -> FeasiblePoint | None:  # fmt: skip
+) -> FeasiblePoint | None:
     """Move u into the feasible set, with equality on the rows V.
 
     V holds the closed rows, the violated ones, and those that corrections violate. The
@@ -152,9 +154,12 @@ def _nearest(
 
 
 def feasible_at_rows(
-    exact: Exact, R: NDArray[np.float64], softness: Vector, u: Extended,
+    exact: Exact,
+    R: NDArray[np.float64],
+    softness: Vector,
+    u: Extended,
     closed: NDArray[np.bool_],
-) -> FeasiblePoint | None:  # fmt: skip
+) -> FeasiblePoint | None:
     """Find a feasible point as `_feasible_near`, moving only components of the rows.
 
     Parameters
@@ -397,10 +402,13 @@ class Balance(NamedTuple):
         supported, floating = supported_and_floating(self.G, w)
         basis = supported @ _whitening((np.sqrt(w)[:, None] * self.G) @ supported)
         lam = _newton(
-            self.forces, multipliers, w, self.G @ basis,
+            self.forces,
+            multipliers,
+            w,
+            self.G @ basis,
             np.asarray(basis.T @ (self.load - self.bent), dtype=Real),
             lambda lam: np.abs(basis).T @ self._terms(lam),
-        )  # fmt: skip
+        )
         if lam is None:
             return None
         missing = np.abs(floating.T @ (self.load - self.G.T @ lam))
@@ -418,9 +426,13 @@ def _whitening(M: Extended) -> NDArray[np.float64]:
 
 
 def _newton(
-    forces: AdmissibleForces, multipliers: Extended, w: Extended, G: Extended,
-    load: Extended, terms: Callable[[Extended], Extended],
-) -> Extended | None:  # fmt: skip
+    forces: AdmissibleForces,
+    multipliers: Extended,
+    w: Extended,
+    G: Extended,
+    load: Extended,
+    terms: Callable[[Extended], Extended],
+) -> Extended | None:
     """Solve the equations of `Balance` for GᵀWG = I; None if that is impossible.
 
     Damped Newton's method for the dual function of `Balance.near`. Rows with w = 0 keep

@@ -247,9 +247,12 @@ def certify_by_eigenvalue(qp: QP, s: Solution, least: float) -> EigenvalueCertif
     moved = move @ (qp.P @ move) + PRODUCT_ROUNDING * largest * (move @ move)
     norm = near @ P_near - PRODUCT_ROUNDING * largest * (near @ near)
     certificate = EigenvalueCertificate(
-        x=near, z=z, distance=float(r / np.sqrt(least)),
-        moved=_root(float(moved)), norm=_root(float(norm)),
-    )  # fmt: skip
+        x=near,
+        z=z,
+        distance=float(r / np.sqrt(least)),
+        moved=_root(float(moved)),
+        norm=_root(float(norm)),
+    )
     if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
@@ -372,9 +375,12 @@ def is_sharp(outcome: Certificate | str) -> bool:
 
 
 def proof(
-    split: Undivided, claimed: Vector | Extended, u: Extended,
-    multipliers: Extended, closed: Any,
-) -> Certificate:  # fmt: skip
+    split: Undivided,
+    claimed: Vector | Extended,
+    u: Extended,
+    multipliers: Extended,
+    closed: Any,
+) -> Certificate:
     """Evaluate (4) and (3) for an admissible pair near u and λ.
 
     Raises
@@ -389,15 +395,26 @@ def proof(
         raise UncertifiableError("the penetration of the answer could not be removed")
     lam = balanced(mechanics, multipliers, feasible)
     return proven(
-        split, mechanics.exact, mechanics.motions.G, claimed=claimed, u=feasible,
-        at_rows=feasible, multipliers=lam,
-    )  # fmt: skip
+        split,
+        mechanics.exact,
+        mechanics.motions.G,
+        claimed=claimed,
+        u=feasible,
+        at_rows=feasible,
+        multipliers=lam,
+    )
 
 
 def proven(
-    split: Split, exact: Exact, G: Extended, *, claimed: Vector | Extended,
-    u: Extended, at_rows: Extended, multipliers: Extended,
-) -> Certificate:  # fmt: skip
+    split: Split,
+    exact: Exact,
+    G: Extended,
+    *,
+    claimed: Vector | Extended,
+    u: Extended,
+    at_rows: Extended,
+    multipliers: Extended,
+) -> Certificate:
     """Evaluate (4) and (3) for an admissible pair, on one process or on ranks.
 
     Parameters
@@ -461,11 +478,20 @@ def proven(
     # ‖M‖ − around ≥ ‖û‖ − √(2g) and ≥ ‖u_λ‖ − √(2g), up to the rest of the solve
     least = _root(u_u - u_d + 0.25 * d_d) - around
     certificate = Certificate(
-        u=u, multipliers=lam, off=near.d, norm=_root(u_u), distance=total, work=work,
-        sliding=float(sliding), rounding=rounding, claimed=in_K,
-        stretch=stretch, least=least / stretch, moved=_root(moved_moved),
+        u=u,
+        multipliers=lam,
+        off=near.d,
+        norm=_root(u_u),
+        distance=total,
+        work=work,
+        sliding=float(sliding),
+        rounding=rounding,
+        claimed=in_K,
+        stretch=stretch,
+        least=least / stretch,
+        moved=_root(moved_moved),
         seminorm=near.unbalanced.size > 0,
-    )  # fmt: skip
+    )
     if not np.isfinite(certificate.error):
         raise UncertifiableError("the answer is too large: its energy overflows")
     return certificate
@@ -515,9 +541,14 @@ class _Reach(NamedTuple):
 
 
 def _reach(
-    split: Split, exact: Exact, G: Extended, supported: NDArray[np.float64],
-    lam: Extended, gaps: Extended, square: float,
-) -> _Reach:  # fmt: skip
+    split: Split,
+    exact: Exact,
+    G: Extended,
+    supported: NDArray[np.float64],
+    lam: Extended,
+    gaps: Extended,
+    square: float,
+) -> _Reach:
     """Bound the rigid part γ of û − u* by the contact conditions (R4).
 
     Any combination y ≥ 0 of the inequalities (R4) that equals ±γₖ is a bound. It is

@@ -283,13 +283,17 @@ def _solved(
     if not (np.isfinite(balance.data).all() and np.isfinite(cost).all()):
         return None
     solution = linprog(
-        cost, A_ub=csr_array(np.abs(cost)[None]), b_ub=[1.0],
-        A_eq=balance, b_eq=np.zeros(n),
+        cost,
+        A_ub=csr_array(np.abs(cost)[None]),
+        b_ub=[1.0],
+        A_eq=balance,
+        b_eq=np.zeros(n),
         options=dict(
-            time_limit=LP_SECONDS, primal_feasibility_tolerance=1e-10,
+            time_limit=LP_SECONDS,
+            primal_feasibility_tolerance=1e-10,
             dual_feasibility_tolerance=1e-10,
         ),
-    )  # fmt: skip
+    )
     if solution.x is None or not solution.fun < 0:
         return None
     terms = solution.x / unit

@@ -253,19 +253,28 @@ def _terms(qp: QP, s: Solution) -> _Terms:
     for support in supports:
         work += support.value
     sizes = (
-        x @ np.abs(Px), np.abs(qp.q) @ x, np.abs(qp.b) @ np.abs(s.y),
-        np.abs(qp.h) @ np.abs(s.z), *(support.terms for support in supports),
-    )  # fmt: skip
+        x @ np.abs(Px),
+        np.abs(qp.q) @ x,
+        np.abs(qp.b) @ np.abs(s.y),
+        np.abs(qp.h) @ np.abs(s.z),
+        *(support.terms for support in supports),
+    )
     return _Terms(
-        x=x, constraints=_constraints(qp, s.x, A_size, G_size),
-        Px=Px, Px_size=Px_size, curvature=d, has_diagonal=has_diagonal,
+        x=x,
+        constraints=_constraints(qp, s.x, A_size, G_size),
+        Px=Px,
+        Px_size=Px_size,
+        curvature=d,
+        has_diagonal=has_diagonal,
         forces=rows + _combined(qp.G, np.minimum(s.z, 0)) + s.z_box,
-        forces_size=_combined(A_size, np.abs(s.y)) + _combined(G_size, np.abs(s.z))
+        forces_size=_combined(A_size, np.abs(s.y))
+        + _combined(G_size, np.abs(s.z))
         + np.abs(s.z_box),
-        residual=Px + qp.q + rows + borne, excess=s.z_box - borne,
+        residual=Px + qp.q + rows + borne,
+        excess=s.z_box - borne,
         energies=np.array([s.x @ Px, qp.q @ s.x, work]),
         energies_size=float(np.sum(sizes)),
-    )  # fmt: skip
+    )
 
 
 def _combined(M: Matrix, z: Vector) -> Vector | float:

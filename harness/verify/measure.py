@@ -216,8 +216,10 @@ def _fresh_copy(qp: QP) -> QP:
         if issparse(M) and hasattr(M, "indptr"):
             M = copy(M)
             M.data, M.indices, M.indptr = (
-                M.data.view(), M.indices.view(), M.indptr.view(),
-            )  # fmt: skip
+                M.data.view(),
+                M.indices.view(),
+                M.indptr.view(),
+            )
         return M
 
     return _with_parts(qp, other)

@@ -216,10 +216,13 @@ def _proven(qp: QP, solve: Reference) -> Optimum | None:
     if not (scale > 0 and doubt <= NEGLIGIBLE * scale):  # no scale where all are zero
         return None
     return Optimum(
-        qp=qp, value=float(value), doubt=doubt + rounding, energy=TERMS_FACTOR * scale,
+        qp=qp,
+        value=float(value),
+        doubt=doubt + rounding,
+        energy=TERMS_FACTOR * scale,
         x=scales_at(qp, s.x.astype(float), scale).x,
         own=own_sizes(qp, s.x.astype(float)),
-    )  # fmt: skip
+    )
 
 
 def _reference_point(qp: QP, solve: Reference) -> Solution | None:
@@ -230,10 +233,11 @@ def _reference_point(qp: QP, solve: Reference) -> Solution | None:
         return None
     s = replace(
         point,
-        x=point.x.astype(np.longdouble), y=point.y.astype(np.longdouble),
+        x=point.x.astype(np.longdouble),
+        y=point.y.astype(np.longdouble),
         z=np.maximum(point.z, 0).astype(np.longdouble),
         z_box=admissible(qp.sets, point.z_box).astype(np.longdouble),
-    )  # fmt: skip
+    )
     return s if kkt_residuals(qp, s, generous=True).worst <= MAX_RESIDUAL else None
 
 
@@ -285,9 +289,10 @@ def exact_optimum_without_guess(qp: QP) -> ExactOptimum | None:
             return _exact(qp, s, point)
         z_box = np.where(wrong, 0.0, s.z_box)
         s = replace(
-            s, z=np.where(over, 1.0, np.where(pulling, 0.0, s.z)),
+            s,
+            z=np.where(over, 1.0, np.where(pulling, 0.0, s.z)),
             z_box=np.where(under, -1.0, np.where(above, 1.0, z_box)),
-        )  # fmt: skip
+        )
     return None
 
 
@@ -323,9 +328,9 @@ def _exact_points(qp: QP, s: Solution) -> Iterator[_ExactPoint]:
         guess = np.zeros(n + len(B))
         guess[:n] = x
         if multipliers is not None:
-            guess[n:] = np.concatenate([
-                multipliers.y, multipliers.z[pressed], multipliers.z_box[at_bound]
-            ])  # fmt: skip
+            guess[n:] = np.concatenate(
+                [multipliers.y, multipliers.z[pressed], multipliers.z_box[at_bound]]
+            )
         at = np.cumsum([n, qp.b.size, int(pressed.sum())])
         exact_x, y, z_pressed, z_bound = np.split(solve(rational(guess)), at)
         z, z_box = rational(0 * qp.h), rational(0 * qp.q)
@@ -353,9 +358,12 @@ def _faults(qp: QP, point: _ExactPoint) -> tuple[NDArray[np.bool_], ...]:
 def _exact(qp: QP, s: Solution, point: _ExactPoint) -> ExactOptimum:
     P, q, x = rational(_dense(qp.P)), rational(qp.q), point.x
     rounded = replace(
-        s, x=x.astype(float), y=point.y.astype(float), z=point.z.astype(float),
+        s,
+        x=x.astype(float),
+        y=point.y.astype(float),
+        z=point.z.astype(float),
         z_box=point.z_box.astype(float),
-    )  # fmt: skip
+    )
     return ExactOptimum(x @ (P @ x) / 2 + q @ x, rounded)
 
 
@@ -365,10 +373,13 @@ def _with_others(
     """Compute the exact optimum of the coupled variables, and of each other alone."""
     P = csr_array(qp.P)
     part = replace(
-        qp, P=P[is_coupled][:, is_coupled], q=qp.q[is_coupled],
-        A=csr_array(qp.A)[:, is_coupled], G=csr_array(qp.G)[:, is_coupled],
+        qp,
+        P=P[is_coupled][:, is_coupled],
+        q=qp.q[is_coupled],
+        A=csr_array(qp.A)[:, is_coupled],
+        G=csr_array(qp.G)[:, is_coupled],
         sets=(Box(qp.lb[is_coupled], qp.ub[is_coupled]),),
-    )  # fmt: skip
+    )
     s = replace(s, x=s.x[is_coupled], z_box=s.z_box[is_coupled])
     exact = exact_optimum(part, s)
     if exact is None:

@@ -255,9 +255,14 @@ def certify_over_ranks(
                 local, exact, rigid, (at, softness, trace), u, lam, closed
             )
             return proven(
-                split, exact, rigid.balance.G, claimed=claimed, u=feasible,
-                at_rows=at_rows, multipliers=forces,
-            )  # fmt: skip
+                split,
+                exact,
+                rigid.balance.G,
+                claimed=claimed,
+                u=feasible,
+                at_rows=at_rows,
+                multipliers=forces,
+            )
         except UncertifiableError as e:
             return str(e)
 
@@ -275,10 +280,14 @@ def certify_over_ranks(
 
 
 def _admissible_pair(
-    local: LocalBodies, exact: Exact, rigid: _RigidMotions,
+    local: LocalBodies,
+    exact: Exact,
+    rigid: _RigidMotions,
     trace: tuple[NDArray[np.int64], Vector, Extended],
-    u: Extended, lam: Extended, closed: NDArray[np.bool_],
-) -> tuple[Extended, Extended, Extended]:  # fmt: skip
+    u: Extended,
+    lam: Extended,
+    closed: NDArray[np.bool_],
+) -> tuple[Extended, Extended, Extended]:
     """Return û at the components of the rows (w,) and at local ones (n,), and λ̂.
 
     Raises
@@ -314,13 +323,15 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
     softness = np.where(is_free & (diagonal > 0), 1 / diagonal, 0)
     first = m - contact.bound.size
     return Exact(
-        f=np.zeros(0, dtype=Real), B=B.astype(Real), c=contact.c.astype(Real),
+        f=np.zeros(0, dtype=Real),
+        B=B.astype(Real),
+        c=contact.c.astype(Real),
         fixed=np.flatnonzero(~is_free),
         forces=AdmissibleForces(
             m, friction_discs(contact.bound, contact.tangents, first)
         ),
         compliance=(B.multiply(B) @ softness).astype(Real),
-    ), softness  # fmt: skip
+    ), softness
 
 
 @dataclass(frozen=True, eq=False)
@@ -369,10 +380,11 @@ def _rigid_motions(
         none = np.zeros((exact.c.size, 0), dtype=Real)
         no_load = np.zeros(0, dtype=Real)
         return _RigidMotions(
-            csr_array((local.components.size, 0)), np.zeros((at.size, 0)),
+            csr_array((local.components.size, 0)),
+            np.zeros((at.size, 0)),
             np.zeros((local.motions, 0)),
             Balance(none, none, no_load, no_load, no_load, exact.forces),
-        )  # fmt: skip
+        )
 
     def at_components(R: Any) -> NDArray[Any]:
         """Return columns (n, k) at these components on all ranks: (w, k)."""
@@ -398,15 +410,19 @@ def _rigid_motions(
     together = [reduction.gathered(column) for column in local_motions.toarray().T]
     felt = R_at[:, :p]
     return _RigidMotions(
-        R, felt.astype(np.float64), np.stack(together, axis=1),
+        R,
+        felt.astype(np.float64),
+        np.stack(together, axis=1),
         Balance(
             np.asarray(exact.B @ felt),
             np.asarray(abs(exact.B) @ np.where(felt, largest[:p], 0)),
-            along[:p], (reduction.along(R != 0, size) * largest)[:p],
-            np.zeros(p, dtype=Real), exact.forces,
+            along[:p],
+            (reduction.along(R != 0, size) * largest)[:p],
+            np.zeros(p, dtype=Real),
+            exact.forces,
         ),
         why,
-    )  # fmt: skip
+    )
 
 
 def _orthonormal(local: LocalBodies, R: csr_array) -> Any:

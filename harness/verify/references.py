@@ -123,11 +123,13 @@ def _solved(mechanics: Mechanics, guess: ActiveSet) -> ReferencePoint:
             f"the reference solve found no admissible pair: {e}"
         ) from None
     return ReferencePoint(
-        u=certificate.u, multipliers=certificate.multipliers,
-        equilibrium=certificate.equilibrium, states=active.states,
+        u=certificate.u,
+        multipliers=certificate.multipliers,
+        equilibrium=certificate.equilibrium,
+        states=active.states,
         norm=certificate.norm,
         bound=certificate.bound,
-    )  # fmt: skip
+    )
 
 
 def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
@@ -143,10 +145,14 @@ def _identified(mechanics: Mechanics, solve: Reference) -> ActiveSet:
     if not m or (m > MAX_DENSE_ROWS and not R.shape[1]):
         return unconstrained_guess(mechanics)
     qp = QP(
-        P=inverse.congruence(B), q=exact.c.astype(np.float64) - B @ inverse(f),
-        A=np.ascontiguousarray((B @ R).T) if R.shape[1] else no_rows(m), b=R.T @ f,
-        G=no_rows(m), h=np.zeros(0), sets=exact.forces.sets,
-    )  # fmt: skip
+        P=inverse.congruence(B),
+        q=exact.c.astype(np.float64) - B @ inverse(f),
+        A=np.ascontiguousarray((B @ R).T) if R.shape[1] else no_rows(m),
+        b=R.T @ f,
+        G=no_rows(m),
+        h=np.zeros(0),
+        sets=exact.forces.sets,
+    )
     try:
         s = solve(qp)
     except (ArithmeticError, ValueError, np.linalg.LinAlgError) as e:

@@ -441,9 +441,11 @@ def _coarse_solve(A: csr_array, kernel: Any) -> Callable[[Vector], Vector]:
     pins = qr(kernel.T, mode="r", pivoting=True)[1][: kernel.shape[1]]
     free = np.setdiff1d(np.arange(A.shape[0]), pins)
     factor = splu(
-        csc_matrix(A[free][:, free]), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
+        csc_matrix(A[free][:, free]),
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
         options={"SymmetricMode": True},
-    )  # fmt: skip
+    )
 
     def solve(b: Vector) -> Vector:
         x = np.zeros_like(b)

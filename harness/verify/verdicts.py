@@ -126,9 +126,10 @@ def judged(
         margin = infeasibility_margin(qp, s)
         record = noted(
             record,
-            "no certificate of infeasibility was found" if margin is None
+            "no certificate of infeasibility was found"
+            if margin is None
             else f"no feasible point: Farkas certificate with a margin of {margin:.1e}",
-        )  # fmt: skip
+        )
     elif s.status is Status.INFEASIBLE:
         record = noted(record, "claims of infeasibility are not examined by ranks")
     if prove is not None and margin is None:
@@ -203,9 +204,12 @@ def evaluated_by_ranks(
 
     """
     found: dict[str, Any] = {
-        "values": None, "bounds": None, "quantities": None, "recover_seconds": None,
+        "values": None,
+        "bounds": None,
+        "quantities": None,
+        "recover_seconds": None,
         "notes": list[str](),
-    }  # fmt: skip
+    }
     try:
         found["values"] = run_collectively(
             ranks, lambda: _values_by_ranks(emitted, s, ranks)

@@ -104,9 +104,10 @@ def _run(registries: Registries, argv: Sequence[str]) -> int:
         from mortarbench import processes
 
         starts = {
-            "worker": processes.worker, "ranks": processes.ranks,
+            "worker": processes.worker,
+            "ranks": processes.ranks,
             "generator": processes.case_worker,
-        }  # fmt: skip
+        }
         return starts[argv[0]](registries, argv[1:])
     for argument in takewhile(lambda text: text != "--", argv):
         if re.fullmatch(r"--[\w-]+=--", argument):  # argparse drops this value
@@ -193,8 +194,11 @@ class _Option(NamedTuple):
         settings: dict[str, Any] = {"help": self.what, **self.settings}
         if self.metavar:
             kind = _KINDS.get(self.metavar)
-            settings = {"metavar": self.metavar, **({"type": kind} if kind else {}),
-                        **settings}  # fmt: skip
+            settings = {
+                "metavar": self.metavar,
+                **({"type": kind} if kind else {}),
+                **settings,
+            }
         elif "choices" not in settings:
             settings["action"] = "store_true"
         command.add_argument(*self.names.split(), **settings)
@@ -208,10 +212,19 @@ def _folder(text: str) -> Path:
 
 #: types of arguments by their metavar; the others are strings
 _KINDS: Mapping[str, Callable[[str], Any]] = {
-    "DIR": Path, "DIR2": Path, "FILE.npz|mat|parquet|qps|hdf5": Path,
-    "FILE.png|pdf|svg": Path, "FILE.vtu": Path, "[LABEL=]FILE.py": PluginFile.of,
-    "T": float, "S": float, "F": float, "SECONDS": float, "MIB": float, "N": int,
-}  # fmt: skip
+    "DIR": Path,
+    "DIR2": Path,
+    "FILE.npz|mat|parquet|qps|hdf5": Path,
+    "FILE.png|pdf|svg": Path,
+    "FILE.vtu": Path,
+    "[LABEL=]FILE.py": PluginFile.of,
+    "T": float,
+    "S": float,
+    "F": float,
+    "SECONDS": float,
+    "MIB": float,
+    "N": int,
+}
 _SEVERAL = {"action": "append", "default": []}
 _JSON = _Option("--json", "", "print JSON")
 _MARKDOWN = "--markdown"
@@ -223,9 +236,10 @@ _PLUGIN = _Option(
     _SEVERAL,
 )
 _CASE = _Option(
-    "case", "CASE", "FAMILY/key=value/…/FORM, for example beam-ring/Nr=4/Nh=3/dual; "
-    "see docs/cases.md",
-)  # fmt: skip
+    "case",
+    "CASE",
+    "FAMILY/key=value/…/FORM, for example beam-ring/Nr=4/Nh=3/dual; see docs/cases.md",
+)
 _RESULTS = _Option("folder", "DIR", "result folder of `run`")
 _INSTEAD = "limit of each measurement; overrides that of the suite"
 
@@ -249,8 +263,12 @@ _COMMANDS = {
         "list_",
         "list the available problems, solvers or suites",
         [
-            _Option("what", "", "what to list",
-                    {"choices": ("problems", "solvers", "suites")}),
+            _Option(
+                "what",
+                "",
+                "what to list",
+                {"choices": ("problems", "solvers", "suites")},
+            ),
             _Option(_MARKDOWN, "", "solvers: print docs/solvers.md"),
             _PLUGIN,
             _JSON,
@@ -261,25 +279,43 @@ _COMMANDS = {
         "measure a suite and write a report on the results",
         [
             _Option("suite", "SUITE.toml", "a file, or a name of `list suites`"),
-            _Option("--out", "DIR", "result folder; default: out/NAME-OF-SUITE",
-                    {"type": _folder}),
-            _Option("--solver", "NAME", "measure only this solver; may be repeated",
-                    _SEVERAL),
-            _Option("--case", "PATTERN",
-                    "measure only these cases, e.g. '*/dual'; may be repeated",
-                    _SEVERAL),
-            _option("set an option of every solver that has it; each of several "
-                    "values is measured"),
+            _Option(
+                "--out",
+                "DIR",
+                "result folder; default: out/NAME-OF-SUITE",
+                {"type": _folder},
+            ),
+            _Option(
+                "--solver",
+                "NAME",
+                "measure only this solver; may be repeated",
+                _SEVERAL,
+            ),
+            _Option(
+                "--case",
+                "PATTERN",
+                "measure only these cases, e.g. '*/dual'; may be repeated",
+                _SEVERAL,
+            ),
+            _option(
+                "set an option of every solver that has it; each of several "
+                "values is measured"
+            ),
             _PLUGIN,
             _Option("--repeats", "N", "number of repeats; overrides that of the suite"),
             _Option("--time-limit", "SECONDS", _INSTEAD),
             _Option("--memory-limit", "MIB", _INSTEAD),
             _Option("--fresh", "", "delete the contents of the folder first"),
-            _Option("--dask", "ADDRESS|local", "measure on the workers of a Dask "
-                    "scheduler, or on several processes of this machine; see "
-                    "docs/cluster.md"),
-            _Option("--strict", "", "exit with 1 if a claim is refuted or a solver "
-                    "failed"),
+            _Option(
+                "--dask",
+                "ADDRESS|local",
+                "measure on the workers of a Dask "
+                "scheduler, or on several processes of this machine; see "
+                "docs/cluster.md",
+            ),
+            _Option(
+                "--strict", "", "exit with 1 if a claim is refuted or a solver failed"
+            ),
             _Option("--quiet", "", "print only warnings and missing measurements"),
             _JSON,
         ],
@@ -291,24 +327,48 @@ _COMMANDS = {
         "run one solver on one case, once, and verify its answer",
         [
             _CASE,
-            _Option("--solver", "NAME", "a name of `list solvers`",
-                    {"required": True}),
-            _Option("--tol", "T", "requested relative accuracy; default: 1e-8",
-                    {"default": 1e-8}),
+            _Option("--solver", "NAME", "a name of `list solvers`", {"required": True}),
+            _Option(
+                "--tol",
+                "T",
+                "requested relative accuracy; default: 1e-8",
+                {"default": 1e-8},
+            ),
             _option("set an option of the solver"),
-            _Option("--mpi --ranks", "N", "solve on N MPI processes, for cases of form "
-                    "dual with feti; default: 1", {"default": 1}),
-            _Option("--plot", "FILE.png|pdf|svg", "draw the deformed bodies with their "
-                    "stresses, and each contact enlarged"),
-            _Option("--scale", "S", "factor of the displacements in the picture; "
-                                    "default: 1 if they are visible, else a round "
-                                    "factor that the picture states; above 1, bodies "
-                                    "in contact may appear to overlap"),
-            _Option("--vtu", "FILE.vtu", "write the deformed bodies for ParaView, and "
-                    "a CSV file along each contact; FILE.pvd: all load steps up to "
-                    "this one"),
-            _Option("--mesh-error", "", "also estimate the discretisation error, from "
-                    "finer meshes (at most a minute)"),
+            _Option(
+                "--mpi --ranks",
+                "N",
+                "solve on N MPI processes, for cases of form "
+                "dual with feti; default: 1",
+                {"default": 1},
+            ),
+            _Option(
+                "--plot",
+                "FILE.png|pdf|svg",
+                "draw the deformed bodies with their "
+                "stresses, and each contact enlarged",
+            ),
+            _Option(
+                "--scale",
+                "S",
+                "factor of the displacements in the picture; "
+                "default: 1 if they are visible, else a round "
+                "factor that the picture states; above 1, bodies "
+                "in contact may appear to overlap",
+            ),
+            _Option(
+                "--vtu",
+                "FILE.vtu",
+                "write the deformed bodies for ParaView, and "
+                "a CSV file along each contact; FILE.pvd: all load steps up to "
+                "this one",
+            ),
+            _Option(
+                "--mesh-error",
+                "",
+                "also estimate the discretisation error, from "
+                "finer meshes (at most a minute)",
+            ),
             _PLUGIN,
             _JSON,
         ],
@@ -319,8 +379,12 @@ _COMMANDS = {
         "write the QP of a case to a file for other programs",
         [
             _CASE,
-            _Option("file", "FILE.npz|mat|parquet|qps|hdf5", "for NumPy, for MATLAB "
-                    "and Octave, for qpbenchmark, or for programs that read QPS"),
+            _Option(
+                "file",
+                "FILE.npz|mat|parquet|qps|hdf5",
+                "for NumPy, for MATLAB "
+                "and Octave, for qpbenchmark, or for programs that read QPS",
+            ),
             _PLUGIN,
         ],
     ),
@@ -329,10 +393,14 @@ _COMMANDS = {
         "compare the answers in a result folder with each other and with references",
         [
             _RESULTS,
-            _Option("--budget", "SECONDS", "time for finer meshes, which are used to "
-                                           "estimate discretisation errors; default: "
-                                           "300",
-                    {"default": 300.0}),
+            _Option(
+                "--budget",
+                "SECONDS",
+                "time for finer meshes, which are used to "
+                "estimate discretisation errors; default: "
+                "300",
+                {"default": 300.0},
+            ),
             _PLUGIN,
             _JSON,
         ],
@@ -343,20 +411,43 @@ _COMMANDS = {
         "write the report on a result folder, or on the changes between several",
         [
             _RESULTS,
-            _Option("others", "DIR2", "report the changes from DIR to DIR2, and to "
-                    "each further folder, in DIR2/report/against-DIR",
-                    {"nargs": "*"}),
-            _Option("--format", ",".join(FORMATS), "formats to write; default: all",
-                    {"default": ",".join(FORMATS)}),
-            _Option("--factor", "F", "an answer is verified if every residual is "
-                    "within F times the tolerance; default: 10"),
-            _Option("--pool-forms", "", "compare solvers over the cases of all forms "
-                    "together (means, ranks and profiles) instead of form by form"),
-            _Option("--fail-on", ",".join(GATES), "exit with 1 if, from DIR to DIR2, "
-                                                  "a verdict became worse or a solver "
-                                                  "became significantly slower"),
-            _Option("--verbose", "", "print the paths of all files written, not only "
-                                     "that of the page"),
+            _Option(
+                "others",
+                "DIR2",
+                "report the changes from DIR to DIR2, and to "
+                "each further folder, in DIR2/report/against-DIR",
+                {"nargs": "*"},
+            ),
+            _Option(
+                "--format",
+                ",".join(FORMATS),
+                "formats to write; default: all",
+                {"default": ",".join(FORMATS)},
+            ),
+            _Option(
+                "--factor",
+                "F",
+                "an answer is verified if every residual is "
+                "within F times the tolerance; default: 10",
+            ),
+            _Option(
+                "--pool-forms",
+                "",
+                "compare solvers over the cases of all forms "
+                "together (means, ranks and profiles) instead of form by form",
+            ),
+            _Option(
+                "--fail-on",
+                ",".join(GATES),
+                "exit with 1 if, from DIR to DIR2, "
+                "a verdict became worse or a solver "
+                "became significantly slower",
+            ),
+            _Option(
+                "--verbose",
+                "",
+                "print the paths of all files written, not only that of the page",
+            ),
             _JSON,
         ],
     ),
@@ -365,9 +456,13 @@ _COMMANDS = {
         "repeat one stored measurement and compare it with the old one",
         [
             _RESULTS,
-            _Option("run_id", "RUN_ID", "run_id of a line of the journal, or its "
-                                        "first digits; a report shows it when you "
-                                        "point at a number"),
+            _Option(
+                "run_id",
+                "RUN_ID",
+                "run_id of a line of the journal, or its "
+                "first digits; a report shows it when you "
+                "point at a number",
+            ),
             _PLUGIN,
             _JSON,
         ],
@@ -376,10 +471,15 @@ _COMMANDS = {
         "merge",
         "merge several result folders into one",
         [
-            _Option("folders", "DIR", "result folders of `run` or `merge`",
-                    {"nargs": "+"}),
-            _Option("--out", "DIR", "a new folder, or one of an earlier merge, to "
-                    "which results are added", {"type": _folder, "required": True}),
+            _Option(
+                "folders", "DIR", "result folders of `run` or `merge`", {"nargs": "+"}
+            ),
+            _Option(
+                "--out",
+                "DIR",
+                "a new folder, or one of an earlier merge, to which results are added",
+                {"type": _folder, "required": True},
+            ),
         ],
         "Duplicate measurements are stored once; environments are kept separate.",
     ),
@@ -387,13 +487,18 @@ _COMMANDS = {
         "test_solver",
         "run the conformance suite on solvers: QPs with known solutions",
         [
-            _Option("solver", "NAME", "a solver, or a pattern such as 'p*'",
-                    {"nargs": "+"}),
+            _Option(
+                "solver", "NAME", "a solver, or a pattern such as 'p*'", {"nargs": "+"}
+            ),
             _PLUGIN,
         ],
         excluding=[
-            _Option(_MARKDOWN, "", "print only the effects of equivalent formulations, "
-                    "as in docs/weaknesses.md"),
+            _Option(
+                _MARKDOWN,
+                "",
+                "print only the effects of equivalent formulations, "
+                "as in docs/weaknesses.md",
+            ),
             _JSON,
         ],
     ),
@@ -401,8 +506,12 @@ _COMMANDS = {
         "paper",
         "reproduce all figures and tables of the paper",
         [
-            _Option("--out", "DIR", "folder for the results; default: out/paper",
-                    {"default": Path("out/paper")}),
+            _Option(
+                "--out",
+                "DIR",
+                "folder for the results; default: out/paper",
+                {"default": Path("out/paper")},
+            ),
             _Option("--quick", "", "fewer sizes and repeats, about a minute"),
         ],
     ),
@@ -415,13 +524,17 @@ _COMMANDS = {
         "new",
         "write a template of a solver, a problem or a suite",
         [
-            _Option("kind", "", "kind of the template",
-                    {"choices": ("solver", "problem", "suite")}),
+            _Option(
+                "kind",
+                "",
+                "kind of the template",
+                {"choices": ("solver", "problem", "suite")},
+            ),
             _Option("name", "NAME", "the file is NAME.py, or NAME.toml for a suite"),
         ],
         "The file passes all checks unchanged. Existing files are not overwritten.",
     ),
-}  # fmt: skip
+}
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -55,10 +55,15 @@ class Problem(Family):
         h = 1 / (n + 1)
         K = diags_array([-1.0, 2.0, -1.0], offsets=[-1, 0, 1], shape=(n, n)) / h
         qp = QP(
-            P=K.tocsc(), q=np.full(n, h),
-            A=no_rows(n), b=np.zeros(0), G=no_rows(n), h=np.zeros(0),
-            lb=np.full(n, -depth), ub=np.full(n, np.inf),
-        )  # fmt: skip
+            P=K.tocsc(),
+            q=np.full(n, h),
+            A=no_rows(n),
+            b=np.zeros(0),
+            G=no_rows(n),
+            h=np.zeros(0),
+            lb=np.full(n, -depth),
+            ub=np.full(n, np.inf),
+        )
 
         def quantities(s: Solution) -> Mapping[str, Any]:
             touching = np.count_nonzero(s.x <= -depth * (1 - 1e-6))

@@ -47,8 +47,9 @@ class Solver:
 
     def prepare(self, qp: QP, tol: float) -> Callable[[], Solution]:
         """Convert the QP and return a function that solves it. Both are timed."""
-        P, A, G = (M if isinstance(M, np.ndarray) else M.toarray()
-                   for M in (qp.P, qp.A, qp.G))  # fmt: skip
+        P, A, G = (
+            M if isinstance(M, np.ndarray) else M.toarray() for M in (qp.P, qp.A, qp.G)
+        )
         # Gx ≤ h and the finite bounds, as one system Cx ≤ d
         up, low, eye = np.isfinite(qp.ub), np.isfinite(qp.lb), np.eye(qp.q.size)
         C = np.vstack([G, eye[up], -eye[low]])
@@ -60,9 +61,14 @@ class Solver:
             z_box[up] += z_ub
             z_box[low] -= z_lb
             return Solution(
-                status=status, x=x, y=y, z=z_rows, z_box=z_box, iterations=k,
+                status=status,
+                x=x,
+                y=y,
+                z=z_rows,
+                z_box=z_box,
+                iterations=k,
                 message="" if status is Status.SOLVED else f"{k} iterations, no end",
-            )  # fmt: skip
+            )
 
         def solve() -> Solution:
             for k, point in enumerate(iterates(P, qp.q, A, qp.b, C, d)):

@@ -135,9 +135,12 @@ def check_friction(
     # unknowns: λ_n, λ_t, and the positive and negative parts of the residual
     program = linprog(
         np.append(np.zeros(forces.shape[1]), np.ones(2 * len(eye))),
-        A_eq=np.hstack([forces, eye, -eye]), b_eq=load, **sides,
-        bounds=limits + [(0, None)] * (2 * len(eye)), method="highs",
-    )  # fmt: skip
+        A_eq=np.hstack([forces, eye, -eye]),
+        b_eq=load,
+        **sides,
+        bounds=limits + [(0, None)] * (2 * len(eye)),
+        method="highs",
+    )
     if program.x is not None and program.fun > MAX_IMBALANCE * size:
         raise InputError(
             f"load step {step}: friction cannot hold the load; within the bound of "

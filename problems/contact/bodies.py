@@ -191,11 +191,18 @@ def assemble(
     length, force = units
     return assemble_stiffness(
         UnassembledBodies(
-            mesh=mesh, body=body, names=names, materials=materials, plane=plane,
-            length=length, force=force, f=load / force,
-            B_D=support_rows(mesh, fixed), pairs=pairs,
+            mesh=mesh,
+            body=body,
+            names=names,
+            materials=materials,
+            plane=plane,
+            length=length,
+            force=force,
+            f=load / force,
+            B_D=support_rows(mesh, fixed),
+            pairs=pairs,
         )
-    )  # fmt: skip
+    )
 
 
 def support_rows(mesh: Mesh, fixed: Nodes) -> csr_array:

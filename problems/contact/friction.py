@@ -95,9 +95,13 @@ def friction_of(
     )
     cohesion = bound * rows.share[rows.row] / bodies.force
     return Friction(
-        T=rows.T, bound=cohesion + mu * normal_forces[place],
-        start=rows.T @ slip_origin, row=rows.row, cohesion=cohesion, mu=mu,
-    )  # fmt: skip
+        T=rows.T,
+        bound=cohesion + mu * normal_forces[place],
+        start=rows.T @ slip_origin,
+        row=rows.row,
+        cohesion=cohesion,
+        mu=mu,
+    )
 
 
 def coulomb_fixed_point(

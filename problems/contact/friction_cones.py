@@ -171,9 +171,16 @@ class FrictionalContact:
 
     def _qp(self, q: Vector, lower: Vector, one: Cones | Discs) -> QP:
         return QP(
-            P=self.W, q=q, A=csr_array(self.A), b=self.b, G=no_rows(q.size),
-            h=np.zeros(0), lb=lower, ub=np.full(q.size, np.inf), sets=(one,),
-        )  # fmt: skip
+            P=self.W,
+            q=q,
+            A=csr_array(self.A),
+            b=self.b,
+            G=no_rows(q.size),
+            h=np.zeros(0),
+            lb=lower,
+            ub=np.full(q.size, np.inf),
+            sets=(one,),
+        )
 
 
 class ConvexStep(NamedTuple):

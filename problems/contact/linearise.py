@@ -66,13 +66,17 @@ def linearisation(
             rows(bodies.mesh.points, u, *pair.sides, tangential=tangential)
             if pair.rigid is None
             else rigid_rows(
-                bodies.mesh.points, u, pair.slave, pair.rigid,
-                clamped=pair.clamped, tangential=tangential,
+                bodies.mesh.points,
+                u,
+                pair.slave,
+                pair.rigid,
+                clamped=pair.clamped,
+                tangential=tangential,
             )
             for rows, pair, tangential in zip(
                 methods, bodies.pairs, has_friction, strict=True
             )
-        ]  # fmt: skip
+        ]
         if not any(part.c.size for part in parts) and not u.any():
             raise InputError(
                 "no node of a slave side faces its master within reach; expected two "

@@ -154,9 +154,13 @@ def mortar(
     B = _rows(integrals, j, (slave, master), points.shape)
     T = _rotated(B if tangential else B[:0])
     return ContactRows(
-        B, integrals.gap[j] / integrals.cover[j] + B @ u,
-        T, np.arange(T.shape[0]), integrals.cover[j], j,
-    )  # fmt: skip
+        B,
+        integrals.gap[j] / integrals.cover[j] + B @ u,
+        T,
+        np.arange(T.shape[0]),
+        integrals.cover[j],
+        j,
+    )
 
 
 def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mortar:
@@ -183,9 +187,11 @@ def integrate(slave: Surface, master: Surface, basis: Basis, reach: Reach) -> Mo
     gap = np.einsum("pgj,pg->pj", phi, measure * gauss.gap)
     cover = np.einsum("pgj,pg->pj", N, measure)
     return Mortar(
-        _sum(D, j, j, (s, s)), _sum(M, j, k, (s, v)),
-        _gather(gap, j, s), _gather(cover, j, s),
-    )  # fmt: skip
+        _sum(D, j, j, (s, s)),
+        _sum(M, j, k, (s, v)),
+        _gather(gap, j, s),
+        _gather(cover, j, s),
+    )
 
 
 def overlaps(slave: Surface, master: Surface) -> Overlaps:

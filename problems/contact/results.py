@@ -40,9 +40,12 @@ class BulkResults(NamedTuple):
 
 
 def quantities(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    bodies: Bodies,
+    primal: QP,
+    s: Solution,
+    friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses, see `results_of`.
 
     stresses : nodal stresses (N,) by name; default: those of linear elasticity
@@ -50,17 +53,22 @@ def quantities(
     l, owner = bodies.length, bodies.body_of_node
     stress = (stresses or nodal_stresses(bodies, s.x * l))["von_mises"]
     bulk = BulkResults(
-        nodes=len(bodies.mesh.points), elements=len(bodies.mesh.cells),
-        supports=primal.b.size, energy=primal.objective(s.x) * bodies.force * l,
+        nodes=len(bodies.mesh.points),
+        elements=len(bodies.mesh.cells),
+        supports=primal.b.size,
+        energy=primal.objective(s.x) * bodies.force * l,
         max_von_mises=[stress[owner == b].max() for b in range(len(bodies.names))],
-    )  # fmt: skip
+    )
     return results_of(bulk, bodies, primal, s, friction)
 
 
 def results_of(
-    bulk: BulkResults, bodies: Bodies | ContactSides, primal: QP, s: Solution,
+    bulk: BulkResults,
+    bodies: Bodies | ContactSides,
+    primal: QP,
+    s: Solution,
     friction: Friction = NO_FRICTION,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return counts, energy, contact forces and stresses by name.
 
     energy: ½uᵀKu − fᵀu, J/m. contact_force: the force −ΣBᵀλ of contact and friction on
@@ -184,10 +192,13 @@ def pair_results(
 
 
 def fields(
-    bodies: Bodies, primal: QP, s: Solution, friction: Friction = NO_FRICTION,
+    bodies: Bodies,
+    primal: QP,
+    s: Solution,
+    friction: Friction = NO_FRICTION,
     stresses: Mapping[str, Vector] | None = None,
     subdomains: NDArray[np.int64] | None = None,
-) -> Fields:  # fmt: skip
+) -> Fields:
     """Return the deformed state for pictures, in SI units.
 
     stresses : see `quantities`

@@ -124,8 +124,10 @@ def rigid_rows(
         B=_rows(-normal, components, points.size),
         c=gap - np.einsum("sx,sx->s", normal, u[components]),
         T=_rows(along.reshape(-1, dim), components[row], points.size),
-        row=row, share=reference.areas[place], place=place,
-    )  # fmt: skip
+        row=row,
+        share=reference.areas[place],
+        place=place,
+    )
 
 
 def _rows(values: Points, components: Nodes, n: int) -> csr_array:

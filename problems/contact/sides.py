@@ -78,15 +78,20 @@ def contact_sides(
         along = side.tangents[:, 0] if dim == 2 else unit(shearing, 0 * shearing)
         sides.append(
             ContactSide(
-                name=name, nodes=slave, length=length,
-                force=contact_force + shearing, pressure=(0.0 - normal) / length,
-                gap=gap, push=push,
+                name=name,
+                nodes=slave,
+                length=length,
+                force=contact_force + shearing,
+                pressure=(0.0 - normal) / length,
+                gap=gap,
+                push=push,
                 shear=np.einsum("sx,sx->s", shearing, along) / length
-                if own.any() else None,
+                if own.any()
+                else None,
                 friction=nodal_state if own.any() else None,
                 friction_force=shearing if own.any() else None,
             )
-        )  # fmt: skip
+        )
     return tuple(sides)
 
 

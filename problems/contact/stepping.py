@@ -102,12 +102,17 @@ def load_steps(
     """
     return tuple(
         Stage(
-            step=k, part=k / steps, forces=forces, fixed=fixed, laws=laws,
+            step=k,
+            part=k / steps,
+            forces=forces,
+            fixed=fixed,
+            laws=laws,
             # relinearisations of a step keep its slip origin
             begin=restart_slip if quasi_static and not i else continue_slip,
         )
-        for k in range(1, steps + 1) for i in range(relin)
-    )  # fmt: skip
+        for k in range(1, steps + 1)
+        for i in range(relin)
+    )
 
 
 class LinearisedProblem(Protocol):

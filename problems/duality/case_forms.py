@@ -79,10 +79,16 @@ def case_of(
         return {**quantities(bodies, primal, s, friction), **problem.results(solution)}
 
     case = contact_case(
-        bodies, primal, form, parts=decomposed,
-        floating=lambda: elastic.floating, clamped=lambda: elastic.clamped,
-        supported=lambda: elastic.supported, quantities=results, friction=friction,
-    )  # fmt: skip
+        bodies,
+        primal,
+        form,
+        parts=decomposed,
+        floating=lambda: elastic.floating,
+        clamped=lambda: elastic.clamped,
+        supported=lambda: elastic.supported,
+        quantities=results,
+        friction=friction,
+    )
     return case if problem.exact is None else with_exact_tractions(case, problem.exact)
 
 
@@ -184,16 +190,24 @@ def contact_case(
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=primal, to_primal=transformed.recover, factorise=supported,
-            mesh_size=bodies.mesh_size, rigid=bodies.rigid, names=bodies.names,
-            scale=energy, grid=Grid(
-                bodies.mesh.points, bodies.mesh.cells, bodies.body,
+            primal=primal,
+            to_primal=transformed.recover,
+            factorise=supported,
+            mesh_size=bodies.mesh_size,
+            rigid=bodies.rigid,
+            names=bodies.names,
+            scale=energy,
+            grid=Grid(
+                bodies.mesh.points,
+                bodies.mesh.cells,
+                bodies.body,
                 np.zeros(bodies.mesh.dofs),
             ),
-            friction=friction, certify_by_subdomains=certify_by_subdomains,
+            friction=friction,
+            certify_by_subdomains=certify_by_subdomains,
         ),
         unsettled=friction.unsettled,
-    )  # fmt: skip
+    )
 
 
 def _paper(

@@ -179,9 +179,13 @@ def distributed_qp_of(
 
 
 def decompose(
-    bodies: ElasticBodies, layout: Subdivision, glue: str, stage: Stage,
-    contact: Contact, cluster: int = 0,
-) -> DecomposedProblem:  # fmt: skip
+    bodies: ElasticBodies,
+    layout: Subdivision,
+    glue: str,
+    stage: Stage,
+    contact: Contact,
+    cluster: int = 0,
+) -> DecomposedProblem:
     """Return the decomposed problem of elastic bodies under the load of a stage."""
     unit = bodies.length / bodies.force
     D = elasticity_matrices(bodies.materials, bodies.plane) * unit
@@ -189,12 +193,19 @@ def decompose(
     share = longitudinal_share(D)
     load = stage.forces._replace(value=stage.forces.value * stage.part)
     return DecomposedProblem(
-        layout=layout, components=bodies.shape.dim, material=layout.body,
-        assemble_class=partial(elastic_class, D=D, E=E), E=E, names=bodies.names,
+        layout=layout,
+        components=bodies.shape.dim,
+        material=layout.body,
+        assemble_class=partial(elastic_class, D=D, E=E),
+        E=E,
+        names=bodies.names,
         shaping=partial(layout.shaping, share) if isinstance(layout, Layout) else None,
-        fixed=stage.fixed, load=force_lookup(load), glue=glue, contact=contact,
+        fixed=stage.fixed,
+        load=force_lookup(load),
+        glue=glue,
+        contact=contact,
         cluster=cluster,
-    )  # fmt: skip
+    )
 
 
 def force_lookup(forces: Forces) -> Callable[[Nodes], Vector]:
@@ -262,18 +273,24 @@ def linearise_sides(
     node = side_nodes(elastic.pairs)
     bodies = ContactSides(
         mesh=Mesh(layout.position(node), np.zeros((0, 4), dtype=np.int64), {}),
-        body_of_node=np.asarray(layout.body[layout.holder(node)]), names=elastic.names,
+        body_of_node=np.asarray(layout.body[layout.holder(node)]),
+        names=elastic.names,
         pairs=tuple(pair.renumbered(node) for pair in elastic.pairs),
-        length=elastic.length, force=elastic.force,
-    )  # fmt: skip
+        length=elastic.length,
+        force=elastic.force,
+    )
     rows = problem.linearise(bodies, stage.laws)(at.u * elastic.length)
     return LinearisedSides(
-        bodies=bodies, node=node, nodes=layout.nodes, B=csr_array(rows.B),
-        c=rows.c / elastic.length, place=rows.place,
+        bodies=bodies,
+        node=node,
+        nodes=layout.nodes,
+        B=csr_array(rows.B),
+        c=rows.c / elastic.length,
+        place=rows.place,
         friction=friction_of(
             bodies, rows, stage.laws, at.slip_origin, at.normal_forces
         ),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -306,13 +323,22 @@ class DistributedSolution:
         if sides.friction.bound.size:
             diagonal = self.solution.diagonal(component)
         primal = QP(
-            P=csc_array(diags_array(diagonal)), q=np.zeros(w),
-            A=no_rows(w), b=np.zeros(0), G=sides.B, h=sides.c, lb=-free, ub=free,
-        )  # fmt: skip
+            P=csc_array(diags_array(diagonal)),
+            q=np.zeros(w),
+            A=no_rows(w),
+            b=np.zeros(0),
+            G=sides.B,
+            h=sides.c,
+            lb=-free,
+            ub=free,
+        )
         s = Solution(
-            status=Status.SOLVED, x=self.at(component), y=np.zeros(0),
-            z=self.solution.z, z_box=np.zeros(w),
-        )  # fmt: skip
+            status=Status.SOLVED,
+            x=self.at(component),
+            y=np.zeros(0),
+            z=self.solution.z,
+            z_box=np.zeros(w),
+        )
         return InterfaceState(sides.bodies, primal, s, sides.friction)
 
 
@@ -324,13 +350,14 @@ def _quantities(
     layout = local.problem.layout
     cells = sum(len(layout.cells(int(s))) for s in local.number)
     bulk = BulkResults(
-        nodes=layout.nodes, supports=local.problem.fixed.size,
+        nodes=layout.nodes,
+        supports=local.problem.fixed.size,
         elements=int(local.ranks.total(np.array([float(cells)]))[0]),
         energy=solution.solution.energy * elastic.force * elastic.length,
         max_von_mises=_max_von_mises(
             solution.solution, elastic.length, elastic.materials, elastic.plane
         ),
-    )  # fmt: skip
+    )
     at = solution.sides
     quantities = results_of(bulk, at.bodies, at.primal, at.solution, at.friction)
     return {**quantities, **problem.results(solution)}

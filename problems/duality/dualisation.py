@@ -190,7 +190,12 @@ def _dual(
     """Return the QP  min ½λᵀBK⁺Bᵀλ − (BK⁺f − c)ᵀλ  over sets; `free` is K⁺f."""
     m, B = c.size, structure.B
     return QP(
-        P=inverse.congruence(B), q=c - B @ free,
-        A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        sets=sets, structure=structure,
-    )  # fmt: skip
+        P=inverse.congruence(B),
+        q=c - B @ free,
+        A=no_rows(m),
+        b=np.zeros(0),
+        G=no_rows(m),
+        h=np.zeros(0),
+        sets=sets,
+        structure=structure,
+    )

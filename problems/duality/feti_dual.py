@@ -52,11 +52,14 @@ def feti_dual(
     m_I = primal.h.size
     bound = friction.bound / scale[m_I:]
     qp = QP(
-        P=dual_operator(B, bodies.domains, m_E, bodies.clusters), q=bodies.c - B @ free,
-        A=csr_array((B @ R).T), b=R.T @ f,
-        G=no_rows(bodies.c.size), h=np.zeros(0),
+        P=dual_operator(B, bodies.domains, m_E, bodies.clusters),
+        q=bodies.c - B @ free,
+        A=csr_array((B @ R).T),
+        b=R.T @ f,
+        G=no_rows(bodies.c.size),
+        h=np.zeros(0),
         sets=multiplier_sets(m_E, m_I, bound, friction.tangents),
-    )  # fmt: skip
+    )
     copies = np.asarray(T.multiply(T).sum(axis=0)).ravel()
     copies[copies == 0] = 1  # eliminated components have no copy, and u = 0 there
     B_I = contact_rows(primal, friction)[0]

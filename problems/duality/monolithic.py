@@ -134,9 +134,13 @@ def load_path(
 
     """
     stages = load_steps(
-        steps, relin, forces_of(bodies.f), bodies.B_D.indices, laws,
+        steps,
+        relin,
+        forces_of(bodies.f),
+        bodies.B_D.indices,
+        laws,
         quasi_static=quasi_static,
-    )  # fmt: skip
+    )
     return _path(
         bodies,
         stages,
@@ -167,10 +171,14 @@ def monolithic_path(problem: ContactProblem, reference: Reference) -> Monolithic
         stage.fixed is elastic.fixed for stage in stages
     )
     return _path(
-        bodies, stages, lambda laws: problem.linearise(bodies, laws),
-        (lambda: elastic.clamped) if is_supported else factor, reference,
-        dual_bounds if is_supported else dualise, problem.initial_force,
-    )  # fmt: skip
+        bodies,
+        stages,
+        lambda laws: problem.linearise(bodies, laws),
+        (lambda: elastic.clamped) if is_supported else factor,
+        reference,
+        dual_bounds if is_supported else dualise,
+        problem.initial_force,
+    )
 
 
 def _path(
@@ -224,8 +232,12 @@ def primal_qp(bodies: Bodies, rows: ContactRows, load_factor: float = 1.0) -> QP
     """Return the nondimensional QP (1),  min ½uᵀKu − fᵀu,  B_D u = 0,  B_M u ≤ c_M."""
     n = bodies.mesh.dofs
     return QP(
-        P=bodies.K, q=-load_factor * bodies.f,
-        A=bodies.B_D, b=np.zeros(bodies.B_D.shape[0]),
-        G=rows.B, h=rows.c / bodies.length,
-        lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
-    )  # fmt: skip
+        P=bodies.K,
+        q=-load_factor * bodies.f,
+        A=bodies.B_D,
+        b=np.zeros(bodies.B_D.shape[0]),
+        G=rows.B,
+        h=rows.c / bodies.length,
+        lb=np.full(n, -np.inf),
+        ub=np.full(n, np.inf),
+    )

@@ -382,10 +382,16 @@ class NewtonPath:
         primal = primal_qp(tangent, at.rows)
         answer = self._solve(primal, inverse)
         return Iteration(
-            tangent=tangent, primal=primal, rows=at.rows, gaps=gaps, u=at.u,
-            load_factor=load_factor, clipped=clipped, answer=answer,
+            tangent=tangent,
+            primal=primal,
+            rows=at.rows,
+            gaps=gaps,
+            u=at.u,
+            load_factor=load_factor,
+            clipped=clipped,
+            answer=answer,
             constant=float(at.energy - at.r @ at.u + 0.5 * at.u @ (K @ at.u)),
-        )  # fmt: skip
+        )
 
     def _convex(
         self, at: Configuration, lam: Vector, curvature: Curvature | None
@@ -486,9 +492,13 @@ class NewtonPath:
         return new.recover(s)
 
     def _line_search(
-        self, at: Configuration, iteration: Iteration, lam: Vector, weight: float,
+        self,
+        at: Configuration,
+        iteration: Iteration,
+        lam: Vector,
+        weight: float,
         best: float,
-    ) -> tuple[Configuration, float, float]:  # fmt: skip
+    ) -> tuple[Configuration, float, float]:
         """Return the new configuration, the step length and the residual."""
         load_factor = iteration.load_factor
         d = iteration.answer.x - at.u

@@ -42,9 +42,12 @@ from mortarbench.problems.fem.stress import recover, von_mises_of
 
 
 def newton_path(
-    bodies: Bodies, linearise: Linearise, params: Mapping[str, Any],
-    reference: Reference, steps: int = 1,
-) -> NewtonPath:  # fmt: skip
+    bodies: Bodies,
+    linearise: Linearise,
+    params: Mapping[str, Any],
+    reference: Reference,
+    steps: int = 1,
+) -> NewtonPath:
     """Return the load path of hyperelastic bodies, see `problems.ranges.KINEMATICS`.
 
     linearise : linearisation of contact by the method in params, if any
@@ -122,11 +125,14 @@ def newton_case(
         return values | path_state(path, at, s) | step_quantities | dict(results(at, s))
 
     case = contact_case(
-        bodies, primal, form,
+        bodies,
+        primal,
+        form,
         floating=lambda: sliding_inverse(bodies),
         clamped=lambda: factorise_clamped(bodies),
-        supported=lambda: factorise_supported(bodies), quantities=collected,
-    )  # fmt: skip
+        supported=lambda: factorise_supported(bodies),
+        quantities=collected,
+    )
     assert case.mechanics is not None
     back, constant = case.mechanics.to_primal, at.constant * unit
 
@@ -136,11 +142,13 @@ def newton_case(
         return fields(bodies, primal, s, stresses=stresses)
 
     return replace(
-        case, fields=drawn, constant=case.constant + constant,
+        case,
+        fields=drawn,
+        constant=case.constant + constant,
         mechanics=replace(
             case.mechanics, constant=constant, rigid=translations(bodies)
         ),
-    )  # fmt: skip
+    )
 
 
 def path_state(path: NewtonPath, at: Iteration, s: Solution) -> dict[str, Any]:

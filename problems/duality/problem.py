@@ -172,9 +172,12 @@ class StructuredSolids:
         ]
         is_grid = len(positions) == len(labels)
         return mesh_in_subdomains(
-            self.mesh, label, self.body, named,
+            self.mesh,
+            label,
+            self.body,
+            named,
             np.concatenate(positions) if is_grid else None,
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -227,11 +230,17 @@ class ElasticBodies:
         f = np.zeros(mesh.dofs)
         f[self.forces.component] = self.forces.value
         return UnassembledBodies(
-            mesh=mesh, body=self.shape.body, names=self.names,
-            materials=self.materials, plane=self.plane, length=self.length,
-            force=self.force, f=f, B_D=support_rows(mesh, self.fixed),
+            mesh=mesh,
+            body=self.shape.body,
+            names=self.names,
+            materials=self.materials,
+            plane=self.plane,
+            length=self.length,
+            force=self.force,
+            f=f,
+            B_D=support_rows(mesh, self.fixed),
             pairs=self.pairs,
-        )  # fmt: skip
+        )
 
     @cached_property
     def is_supported(self) -> bool:
@@ -260,10 +269,16 @@ def elastic_bodies_of(bodies: UnassembledBodies) -> ElasticBodies:
     fixed = bodies.B_D.indices
     named = np.concatenate([fixed, bodies.interface]) // bodies.mesh.dim
     result = ElasticBodies(
-        shape=Meshed(bodies.mesh, bodies.body, named), names=bodies.names,
-        materials=bodies.materials, plane=bodies.plane, length=bodies.length,
-        force=bodies.force, fixed=fixed, forces=forces_of(bodies.f), pairs=bodies.pairs,
-    )  # fmt: skip
+        shape=Meshed(bodies.mesh, bodies.body, named),
+        names=bodies.names,
+        materials=bodies.materials,
+        plane=bodies.plane,
+        length=bodies.length,
+        force=bodies.force,
+        fixed=fixed,
+        forces=forces_of(bodies.f),
+        pairs=bodies.pairs,
+    )
     vars(result)["whole"] = bodies
     if isinstance(bodies, Bodies):
         vars(result)["assembled"] = bodies
@@ -368,9 +383,12 @@ def qp_choice(form: str, params: Mapping[str, Value]) -> Choice:
             f"{key} with form {form} is not built; expected form dual, or no {key}"
         )
     return Choice(
-        p.get("step", 1), p.get("iterate", 0), size, p.get("glue", "orthonormal"),
+        p.get("step", 1),
+        p.get("iterate", 0),
+        size,
+        p.get("glue", "orthonormal"),
         p.get("cluster", 0),
-    )  # fmt: skip
+    )
 
 
 def cached_problem(

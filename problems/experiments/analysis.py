@@ -77,7 +77,7 @@ def analyse(
 
     path = load_path(
         bodies, linearise, lambda: inverse, solve_dual, steps, transform=dualise
-    )  # fmt: skip
+    )
     path.solution(steps)
     watch.lap("recovery")
     laps = dict(watch.laps)

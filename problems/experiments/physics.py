@@ -53,9 +53,12 @@ def _results(bodies: Bodies, path: MonolithicPath, step: int) -> dict[str, Value
     tip = s.x[dofs_of(np.intersect1d(sides["top"], sides["right"]), 2)] * LENGTH
     force = values["contact_force"]
     return {
-        "tip_x": float(tip[0]), "tip_y": float(tip[1]), "energy": values["energy"],
-        "force_x": force[0], "force_y": force[1],
-    }  # fmt: skip
+        "tip_x": float(tip[0]),
+        "tip_y": float(tip[1]),
+        "energy": values["energy"],
+        "force_x": force[0],
+        "force_y": force[1],
+    }
 
 
 def pressures(plan: Plan, solve: Reference) -> Rows:
@@ -82,10 +85,14 @@ def pressures(plan: Plan, solve: Reference) -> Rows:
             columns = zip(angles, lengths, forces, strict=True)
             for node, (angle, length, force) in enumerate(columns):
                 yield {
-                    "contact": contact, "step": step, "node": node,
-                    "angle": float(angle), "length": float(length),
-                    "force": float(force), "pressure": float(force / length),
-                }  # fmt: skip
+                    "contact": contact,
+                    "step": step,
+                    "node": node,
+                    "angle": float(angle),
+                    "length": float(length),
+                    "force": float(force),
+                    "pressure": float(force / length),
+                }
 
 
 def verification(plan: Plan, solve: Reference) -> Rows:

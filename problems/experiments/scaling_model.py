@@ -44,9 +44,12 @@ class Machine:
 #: Machine of the extrapolation in docs/scaling-model.md: 3 GB/s per core. The bandwidth
 #: of its node reproduces an earlier prototype; the network is a usual one.
 PAPER = Machine(
-    bandwidth=3e9, rate=float("inf"), node_bandwidth=231e9, latency=2e-6,
+    bandwidth=3e9,
+    rate=float("inf"),
+    node_bandwidth=231e9,
+    latency=2e-6,
     seconds_per_byte=1e-10,
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True, kw_only=True)

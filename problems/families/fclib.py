@@ -112,10 +112,13 @@ class Fclib(FromFile):
             }
 
         return Case(
-            qp=steps[-1].qp, recover=lambda s: force * s.x, quantities=evaluate,
-            scale=force * speed, remarks=tuple(remarks),
+            qp=steps[-1].qp,
+            recover=lambda s: force * s.x,
+            quantities=evaluate,
+            scale=force * speed,
+            remarks=tuple(remarks),
             unsettled=0.0 if p["iterate"] == 0 else steps[-1].error,
-        )  # fmt: skip
+        )
 
 
 #: scaled natural map of a stored solution that counts as a dummy: zeros have about 1

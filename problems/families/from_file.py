@@ -92,6 +92,9 @@ class FromFile(Family):
             return {"value": scale * qp.objective(s.x) + constant}
 
         return Case(
-            qp=qp, recover=lambda s: s.x, quantities=quantities,
-            scale=scale, constant=constant,
-        )  # fmt: skip
+            qp=qp,
+            recover=lambda s: s.x,
+            quantities=quantities,
+            scale=scale,
+            constant=constant,
+        )

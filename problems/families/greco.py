@@ -26,9 +26,13 @@ class Greco(ContactFamily):
 
     name = "greco"
     keys = schema(
-        n=key(32, 2), mu=key(1.0), iterate=key(0, 0), **DECOMPOSITION, **DIMENSION,
+        n=key(32, 2),
+        mu=key(1.0),
+        iterate=key(0, 0),
+        **DECOMPOSITION,
+        **DIMENSION,
         depth=key(1, 1),
-    )  # fmt: skip
+    )
     forms = CONTACT_FORMS
     problem = "greco.problem"
 

@@ -115,9 +115,14 @@ def stiffness(
     if material is None:
         material = np.zeros(len(mesh.cells), dtype=np.int64)
     data = add_stiffness(
-        mesh.element, mesh.points, pattern.cells, D.reshape(-1, *D.shape[-2:]),
-        material.astype(np.int32), pattern.ptr, pattern.slot,
-    )  # fmt: skip
+        mesh.element,
+        mesh.points,
+        pattern.cells,
+        D.reshape(-1, *D.shape[-2:]),
+        material.astype(np.int32),
+        pattern.ptr,
+        pattern.slot,
+    )
     n = mesh.dofs
     return csc_array((data, pattern.indices, pattern.indptr), shape=(n, n))
 

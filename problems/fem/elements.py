@@ -73,10 +73,12 @@ class Element:
     @property
     def weights(self) -> Vector:
         """Weights of the quadrature points, (q,); their sum is the volume."""
-        volume = np.prod([
-            abs(np.linalg.det(s[1:] - s[0])) / factorial(s.shape[1])
-            for s in self.simplices
-        ])  # fmt: skip
+        volume = np.prod(
+            [
+                abs(np.linalg.det(s[1:] - s[0])) / factorial(s.shape[1])
+                for s in self.simplices
+            ]
+        )
         return np.full(len(self.points), volume / len(self.points))
 
     def shapes(self, xi: Vector) -> Vector:
@@ -138,7 +140,7 @@ HEXAHEDRON = Element(
     "hexahedron",
     simplices=(INTERVAL, INTERVAL, INTERVAL),
     vertices=np.vstack([np.insert(QUAD.vertices, 2, z, axis=1) for z in (0, 1)]),
-)  # fmt: skip
+)
 WEDGE = Element(
     "wedge",
     simplices=(TRIANGLE, INTERVAL),

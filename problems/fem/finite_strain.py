@@ -91,11 +91,14 @@ def cells_of(
     corners = mesh.points[mesh.cells]
     points = [shape_gradients(corners, point) for point in mesh.element.points]
     return Cells(
-        mesh, tuple(materials), body, cell_dofs(mesh),
+        mesh,
+        tuple(materials),
+        body,
+        cell_dofs(mesh),
         gradients=np.stack([gradients for gradients, _ in points], axis=1),
         volumes=np.stack([det for _, det in points], axis=1),
         pattern=sparsity(mesh),
-    )  # fmt: skip
+    )
 
 
 def deformation_gradients(cells: Cells, u: Vector) -> Floats:
@@ -154,9 +157,7 @@ def evaluate(cells: Cells, u: Vector) -> EnergyDerivatives:
         # ∂²(w + U′θ)/∂F² at fixed U′; the rest is U″ θ′⊗θ′, or U″/V ggᵀ of the mean
         A = w.second + slope[..., None, None, None, None] * theta.second
         if not mean:
-            A += np.einsum(
-                "eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first
-            )  # fmt: skip
+            A += np.einsum("eq,eqij,eqkl->eqijkl", curvature, theta.first, theta.first)
         tangents[index] = cell_tangents(gradients, volumes, A)
         if mean:
             g = _nodal(theta.first, gradients, volumes)
@@ -247,10 +248,14 @@ def cauchy_stress(cells: Cells, u: Vector) -> Floats:
         P = material.shear(F).first + slope[:, None, None] * theta.first
         J = determinant(F)
         sigma = P @ np.swapaxes(F, 1, 2) / J[:, None, None]
-        stress[index] = np.column_stack([
-            sigma[:, 0, 0], sigma[:, 1, 1], sigma[:, 0, 1],
-            slope * material.thickness_rate(F) / J,
-        ])  # fmt: skip
+        stress[index] = np.column_stack(
+            [
+                sigma[:, 0, 0],
+                sigma[:, 1, 1],
+                sigma[:, 0, 1],
+                slope * material.thickness_rate(F) / J,
+            ]
+        )
     return stress
 
 

@@ -111,9 +111,12 @@ class NeoHooke(Hyperelastic):
         return Derivatives(
             mu * ((F**2).sum((-2, -1)) / 2 - 1 - log_J),
             mu * (F - back),  # ∂ ln J/∂F = F⁻ᵀ
-            mu * (np.einsum("ik,jl->ijkl", _I, _I)
-                  + np.einsum("...il,...kj->...ijkl", back, back)),
-        )  # fmt: skip
+            mu
+            * (
+                np.einsum("ik,jl->ijkl", _I, _I)
+                + np.einsum("...il,...kj->...ijkl", back, back)
+            ),
+        )
 
     def dilatation(self, F: Floats) -> Derivatives:
         """Return θ = J."""
@@ -149,10 +152,13 @@ class StVenantKirchhoff(Hyperelastic):
         return Derivatives(
             mu * (E**2).sum((-2, -1)),
             2 * mu * (F @ E),
-            mu * (2 * np.einsum("ik,...jl->...ijkl", _I, E)
-                  + np.einsum("...il,...kj->...ijkl", F, F)
-                  + np.einsum("...ik,jl->...ijkl", F @ np.swapaxes(F, -1, -2), _I)),
-        )  # fmt: skip
+            mu
+            * (
+                2 * np.einsum("ik,...jl->...ijkl", _I, E)
+                + np.einsum("...il,...kj->...ijkl", F, F)
+                + np.einsum("...ik,jl->...ijkl", F @ np.swapaxes(F, -1, -2), _I)
+            ),
+        )
 
     def dilatation(self, F: Floats) -> Derivatives:
         """Return θ = tr E."""

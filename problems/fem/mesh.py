@@ -129,9 +129,10 @@ class StructuredGrid:
         for line in np.unique(row if by_rows else column):
             k = np.flatnonzero((row if by_rows else column) == line)
             parameters = (
-                (self.columns[column[k]], self.rows[[line]]) if by_rows
+                (self.columns[column[k]], self.rows[[line]])
+                if by_rows
                 else (self.columns[[line]], self.rows[row[k]])
-            )  # fmt: skip
+            )
             points[k] = self.place(*parameters).reshape(-1, 2)
         return points
 
@@ -234,8 +235,9 @@ def cells_of_block(columns: int, rows: int) -> Nodes:
     return np.stack(corners, axis=-1).reshape(-1, 4)
 
 
-def rectangle_grid(corner: tuple[float, float], size: tuple[float, float],
-                   divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
+def rectangle_grid(
+    corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
+) -> StructuredGrid:
     """Divide a rectangle into nx × ny equal cells; sides bottom, right, top, left."""
     nx, ny = divisions
     return StructuredGrid(
@@ -246,8 +248,9 @@ def rectangle_grid(corner: tuple[float, float], size: tuple[float, float],
     )
 
 
-def box(corner: tuple[float, ...], size: tuple[float, ...],
-        divisions: tuple[int, ...]) -> Mesh:  # fmt: skip
+def box(
+    corner: tuple[float, ...], size: tuple[float, ...], divisions: tuple[int, ...]
+) -> Mesh:
     """Mesh a box by nx × ny × nz equal hexahedra, x numbered fastest.
 
     The boundaries have the names of those of `box_grid`. Lengths are in m.
@@ -280,10 +283,14 @@ def box_grid(x: Vector, y: Vector, z: Vector) -> Mesh:
     centre = points[facets].mean(axis=1)
     names = ("left", "right", "front", "back", "bottom", "top")
     planes = [(k, axes[k][end]) for k in range(3) for end in (0, -1)]
-    return Mesh(points, cells, {
-        name: facets[centre[:, k] == place]
-        for name, (k, place) in zip(names, planes, strict=True)
-    })  # fmt: skip
+    return Mesh(
+        points,
+        cells,
+        {
+            name: facets[centre[:, k] == place]
+            for name, (k, place) in zip(names, planes, strict=True)
+        },
+    )
 
 
 def extruded(mesh: Mesh, layers: int, thickness: float) -> Mesh:
@@ -322,8 +329,9 @@ def distorted(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
     return replace(mesh, points=points + move)
 
 
-def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
-                   divisions: tuple[int, int]) -> StructuredGrid:  # fmt: skip
+def half_ring_grid(
+    centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
+) -> StructuredGrid:
     """Divide the upper half of a ring by equal angles × equal layers.
 
     Sides: outer (from angle 0 to π), left_foot, inner, right_foot.
@@ -337,12 +345,14 @@ def half_ring_grid(centre: tuple[float, float], radii: tuple[float, float],
     return StructuredGrid(
         columns=np.pi * np.arange(angles + 1) / angles,
         rows=radii[1] + (radii[0] - radii[1]) * np.arange(layers + 1) / layers,
-        place=place, names=("outer", "left_foot", "inner", "right_foot"),
-    )  # fmt: skip
+        place=place,
+        names=("outer", "left_foot", "inner", "right_foot"),
+    )
 
 
-def rectangle(corner: tuple[float, float], size: tuple[float, float],
-              divisions: tuple[int, int]) -> Mesh:  # fmt: skip
+def rectangle(
+    corner: tuple[float, float], size: tuple[float, float], divisions: tuple[int, int]
+) -> Mesh:
     """Mesh a rectangle by nx × ny equal cells.
 
     Boundaries: bottom, right, top, left. Lengths are in m.
@@ -353,8 +363,9 @@ def rectangle(corner: tuple[float, float], size: tuple[float, float],
     return rectangle_grid(corner, size, divisions).mesh()
 
 
-def half_ring(centre: tuple[float, float], radii: tuple[float, float],
-              divisions: tuple[int, int]) -> Mesh:  # fmt: skip
+def half_ring(
+    centre: tuple[float, float], radii: tuple[float, float], divisions: tuple[int, int]
+) -> Mesh:
     """Mesh the upper half of a ring by equal angles × equal layers.
 
     Boundaries: outer (from angle 0 to π), left_foot, inner, right_foot.

@@ -88,9 +88,17 @@ def multifrontal(
     offset = np.append(0, np.cumsum(pivots.astype(np.int64) * (pivots + border)))
     rows = np.zeros(offset[-1])
     definite = eliminate(
-        *index_arrays(K), K.data, order, position, fronts.start, fronts.first,
-        fronts.border, fronts.children, offset, rows,
-    )  # fmt: skip
+        *index_arrays(K),
+        K.data,
+        order,
+        position,
+        fronts.start,
+        fronts.first,
+        fronts.border,
+        fronts.children,
+        offset,
+        rows,
+    )
     if not definite:
         raise np.linalg.LinAlgError("the matrix is not positive definite")
     return Multifrontal(order, fronts, offset, rows)

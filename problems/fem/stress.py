@@ -63,9 +63,10 @@ def recover(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     k, terms = values.shape[1], dim + 1
     size = np.ptp(mesh.points, axis=0).max()
     centre = np.average(
-        mesh.points[mesh.cells], axis=1,
+        mesh.points[mesh.cells],
+        axis=1,
         weights=np.broadcast_to(corner[..., None], (*corner.shape, dim)),
-    )  # fmt: skip
+    )
     offset = (centre[cells] - mesh.points[nodes]) / size
     # 1, x, … about the node, in units of the extent of the mesh
     basis = np.column_stack([np.ones(len(nodes)), offset])

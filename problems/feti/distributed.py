@@ -118,9 +118,12 @@ SIZE_WEIGHTS = (0.25, 0.5, 1.0)  #: weights of the size relative to the work
 
 
 def balanced_partition(
-    graph: csr_array, work: NDArray[np.int64], size: NDArray[np.int64], ranks: int,
+    graph: csr_array,
+    work: NDArray[np.int64],
+    size: NDArray[np.int64],
+    ranks: int,
     cluster: NDArray[np.int64] | None = None,
-) -> NDArray[np.int64]:  # fmt: skip
+) -> NDArray[np.int64]:
     """Partition subdomains over ranks, balancing both work and size (S,).
 
     METIS balances a single weight, and the first one is the work. If the sizes are then
@@ -177,10 +180,13 @@ def _partitioned(
     from pymetis import CSRAdjacency, Options, part_graph  # not needed on one rank
 
     _, labels = part_graph(
-        ranks, CSRAdjacency(graph.indptr, graph.indices), eweights=graph.data,
-        vweights=weight, recursive=True,
+        ranks,
+        CSRAdjacency(graph.indptr, graph.indices),
+        eweights=graph.data,
+        vweights=weight,
+        recursive=True,
         options=Options() if seed is None else Options(seed=seed),
-    )  # fmt: skip
+    )
     rank = np.array(labels, dtype=np.int64)
     # with few subdomains METIS may leave a rank empty
     for idle in np.setdiff1d(np.arange(ranks), rank):
@@ -273,11 +279,14 @@ def build_halo(
         exported.append(np.searchsorted(owned, needed))
         ghosts.append(np.flatnonzero((owner == r) & (r != me)))
     return Halo(
-        ranks=ranks, rows=rows, owned=owned,
-        exported=np.concatenate(exported), ghosts=np.concatenate(ghosts),
+        ranks=ranks,
+        rows=rows,
+        owned=owned,
+        exported=np.concatenate(exported),
+        ghosts=np.concatenate(ghosts),
         export_counts=np.array([*map(len, exported)]),
         ghost_counts=np.array([*map(len, ghosts)]),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,10 +311,13 @@ class RowsOverRanks:
         owned, ghosts = csr_array(B[at.owned]), csr_array(B[at.ghosts])
         columns = np.unique(ghosts.indices)
         return cls(
-            at, CompressedRows(owned), CompressedRows(csr_array(owned.T)),
+            at,
+            CompressedRows(owned),
+            CompressedRows(csr_array(owned.T)),
             CompressedRows(ghosts),
-            CompressedRows(csr_array(ghosts[:, columns].T)), columns,
-        )  # fmt: skip
+            CompressedRows(csr_array(ghosts[:, columns].T)),
+            columns,
+        )
 
     def transposed_times(self, x: Vector) -> Vector:
         """Return Bᵀx (M,) on this rank, from its slice x (o,)."""
@@ -606,8 +618,9 @@ def condense_over_ranks(
     position = {name: i for i, name in enumerate(names)}
     factors = {
         n: groups_by_name[n].template.border_factor(groups_by_name[n].touched)
-        for n in sent + local if n not in exclusive
-    }  # fmt: skip
+        for n in sent + local
+        if n not in exclusive
+    }
     blocks = dict[str, Dense]()  # (2, b, b) of classes on several ranks
 
     def formed(some: list[str]) -> Iterator[tuple[int, Condensed]]:
@@ -692,19 +705,26 @@ def local_share(qp: QP, operator: DualOperator, ranks: Ranks) -> Share:
         tuple(domains.classes[k].without_factor(str(k)) for k in classes), class_of
     )
     local = DualOperator(
-        csr_array(B[halo.rows][:, columns]), local_domains,
-        operator.explicit[classes], operator.equalities,
+        csr_array(B[halo.rows][:, columns]),
+        local_domains,
+        operator.explicit[classes],
+        operator.equalities,
         partial(condense_over_ranks, ranks=ranks),
         operator.clusters
         and operator.clusters.restrict(subdomains, classes, local_domains),
-    )  # fmt: skip
+    )
     owned = halo.rows[halo.owned]
     q, lb, ub = (distributed(v[owned], ranks) for v in (qp.q, qp.lb, qp.ub))
     qp_local = QP(
         P=RankOperator(local, halo),
-        q=q, lb=lb, ub=ub, G=no_rows(owned.size), h=np.zeros(0),
-        A=DistributedColumns(csr_array(qp.A[:, owned]), ranks), b=np.array(qp.b),
-    )  # fmt: skip
+        q=q,
+        lb=lb,
+        ub=ub,
+        G=no_rows(owned.size),
+        h=np.zeros(0),
+        A=DistributedColumns(csr_array(qp.A[:, owned]), ranks),
+        b=np.array(qp.b),
+    )
 
     return Share(qp_local, gather_on_rank_0(halo, qp.q.size))
 

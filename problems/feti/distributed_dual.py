@@ -102,16 +102,24 @@ class LocalDual:
         unfactored = Subdomains(classes, domains.class_of)
         clusters = self.subdomains.clusters
         local = DualOperator(
-            rows.B, unfactored, self.explicit, rows.equalities,
+            rows.B,
+            unfactored,
+            self.explicit,
+            rows.equalities,
             partial(condense_over_ranks, ranks=ranks),
             clusters and replace(clusters, domains=unfactored),
-        )  # fmt: skip
+        )
         lower, upper = self.bounds(self.subdomains.problem.contact.bound)
         qp = QP(
-            P=RankOperator(local, self.halo), q=distributed(self.q, ranks),
-            lb=lower, ub=upper, G=no_rows(self.q.size), h=np.zeros(0),
-            A=DistributedColumns(self.G, ranks), b=self.b,
-        )  # fmt: skip
+            P=RankOperator(local, self.halo),
+            q=distributed(self.q, ranks),
+            lb=lower,
+            ub=upper,
+            G=no_rows(self.q.size),
+            h=np.zeros(0),
+            A=DistributedColumns(self.G, ranks),
+            b=self.b,
+        )
         return Share(qp, gather_on_rank_0(self.halo, rows.total))
 
     def bounds(self, bound: Vector) -> tuple[DistributedVector, DistributedVector]:
@@ -192,13 +200,15 @@ def distributed_qp(
 
     bounds = dual.bounds(local.problem.contact.bound)
     return DistributedQP(
-        variables=local.rows.total, equality_rows=local.unit_motions,
+        variables=local.rows.total,
+        equality_rows=local.unit_motions,
         bounds=sum(int(np.count_nonzero(np.isfinite(v))) for v in bounds),
-        share=dual.share, digest=digest,
+        share=dual.share,
+        digest=digest,
         answer=evaluation(
             local, dual.halo, _decomposition(local, dual.explicit), results
         ),
-    )  # fmt: skip
+    )
 
 
 def _decomposition(
@@ -216,11 +226,14 @@ def _decomposition(
     dofs, formed, mib = ranks.total(np.array(counts, dtype=float)).tolist()
     classes = ranks.comm.allgather({kind.name for kind in domains.classes})
     return {
-        "subdomains": local.rank.size, "kinds": len(set().union(*classes)),
-        "torn_dofs": int(dofs), "multipliers": rows.total,
+        "subdomains": local.rank.size,
+        "kinds": len(set().union(*classes)),
+        "torn_dofs": int(dofs),
+        "multipliers": rows.total,
         "coarse_unknowns": local.unit_motions,
-        "explicit_subdomains": int(formed), "explicit_mib": mib,
-    }  # fmt: skip
+        "explicit_subdomains": int(formed),
+        "explicit_mib": mib,
+    }
 
 
 def _digest(local: LocalSubdomains) -> str:

@@ -154,17 +154,22 @@ def _local_bodies(local: LocalSubdomains) -> tuple[LocalBodies, Vector]:
     multiplicity[place] = local.multiplicity
     parts = LocalProblems(local.decomposed, problem.components)
     return LocalBodies(
-        ranks=local.ranks, parts=parts, components=components,
+        ranks=local.ranks,
+        parts=parts,
+        components=components,
         shared=np.bincount(place, minlength=multiplicity.size) < multiplicity,
         coarse=local.local_motions,
-        motions=local.coarse_size, f=local.f,
+        motions=local.coarse_size,
+        f=local.f,
         fixed=np.flatnonzero(np.isin(components, problem.fixed)),
         contact=Contact(
-            rows=csr_array(contact.rows[active]), c=contact.c[active],
-            bound=contact.bound[contact.bound > 0], tangents=contact.tangents,
+            rows=csr_array(contact.rows[active]),
+            c=contact.c[active],
+            bound=contact.bound[contact.bound > 0],
+            tangents=contact.tangents,
         ),
         floating=_floating_bodies(local),
-    ), multiplicity  # fmt: skip
+    ), multiplicity
 
 
 def _force_rows(problem: DecomposedProblem) -> Nodes:

@@ -127,6 +127,8 @@ def _clusters(arrays: Arrays, domains: Subdomains) -> Clusters:
     joints = tuple(arrays[f"joints_{part}"] for part in _PARTS)
     coordinates = int(np.diff(ends)[domains.class_of].sum())
     return Clusters(
-        domains=domains, cluster=arrays["cluster"], faces=tuple(faces),
+        domains=domains,
+        cluster=arrays["cluster"],
+        faces=tuple(faces),
         joints=csr_array(joints, shape=(joints[2].size - 1, coordinates)),
-    )  # fmt: skip
+    )

@@ -240,9 +240,12 @@ class DualOperator:
             B_D = csr_array(vstack([inverse @ BW[:E], BW[E:]]))
             solve = DirectSum(Identity(E), contact)
             self._preconditioners[kind, scaling] = Composition(
-                solve, CompressedRows(B_D), self.stiffness_map(blocks, weights),
-                CompressedRows(csr_array(B_D.T)), solve,
-            )  # fmt: skip
+                solve,
+                CompressedRows(B_D),
+                self.stiffness_map(blocks, weights),
+                CompressedRows(csr_array(B_D.T)),
+                solve,
+            )
         return self._preconditioners[kind, scaling]
 
     @cached_property
@@ -266,9 +269,10 @@ class DualOperator:
                 raise ValueError(f"{name} {value!r}; known: {', '.join(known)}")
         groups = self.packed.groups
         blocks = (
-            [g.template.block(g.touched) for g in groups] if kind == "lumped"
+            [g.template.block(g.touched) for g in groups]
+            if kind == "lumped"
             else self._blocks.schur
-        )  # fmt: skip
+        )
         softness = [
             np.repeat(1 / g.template.stiffness[g.touched], g.members.size)
             for g in groups
@@ -365,8 +369,9 @@ class _Joints:
             BlockDiagonal(self.columns, [len(block) for block in rows], members),
             CompressedRows(csr_array(-self.combine.T)),
             BlockDiagonal(self.saddle_inverses, self.sizes, [1] * len(self.sizes)),
-            CompressedRows(self.combine), BlockDiagonal(rows, sizes, members),
-        )  # fmt: skip
+            CompressedRows(self.combine),
+            BlockDiagonal(rows, sizes, members),
+        )
 
     def diagonal(self, B: csr_array) -> Vector:
         """Return the diagonal of −BV M⁺VᵀBᵀ (m,) for packed rows B."""
@@ -421,10 +426,12 @@ def average_free(
         rows = [np.ascontiguousarray(block.T) for block in right]
         sizes = np.diff(clusters.rows).tolist()
         minus_joined = Composition(
-            BlockDiagonal(left, q, members), CompressedRows(csr_array(-C.T)),
+            BlockDiagonal(left, q, members),
+            CompressedRows(csr_array(-C.T)),
             BlockDiagonal(clusters.gram_inverses(grams), sizes, [1] * len(sizes)),
-            CompressedRows(C), BlockDiagonal(rows, n, members),
-        )  # fmt: skip
+            CompressedRows(C),
+            BlockDiagonal(rows, n, members),
+        )
         return Sum(Identity(D.shape[0]), minus_joined)
 
     return Composition(oblique(modes, weighted), D, oblique(weighted, modes))
@@ -478,9 +485,12 @@ def _joints(clusters: Clusters, packed: Packed, inverses: Sequence[Any]) -> _Joi
         format="csr",
     )
     return _Joints(
-        packed.groups, columns, csr_array(combine[order]),
-        clusters.saddle_inverses(compliance), sizes,
-    )  # fmt: skip
+        packed.groups,
+        columns,
+        csr_array(combine[order]),
+        clusters.saddle_inverses(compliance),
+        sizes,
+    )
 
 
 def _explicit(group: Group, blocks: Condensed) -> tuple[Any, Any]:

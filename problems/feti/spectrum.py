@@ -69,9 +69,15 @@ class Spectrum(NamedTuple):
 
 
 def spectrum(
-    F: Product, P: Product, n: int, M: Product | None = None, tol: float = 1e-5,
-    *, rows: Nodes | None = None, total: Product = np.asarray,
-) -> Spectrum:  # fmt: skip
+    F: Product,
+    P: Product,
+    n: int,
+    M: Product | None = None,
+    tol: float = 1e-5,
+    *,
+    rows: Nodes | None = None,
+    total: Product = np.asarray,
+) -> Spectrum:
     """Compute the extreme eigenvalues of PFP, or of PMPF, on the range of P.
 
     Parameters
@@ -147,11 +153,16 @@ def spectra_over_ranks(
     inverses = [p and plain(F.preconditioner(*p)) for p in preconditioners]
     return [
         spectrum(
-            plain(F), project, int(m), M, tol,
-            rows=halo.rows[halo.owned], total=ranks.total,
+            plain(F),
+            project,
+            int(m),
+            M,
+            tol,
+            rows=halo.rows[halo.owned],
+            total=ranks.total,
         )
         for M in inverses
-    ]  # fmt: skip
+    ]
 
 
 def projector(F: RankOperator, G: DistributedColumns) -> Product:
@@ -192,7 +203,9 @@ def ritz_bounds(alpha: Vector, beta: Vector, length: float) -> Spectrum:
     )
     rounding = float(np.finfo(float).eps) * alpha.size * float(largest[0])
     return Spectrum(
-        float(smallest[0]), float(largest[0]),
+        float(smallest[0]),
+        float(largest[0]),
         length * abs(float(s[-1, 0])) + rounding,
-        length * abs(float(t[-1, 0])) + rounding, alpha.size,
-    )  # fmt: skip
+        length * abs(float(t[-1, 0])) + rounding,
+        alpha.size,
+    )

@@ -342,8 +342,9 @@ class Layout:
         left, low, columns, rows = self.corner(np.arange(self.count))
         alone = []
         for lines, first, count in (
-            (self._columns, left, columns), (self._rows, low, rows),
-        ):  # fmt: skip
+            (self._columns, left, columns),
+            (self._rows, low, rows),
+        ):
             at = lines.start[self.block.body] + first
             ends = (lines.multiplicity[at] == 2).astype(int) + (
                 lines.multiplicity[at + count - 1] == 2
@@ -412,6 +413,8 @@ def _lines(cuts: list[Nodes]) -> _Lines:
     return _Lines(
         start=np.cumsum([0, *map(len, multiplicity)]),
         multiplicity=np.concatenate(multiplicity),
-        first=np.concatenate(first), before=np.concatenate(before, axis=1),
-        cut=np.concatenate(cuts), cut_start=np.cumsum([0, *map(len, cuts)]),
-    )  # fmt: skip
+        first=np.concatenate(first),
+        before=np.concatenate(before, axis=1),
+        cut=np.concatenate(cuts),
+        cut_start=np.cumsum([0, *map(len, cuts)]),
+    )

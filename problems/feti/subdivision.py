@@ -149,9 +149,12 @@ class ListedSubdivision:
         )
         copy[listed] = position - self.start[place[listed]]
         return SubdomainNodes(
-            subdomain, number, self.multiplicity(number).astype(np.int32), copy,
+            subdomain,
+            number,
+            self.multiplicity(number).astype(np.int32),
+            copy,
             np.concatenate([[0], np.cumsum(sizes)]),
-        )  # fmt: skip
+        )
 
     def keys(self, subdomains: Nodes) -> Sequence[Hashable]:
         """Return a digest of the cells of each subdomain."""
@@ -261,11 +264,16 @@ def half_discs_in_blocks(
     subdomain = np.repeat(np.arange(len(every)), [nodes.size for nodes in around])
     node, start, holders = sort_holders(np.concatenate(around), subdomain, len(every))
     return ListedSubdivision(
-        nodes=int(first[-1]), body=body,
+        nodes=int(first[-1]),
+        body=body,
         sizes=np.array([_nodes(disc, *block) for disc, _, *block in every]),
-        node=node, start=start, holders=holders,
-        part=part, position=position, labelling=lambda: _labels(blocks),
-    )  # fmt: skip
+        node=node,
+        start=start,
+        holders=holders,
+        part=part,
+        position=position,
+        labelling=lambda: _labels(blocks),
+    )
 
 
 def _labels(blocks: Sequence[Sequence[Block]]) -> NDArray[np.int64]:
@@ -327,8 +335,14 @@ def mesh_in_subdomains(
         return nodes, corner.reshape(own_cells.shape)
 
     return ListedSubdivision(
-        nodes=N, body=body[by_label[ends[:-1]]],
-        sizes=np.bincount(subdomain, minlength=S), node=node, start=start,
-        holders=holders, part=part, position=points.__getitem__,
-        labelling=lambda: label, positions=positions,
-    )  # fmt: skip
+        nodes=N,
+        body=body[by_label[ends[:-1]]],
+        sizes=np.bincount(subdomain, minlength=S),
+        node=node,
+        start=start,
+        holders=holders,
+        part=part,
+        position=points.__getitem__,
+        labelling=lambda: label,
+        positions=positions,
+    )

@@ -506,8 +506,9 @@ def _restricted(kind: SubdomainClass, free: NDArray[np.bool_]) -> SubdomainClass
     R = np.linalg.qr(R[free])[0]
     number = np.cumsum(free) - 1
     return SubdomainClass(
-        K=csc_array(kind.K[free][:, free]), R=R,
+        K=csc_array(kind.K[free][:, free]),
+        R=R,
         fixing=np.sort(qr(R.T, mode="r", pivoting=True)[1][: R.shape[1]]),
         boundary=number[kind.boundary[free[kind.boundary]]],
         stiffness=kind.stiffness[free],
-    )  # fmt: skip
+    )

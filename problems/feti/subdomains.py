@@ -465,11 +465,16 @@ class LocalSubdomains:
         """The local subdomains with their rows of B and their components."""
         domains, rows = self.domains, self.rows
         return DecomposedBodies(
-            classes=domains.classes, class_of=domains.class_of,
-            spread=self.spread, B=rows.B, c=rows.c,
-            scale=self.problem.contact_scale, f=self.f, equalities=rows.equalities,
+            classes=domains.classes,
+            class_of=domains.class_of,
+            spread=self.spread,
+            B=rows.B,
+            c=rows.c,
+            scale=self.problem.contact_scale,
+            f=self.f,
+            equalities=rows.equalities,
             clusters=self.clusters,
-        )  # fmt: skip
+        )
 
     def with_bound(self, bound: Vector) -> LocalSubdomains:
         """Return a copy with another friction bound (k,); cached results are kept."""
@@ -588,13 +593,14 @@ def _local_clusters(local: LocalSubdomains) -> Clusters:
         shape=(row.size, first[-1]),
     )
     return Clusters(
-        domains=domains, cluster=np.unique(labels, return_inverse=True)[1],
+        domains=domains,
+        cluster=np.unique(labels, return_inverse=True)[1],
         faces=tuple(
             _columns(of_class, template.R.shape[0], d)
             for of_class, template in zip(faces, domains.classes, strict=True)
         ),
         joints=joints,
-    )  # fmt: skip
+    )
 
 
 def _columns(faces: Mapping[bytes, tuple[int, Dense]], n: int, d: int) -> csr_array:
@@ -707,9 +713,12 @@ def _gluing_rows(local: LocalSubdomains) -> Entries:
                 node = several[rows]
                 value = weights[nodes.copy[node]]
                 entries = _rotated(
-                    local, row, node, np.full(node.size, k),
+                    local,
+                    row,
+                    node,
+                    np.full(node.size, k),
                     np.sqrt(local.row_stiffness(node, supports=False)) * value,
-                )  # fmt: skip
+                )
                 ranks_there = ranks[rows][:, weights != 0]
                 reached = np.stack(
                     [np.repeat(row, ranks_there.shape[1]), ranks_there.ravel()], axis=1

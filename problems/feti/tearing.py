@@ -99,8 +99,9 @@ def compact_blocks(sides: Sides, most: int) -> list[Block]:
     while pending:
         rows, columns = pending.pop()
         lengths = (
-            deep[rows] * deep_of[columns].mean(), wide[columns] * wide_of[rows].mean(),
-        )  # fmt: skip
+            deep[rows] * deep_of[columns].mean(),
+            wide[columns] * wide_of[rows].mean(),
+        )
         size = [0.0 if part.size == 1 else part.sum() for part in lengths]
         if lengths[0].size * lengths[1].size <= most**2 or not any(size):
             finished.append((rows, columns))
@@ -145,10 +146,12 @@ def compact_boxes(points: NDArray[np.float64], most: int) -> NDArray[np.int64]:
         block = pending.pop()
         count = np.array([part.stop - part.start for part in block])
         nodes = [slice(part.start, part.stop + 1) for part in block]
-        h = np.array([
-            edge[(*nodes[:a], block[a], *nodes[a + 1 :])].mean()
-            for a, edge in enumerate(edges)
-        ])  # fmt: skip
+        h = np.array(
+            [
+                edge[(*nodes[:a], block[a], *nodes[a + 1 :])].mean()
+                for a, edge in enumerate(edges)
+            ]
+        )
         # ratios just below ½, by rounding, count as ½: congruent blocks are cut alike
         side = np.floor(most * h.min() / h + 0.5 + CONGRUENCE_TOL).clip(1, most)
         parts = np.ceil(count / side).astype(int)

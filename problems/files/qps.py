@@ -140,8 +140,9 @@ def _lines(qp: QP, meta: Mapping[str, Any]) -> Iterator[str]:
     yield " N  obj"
     yield from (f" {'E' if row[0] == 'e' else 'L'}  {row}" for row in rows)
     yield "COLUMNS"
-    yield from _column_lines(csc_array(vstack([csc_array(qp.A), csc_array(qp.G)])),
-                             qp.q, rows)  # fmt: skip
+    yield from _column_lines(
+        csc_array(vstack([csc_array(qp.A), csc_array(qp.G)])), qp.q, rows
+    )
     yield "RHS"
     sides = zip(rows, np.append(qp.b, qp.h), strict=True)
     yield from (f"    rhs       {row}  {_digits(side)}" for row, side in sides if side)
@@ -286,11 +287,16 @@ def _quadratic(target: str) -> Callable[[_QPSModel, list[str]], None]:
 
 
 _SECTIONS: dict[str, Callable[[_QPSModel, list[str]], None]] = {
-    "OBJSENSE": _sense, "ROWS": _row, "COLUMNS": _column,
-    "RHS": _sides("rhs"), "RANGES": _sides("ranges"), "BOUNDS": _bound,
-    "QUADOBJ": _quadratic("triangle"), "QSECTION": _quadratic("triangle"),
+    "OBJSENSE": _sense,
+    "ROWS": _row,
+    "COLUMNS": _column,
+    "RHS": _sides("rhs"),
+    "RANGES": _sides("ranges"),
+    "BOUNDS": _bound,
+    "QUADOBJ": _quadratic("triangle"),
+    "QSECTION": _quadratic("triangle"),
     "QMATRIX": _quadratic("whole"),
-}  # fmt: skip
+}
 
 
 def _two_sided(model: _QPSModel) -> TwoSidedQP:
@@ -299,23 +305,37 @@ def _two_sided(model: _QPSModel) -> TwoSidedQP:
         row: i for i, row in enumerate(k for k, v in model.rows.items() if v != "N")
     }
     sides = np.array([_limits(model, row) for row in rows]).reshape(-1, 2)
-    A = [(rows[r], model.columns[c], v) for (r, c), v in model.entries.items()
-         if r in rows]  # fmt: skip
-    P = [(model.columns[i], model.columns[j], v)
-         for (i, j), v in (model.whole | model.triangle).items()]  # fmt: skip
-    P += [(model.columns[j], model.columns[i], v)
-          for (i, j), v in model.triangle.items() if i != j]  # fmt: skip
+    A = [
+        (rows[r], model.columns[c], v)
+        for (r, c), v in model.entries.items()
+        if r in rows
+    ]
+    P = [
+        (model.columns[i], model.columns[j], v)
+        for (i, j), v in (model.whole | model.triangle).items()
+    ]
+    P += [
+        (model.columns[j], model.columns[i], v)
+        for (i, j), v in model.triangle.items()
+        if i != j
+    ]
     objective = model.objective
     q = np.array([model.entries.get((objective, name), 0.0) for name in names])
     free = [model.upper.get(name, math.inf) < 0 for name in names]
-    lower = [model.lower.get(name, -math.inf if f else 0.0)
-             for name, f in zip(names, free, strict=True)]  # fmt: skip
+    lower = [
+        model.lower.get(name, -math.inf if f else 0.0)
+        for name, f in zip(names, free, strict=True)
+    ]
     return TwoSidedQP(
-        P=model.sign * _sparse(P, (n, n)), q=model.sign * q,
+        P=model.sign * _sparse(P, (n, n)),
+        q=model.sign * q,
         r=-model.sign * model.rhs.get(objective, 0.0),
-        A=_sparse(A, (len(rows), n)), l=sides[:, 0], u=sides[:, 1],
-        lb=np.array(lower), ub=np.array([model.upper.get(k, math.inf) for k in names]),
-    )  # fmt: skip
+        A=_sparse(A, (len(rows), n)),
+        l=sides[:, 0],
+        u=sides[:, 1],
+        lb=np.array(lower),
+        ub=np.array([model.upper.get(k, math.inf) for k in names]),
+    )
 
 
 def _limits(model: _QPSModel, row: str) -> tuple[float, float]:

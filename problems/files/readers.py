@@ -80,9 +80,13 @@ def _qps(path: Path) -> Loaded:
 
 
 _READERS: dict[str, Callable[[Path], Loaded]] = {
-    ".npz": _npz, ".mat": _mat, ".parquet": _parquet,
-    ".qps": _qps, ".mps": _qps, ".sif": _qps,
-}  # fmt: skip
+    ".npz": _npz,
+    ".mat": _mat,
+    ".parquet": _parquet,
+    ".qps": _qps,
+    ".mps": _qps,
+    ".sif": _qps,
+}
 
 
 def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
@@ -104,8 +108,11 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     if not all(np.isfinite(values).all() for values in (P.data, A.data, q, r)):
         raise InputError("P, A, q or r hold inf; expected finite numbers")
     n, m = q.size, l.size
-    for name, got, right in (("P", P.shape, (n, n)), ("A", A.shape, (m, n)),
-                             ("u", u.shape, (m,))):  # fmt: skip
+    for name, got, right in (
+        ("P", P.shape, (n, n)),
+        ("A", A.shape, (m, n)),
+        ("u", u.shape, (m,)),
+    ):
         if got != right:
             raise InputError(f"{name} has shape {got}, expected {right}")
     for name, size in (("n", n), ("m", m)):
@@ -114,10 +121,15 @@ def maros_meszaros(arrays: Mapping[str, Any]) -> TwoSidedQP:
     bounded = m >= n and (A[m - n :] != eye_array(n, format="csc")).nnz == 0
     rows = m - n if bounded else m
     return TwoSidedQP(
-        P=P, q=q, r=r, A=A[:rows], l=l[:rows], u=u[:rows],
+        P=P,
+        q=q,
+        r=r,
+        A=A[:rows],
+        l=l[:rows],
+        u=u[:rows],
         lb=l[rows:] if bounded else np.full(n, -np.inf),
         ub=u[rows:] if bounded else np.full(n, np.inf),
-    )  # fmt: skip
+    )
 
 
 def _first_named(

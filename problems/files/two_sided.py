@@ -49,10 +49,15 @@ def one_sided(qp: TwoSidedQP) -> QP:
     equal = l == u
     upper, lower = np.isfinite(u) & ~equal, np.isfinite(l) & ~equal
     return QP(
-        P=P, q=qp.q, A=A[equal], b=u[equal],
-        G=csr_array(vstack([A[upper], -A[lower]])), h=np.append(u[upper], -l[lower]),
-        lb=lb, ub=ub,
-    )  # fmt: skip
+        P=P,
+        q=qp.q,
+        A=A[equal],
+        b=u[equal],
+        G=csr_array(vstack([A[upper], -A[lower]])),
+        h=np.append(u[upper], -l[lower]),
+        lb=lb,
+        ub=ub,
+    )
 
 
 def _limits(what: str, low: Vector, high: Vector) -> tuple[Vector, Vector]:

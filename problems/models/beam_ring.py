@@ -67,16 +67,22 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     elastic = bodies(p["Nr"], p["Nh"], p["radial"], p["plane"], p["depth"], p["sides"])
     tip, share = _tip(elastic.shape)
     return ContactProblem(
-        bodies=elastic, linearise=keyed_linearisation(p),
+        bodies=elastic,
+        linearise=keyed_linearisation(p),
         stages=load_steps(
-            p["steps"], p["relin"], elastic.forces, elastic.fixed, (law_of(p),),
+            p["steps"],
+            p["relin"],
+            elastic.forces,
+            elastic.fixed,
+            (law_of(p),),
             quasi_static=p["loading"] == "quasi-static",
         ),
         results=lambda answer: {
-            "tip": (share @ as_vectors(answer.at(tip), elastic.shape.dim) * LENGTH)
-            .tolist()
+            "tip": (
+                share @ as_vectors(answer.at(tip), elastic.shape.dim) * LENGTH
+            ).tolist()
         },
-    )  # fmt: skip
+    )
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
@@ -84,9 +90,13 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     p: Any = params
     geometry = (p["Nr"], p["Nh"], p["radial"], p["plane"])
     path = _newton_path(
-        geometry, (p["contact"], p["basis"]), p["steps"], p["material"],
-        p["contact_stiffness"], reference,
-    )  # fmt: skip
+        geometry,
+        (p["contact"], p["basis"]),
+        p["steps"],
+        p["material"],
+        p["contact_stiffness"],
+        reference,
+    )
     tip, _ = _tip(bodies(*geometry).shape)
 
     def results(_: Iteration, s: Solution) -> dict[str, Any]:
@@ -123,13 +133,17 @@ def bodies(
     fixed = np.concatenate(clamped)
     tip, share = _tip(shape)
     return ElasticBodies(
-        shape=shape, names=NAMES, materials=(BEAM, RING),
-        plane=None if depth else plane, length=LENGTH, force=LOAD,
+        shape=shape,
+        names=NAMES,
+        materials=(BEAM, RING),
+        plane=None if depth else plane,
+        length=LENGTH,
+        force=LOAD,
         fixed=np.unique(fixed) if depth else fixed,
         forces=Forces(tip[1 :: shape.dim], -share),
         # as in the paper: the ring is the slave, the beam the master
         pairs=(ContactPair(slave=by_name["outer"], master=by_name["bottom"]),),
-    )  # fmt: skip
+    )
 
 
 def model(Nr: int, Nh: int, radial: int, plane: Plane) -> Bodies:
@@ -172,7 +186,8 @@ def _newton_path(
 ) -> NewtonPath:
     whole = model(*geometry)
     keys = {
-        "material": material, "contact": method[0],
+        "material": material,
+        "contact": method[0],
         "contact_stiffness": contact_stiffness,
-    }  # fmt: skip
+    }
     return newton_path(whole, linearisation(whole, *method), keys, reference, steps)

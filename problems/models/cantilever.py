@@ -84,9 +84,14 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     """Return the QP of one Newton iteration of a load step in the given form."""
     p: Any = params
     path = _path(
-        p["slenderness"], p["load"], (p["nx"], p["ny"]), p["nu"], p["material"],
-        p["steps"], reference,
-    )  # fmt: skip
+        p["slenderness"],
+        p["load"],
+        (p["nx"], p["ny"]),
+        p["nu"],
+        p["material"],
+        p["steps"],
+        reference,
+    )
     exact = elastica(p["load"] * p["step"] / p["steps"])
 
     def results(at: Iteration, s: Solution) -> dict[str, Any]:
@@ -117,17 +122,28 @@ def beam(slenderness: float, load: float, cells: tuple[int, int], nu: float) -> 
     force = np.zeros(mesh.dofs)
     force[dofs_of(end, 2, 1)] = -P * share / share.sum()
     return assemble(
-        mesh, np.zeros(len(mesh.cells), dtype=np.int64), names=("beam",),
-        materials=(Material(E, nu),), plane="strain", units=(LENGTH, P),
-        fixed=dofs_of(mesh.boundaries["left"], 2), load=force, pairs=(),
-    )  # fmt: skip
+        mesh,
+        np.zeros(len(mesh.cells), dtype=np.int64),
+        names=("beam",),
+        materials=(Material(E, nu),),
+        plane="strain",
+        units=(LENGTH, P),
+        fixed=dofs_of(mesh.boundaries["left"], 2),
+        load=force,
+        pairs=(),
+    )
 
 
 @lru_cache(maxsize=4)
 def _path(
-    slenderness: float, load: float, cells: tuple[int, int], nu: float, material: str,
-    steps: int, reference: Reference,
-) -> NewtonPath:  # fmt: skip
+    slenderness: float,
+    load: float,
+    cells: tuple[int, int],
+    nu: float,
+    material: str,
+    steps: int,
+    reference: Reference,
+) -> NewtonPath:
     bodies = beam(slenderness, load, cells, nu)
     n = bodies.mesh.dofs
     places = np.zeros(0, dtype=np.int64)

@@ -126,9 +126,15 @@ _RIGID: Mapping[int, Mapping[str, tuple[str, ...]]] = {
 }
 #: units of length by name, m
 LENGTH_UNITS = {
-    "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "km": 1e3,
-    "in": 0.0254, "ft": 0.3048,
-}  # fmt: skip
+    "m": 1.0,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "um": 1e-6,
+    "nm": 1e-9,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+}
 #: smaller moduli, in Pa, are softer than rubber; a remark asks whether MPa was meant
 MIN_PLAUSIBLE_E = 1e6
 _KEYS = (
@@ -219,12 +225,17 @@ def read_bodies(path: Path, plane: Any, halvings: int = 0) -> UnassembledBodies:
     )
     mesh = Mesh(named.points, named.cells, {})
     return UnassembledBodies(
-        mesh=mesh, body=body, names=tuple(named.surfaces),
+        mesh=mesh,
+        body=body,
+        names=tuple(named.surfaces),
         materials=tuple(materials[name] for name in named.surfaces),
-        plane=plane if named.dim == 2 else None, length=length, force=force,
-        f=load.ravel() / force, pairs=tuple(pairs),
+        plane=plane if named.dim == 2 else None,
+        length=length,
+        force=force,
+        f=load.ravel() / force,
+        pairs=tuple(pairs),
         B_D=support_rows(mesh, held),
-    )  # fmt: skip
+    )
 
 
 def remarks(path: Path) -> tuple[str, ...]:

@@ -77,9 +77,13 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
     check_dimension(elastic, p)
     laws = laws_of(p)
     stages = load_steps(
-        p["steps"], p["relin"], elastic.forces, elastic.fixed, laws,
+        p["steps"],
+        p["relin"],
+        elastic.forces,
+        elastic.fixed,
+        laws,
         quasi_static=p["loading"] == "quasi-static",
-    )  # fmt: skip
+    )
     whole_load = float(np.abs(elastic.forces.value).sum())
     if not elastic.is_supported:
         whole = elastic.whole
@@ -91,10 +95,12 @@ def _problem(params: Mapping[str, Value]) -> ContactProblem:
             for stage in stages
         )
     return ContactProblem(
-        bodies=elastic, linearise=keyed_linearisation(p), stages=stages,
+        bodies=elastic,
+        linearise=keyed_linearisation(p),
+        stages=stages,
         # first bound of Coulomb's law: large enough to support bodies by friction
         initial_force=whole_load if p["steps"] == p["relin"] == 1 else 0.0,
-    )  # fmt: skip
+    )
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
@@ -114,9 +120,13 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
                 "expected a master, or kinematics=linear"
             )
         path = _newton_path(
-            source, (p["contact"], p["basis"]), p["steps"], p["material"],
-            p["contact_stiffness"], reference,
-        )  # fmt: skip
+            source,
+            (p["contact"], p["basis"]),
+            p["steps"],
+            p["material"],
+            p["contact_stiffness"],
+            reference,
+        )
         return newton_case(path, form, p["step"], p["newton"])
 
 
@@ -153,12 +163,17 @@ def has_arcs(params: Mapping[str, Value]) -> bool:
 
 @lru_cache(maxsize=4)
 def _newton_path(
-    source: tuple[str, str, Any, int], method: tuple[str, str], steps: int,
-    material: str, contact_stiffness: str, reference: Reference,
-) -> NewtonPath:  # fmt: skip
+    source: tuple[str, str, Any, int],
+    method: tuple[str, str],
+    steps: int,
+    material: str,
+    contact_stiffness: str,
+    reference: Reference,
+) -> NewtonPath:
     whole = bodies(*source).assembled
     keys = {
-        "material": material, "contact": method[0],
+        "material": material,
+        "contact": method[0],
         "contact_stiffness": contact_stiffness,
-    }  # fmt: skip
+    }
     return newton_path(whole, linearisation(whole, *method), keys, reference, steps)

@@ -79,10 +79,15 @@ def plate(n: int) -> Plate:
     )
     corner = sides["bottom"][-1:]
     return Plate(
-        shape=StructuredGrids((grid,)), ground=sides["bottom"][:-1], top=top, left=left,
-        right=sides["right"], corner=corner, ends=np.zeros(0, dtype=np.int64),
+        shape=StructuredGrids((grid,)),
+        ground=sides["bottom"][:-1],
+        top=top,
+        left=left,
+        right=sides["right"],
+        corner=corner,
+        ends=np.zeros(0, dtype=np.int64),
         thickness=1.0,
-    )  # fmt: skip
+    )
 
 
 def extruded_plate(n: int, depth: int) -> Plate:
@@ -93,11 +98,15 @@ def extruded_plate(n: int, depth: int) -> Plate:
     ground, right = sides["front"], np.unique(sides["right"])
     top, left = (nodal_areas(mesh.points, sides[name]) for name in ("back", "left"))
     return Plate(
-        shape=StructuredSolids((mesh,), (divisions,)), ground=ground, top=top,
-        left=left, right=right, corner=np.intersect1d(ground, right),
+        shape=StructuredSolids((mesh,), (divisions,)),
+        ground=ground,
+        top=top,
+        left=left,
+        right=right,
+        corner=np.intersect1d(ground, right),
         ends=np.unique(np.concatenate([sides["bottom"], sides["top"]])),
         thickness=thickness,
-    )  # fmt: skip
+    )
 
 
 @cached_problem
@@ -112,29 +121,44 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         np.concatenate([dofs_of(top, dim, 1), dofs_of(left, dim, 0)]),
         np.concatenate([-TOP * top_shares / unit, LEFT * left_shares / unit]),
     )
-    fixed = np.concatenate([
-        dofs_of(body.right, dim, 0), dofs_of(body.corner, dim, 1),
-        dofs_of(body.ends, dim, dim - 1),
-    ])  # fmt: skip
+    fixed = np.concatenate(
+        [
+            dofs_of(body.right, dim, 0),
+            dofs_of(body.corner, dim, 1),
+            dofs_of(body.ends, dim, dim - 1),
+        ]
+    )
     on_rigid = ContactPair(body.ground, body.ground[:0])
     normal = (0.0, 1.0, 0.0)[:dim]
     rigid = RigidPlane((0.0,) * dim, normal)
     return ContactProblem(
         bodies=ElasticBodies(
-            shape=body.shape, names=("plate",), materials=(MATERIAL,),
-            plane="strain" if dim == 2 else None, length=SIDE, force=unit,
-            fixed=fixed, forces=forces, pairs=(on_rigid,),
+            shape=body.shape,
+            names=("plate",),
+            materials=(MATERIAL,),
+            plane="strain" if dim == 2 else None,
+            length=SIDE,
+            force=unit,
+            fixed=fixed,
+            forces=forces,
+            pairs=(on_rigid,),
         ),
         stages=load_steps(1, 1, forces, fixed, (FrictionLaw("coulomb", mu=p["mu"]),)),
-        linearise=lambda bodies, _: lambda u: rigid_rows(
-            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, rigid,
-            clamped=_corner(bodies), tangential=True,
+        linearise=lambda bodies, _: (
+            lambda u: rigid_rows(
+                bodies.mesh.points,
+                np.zeros_like(u),
+                bodies.pairs[0].slave,
+                rigid,
+                clamped=_corner(bodies),
+                tangential=True,
+            )
         ),
         results=lambda answer: {
             **published_quantities(*answer.sides, thickness=body.thickness),
             "tresca_problems": answer.problems,
         },
-    )  # fmt: skip
+    )
 
 
 def _corner(bodies: UnassembledBodies | ContactSides) -> Nodes:
@@ -144,9 +168,12 @@ def _corner(bodies: UnassembledBodies | ContactSides) -> Nodes:
 
 
 def published_quantities(
-    bodies: Bodies | ContactSides, primal: QP, s: Solution, friction: Friction,
+    bodies: Bodies | ContactSides,
+    primal: QP,
+    s: Solution,
+    friction: Friction,
     thickness: float,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Return the published quantities, interpolated linearly between nodes.
 
     In space, displacements are means over z, and forces are sums over z divided by the

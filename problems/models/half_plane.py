@@ -137,10 +137,18 @@ def _hertz_case(n: int) -> Case:
     def fields(s: Solution) -> Fields:
         p = s.x * EXACT.P / width
         gap = -s.z_box * _length_unit(EXACT.P)
-        return _surface(x, ContactSide(
-            name=SIDE, nodes=np.arange(n), length=np.full(n, width),
-            force=np.outer(p * width, (0.0, 1.0)), pressure=p, gap=gap, exact=exact,
-        ))  # fmt: skip
+        return _surface(
+            x,
+            ContactSide(
+                name=SIDE,
+                nodes=np.arange(n),
+                length=np.full(n, width),
+                force=np.outer(p * width, (0.0, 1.0)),
+                pressure=p,
+                gap=gap,
+                exact=exact,
+            ),
+        )
 
     return _case(qp, EXACT.P, quantities, fields)
 
@@ -199,11 +207,20 @@ def _cattaneo_case(n: int, exact: TangentialContact) -> Case:
 
     def fields(s: Solution) -> Fields:
         p, q = bound * EXACT.P / width, s.x * F0 / width
-        return _surface(x, ContactSide(
-            name=SIDE, nodes=np.arange(n), length=np.full(n, width),
-            force=width * np.column_stack([-q, p]), pressure=p, gap=np.zeros(n),
-            shear=-q, friction=np.where(slipping(s), "slip", "stick"), exact=tractions,
-        ))  # fmt: skip
+        return _surface(
+            x,
+            ContactSide(
+                name=SIDE,
+                nodes=np.arange(n),
+                length=np.full(n, width),
+                force=width * np.column_stack([-q, p]),
+                pressure=p,
+                gap=np.zeros(n),
+                shear=-q,
+                friction=np.where(slipping(s), "slip", "stick"),
+                exact=tractions,
+            ),
+        )
 
     return _case(qp, F0, quantities, fields)
 
@@ -231,9 +248,15 @@ def _dual(F: Matrix, gap: Vector, force: float, lower: Vector, upper: Vector) ->
     """Return the QP  min ½λᵀFλ + gᵀλ,  Σλ = force,  lower ≤ λ ≤ upper."""
     n = gap.size
     return QP(
-        P=F, q=gap, A=np.ones((1, n)), b=np.array([force]),
-        G=no_rows(n), h=np.zeros(0), lb=lower, ub=upper,
-    )  # fmt: skip
+        P=F,
+        q=gap,
+        A=np.ones((1, n)),
+        b=np.array([force]),
+        G=no_rows(n),
+        h=np.zeros(0),
+        lb=lower,
+        ub=upper,
+    )
 
 
 def _case(
@@ -260,10 +283,14 @@ def _surface(x: Vector, side: ContactSide) -> Fields:
     """
     n = x.size
     return Fields(
-        points=np.column_stack([x, np.zeros(n)]), displacement=np.zeros((n, 2)),
-        cells=np.zeros((0, 4), dtype=np.int64), bodies=np.zeros(0, dtype=np.int64),
-        contact_nodes=side.nodes, contact_forces=side.force, contacts=(side,),
-    )  # fmt: skip
+        points=np.column_stack([x, np.zeros(n)]),
+        displacement=np.zeros((n, 2)),
+        cells=np.zeros((0, 4), dtype=np.int64),
+        bodies=np.zeros(0, dtype=np.int64),
+        contact_nodes=side.nodes,
+        contact_forces=side.force,
+        contacts=(side,),
+    )
 
 
 def _length_unit(force: float) -> float:

@@ -97,13 +97,16 @@ def plane_problem(params: Mapping[str, Value]) -> ContactProblem:
         return pressure_quantities(bodies, primal, exact, s)
 
     return ContactProblem(
-        bodies=elastic, stages=load_steps(1, 1, elastic.forces, elastic.fixed),
-        linearise=lambda bodies, _: lambda u: rigid_rows(
-            bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND
+        bodies=elastic,
+        stages=load_steps(1, 1, elastic.forces, elastic.fixed),
+        linearise=lambda bodies, _: (
+            lambda u: rigid_rows(
+                bodies.mesh.points, np.zeros_like(u), bodies.pairs[0].slave, GROUND
+            )
         ),
         results=results,
         exact=_curve(exact),
-    )  # fmt: skip
+    )
 
 
 def newton_step(form: str, params: Mapping[str, Value], reference: Reference) -> Case:
@@ -111,9 +114,12 @@ def newton_step(form: str, params: Mapping[str, Value], reference: Reference) ->
     exact = _cylinder_on_plane(params)[1]
     path = _newton_path(tuple({**params, "newton": 0}.items()), reference)
     case = newton_case(
-        path, form, 1, int(params["newton"]),
+        path,
+        form,
+        1,
+        int(params["newton"]),
         lambda at, s: pressure_quantities(at.tangent, at.primal, exact, s),
-    )  # fmt: skip
+    )
     return with_exact_tractions(case, _curve(exact))
 
 
@@ -140,11 +146,16 @@ def _cylinder_on_plane(
     shape = HalfDiscs((_half_cylinder(RADIUS, a / p["n"], a, p["halvings"]),))
     sides = shape.sides
     return ElasticBodies(
-        shape=shape, names=("cylinder",), materials=(MATERIAL,), plane=p["plane"],
-        length=RADIUS, force=exact.P, fixed=_on_axis(sides),
+        shape=shape,
+        names=("cylinder",),
+        materials=(MATERIAL,),
+        plane=p["plane"],
+        length=RADIUS,
+        force=exact.P,
+        fixed=_on_axis(sides),
         forces=_pressing(shape.parts, "flat", 1.0),
         pairs=(ContactPair(sides["arc"], np.zeros(0, dtype=np.int64)),),
-    ), exact  # fmt: skip
+    ), exact
 
 
 class HalfCylinders(NamedTuple):
@@ -180,10 +191,12 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     stages = load_steps(1, 1, elastic.forces, elastic.fixed, laws)
     has_exact = p["friction"] == "none" or shear is not None
     return ContactProblem(
-        bodies=elastic, linearise=linearise, results=results,
+        bodies=elastic,
+        linearise=linearise,
+        results=results,
         stages=stages if shear is None else _programme(p, elastic),
         exact=_curve(exact, shear or np.zeros_like) if has_exact else None,
-    )  # fmt: skip
+    )
 
 
 def _programme(
@@ -221,11 +234,15 @@ def _programme(
     first = Stage(step=1, part=1.0, forces=acting(loads[0][0], 0.0), fixed=fixed)
     return first, *(
         Stage(
-            step=1, part=1.0, forces=acting(P, Q), fixed=elastic.fixed,
-            laws=(law_of(p),), begin=partial(begin, k),
+            step=1,
+            part=1.0,
+            forces=acting(P, Q),
+            fixed=elastic.fixed,
+            laws=(law_of(p),),
+            begin=partial(begin, k),
         )
         for k, (P, Q) in enumerate(loads)
-    )  # fmt: skip
+    )
 
 
 def half_cylinders(params: Mapping[str, Value]) -> HalfCylinders:
@@ -268,10 +285,16 @@ def two_cylinders(params: Mapping[str, Value]) -> tuple[ElasticBodies, LineConta
         upper = _on_axis(sides, "upper_")
         fixed = np.concatenate([upper, on_axis, dofs_of(flat, 2, 1)])
     return ElasticBodies(
-        shape=shape, names=NAMES, materials=halves.materials, plane=p["plane"],
-        length=RADIUS, force=exact.P, fixed=fixed, forces=_summed(forces),
+        shape=shape,
+        names=NAMES,
+        materials=halves.materials,
+        plane=p["plane"],
+        length=RADIUS,
+        force=exact.P,
+        fixed=fixed,
+        forces=_summed(forces),
         pairs=(_pair(params, sides),),
-    ), exact  # fmt: skip
+    ), exact
 
 
 def _pair(params: Mapping[str, Value], sides: Mapping[str, Nodes]) -> ContactPair:
@@ -446,8 +469,9 @@ def shear_quantities(
         return values
     c = mindlin.stick_half_width(float(force @ x**2), float(pressing @ x**2))
     return values | {
-        "stick_half_width": c, "stick_half_width_error": c / mindlin.c - 1,
-    }  # fmt: skip
+        "stick_half_width": c,
+        "stick_half_width_error": c / mindlin.c - 1,
+    }
 
 
 def _without_slip(params: Mapping[str, Value]) -> bool:

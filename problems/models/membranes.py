@@ -86,12 +86,16 @@ def membranes(form: str, params: Mapping[str, Value]) -> Case:
         matrices=matrices,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=pair.qp, to_primal=new.recover, factorise=pair.factorise,
-            mesh_size=1 / pair.side, rigid=pair.rigid, names=NAMES,
+            primal=pair.qp,
+            to_primal=new.recover,
+            factorise=pair.factorise,
+            mesh_size=1 / pair.side,
+            rigid=pair.rigid,
+            names=NAMES,
             grid=Grid(pair.mesh.points, pair.mesh.cells, pair.body, np.zeros(dofs)),
             certify_by_subdomains=certify_by_subdomains,
         ),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +142,13 @@ class Membranes:
         return QP(
             P=csc_array(block_diag([K, K], format="csc")),
             q=-self.load(np.arange(nodes)),
-            A=A, b=np.zeros(A.shape[0]), G=G, h=np.zeros(G.shape[0]),
-            lb=np.full(nodes, -np.inf), ub=np.full(nodes, np.inf),
-        )  # fmt: skip
+            A=A,
+            b=np.zeros(A.shape[0]),
+            G=G,
+            h=np.zeros(G.shape[0]),
+            lb=np.full(nodes, -np.inf),
+            ub=np.full(nodes, np.inf),
+        )
 
     def load(self, node: Nodes) -> Vector:
         """Return the nodal forces on some nodes (k,)."""
@@ -157,11 +165,18 @@ class Membranes:
         sides = joined_sides(self.grids)
         G = _contact_rows(sides, layout.nodes)
         return DecomposedProblem(
-            layout=layout, components=1, material=np.zeros(layout.count, dtype=int),
-            assemble_class=membrane_class, E=np.ones(2), names=NAMES, load=self.load,
-            glue=rows, cluster=cluster, fixed=np.sort(sides["left left"]),
+            layout=layout,
+            components=1,
+            material=np.zeros(layout.count, dtype=int),
+            assemble_class=membrane_class,
+            E=np.ones(2),
+            names=NAMES,
+            load=self.load,
+            glue=rows,
+            cluster=cluster,
+            fixed=np.sort(sides["left left"]),
             contact=Contact(G, np.zeros(G.shape[0]), np.zeros(0)),
-        )  # fmt: skip
+        )
 
     @property
     def rigid(self) -> Any:

@@ -105,21 +105,28 @@ def obstacle_case(form: str, params: Mapping[str, Value]) -> Case:
         qp=new.qp,
         recover=lambda s: problem.lift + new.recover(s).x,
         quantities=lambda s: {
-            **obstacle_quantities(problem, new.recover(s)), **decomposition,
+            **obstacle_quantities(problem, new.recover(s)),
+            **decomposition,
         },
         scale=new.sign,
         constant=new.constant + datum,
         dualise_seconds=seconds,
         mechanics=Mechanics(
-            primal=rows, to_primal=new.recover, factorise=problem.factorise,
-            mesh_size=2 * HALF[p["shape"]] / p["n"], rigid=np.zeros((rows.q.size, 0)),
+            primal=rows,
+            to_primal=new.recover,
+            factorise=problem.factorise,
+            mesh_size=2 * HALF[p["shape"]] / p["n"],
+            rigid=np.zeros((rows.q.size, 0)),
             certify_by_subdomains=certify_by_subdomains,
-            constant=datum, grid=Grid(
-                problem.x, cells(p["dim"], p["n"]),
-                np.zeros(problem.cells, dtype=np.int64), problem.lift,
+            constant=datum,
+            grid=Grid(
+                problem.x,
+                cells(p["dim"], p["n"]),
+                np.zeros(problem.cells, dtype=np.int64),
+                problem.lift,
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
@@ -136,12 +143,18 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     ends = np.arange(free.size + 1)
     rows = csr_array((np.full(free.size, -1.0), free, ends), (free.size, grid.nodes))
     return DecomposedProblem(
-        layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        assemble_class=partial(membrane_class, h=2 * HALF[shape] / n), E=np.ones(1),
-        names=("membrane",), load=partial(_load, grid, shape), fixed=boundary,
-        contact=Contact(rows, -psi, np.zeros(0)), glue=p["glue"],
+        layout=layout,
+        components=1,
+        material=np.zeros(layout.count, dtype=np.int64),
+        assemble_class=partial(membrane_class, h=2 * HALF[shape] / n),
+        E=np.ones(1),
+        names=("membrane",),
+        load=partial(_load, grid, shape),
+        fixed=boundary,
+        contact=Contact(rows, -psi, np.zeros(0)),
+        glue=p["glue"],
         cluster=p["cluster"],
-    )  # fmt: skip
+    )
 
 
 def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
@@ -152,12 +165,18 @@ def _string_in_subdomains(p: Mapping[str, Any]) -> DecomposedProblem:
     layout = mesh_in_subdomains(mesh, blocks((n,), p["feti"]), body, np.arange(n + 1))
     qp = problem.qp
     return DecomposedProblem(
-        layout=layout, components=1, material=np.zeros(layout.count, dtype=np.int64),
-        assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n), E=np.ones(1),
-        names=("string",), load=lambda node: -qp.q[node], fixed=qp.A.indices,
-        contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)), glue=p["glue"],
+        layout=layout,
+        components=1,
+        material=np.zeros(layout.count, dtype=np.int64),
+        assemble_class=partial(membrane_class, h=2 * HALF["flat"] / n),
+        E=np.ones(1),
+        names=("string",),
+        load=lambda node: -qp.q[node],
+        fixed=qp.A.indices,
+        contact=Contact(csr_array(qp.G), qp.h, np.zeros(0)),
+        glue=p["glue"],
         cluster=p["cluster"],
-    )  # fmt: skip
+    )
 
 
 def results(params: Mapping[str, Value], dual: LocalDual) -> Results:
@@ -183,20 +202,23 @@ def _rank_quantities(
     u = np.where(at_boundary, exact_height(x, shape), answer.u)
     error = float(np.abs(u - exact_height(x, shape)).max())
     return _quantities(
-        shape, (2, grid.nodes, n**2, boundary.size), answer.z,
+        shape,
+        (2, grid.nodes, n**2, boundary.size),
+        answer.z,
         answer.energy + float(w @ (q + load) / 2),
         answer.bodies.ranks.extreme(error, np.max),
-    )  # fmt: skip
+    )
 
 
 def _grid(n: int, shape: str) -> StructuredGrid:
     """Return the grid of Ω ⊂ ℝ², with nodes numbered as in `nodes`, along y first."""
     x = np.linspace(-HALF[shape], HALF[shape], n + 1)
     return StructuredGrid(
-        columns=x, rows=x,
+        columns=x,
+        rows=x,
         place=lambda y, x: np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1),
         names=("left", "top", "right", "bottom"),
-    )  # fmt: skip
+    )
 
 
 def _load(grid: StructuredGrid, shape: str, node: Nodes) -> Vector:
@@ -280,11 +302,15 @@ def obstacle_problem(dim: int, n: int, shape: str = "flat") -> Problem:
     w = np.where(at_boundary, exact_height(x, shape), 0.0)
     one, N = csr_array(eye_array(len(x))), len(x)
     qp = QP(
-        P=K, q=LOAD[shape] * share + K @ w,
-        A=one[at_boundary], b=np.zeros(at_boundary.sum()),
-        G=-one[~at_boundary], h=-obstacle_height(x[~at_boundary], shape),
-        lb=np.full(N, -np.inf), ub=np.full(N, np.inf),
-    )  # fmt: skip
+        P=K,
+        q=LOAD[shape] * share + K @ w,
+        A=one[at_boundary],
+        b=np.zeros(at_boundary.sum()),
+        G=-one[~at_boundary],
+        h=-obstacle_height(x[~at_boundary], shape),
+        lb=np.full(N, -np.inf),
+        ub=np.full(N, np.inf),
+    )
     return Problem(shape, x, n**dim, w, qp)
 
 
@@ -294,10 +320,15 @@ def bound_form(rows: QP) -> Transformed:
     n, m = rows.q.size, free.size
     K = csc_array(rows.P)
     qp = QP(
-        P=K[free][:, free], q=rows.q[free],
-        A=no_rows(m), b=np.zeros(0), G=no_rows(m), h=np.zeros(0),
-        lb=-rows.h, ub=np.full(m, np.inf),
-    )  # fmt: skip
+        P=K[free][:, free],
+        q=rows.q[free],
+        A=no_rows(m),
+        b=np.zeros(0),
+        G=no_rows(m),
+        h=np.zeros(0),
+        lb=-rows.h,
+        ub=np.full(m, np.inf),
+    )
 
     def recover(s: Solution) -> Solution:
         v = np.zeros(n)
@@ -378,9 +409,12 @@ def obstacle_quantities(problem: Problem, s: Solution) -> dict[str, Any]:
     N, dim = problem.x.shape
     error = problem.lift + s.x - exact_height(problem.x, problem.shape)
     return _quantities(
-        problem.shape, (dim, N, problem.cells, problem.qp.b.size), s.z,
-        problem.energy(s.x), float(np.abs(error).max()),
-    )  # fmt: skip
+        problem.shape,
+        (dim, N, problem.cells, problem.qp.b.size),
+        s.z,
+        problem.energy(s.x),
+        float(np.abs(error).max()),
+    )
 
 
 def _quantities(

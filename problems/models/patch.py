@@ -98,11 +98,13 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
         return {"stress_error": answer.largest(largest)}
 
     return ContactProblem(
-        bodies=elastic, linearise=keyed_linearisation(p), results=error,
+        bodies=elastic,
+        linearise=keyed_linearisation(p),
+        results=error,
         stages=load_steps(1, 1, elastic.forces, elastic.fixed, (law_of(p),)),
         # first bound of Coulomb's law: large enough to support blocks by friction
         initial_force=float(np.abs(elastic.forces.value).sum()),
-    )  # fmt: skip
+    )
 
 
 class Homogeneous(NamedTuple):
@@ -122,16 +124,19 @@ def homogeneous(material: Hyperelastic, stretch: float) -> Homogeneous:
     def F(lateral: float) -> NDArray[np.float64]:
         return np.diag([lateral, stretch])
 
-    lateral = float(brentq(
-        lambda lateral: material.stress(F(lateral))[0, 0], 0.5, 3.0, xtol=1e-15
-    ))  # fmt: skip
+    lateral = float(
+        brentq(lambda lateral: material.stress(F(lateral))[0, 0], 0.5, 3.0, xtol=1e-15)
+    )
     P, A = material.stress(F(lateral)), material.tangent(F(lateral))
     return Homogeneous(
-        lateral, stretch, float(P[1, 1]), float(P[1, 1] / lateral),
+        lateral,
+        stretch,
+        float(P[1, 1]),
+        float(P[1, 1] / lateral),
         float(material.energy(F(lateral))),
         # dP₁₁ = 0 determines dλ₁, which is eliminated from dP₂₂
         float(A[1, 1, 1, 1] - A[0, 0, 1, 1] ** 2 / A[0, 0, 0, 0]),
-    )  # fmt: skip
+    )
 
 
 def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
@@ -156,10 +161,14 @@ def state_at_stretch(material: Hyperelastic, stretch: float) -> Homogeneous:
 def state_under_pressure(material: Hyperelastic, pressure: float) -> Homogeneous:
     """Return the state under a nominal pressure, Pa."""
     least = max(_softest(material), MIN_STRETCH)
-    stretch = float(brentq(
-        lambda stretch: homogeneous(material, stretch).nominal + pressure, least, 1.0,
-        xtol=1e-15,
-    ))  # fmt: skip
+    stretch = float(
+        brentq(
+            lambda stretch: homogeneous(material, stretch).nominal + pressure,
+            least,
+            1.0,
+            xtol=1e-15,
+        )
+    )
     return homogeneous(material, stretch)
 
 
@@ -253,11 +262,16 @@ def bodies(params: Mapping[str, Value]) -> ElasticBodies:
     rollers = dofs_of(left, 2, 0), dofs_of(sides["lower_bottom"], 2, 1)
     pressing = -PRESSURE * nodal_lengths(shape.parts[1].side("upper_top"))
     return ElasticBodies(
-        shape=shape, names=NAMES, plane=p["plane"], length=LENGTH, force=force,
+        shape=shape,
+        names=NAMES,
+        plane=p["plane"],
+        length=LENGTH,
+        force=force,
         materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
-        fixed=np.concatenate(rollers), pairs=(_pair(params, sides),),
+        fixed=np.concatenate(rollers),
+        pairs=(_pair(params, sides),),
         forces=Forces(dofs_of(sides["upper_top"], 2, 1), pressing / force),
-    )  # fmt: skip
+    )
 
 
 def _bodies_in_space(params: Mapping[str, Value]) -> ElasticBodies:
@@ -284,11 +298,16 @@ def _bodies_in_space(params: Mapping[str, Value]) -> ElasticBodies:
     ]  # fmt: skip
     top, areas = nodal_areas(shape.mesh.points, sides["upper_top"])
     return ElasticBodies(
-        shape=shape, names=NAMES, plane=None, length=LENGTH, force=force,
+        shape=shape,
+        names=NAMES,
+        plane=None,
+        length=LENGTH,
+        force=force,
         materials=(Material(p["ratio"] * E_UPPER, NU), Material(E_UPPER, NU)),
-        fixed=np.unique(np.concatenate(rollers)), pairs=(_pair(params, sides),),
+        fixed=np.unique(np.concatenate(rollers)),
+        pairs=(_pair(params, sides),),
         forces=Forces(dofs_of(top, 3, 2), -PRESSURE * areas / force),
-    )  # fmt: skip
+    )
 
 
 def model(params: Mapping[str, Value]) -> Bodies:

@@ -111,25 +111,33 @@ def clamped_plate(form: str, params: Mapping[str, Value]) -> Case:
         recover=lambda s: new.recover(s).x * LENGTH,
         quantities=results,
         fields=lambda s: Fields(
-            points=mesh.points, cells=mesh.cells, bodies=plate.material,
+            points=mesh.points,
+            cells=mesh.cells,
+            bodies=plate.material,
             displacement=as_vectors(new.recover(s).x * LENGTH, mesh.dim),
         ),
         scale=new.sign * LOAD * LENGTH,
         constant=new.constant * LOAD * LENGTH,
         matrices=feti_matrices(plate.torn, new.qp) if form == "dual" else {},
         mechanics=Mechanics(
-            primal=plate.primal, to_primal=new.recover, factorise=plate.factorise,
+            primal=plate.primal,
+            to_primal=new.recover,
+            factorise=plate.factorise,
             mesh_size=(plate.volume / len(mesh.cells)) ** (1 / mesh.dim) / LENGTH,
-            rigid=rigid_modes(mesh.points), names=("plate",),
-            scale=LOAD * LENGTH, grid=Grid(
-                mesh.points, mesh.cells, np.zeros(len(mesh.cells), dtype=np.int64),
+            rigid=rigid_modes(mesh.points),
+            names=("plate",),
+            scale=LOAD * LENGTH,
+            grid=Grid(
+                mesh.points,
+                mesh.cells,
+                np.zeros(len(mesh.cells), dtype=np.int64),
                 np.zeros(mesh.dofs),
             ),
             certify_by_subdomains=(
                 certifier(plate.own, plate.primal.P) if form == "dual" else None
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -200,14 +208,25 @@ def model(params: tuple[tuple[str, Value], ...]) -> Plate:
     one = csr_array(eye_array(n, format="csr"))
     clamped = _clamped(mesh.boundaries, mesh.dim)
     primal = QP(
-        P=stiffness(mesh, D, material), q=-parts.load(np.arange(n)),
-        A=one[clamped], b=np.zeros(clamped.size), G=no_rows(n), h=np.zeros(0),
-        lb=np.full(n, -np.inf), ub=np.full(n, np.inf),
-    )  # fmt: skip
+        P=stiffness(mesh, D, material),
+        q=-parts.load(np.arange(n)),
+        A=one[clamped],
+        b=np.zeros(clamped.size),
+        G=no_rows(n),
+        h=np.zeros(0),
+        lb=np.full(n, -np.inf),
+        ub=np.full(n, np.inf),
+    )
     return Plate(
-        volume=float(np.prod(_size(p))), mesh=mesh, subdomain=subdomain,
-        material=material, moduli=moduli, D=D, primal=primal, parts=parts,
-    )  # fmt: skip
+        volume=float(np.prod(_size(p))),
+        mesh=mesh,
+        subdomain=subdomain,
+        material=material,
+        moduli=moduli,
+        D=D,
+        primal=primal,
+        parts=parts,
+    )
 
 
 def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
@@ -218,14 +237,19 @@ def in_subdomains(params: Mapping[str, Value]) -> DecomposedProblem:
     # no contact rows, but the interface of problems with contact
     none = np.zeros(0)
     return DecomposedProblem(
-        layout=layout, components=shape.dim, E=moduli[:1], names=("plate",),
-        glue=p["glue"], cluster=p["cluster"], material=_material(p),
+        layout=layout,
+        components=shape.dim,
+        E=moduli[:1],
+        names=("plate",),
+        glue=p["glue"],
+        cluster=p["cluster"],
+        material=_material(p),
         assemble_class=partial(elastic_class, D=D, E=moduli),
         load=force_lookup(_pull(layout, shape.sides["right"], p["load"])),
         fixed=_clamped(shape.sides, shape.dim),
         eliminated=p["supports"] == "eliminated",
         contact=Contact(no_rows(shape.dim * layout.nodes), none, none),
-    )  # fmt: skip
+    )
 
 
 def results(params: Mapping[str, Value], dual: LocalDual) -> Results:

@@ -75,9 +75,15 @@ def _second_difference(n: int) -> Any:
 
 def _case(P: Any, q: Vector, lower: Vector, upper: Vector) -> Case:
     qp = QP(
-        P=csc_array(P), q=q, A=no_rows(q.size), b=np.zeros(0),
-        G=no_rows(q.size), h=np.zeros(0), lb=lower, ub=upper,
-    )  # fmt: skip
+        P=csc_array(P),
+        q=q,
+        A=no_rows(q.size),
+        b=np.zeros(0),
+        G=no_rows(q.size),
+        h=np.zeros(0),
+        lb=lower,
+        ub=upper,
+    )
 
     def quantities(s: Solution) -> dict[str, float]:
         at_bound = (s.x <= lower) | (s.x >= upper)

@@ -133,6 +133,12 @@ def ratio_text(ratio: Ratio | Mean) -> str:
 
 
 TEXT = Sentences(
-    __name__, ALIKE=ALIKE, FACTOR=VERIFIED_FACTOR, MISS=1 - COVERAGE, NAMED=NAMED,
-    VERDICTS=VERDICTS, WORDS=WORDS, ratio_text=ratio_text,
-)  # fmt: skip
+    __name__,
+    ALIKE=ALIKE,
+    FACTOR=VERIFIED_FACTOR,
+    MISS=1 - COVERAGE,
+    NAMED=NAMED,
+    VERDICTS=VERDICTS,
+    WORDS=WORDS,
+    ratio_text=ratio_text,
+)

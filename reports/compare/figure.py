@@ -35,10 +35,12 @@ def ratios_figure(c: Comparison) -> Figure:
         mark
         for row, solver in enumerate(solvers)
         for mark in _row(
-            solver, -row, [p for p in c.of(solver) if p.log is not None],
+            solver,
+            -row,
+            [p for p in c.of(solver) if p.log is not None],
             look(c.after.solvers.index(solver)).colour,
         )
-    ]  # fmt: skip
+    ]
     panel = Panel(
         x=Axis(label="time after / time before", log=True, plain=True),
         y=categories([legible(s) for s in solvers]),
@@ -61,9 +63,12 @@ def _row(solver: str, row: int, pairs: Sequence[Pair], colour: str) -> list[Mark
         chosen = [p for p in pairs if (p.change != 0) is changed]
         if chosen:
             style = Look(
-                colour=colour, marker="o", dash=None, size=4,
+                colour=colour,
+                marker="o",
+                dash=None,
+                size=4,
                 fill="" if changed else "none",
-            )  # fmt: skip
+            )
             made.append(
                 Series(
                     x=tuple(float(np.exp(p.log or 0.0)) for p in chosen),

@@ -91,12 +91,16 @@ def regressions(c: Comparison) -> Regressions:
     miss = (1 - COVERAGE) / 2 / c.folders
     found = [_of_solver(s, of, miss / len(judged)) for s, of in judged.items()]
     if cells:
-        scatter = _NORMAL * float(np.median([
-            abs(mean - float(np.median(means)))
-            for of in by_solver.values()
-            for means in [[_mean(change.relative) for change in of]]
-            for mean in means
-        ]))  # fmt: skip
+        scatter = _NORMAL * float(
+            np.median(
+                [
+                    abs(mean - float(np.median(means)))
+                    for of in by_solver.values()
+                    for means in [[_mean(change.relative) for change in of]]
+                    for mean in means
+                ]
+            )
+        )
         freedom = max(len(cells) - len(by_solver), 1)
         found += [_of_cell(x, scatter, freedom, miss / len(cells)) for x in cells]
     return Regressions(
@@ -169,11 +173,13 @@ def _logs(outcome: Outcome) -> Floats:
 def _relative(own: Outcome, others: Sequence[Outcome]) -> Floats:
     """Return logarithms of time over the geometric mean of the others, by block."""
     times = [o.by_block for o in others]
-    return np.array([
-        np.log(seconds) - np.mean([np.log(of[block]) for of in times])
-        for block, seconds in own.by_block.items()
-        if times and all(block in of for of in times)
-    ])  # fmt: skip
+    return np.array(
+        [
+            np.log(seconds) - np.mean([np.log(of[block]) for of in times])
+            for block, seconds in own.by_block.items()
+            if times and all(block in of for of in times)
+        ]
+    )
 
 
 def _mean(logs: tuple[Floats, Floats]) -> float:

@@ -25,9 +25,7 @@ MULTIGRID = "pdas-amg"  #: solver that is a route of its own
 #: keys that choose a decomposition; they do not change the mesh
 DECOMPOSITION = ("feti", "glue", "parts", "cluster")
 #: routes that a complete map contains, on one rank
-KINDS = (
-    "primal", "primal, multigrid", "dual", "dual-bounds", "TFETI", "hybrid TFETI"
-)  # fmt: skip
+KINDS = ("primal", "primal, multigrid", "dual", "dual-bounds", "TFETI", "hybrid TFETI")
 PRIMAL = KINDS[:2]
 
 
@@ -85,10 +83,13 @@ class Map:
                 break
             pays = n
         return Crossover(
-            pays=pays, largest=common[-1], smallest=common[0],
-            ratio=ratios[common[-1]], beyond=max(a) > max(b),
+            pays=pays,
+            largest=common[-1],
+            smallest=common[0],
+            ratio=ratios[common[-1]],
+            beyond=max(a) > max(b),
             answers=(a[common[-1]], b[common[-1]]),
-        )  # fmt: skip
+        )
 
 
 class Crossover(NamedTuple):

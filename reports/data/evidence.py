@@ -312,10 +312,11 @@ def _unite_environments(directory: Path, records: list[Record]) -> list[Record]:
         )
         representatives.setdefault(united[digest], environment)
     return [
-        r if united[r.environment] == r.environment
+        r
+        if united[r.environment] == r.environment
         else r.replace(environment=united[r.environment])
         for r in records
-    ]  # fmt: skip
+    ]
 
 
 def _one_name_per_qp(records: list[Record]) -> list[Record]:
@@ -326,9 +327,10 @@ def _one_name_per_qp(records: list[Record]) -> list[Record]:
             first.setdefault(r.qp, r)
     return [
         r.replace(case=same.case, params=same.params)
-        if r.family == FROM_FILE and (same := first.get(r.qp or "")) else r
+        if r.family == FROM_FILE and (same := first.get(r.qp or ""))
+        else r
         for r in records
-    ]  # fmt: skip
+    ]
 
 
 def _warn_of_contradictions(

@@ -174,9 +174,14 @@ class Section:
             tuple(kinds.get(kind, ())) for kind in fields
         )
         return cls(
-            name=name, title=title, statements=statements, prose=prose, points=points,
-            tables=tables, pictures=pictures,
-        )  # fmt: skip
+            name=name,
+            title=title,
+            statements=statements,
+            prose=prose,
+            points=points,
+            tables=tables,
+            pictures=pictures,
+        )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

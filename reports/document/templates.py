@@ -21,9 +21,15 @@ from mortarbench.reports.document.layout import Point
 from mortarbench.reports.statistics.intervals import COVERAGE
 
 _FORMATS = (
-    "clean", "estimate", "listing", "plural", "power", "seconds", "significant",
+    "clean",
+    "estimate",
+    "listing",
+    "plural",
+    "power",
+    "seconds",
+    "significant",
     "tolerance",
-)  # fmt: skip
+)
 _SPACE = re.compile(r"[ \n]+")
 
 

@@ -26,10 +26,12 @@ def write_records(path: Path, records: Sequence[Record]) -> Path:
     options, counts, quantities, …) are JSON text, since they differ between families
     and solvers. Equal records give equal bytes.
     """
-    table = pa.table({
-        name: _column([getattr(r, f.name) for r in records], str(f.type))
-        for name, f in JOURNAL.items()
-    })  # fmt: skip
+    table = pa.table(
+        {
+            name: _column([getattr(r, f.name) for r in records], str(f.type))
+            for name, f in JOURNAL.items()
+        }
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as file:
         pq.write_table(table, file, compression="zstd")

@@ -160,10 +160,17 @@ def write_series(states: Iterable[tuple[float, Fields]], path: Path) -> list[Pat
         vtu = path.with_name(f"{path.stem}_{i:04d}.vtu")
         written.extend(write_vtu(fields, vtu))
         lines.append(f'    <DataSet timestep="{time!r}" file={quoteattr(vtu.name)}/>')
-    text = "\n".join([
-        '<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">',
-        "  <Collection>", *lines, "  </Collection>", "</VTKFile>", "",
-    ])  # fmt: skip
+    text = "\n".join(
+        [
+            '<?xml version="1.0"?>',
+            '<VTKFile type="Collection" version="0.1">',
+            "  <Collection>",
+            *lines,
+            "  </Collection>",
+            "</VTKFile>",
+            "",
+        ]
+    )
     with _named(path), replacing(path) as file:
         file.write(text.encode())
     return [path, *written]

@@ -54,9 +54,12 @@ def convergence_figure(c: CaseHistories) -> Figure | None:
         tol = c.runs[0].outcome.tol
         name = Text(text="tol", place=(1, tol), inside=(True, False), offset=(3, 0))
         panel = _curves(
-            c, errors, r"$\|Ax-b\|$, relative", texts=(name,),
+            c,
+            errors,
+            r"$\|Ax-b\|$, relative",
+            texts=(name,),
             rules=(Rule(axis="y", at=tol, look=_TOLERANCE),),
-        )  # fmt: skip
+        )
         rows.append(Row(panels=(panel,), height=1.9))
     if not rows:
         return None
@@ -92,8 +95,9 @@ def active_set_figure(c: CaseHistories) -> Figure | None:
         if counts:
             most = max(*(float(np.nanmax(n)) for _, n in counts), 1.0)
             axis = Axis(label=label, low=0, high=1.06 * most, most=6, integers=True)
-            lines = (replace(_line(c, run, c.work(run), n), step=True)
-                     for run, n in counts)  # fmt: skip
+            lines = (
+                replace(_line(c, run, c.work(run), n), step=True) for run, n in counts
+            )
             panel = Panel(x=_work(c), y=axis, marks=tuple(lines))
             rows.append(Row(panels=(panel,), height=height))
     return _figure(c, rows, [r for r in c.runs if r.numbers("active") is not None])
@@ -132,9 +136,11 @@ def _figure(
             keys.append(Key(label=name, look=_mark(marker, INK)))
     one = c.runs[0].outcome
     return Figure(
-        rows=tuple(stack), height=height, legend=below(keys, COLUMNS),
+        rows=tuple(stack),
+        height=height,
+        legend=below(keys, COLUMNS),
         title=legible(f"{one.case}, tol {tolerance(one.tol)}", 96),
-    )  # fmt: skip
+    )
 
 
 def _work(c: CaseHistories) -> Axis:
@@ -157,11 +163,12 @@ def _strip(c: CaseHistories, outer: Sequence[SolverRun]) -> Panel:
                 (at, -row - 0.38, at, -row + 0.38)
                 for at in c.work(run)[run.outer_ends].tolist()
             ),
-            colour=_style(c, run).colour, solver=run.outcome.solver,
+            colour=_style(c, run).colour,
+            solver=run.outcome.solver,
             runs=((run.record.run_id,),),
         )
         for row, run in enumerate(outer)
-    )  # fmt: skip
+    )
     axis = Axis(label="outer", ticks=(), line=False, low=0.4 - len(outer), high=0.6)
     return Panel(x=_work(c), y=axis, marks=marks, grid="none")
 
@@ -181,9 +188,12 @@ def _curves(c: CaseHistories, drawn: Curves, label: str, **more: Any) -> Panel:
 
 def _line(c: CaseHistories, run: SolverRun, x: Vector, y: Vector) -> Series:
     return Series(
-        x=numbers(x), y=numbers(y), look=_style(c, run), solver=run.outcome.solver,
+        x=numbers(x),
+        y=numbers(y),
+        look=_style(c, run),
+        solver=run.outcome.solver,
         runs=((run.record.run_id,),),
-    )  # fmt: skip
+    )
 
 
 def _steps(
@@ -207,9 +217,10 @@ def _steps(
             places.append(size * (scale(column) - low) / (high - low))
         kept = list[int]()
         for i, (x, y) in enumerate(zip(*places, strict=True)):
-            if not kept or hypot(
-                x - places[0][kept[-1]], y - places[1][kept[-1]]
-            ) >= CLOSEST:  # fmt: skip
+            if (
+                not kept
+                or hypot(x - places[0][kept[-1]], y - places[1][kept[-1]]) >= CLOSEST
+            ):
                 kept.append(i)
         if kept:
             style = _mark(marker, _style(c, run).colour)
@@ -224,6 +235,10 @@ def _style(c: CaseHistories, run: SolverRun) -> Look:
 
 def _mark(marker: str, colour: str) -> Look:
     return Look(
-        colour=colour, marker=marker, dash=None, size=3.2, edge=0.7,
+        colour=colour,
+        marker=marker,
+        dash=None,
+        size=3.2,
+        edge=0.7,
         fill="none" if marker == "^" else "",
-    )  # fmt: skip
+    )

@@ -91,9 +91,13 @@ def _panel(
             texts.append(Text(text=letter, place=(n, last.value), offset=(6, 0)))
     rules = () if limit is None else (Rule(axis="y", at=float(limit), look=_LIMIT),)
     return Panel(
-        x=log("degrees of freedom"), y=log(label), marks=tuple(marks),
-        texts=tuple(texts), rules=rules, title=title,
-    )  # fmt: skip
+        x=log("degrees of freedom"),
+        y=log(label),
+        marks=tuple(marks),
+        texts=tuple(texts),
+        rules=rules,
+        title=title,
+    )
 
 
 def end_letter(one: Map, route: Route) -> str:

@@ -168,9 +168,15 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
         at = np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
         frames += [
             Polygons(corners=(at,), edge=_ARROW, width=0.8, cased=True),
-            Label(text=letter, place=_pair(at[2]), offset=(3, 0), align=("left", "top"),
-                  colour=_ARROW, cased=True),
-        ]  # fmt: skip
+            Label(
+                text=letter,
+                place=_pair(at[2]),
+                offset=(3, 0),
+                align=("left", "top"),
+                colour=_ARROW,
+                cased=True,
+            ),
+        ]
     bands = [mark for contact in loaded for mark in _bands(contact, points)]
     there = moved(fields)  # magnified bodies would overlap in contact
     near = (
@@ -179,12 +185,13 @@ def deformed_figure(fields: Fields, scale: float | None = None) -> FieldFigure:
     )
     truly = "" if scale == SCALE else f"displacement × {SCALE:g}"
     overview = FieldPanel(
-        low=_pair(corners[0]), high=_pair(corners[1]),
+        low=_pair(corners[0]),
+        high=_pair(corners[1]),
         marks=(*bodies, *_subdomains(fields, points), *before, *after, *bands, *frames),
         title=f"{'(a) ' if loaded else ''}deformed bodies, displacement × {scale:g}; "
         "dashed: undeformed",
         **_axes(span),
-    )  # fmt: skip
+    )
     windows = []
     for letter, contact in zip(letters, loaded, strict=True):
         words = ", ".join(filter(None, (contact.name, truly)))
@@ -208,8 +215,9 @@ def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     faces = boundary_facets(fields.cells, 3)
     sides = [
         (side, faces[np.isin(faces, side.nodes).all(axis=1)])
-        for side in fields.contacts if side.pressure.max(initial=0.0) > 0
-    ]  # fmt: skip
+        for side in fields.contacts
+        if side.pressure.max(initial=0.0) > 0
+    ]
     sides = [(side, own) for side, own in sides if len(own)]
     normals = [face_normals(fields.points, own).sum(axis=0) for _, own in sides]
     normals = [normal / np.linalg.norm(normal) for normal in normals]
@@ -221,9 +229,13 @@ def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     colours = _scale(fields)
     stress = np.full(len(points), 0.3) if colours is None else fields.nodal["von_mises"]
     shown = visible_faces(
-        camera, points, faces, stress, colours or _PLAIN,
+        camera,
+        points,
+        faces,
+        stress,
+        colours or _PLAIN,
         mesh=len(faces) <= _MESH_SHOWN,
-    )  # fmt: skip
+    )
     before = crease_edges(camera, fields.points, faces, _CREASE)
     outlines = [Path(points=ends, look=_BEFORE) for ends in before]
     both = np.vstack([shown.corners.reshape(-1, 2), before.reshape(-1, 2)])
@@ -232,24 +244,33 @@ def _figure_in_space(fields: Fields, scale: float) -> FieldFigure:
     letters = iter("abcdefghijklmnopqrstuvwxyz")
     panels = [
         FieldPanel(
-            low=_pair(low), high=_pair(high), axes="none", scale=colours,
+            low=_pair(low),
+            high=_pair(high),
+            axes="none",
+            scale=colours,
             marks=(*outlines, shown, *_triad(camera, low, high)),
             title=f"({next(letters)}) displacement × {scale:g}; dashed: undeformed",
         )
-    ]  # fmt: skip
+    ]
     for (side, own), normal in zip(sides, normals, strict=True):
         panels.append(_pressure_panel(fields, side, own, normal, next(letters), span))
     rows = -(-len(panels) // 2)
     return FieldFigure(
-        panels=tuple(panels), columns=min(len(panels), 2), height=3.9 * rows,
+        panels=tuple(panels),
+        columns=min(len(panels), 2),
+        height=3.9 * rows,
         heights=(1.0,) * rows,
-    )  # fmt: skip
+    )
 
 
 def _pressure_panel(
-    fields: Fields, side: ContactSide, faces: NDArray[np.int64], normal: Vector,
-    letter: str, span: float,
-) -> FieldPanel:  # fmt: skip
+    fields: Fields,
+    side: ContactSide,
+    faces: NDArray[np.int64],
+    normal: Vector,
+    letter: str,
+    span: float,
+) -> FieldPanel:
     """Show the pressure on the undeformed faces of a side, along its mean normal.
 
     If this normal is nearly parallel to an axis, the view is along the axis, and
@@ -265,9 +286,12 @@ def _pressure_panel(
     largest = float(side.pressure.max())
     factor, prefix = prefixed(largest)
     colours = ColourScale(
-        colours="inferno", low=0, high=largest, unit=factor,
+        colours="inferno",
+        low=0,
+        high=largest,
+        unit=factor,
         label=f"contact pressure in {prefix}Pa",
-    )  # fmt: skip
+    )
     shown = visible_faces(
         camera, fields.points, faces, pressure, colours, mesh=len(faces) <= _MESH_SHOWN
     )
@@ -283,10 +307,15 @@ def _pressure_panel(
     labels = [_axis_name(axis, name) for axis in (camera.right, camera.up)]
     arrows, key = _friction_arrows(fields, side, camera, float((high - low).max()))
     return FieldPanel(
-        low=_pair(low), high=_pair(high), marks=(shown, *arrows), scale=colours,
-        unit=unit, xlabel=labels[0], ylabel=labels[1],
+        low=_pair(low),
+        high=_pair(high),
+        marks=(shown, *arrows),
+        scale=colours,
+        unit=unit,
+        xlabel=labels[0],
+        ylabel=labels[1],
         title=f"({letter}) {side.name}{key}",
-    )  # fmt: skip
+    )
 
 
 def _friction_arrows(
@@ -305,11 +334,12 @@ def _friction_arrows(
     drawn = 0.12 * span / (largest or 1.0) * camera.project(traction)
     feet, acts = camera.project(fields.points[side.nodes]), sizes > _ACTIVE * largest
     arrows: list[FieldMark] = [
-        Vectors(feet=feet[of], vectors=drawn[of], colour=colour, width=0.006,
-                cased=True)
+        Vectors(
+            feet=feet[of], vectors=drawn[of], colour=colour, width=0.006, cased=True
+        )
         for state, (colour, _) in FRICTION.items()
         if (of := acts & (side.friction == state)).any()
-    ]  # fmt: skip
+    ]
     factor, prefix = prefixed(largest)
     return arrows, (
         f"\narrows: friction on the slave, at most {largest / factor:.3g} {prefix}Pa"
@@ -335,9 +365,12 @@ def _triad(camera: Camera, low: Vector, high: Vector) -> list[FieldMark]:
             Arrow(start=_pair(origin), end=_pair(origin + tip), head="-|>", size=6)
         )
         marks.append(
-            Label(text=f"${name}$", place=_pair(origin + 1.25 * tip),
-                  align=("center", "center"))
-        )  # fmt: skip
+            Label(
+                text=f"${name}$",
+                place=_pair(origin + 1.25 * tip),
+                align=("center", "center"),
+            )
+        )
     return marks
 
 
@@ -364,10 +397,14 @@ def _subdomains(fields: Fields, points: Points) -> list[FieldMark]:
             place = _pair(centres[middle])  # a cell: the centroid may lie outside
             marks.append(
                 Label(
-                    text=f"{number}", place=place, align=("center", "center"),
-                    colour=_ARROW, cased=True, size=size,
+                    text=f"{number}",
+                    place=place,
+                    align=("center", "center"),
+                    colour=_ARROW,
+                    cased=True,
+                    size=size,
                 )
-            )  # fmt: skip
+            )
     return marks
 
 
@@ -383,10 +420,13 @@ def _scale(fields: Fields) -> ColourScale | None:
     clipped, largest = limits
     factor, prefix = prefixed(clipped)
     return ColourScale(
-        colours="viridis", low=0, high=clipped or 1.0, unit=factor,
+        colours="viridis",
+        low=0,
+        high=clipped or 1.0,
+        unit=factor,
         label=f"von Mises stress in {prefix}Pa",
         beyond="max" if largest > clipped else "neither",
-    )  # fmt: skip
+    )
 
 
 def prefixed(value: float) -> tuple[float, str]:
@@ -405,10 +445,12 @@ def _bodies(
         cells = fields.cells[fields.bodies == body]
         marks.append(
             ColourField(
-                points=points, triangles=triangles(cells), values=stress,
+                points=points,
+                triangles=triangles(cells),
+                values=stress,
                 scale=scale or _PLAIN,
             )
-        )  # fmt: skip
+        )
         if len(fields.cells) <= _MESH_SHOWN:
             ends = points[edges(cells)]
             marks.append(
@@ -526,22 +568,26 @@ def _enlarged(
     thick = 0.0032 if closed.sum() < 25 else 0.002
     arrows = [
         Vectors(
-            feet=(tips - drawn)[of], vectors=drawn[of],
+            feet=(tips - drawn)[of],
+            vectors=drawn[of],
             width=thick if state in _TOUCHING else 0.4 * thick,
             cased=state in _TOUCHING,
             colour=colours[state][0],
         )
         for state in sorted(set(contact.friction), key=lambda s: (s in _TOUCHING, s))
         if (of := shown & (contact.friction == state)).any()
-    ]  # fmt: skip
+    ]
     key = f"\n{_states(contact.friction)}" if contact.friction.any() else ""
     factor, prefix = prefixed(largest)
     return FieldPanel(
-        low=_pair(low), high=_pair(high), marks=(*bodies, *arrows), axes="frame",
+        low=_pair(low),
+        high=_pair(high),
+        marks=(*bodies, *arrows),
+        axes="frame",
         title=f"{title}contact forces on the slave nodes, largest "
         f"{largest / factor:.3g} {prefix}N/m{key}",
         **_axes(span),
-    )  # fmt: skip
+    )
 
 
 def _states(friction: NDArray[np.str_]) -> str:

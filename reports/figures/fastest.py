@@ -88,9 +88,13 @@ def _panel(f: FastestSolver, solvers: Sequence[str], most: int) -> Panel:
             marks += _marks(_RAISED - k if below else -float(k), c, f, style)
         if failed:
             texts.append(
-                Text(text=_failure(c), place=(0.995, -k - below),
-                     inside=(True, False), align=("right", "center"))
-            )  # fmt: skip
+                Text(
+                    text=_failure(c),
+                    place=(0.995, -k - below),
+                    inside=(True, False),
+                    align=("right", "center"),
+                )
+            )
     return Panel(
         x=_ratios(f),
         y=categories([_short(_name(c)) for c in _rows(f, most)]),

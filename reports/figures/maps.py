@@ -51,10 +51,11 @@ def traction_maps(fields: Fields) -> FieldFigure | None:
         values["shear traction"] = side.shear
     alone = side.friction is None
     panels = [
-        grid.panel(name if alone else f"({letter}) {name}", v, _scale(name, v),
-                   circles * alone)
+        grid.panel(
+            name if alone else f"({letter}) {name}", v, _scale(name, v), circles * alone
+        )
         for letter, (name, v) in zip("ab", values.items(), strict=False)
-    ]  # fmt: skip
+    ]
     if not alone:
         slips = closed & (side.friction == "slip")
         arrows = grid.arrows(-side.force[:, :2], slips)
@@ -64,9 +65,11 @@ def traction_maps(fields: Fields) -> FieldFigure | None:
         )
     columns = len(panels)
     return FieldFigure(
-        panels=tuple(panels), columns=columns, height=3.1 if columns > 1 else 4.2,
+        panels=tuple(panels),
+        columns=columns,
+        height=3.1 if columns > 1 else 4.2,
         width=WIDTH if columns > 1 else 3.6,
-    )  # fmt: skip
+    )
 
 
 class _Grid:
@@ -99,11 +102,16 @@ class _Grid:
         unit, name = length_unit(self.size)
         first = not title.startswith(("(b)", "(c)"))
         return FieldPanel(
-            low=_pair(self.low), high=_pair(self.high), marks=(raster, *above),
-            title=title, xlabel=f"$x$ in {name}", unit=unit,
-            ylabel=f"$y$ in {name}" if first else "", numbered=(True, first),
+            low=_pair(self.low),
+            high=_pair(self.high),
+            marks=(raster, *above),
+            title=title,
+            xlabel=f"$x$ in {name}",
+            unit=unit,
+            ylabel=f"$y$ in {name}" if first else "",
+            numbered=(True, first),
             scale=scale,
-        )  # fmt: skip
+        )
 
     def arrows(
         self, vectors: NDArray[np.float64], at: NDArray[np.bool_]
@@ -126,9 +134,12 @@ def _scale(name: str, values: Vector) -> ColourScale:
     largest = float(values.max())
     factor, prefix = prefixed(largest)
     return ColourScale(
-        colours="viridis", low=0, high=largest or 1.0, unit=factor,
+        colours="viridis",
+        low=0,
+        high=largest or 1.0,
+        unit=factor,
         label=f"{name} in {prefix}Pa",
-    )  # fmt: skip
+    )
 
 
 def _circles(side: ContactSide) -> tuple[FieldMark, ...]:

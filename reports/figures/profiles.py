@@ -172,16 +172,26 @@ def _profile(
     at, share = curve(values, *ends)
     x = numbers(at)
     line = Series(
-        x=x, y=numbers(share.value), look=style, step=True, few=True, clipped=False,
+        x=x,
+        y=numbers(share.value),
+        look=style,
+        step=True,
+        few=True,
+        clipped=False,
         solver=solver,
-    )  # fmt: skip
+    )
     if not band:
         return [line]
     low, high = numbers(share.low), numbers(share.high)
     around = Area(
-        x=x, low=low, high=high, colour=style.colour, opacity=0.11, step=True,
+        x=x,
+        low=low,
+        high=high,
+        colour=style.colour,
+        opacity=0.11,
+        step=True,
         solver=solver,
-    )  # fmt: skip
+    )
     return [around, line]
 
 

@@ -59,9 +59,14 @@ def face_normals(points: Points, faces: Integers) -> Points:
 
 
 def visible_faces(
-    camera: Camera, points: Points, faces: Integers, values: Vector,
-    scale: ColourScale, *, mesh: bool,
-) -> Faces:  # fmt: skip
+    camera: Camera,
+    points: Points,
+    faces: Integers,
+    values: Vector,
+    scale: ColourScale,
+    *,
+    mesh: bool,
+) -> Faces:
     """Return the faces (k, 4) towards the camera in tiles, back to front.
 
     Faces may be large compared with the distance between bodies, tiles are not: the
@@ -89,10 +94,14 @@ def visible_faces(
         start, end = sides[:, :-1].ravel(), sides[:, 1:].ravel()
         pieces = grid[:, np.stack([start, end, end, start], axis=-1)].reshape(-1, 4, 3)
         edge = np.arange(tiles)
-        beside = np.concatenate([
-            edge * tiles, (tiles - 1) * tiles + edge, edge[::-1] * tiles + tiles - 1,
-            edge[::-1],
-        ])  # fmt: skip
+        beside = np.concatenate(
+            [
+                edge * tiles,
+                (tiles - 1) * tiles + edge,
+                edge[::-1] * tiles + tiles - 1,
+                edge[::-1],
+            ]
+        )
         after = depth.reshape(len(visible), -1)[:, beside].ravel()
         at, depth = np.concatenate([at, pieces]), np.append(depth, after)
         colours = np.append(colours, np.full(len(pieces), np.nan))

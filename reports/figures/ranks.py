@@ -64,10 +64,12 @@ def strong_figure(series: Sequence[StrongSeries]) -> Figure:
             marks += _speed_ups(s, phase, look(i))
         panels.append(
             Panel(
-                x=_ranks_axis(shown), y=_times_axis("speed-up", marks),
-                title=phase, marks=tuple(marks),
+                x=_ranks_axis(shown),
+                y=_times_axis("speed-up", marks),
+                title=phase,
+                marks=tuple(marks),
             )
-        )  # fmt: skip
+        )
     for i, s in enumerate(series):
         label = legible(s.title, _LONG)
         keys.append(Key(label=label, look=_line(look(i)), solver=s.solver))
@@ -108,29 +110,44 @@ def model_figure(predicted: Sequence[tuple[StrongSeries, Sequence[int]]]) -> Fig
         beyond = {float(n): s.model.speed_up(n) for n in (last, *asked)}
         ranks, modelled = tuple(beyond), beyond.values()
         colour = look(i).colour
-        measured = [(n, s.speed_up(n, "solve"), s.answers[n])
-                    for n in s.model.measured[1:]]  # fmt: skip
+        measured = [
+            (n, s.speed_up(n, "solve"), s.answers[n]) for n in s.model.measured[1:]
+        ]
         marks: list[Mark] = [
             _ideal([1, *asked]),
-            Area(x=ranks, low=tuple(v.low for v in modelled),
-                 high=tuple(v.high for v in modelled), colour=colour, opacity=_BAND,
-                 solver=s.solver),
-            Series(x=ranks, y=tuple(v.value for v in modelled), solver=s.solver,
-                   look=replace(_MODEL, colour=colour)),
+            Area(
+                x=ranks,
+                low=tuple(v.low for v in modelled),
+                high=tuple(v.high for v in modelled),
+                colour=colour,
+                opacity=_BAND,
+                solver=s.solver,
+            ),
+            Series(
+                x=ranks,
+                y=tuple(v.value for v in modelled),
+                solver=s.solver,
+                look=replace(_MODEL, colour=colour),
+            ),
             *curve([(1, _ONE, s.answers[1]), *measured], _line(look(i)), s.solver),
-        ]  # fmt: skip
+        ]
         panels.append(
             Panel(
                 x=_ranks_axis([1, *s.model.measured[1:], *asked]),
                 y=_times_axis("speed-up of the solve", marks),
-                title=legible(s.case, 44), marks=tuple(marks),
+                title=legible(s.case, 44),
+                marks=tuple(marks),
                 rules=(Rule(axis="x", at=float(last), look=_EDGE),),
                 texts=(
-                    Text(text="model, not measured", place=(0.97, 0.06),
-                         inside=(True, True), align=("right", "center")),
+                    Text(
+                        text="model, not measured",
+                        place=(0.97, 0.06),
+                        inside=(True, True),
+                        align=("right", "center"),
+                    ),
                 ),
             )
-        )  # fmt: skip
+        )
     keys = (
         Key(label="measured", look=_line(look(0))),
         Key(label="model, not measured", look=_MODEL),
@@ -155,18 +172,22 @@ def parts_figure(series: Sequence[tuple[StrongSeries, int]]) -> Figure:
                 marks.append(
                     Segments(
                         ends=((start, -float(i), start + taken, -float(i)),),
-                        colour=colours.get(name, _REST), width=_BAR, solver=s.solver,
+                        colour=colours.get(name, _REST),
+                        width=_BAR,
+                        solver=s.solver,
                         runs=(o.run_ids,),
                     )
-                )  # fmt: skip
+                )
                 start += taken
     keys = [Key(label=name, look=_bar(colours.get(name, _REST))) for name in named]
     keys.append(Key(label="rest", look=_bar(_REST)))
     names = [f"{n} ranks, {legible(s.case, 44)}" for s, n in series]
     panel = Panel(
-        x=Axis(label="solve time in s", low=0.0), y=categories(names),
-        marks=tuple(marks), grid="x",
-    )  # fmt: skip
+        x=Axis(label="solve time in s", low=0.0),
+        y=categories(names),
+        marks=tuple(marks),
+        grid="x",
+    )
     figure = with_legend((Row(panels=(panel,)),), keys, 6, 0.0)
     return replace(figure, height=0.9 + LEGEND_LINE + 0.26 * len(series))
 
@@ -189,15 +210,20 @@ def weak_figure(series: Sequence[WeakSeries]) -> Figure:
                     marks += curve(timed, style, s.solver)
         panels.append(
             Panel(
-                x=_ranks_axis(shown), y=log("time in s"), title=phase,
+                x=_ranks_axis(shown),
+                y=log("time in s"),
+                title=phase,
                 marks=tuple(marks),
             )
-        )  # fmt: skip
+        )
     keys = [
-        Key(label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs per rank",
-            look=_line(look(i)), solver=s.solver)
+        Key(
+            label=f"{legible(s.title, _LONG)}: {s.members[0].dofs} dofs per rank",
+            look=_line(look(i)),
+            solver=s.solver,
+        )
         for i, s in enumerate(series)
-    ]  # fmt: skip
+    ]
     if any(s.copies for s in series):
         keys.append(
             Key(
@@ -216,9 +242,12 @@ def _ideal(ranks: Sequence[int]) -> Series:
 def _ranks_axis(ranks: Sequence[int]) -> Axis:
     low, high = float(min(ranks)), float(max(ranks))
     return Axis(
-        label="ranks $N$", log=True, low=low / 1.15, high=high * 1.15,
+        label="ranks $N$",
+        log=True,
+        low=low / 1.15,
+        high=high * 1.15,
         ticks=tuple((float(n), str(n)) for n in sorted(set(ranks))),
-    )  # fmt: skip
+    )
 
 
 def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
@@ -237,9 +266,12 @@ def _times_axis(label: str, marks: Sequence[Mark]) -> Axis:
     low, high = min([0.9, *shown]), max([2.0, *shown])
     ticks = [2.0**k for k in range(-6, 13) if low <= 2.0**k <= 1.1 * high]
     return Axis(
-        label=label, log=True, low=low / 1.1, high=high * 1.15,
+        label=label,
+        log=True,
+        low=low / 1.1,
+        high=high * 1.15,
         ticks=tuple((v, f"{v:g}") for v in ticks),
-    )  # fmt: skip
+    )
 
 
 def _line(style: Look) -> Look:

@@ -127,9 +127,11 @@ def with_slopes(panel: Panel) -> Panel:
         texts.append(Text(text=name, place=(stop, end), offset=(2, 0)))
     return replace(
         panel,
-        x=replace(panel.x, low=x0, high=x1), y=replace(panel.y, low=y0, high=y1),
-        marks=(*guides, *panel.marks), texts=(*panel.texts, *texts),
-    )  # fmt: skip
+        x=replace(panel.x, low=x0, high=x1),
+        y=replace(panel.y, low=y0, high=y1),
+        marks=(*guides, *panel.marks),
+        texts=(*panel.texts, *texts),
+    )
 
 
 def along(ends: Limits, part: float) -> float:

@@ -71,11 +71,14 @@ def accuracy_figure(evidence: Evidence) -> Figure | None:
         rules=(Rule(axis="y", at=evidence.factor, look=Look(colour=INK, width=0.8)),),
         texts=(
             Text(
-                text="verified below", place=(0.995, evidence.factor),
-                inside=(True, False), offset=(0, -3), align=("right", "top"),
+                text="verified below",
+                place=(0.995, evidence.factor),
+                inside=(True, False),
+                offset=(0, -3),
+                align=("right", "top"),
             ),
         ),
-    )  # fmt: skip
+    )
     names = dict.fromkeys(o.solver for o in shown)
     keys = tuple(Key(label=legible(s), look=looks[s], solver=s) for s in names)
     return Figure(
@@ -150,8 +153,10 @@ def certified_figure(
                 ("discretisation error", _MESH),
                 ("a tenth of the discretisation error", _TENTH),
             ]
-            rules = [Rule(axis="y", at=error, look=_MESH),
-                     Rule(axis="y", at=SHARE * error, look=_TENTH)]  # fmt: skip
+            rules = [
+                Rule(axis="y", at=error, look=_MESH),
+                Rule(axis="y", at=SHARE * error, look=_TENTH),
+            ]
         panels.append(_panel(case, "certified relative error", marks, rules))
     return _figure(panels, swept, solvers, lines)
 

@@ -87,7 +87,9 @@ def geometry_figure(fields: Fields, load: float) -> FieldFigure:
     clamped += [_rectangle((x - 0.03, -0.05), d.r2 - d.r1 + 0.06, 0.05) for x in feet]
     bodies = zip((_rectangle((0, d.a), d.l, d.h), np.array(ring)), FILLS, strict=True)
     panel = FieldPanel(
-        low=(-0.1, -0.25), high=(2.5, 1.07), axes="none",
+        low=(-0.1, -0.25),
+        high=(2.5, 1.07),
+        axes="none",
         marks=(
             _line((0.1, 0), (d.l + 0.45, 0), dash=(6, 4)),
             *(
@@ -95,9 +97,11 @@ def geometry_figure(fields: Fields, load: float) -> FieldFigure:
                 for at, (fill, opacity) in bodies
             ),
             *(Polygons(corners=(at,), edge=_SOFT, hatch="//////") for at in clamped),
-            *_lengths(d), *_load(d, load), *_names(d),
+            *_lengths(d),
+            *_load(d, load),
+            *_names(d),
         ),
-    )  # fmt: skip
+    )
     return FieldFigure(panels=(panel,), height=3.45)
 
 
@@ -148,13 +152,17 @@ def _load(d: Dimensions, load: float) -> list[FieldMark]:
     text, colour = f"$F={load / 1e9:g}$ GN/m", COLOURS[1]
     return [
         Arrow(
-            start=(x, y + 0.28), end=(x, y), head="-|>", width=1.6, colour=colour,
+            start=(x, y + 0.28),
+            end=(x, y),
+            head="-|>",
+            width=1.6,
+            colour=colour,
             size=12,
         ),
         Label(
             text=text, place=(x + 0.04, y + 0.27), align=("left", "top"), colour=colour
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _names(d: Dimensions) -> list[FieldMark]:
@@ -168,10 +176,11 @@ def _names(d: Dimensions) -> list[FieldMark]:
             start=outside, end=(x - 0.03, y), head="-", width=0.5, colour=_SOFT, gap=2
         ),
         Label(
-            text=f"gap {d.a - d.r2 - d.centre[1]:.2g} m", place=outside,
+            text=f"gap {d.a - d.r2 - d.centre[1]:.2g} m",
+            place=outside,
             align=("right", "center"),
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _panels(
@@ -187,11 +196,15 @@ def _panels(
         lowest, left = i + 2 >= len(pictures), i % 2 == 0
         panels.append(
             FieldPanel(
-                low=low, high=high, title=f"({'abcdefgh'[i]}) {title}",
-                xlabel="$x$ in m" * lowest, ylabel="$y$ in m" * left,
-                numbered=(lowest, left), **how,
+                low=low,
+                high=high,
+                title=f"({'abcdefgh'[i]}) {title}",
+                xlabel="$x$ in m" * lowest,
+                ylabel="$y$ in m" * left,
+                numbered=(lowest, left),
+                **how,
             )
-        )  # fmt: skip
+        )
     return tuple(panels)
 
 
@@ -247,16 +260,21 @@ def stress_figure(fields: Fields) -> FieldFigure:
     for name, title in STRESSES.items():
         limit, signed = extent(fields, name).clipped, name != "von_mises"
         scale = ColourScale(
-            colours="RdBu_r" if signed else "viridis", low=-limit if signed else 0,
-            high=limit, unit=1e9, beyond="both" if signed else "max",
-        )  # fmt: skip
+            colours="RdBu_r" if signed else "viridis",
+            low=-limit if signed else 0,
+            high=limit,
+            unit=1e9,
+            beyond="both" if signed else "max",
+        )
         colours = [
             ColourField(
-                points=points, triangles=triangles(fields.cells[fields.bodies == body]),
-                values=fields.nodal[name], scale=scale,
+                points=points,
+                triangles=triangles(fields.cells[fields.bodies == body]),
+                values=fields.nodal[name],
+                scale=scale,
             )
             for body in np.unique(fields.bodies)
-        ]  # fmt: skip
+        ]
         marks = (*colours, *_outlined(fields, points, 0.6))
         pictures.append((f"{title} in GPa", points, {"marks": marks, "scale": scale}))
     return FieldFigure(panels=_panels(pictures), height=4.05, columns=2, heights=(1, 1))
@@ -287,7 +305,8 @@ def zoom_figure(fields: Fields) -> FieldFigure:
     unit, colour = float(f"{largest / 2:.0e}"), COLOURS[1]
     x, y, arrow = x0 + 0.05 * reach, y0 + 0.05 * reach, scale * unit
     panel = FieldPanel(
-        low=(x0, y0), high=(x1, y1),
+        low=(x0, y0),
+        high=(x1, y1),
         marks=(
             *mesh(fields, points, 0.9),
             Polygons(
@@ -300,10 +319,13 @@ def zoom_figure(fields: Fields) -> FieldFigure:
                 start=(x, y), end=(x, y + arrow), head="-|>", width=1.2, colour=colour
             ),
             Label(
-                text=f"pressure {unit / 1e9:g} GPa", place=(x, y + arrow / 2),
+                text=f"pressure {unit / 1e9:g} GPa",
+                place=(x, y + arrow / 2),
                 offset=(6, 0),
             ),
         ),
-        xlabel="$x$ in m", ylabel="$y$ in m", axes="frame",
-    )  # fmt: skip
+        xlabel="$x$ in m",
+        ylabel="$y$ in m",
+        axes="frame",
+    )
     return FieldFigure(panels=(panel,), height=4.1)

@@ -108,8 +108,9 @@ def _figure(
 ) -> Figure:
     """Plot times in a panel for each form, above a strip of unverified answers."""
     found = {form: places(evidence, form, dofs=dofs) for form in titles}
-    every = {s: [p for f in found.values() for p in f.get(s, ())]
-             for s in evidence.solvers}  # fmt: skip
+    every = {
+        s: [p for f in found.values() for p in f.get(s, ())] for s in evidence.solvers
+    }
     drawn = [s for s, of in every.items() if any(p.tried for p in of)]
     failing = [s for s in drawn if any(p.failed for p in every[s])]
     looks = {s: look(i) for i, s in enumerate(evidence.solvers)}
@@ -123,22 +124,38 @@ def _figure(
             for solver, mine in found[form].items()
             for mark in curve(
                 ((p.size, p.time, p.outcome) for p in mine if p.outcome.verified),
-                looks[solver], solver,
+                looks[solver],
+                solver,
             )
-        ]  # fmt: skip
-        above.append((title, Panel(
-            x=top if failing else axis, marks=tuple(marks),
-            y=Axis(label="time in s" * first, log=True, shared="time", numbered=first),
-        )))  # fmt: skip
+        ]
+        above.append(
+            (
+                title,
+                Panel(
+                    x=top if failing else axis,
+                    marks=tuple(marks),
+                    y=Axis(
+                        label="time in s" * first,
+                        log=True,
+                        shared="time",
+                        numbered=first,
+                    ),
+                ),
+            )
+        )
         crosses = [
             mark
             for row, solver in enumerate(failing)
             for mark in curve(
-                ((p.size, -float(row), p.outcome)
-                 for p in found[form].get(solver, ()) if p.failed),
-                replace(_FAILED, colour=looks[solver].colour, size=5, edge=1.2), solver,
+                (
+                    (p.size, -float(row), p.outcome)
+                    for p in found[form].get(solver, ())
+                    if p.failed
+                ),
+                replace(_FAILED, colour=looks[solver].colour, size=5, edge=1.2),
+                solver,
             )
-        ]  # fmt: skip
+        ]
         names = categories([legible(s) for s in failing], line=False, numbered=first)
         strips.append(Panel(x=axis, y=names, marks=tuple(crosses), grid="none"))
     height = 0.17 * len(failing) + 0.04
@@ -162,9 +179,10 @@ def fleet_table(evidence: Evidence, form: str) -> Table:
     for solver, mine in found.items():
         at = {p.size: p.outcome for p in mine}
         timed = [
-            (p.size, t.value) for p in mine
+            (p.size, t.value)
+            for p in mine
             if p.outcome.verified and (t := p.time) is not None
-        ]  # fmt: skip
+        ]
         power = Cell(title="fewer than three verified sizes")
         if len({size for size, _ in timed}) >= 3:
             law = power_law(*zip(*timed, strict=True))
@@ -228,9 +246,10 @@ def certified_figure(evidence: Evidence) -> Figure:
             for solver, answers in swept(evidence, form).items()
             for mark in curve(
                 ((time.value, error, o) for o, time, error in answers),
-                look(evidence.solvers.index(solver)), solver,
+                look(evidence.solvers.index(solver)),
+                solver,
             )
-        ]  # fmt: skip
+        ]
         label = "certified relative error, energy norm" * (not panels)
         error = replace(log(label), shared="error", numbered=not panels)
         panel = Panel(x=log("median time in s"), y=error, marks=tuple(marks))
@@ -265,11 +284,12 @@ def certified_table(evidence: Evidence) -> Table:
                 o, time, error = min(good, key=lambda answer: answer[1].value)
                 cells.append(
                     Cell(
-                        text=seconds(time), after=f"tol {tolerance(o.tol)}",
+                        text=seconds(time),
+                        after=f"tol {tolerance(o.tol)}",
                         value=time.value,
                         title=f"{source(o)}, certified {significant(error)}",
                     )
-                )  # fmt: skip
+                )
             rows.append(tuple(cells))
     return Table(
         caption="Smallest median time to a certified relative error in the energy "

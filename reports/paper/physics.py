@@ -99,28 +99,50 @@ def pressure_figure(rows: Sequence[Row]) -> Figure:
         for (contact, style), size in zip(_LOOKS.items(), (4, 3), strict=True)
     )
     nodes, keys = labelled(
-        (CONTACTS[contact], touched[contact],
-         replace(style, size=size, edge=0.7, dash=None))
+        (
+            CONTACTS[contact],
+            touched[contact],
+            replace(style, size=size, edge=0.7, dash=None),
+        )
         for (contact, style), size in zip(_LOOKS.items(), (3.4, 6.2), strict=True)
-    )  # fmt: skip
+    )
     at_end = Panel(
-        x=angle, y=Axis(label=_PRESSURE), marks=methods,
+        x=angle,
+        y=Axis(label=_PRESSURE),
+        marks=methods,
         legend=Legend(keys=named, place="upper left", size=8.5),
-    )  # fmt: skip
+    )
     _, top = limits([at_end], "y")
     panels = titled(
-        ("node-to-segment, all load steps", Panel(
-            x=angle, y=Axis(label=_PRESSURE, low=0), marks=through,
-            bar=ColourBar(label="load step", colours=colours),
-        )),
-        (f"both methods, load step {last}",
-         replace(at_end, y=replace(at_end.y, low=0, high=1.3 * top))),
-        ("active set: the nodes in contact", Panel(
-            x=angle, y=Axis(label="load step", low=0.3, high=last + 0.7,
-                            most=min(last, 10), integers=True),
-            marks=nodes, span=2,
-        )),
-    )  # fmt: skip
+        (
+            "node-to-segment, all load steps",
+            Panel(
+                x=angle,
+                y=Axis(label=_PRESSURE, low=0),
+                marks=through,
+                bar=ColourBar(label="load step", colours=colours),
+            ),
+        ),
+        (
+            f"both methods, load step {last}",
+            replace(at_end, y=replace(at_end.y, low=0, high=1.3 * top)),
+        ),
+        (
+            "active set: the nodes in contact",
+            Panel(
+                x=angle,
+                y=Axis(
+                    label="load step",
+                    low=0.3,
+                    high=last + 0.7,
+                    most=min(last, 10),
+                    integers=True,
+                ),
+                marks=nodes,
+                span=2,
+            ),
+        ),
+    )
     rows_of = (
         figure.Row(panels=panels[:2]),
         figure.Row(panels=panels[2:], height=0.85),
@@ -196,9 +218,11 @@ def stepping_figure(rows: Sequence[Row]) -> Figure:
         top = along((y0, y1), 0.93)
         guide = Series(x=(start, stop), y=(top, top * start / stop), look=GUIDE)
         name = Text(
-            text="first order", place=(sqrt(start * stop), top * sqrt(start / stop)),
-            offset=(4, 3), align=("left", "bottom"),
-        )  # fmt: skip
+            text="first order",
+            place=(sqrt(start * stop), top * sqrt(start / stop)),
+            offset=(4, 3),
+            align=("left", "bottom"),
+        )
         panel = replace(
             panel,
             x=replace(panel.x, low=x0, high=x1),
@@ -228,9 +252,10 @@ def orders(rows: Sequence[Row]) -> Table:
             ]
         lines.append(tuple(cells))
     heads = [
-        head for q in QUANTITIES
+        head
+        for q in QUANTITIES
         for head in (f"{q}: order [95 %]", f"error at {PAPER} steps")
-    ]  # fmt: skip
+    ]
     return Table(
         caption=f"Order in 1/steps, fitted to {SINCE} and more steps, and relative "
         f"error at {PAPER} steps. The first row is the scheme of the paper.",

@@ -203,21 +203,24 @@ def _bodies(experiment: Experiment) -> tuple[Section, ...]:
     }
     return (
         _section(
-            "figure1", "Geometry",
+            "figure1",
+            "Geometry",
             geometry_figure(states["example-2Nh"], setting["load"]),
             "Geometry, supports and load, drawn from the mesh. Hatched: clamped. "
             f"E = {E['beam']:g} GPa (A) and {E['ring']:g} GPa (B), "
             f"ν = {setting['materials']['beam']['nu']:g} in both bodies.",
         ),
         _section(
-            "figure2", "Mesh and solution", mesh_figure(meshes),
+            "figure2",
+            "Mesh and solution",
+            mesh_figure(meshes),
             f"Mesh with Nr = {Nr}, Nh = {Nh} and its deformation (displacement × "
             f"{SCALE:g}) with two numbers of radial layers. (a), (b): Nh layers as in "
             f"the figure of the paper, {one} nodes (the paper: "
             f"{published.FIGURE_2_NODES}). (c), (d): 2·Nh layers as in its text and "
             f"Table 1, {two} nodes.",
         ),
-    )  # fmt: skip
+    )
 
 
 def _times(experiment: Experiment) -> tuple[Section, ...]:
@@ -226,14 +229,18 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
     law = pinv_fit(five, "build")
     return (
         _section(
-            "figure3", "Assembly", assembly_figure(three),
+            "figure3",
+            "Assembly",
+            assembly_figure(three),
             "Assembly of the rectangle's stiffness matrix against its size, "
             f"{_repeats(three)} repeats (the paper: averages of 100 runs of the "
             "vectorised library [6]). Star: the only published value, 0.087 s, "
             f"for both bodies ({published.DOFS} dofs).",
         ),
         _section(
-            "figure4", "Contact rows", contact_figure(four),
+            "figure4",
+            "Contact rows",
+            contact_figure(four),
             "One linearisation of the contact at u = 0 against the slave segments "
             "(ring), a curve for each number of master segments (beam), "
             f"{_repeats(four)} repeats (the paper: averages of 10 runs). Star: a tenth "
@@ -241,7 +248,9 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             f"segments ({published.MACHINE}).",
         ),
         _section(
-            "figure5", "Generalised inverse", inverse_figure(five),
+            "figure5",
+            "Generalised inverse",
+            inverse_figure(five),
             "Generalised inverse of the rectangle's stiffness: construction (a), "
             f"multiplication with a random vector (b), {_repeats(five)} repeats (the "
             "paper: averages of 10 runs). The dense pseudoinverse is measured up to "
@@ -251,14 +260,16 @@ def _times(experiment: Experiment) -> tuple[Section, ...]:
             "the errata).",
         ),
         _section(
-            "figure6", "Scaling", scaling_figure(six),
+            "figure6",
+            "Scaling",
+            scaling_figure(six),
             f"Growth with Nr at Nh = {six[0]['Nh']}, "
             f"{experiment.setting['plan']['steps']} load steps, {_repeats(six)} "
             "repeats. (c): the condensed curve includes the factorisation, which "
             "dominates its time; the other curve does not. (d): complete analysis. "
             f"Star and cross: published values for Nr = 30 ({published.MACHINE}).",
         ),
-    )  # fmt: skip
+    )
 
 
 def _repeats(rows: Sequence[Row]) -> str:
@@ -323,11 +334,13 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
             title="Beyond the paper: the contact",
             pictures=(
                 Picture(
-                    name="zoom", caption=zoom,
+                    name="zoom",
+                    caption=zoom,
                     figure=zoom_figure(experiment.states["largest"]),
                 ),
                 Picture(
-                    name="pressure", caption=pressures,
+                    name="pressure",
+                    caption=pressures,
                     figure=pressure_figure(tables["pressures"]),
                 ),
             ),
@@ -345,19 +358,20 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
                     name="verification",
                     figure=verification_figure(tables["verification"]),
                     caption="Contact rows compared with exact solutions. (a): "
-                            "largest error of σy at the Gauss points of the patch "
-                            "test with 3 elements meeting 2 (errors below 1e-12 are "
-                            "rounding, drawn at 1e-12). On the finest mesh it is "
-                            f"{100 * float(left['error']):.2g} % for node-to-segment, "
-                            f"and at most {mortar:.0e} for mortar. (b): pressure "
-                            "between two cylinders compared with Hertz's, in L²; its "
-                            "error is at least of order a²/R² because the bodies are "
-                            "finite.",
+                    "largest error of σy at the Gauss points of the patch "
+                    "test with 3 elements meeting 2 (errors below 1e-12 are "
+                    "rounding, drawn at 1e-12). On the finest mesh it is "
+                    f"{100 * float(left['error']):.2g} % for node-to-segment, "
+                    f"and at most {mortar:.0e} for mortar. (b): pressure "
+                    "between two cylinders compared with Hertz's, in L²; its "
+                    "error is at least of order a²/R² because the bodies are "
+                    "finite.",
                 ),
             ),
         ),
         _section(
-            "stepping", "Beyond the paper: accuracy of the load steps",
+            "stepping",
+            "Beyond the paper: accuracy of the load steps",
             stepping_figure(tables["stepping"]),
             f"Error of the load steps at Nr = {Nr}, Nh = {Nh} (node-to-segment) "
             f"against their number. The reference has {settled['relin']} "
@@ -372,14 +386,15 @@ def _physics(experiment: Experiment) -> tuple[Section, ...]:
             ),
             tables=(orders(tables["stepping"]),),
         ),
-    )  # fmt: skip
+    )
 
 
 def _fleet(evidence: Evidence) -> tuple[Section, ...]:
     """Return the sections on times of all solvers against m, and on primal and dual."""
     return (
         _section(
-            "fleet", "Beyond the paper: SMALBE and other solvers",
+            "fleet",
+            "Beyond the paper: SMALBE and other solvers",
             fleet_figure(evidence),
             "Time against the size m of the dual at the last load step, tolerance "
             "1e-6, verified answers only; crosses: unverified answers. Bars: "
@@ -388,7 +403,8 @@ def _fleet(evidence: Evidence) -> tuple[Section, ...]:
             tables=tuple(fleet_table(evidence, form) for form in DUALS),
         ),
         _section(
-            "totals", "Beyond the paper: primal against dual",
+            "totals",
+            "Beyond the paper: primal against dual",
             primal_dual_figure(evidence),
             "Total times of the primal and dual forms, for verified answers only. "
             "Dual forms include the dualisation of one load step with the "
@@ -397,7 +413,7 @@ def _fleet(evidence: Evidence) -> tuple[Section, ...]:
             "primal form.",
             tables=(totals_table(evidence),),
         ),
-    )  # fmt: skip
+    )
 
 
 def _certified(evidence: Evidence) -> tuple[Section, ...]:
@@ -411,11 +427,14 @@ def _certified(evidence: Evidence) -> tuple[Section, ...]:
     )
     return (
         _section(
-            "certified", "Beyond the paper: time to certified accuracy",
-            certified_figure(evidence), caption,
-            prose=(REPEATED,), tables=(certified_table(evidence),),
+            "certified",
+            "Beyond the paper: time to certified accuracy",
+            certified_figure(evidence),
+            caption,
+            prose=(REPEATED,),
+            tables=(certified_table(evidence),),
         ),
-    )  # fmt: skip
+    )
 
 
 #: suite → function that returns its sections

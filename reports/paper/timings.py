@@ -158,9 +158,11 @@ def assembly_figure(rows: Sequence[Row]) -> Figure:
     marks, keys = labelled([*curves, (words, [place], _PUBLISHED)])
     time = "assembly time in s"
     left = Panel(
-        x=Axis(label=DOFS, low=0, most=4), y=Axis(label=time, low=0), marks=marks,
+        x=Axis(label=DOFS, low=0, most=4),
+        y=Axis(label=time, low=0),
+        marks=marks,
         grid="none",
-    )  # fmt: skip
+    )
     right = Panel(x=log(DOFS), y=log(time), marks=marks)
     panels = titled(("linear scale", left), ("logarithmic scale", right))
     return Figure(rows=in_rows(panels, 2), height=3.4, legend=below(keys, 2))
@@ -173,8 +175,9 @@ def contact_figure(rows: Sequence[Row]) -> Figure:
     name = f"published\n({published.SEGMENTS['master']} master segments)"
     panels = []
     for method, title in (
-        ("nts", "node-to-segment, as in the paper"), ("mortar", "mortar, dual basis"),
-    ):  # fmt: skip
+        ("nts", "node-to-segment, as in the paper"),
+        ("mortar", "mortar, dual basis"),
+    ):
         first = method == "nts"
         marks, keys = labelled(
             (f"{master}", times(rows, "slave", method=method, master=master), look(i))
@@ -183,12 +186,15 @@ def contact_figure(rows: Sequence[Row]) -> Figure:
         panel = Panel(
             x=log("slave segments"),
             y=Axis(
-                label="time of one linearisation in s" * first, log=True, high=0.7,
-                shared="time", numbered=first,
+                label="time of one linearisation in s" * first,
+                log=True,
+                high=0.7,
+                shared="time",
+                numbered=first,
             ),
             marks=(*marks, *curve([place] * first, _PUBLISHED)),
             texts=(Text(text=name, place=place, offset=(9, 0)),) * first,
-        )  # fmt: skip
+        )
         panels.append((title, panel))
     return Figure(
         rows=in_rows(titled(*panels), 2),
@@ -202,8 +208,9 @@ def inverse_figure(rows: Sequence[Row]) -> Figure:
     until = float(max(r["n"] for r in rows))
     panels = []
     for part, title in (
-        ("build", "building"), ("multiply", "multiplication with a random vector"),
-    ):  # fmt: skip
+        ("build", "building"),
+        ("multiply", "multiplication with a random vector"),
+    ):
         marks, keys = labelled(
             (METHODS[method], times(rows, "n", method=method, part=part), look(i))
             for method, i in (("pinv", 2), ("geometric", 0), ("spectral", 1))
@@ -231,21 +238,29 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     Nr, n, m_E, m_I = np.array(sizes, dtype=float).T
     most = float(max(m_E.max(), m_I.max()))
     unknowns = _against_Nr(
-        Nr, Axis(label="unknowns", log=True, low=100, high=1e5),
+        Nr,
+        Axis(label="unknowns", log=True, low=100, high=1e5),
         {"primal, $n$": n, "dual, $m = m_E + m_I$": m_E + m_I},
-    )  # fmt: skip
+    )
     constraints = _against_Nr(
-        Nr, Axis(label="rows", low=0, high=1.35 * most),
+        Nr,
+        Axis(label="rows", low=0, high=1.35 * most),
         {"Dirichlet equalities $m_E$": m_E, "contact inequalities $m_I$": m_I},
-    )  # fmt: skip
+    )
     summed = [{**row, "m": int(row["m_E"]) + int(row["m_I"])} for row in rows]
     dual, whole = list[Labelled](), list[Labelled]()
-    for i, (label, method, parts) in enumerate((
-        ("dualisation, one solve per row", "per-row", ("dualisation",)),
-        ("dualisation, condensed, with factor", "condensed", ("factor", "dualisation")),
-        ("dual QPs, textbook SMALBE", "per-row", ("qp",)),
-        ("dual QPs, our SMALBE", "condensed", ("qp",)),
-    )):  # fmt: skip
+    for i, (label, method, parts) in enumerate(
+        (
+            ("dualisation, one solve per row", "per-row", ("dualisation",)),
+            (
+                "dualisation, condensed, with factor",
+                "condensed",
+                ("factor", "dualisation"),
+            ),
+            ("dual QPs, textbook SMALBE", "per-row", ("qp",)),
+            ("dual QPs, our SMALBE", "condensed", ("qp",)),
+        )
+    ):
         points = times(summed, "m", method=method, part=parts)
         dual.append((label, points, look(i)))
     for label, part, marker, size in (
@@ -260,10 +275,12 @@ def scaling_figure(rows: Sequence[Row]) -> Figure:
     panels = titled(
         ("size of the problems", unknowns),
         ("constraints", constraints),
-        ("dualisation and QPs, all steps",
-         _with_head_room("size of the dual $m$", dual, 3.8)),
+        (
+            "dualisation and QPs, all steps",
+            _with_head_room("size of the dual $m$", dual, 3.8),
+        ),
         ("complete analysis", _with_head_room("size of the primal $n$", whole, 2.2)),
-    )  # fmt: skip
+    )
     return Figure(rows=in_rows(panels, 2), height=6.3)
 
 
@@ -312,10 +329,13 @@ def table_1(experiment: Experiment) -> Table:
     heads = ("nodes", "elements", "dofs")
     counted = experiment.tables["table1"]
     lines: list[tuple[Cell, tuple[Any, ...], tuple[Any, ...]]] = [
-        (Cell(text=str(r["body"])), tuple(int(r[k]) for k in ("N", *heads, "segments")),
-         published.TABLE_1[str(r["body"])])
+        (
+            Cell(text=str(r["body"])),
+            tuple(int(r[k]) for k in ("N", *heads, "segments")),
+            published.TABLE_1[str(r["body"])],
+        )
         for r in counted
-    ]  # fmt: skip
+    ]
     sums = tuple(sum(int(r[k]) for r in counted) for k in heads)
     total = ("", *published.TOTALS, "")
     lines.append((Cell(text="total", kind="total"), ("", *sums, ""), total))
@@ -323,11 +343,14 @@ def table_1(experiment: Experiment) -> Table:
         caption="Parameters of the largest problem (the paper's Table 1).",
         columns=("", "N", *heads, "segments", "the paper"),
         rows=tuple(
-            (name, *(Cell(text=str(v), value=v or None) for v in ours),
-             Cell(text="equal" if ours == theirs else "different size"))
+            (
+                name,
+                *(Cell(text=str(v), value=v or None) for v in ours),
+                Cell(text="equal" if ours == theirs else "different size"),
+            )
             for name, ours, theirs in lines
         ),
-    )  # fmt: skip
+    )
 
 
 def timings(experiment: Experiment) -> Table:
@@ -347,14 +370,17 @@ def timings(experiment: Experiment) -> Table:
             ends = (ours.value, ours.high, ours.low)
             text = bracketed(*(published_time / t for t in ends))
             ratio = Cell(text=text, value=published_time / ours.value)
-        lines.append((
-            Cell(text=name, kind="total" if parts == PARTS else ""),
-            Cell(text=f"{published_time:.4g} s", value=published_time)
-            if published_time else Cell(),
-            Cell(text=seconds(way), value=way.value),
-            Cell(text=seconds(ours), value=ours.value),
-            ratio,
-        ))  # fmt: skip
+        lines.append(
+            (
+                Cell(text=name, kind="total" if parts == PARTS else ""),
+                Cell(text=f"{published_time:.4g} s", value=published_time)
+                if published_time
+                else Cell(),
+                Cell(text=seconds(way), value=way.value),
+                Cell(text=seconds(ours), value=ours.value),
+                ratio,
+            )
+        )
     return Table(
         caption=f"Section 5: times at Nr = {rows[0]['Nr']}, Nh = {rows[0]['Nh']}, "
         f"{steps} steps. Published: {published.MACHINE}; ours: {clean(machine)}. "
@@ -376,10 +402,16 @@ def csv_tables(experiment: Experiment) -> dict[str, pd.DataFrame]:
     for name, columns in KEYS.items():
         rows = [
             dict(zip(columns, key, strict=True))
-            | {"kind": "measured", "median": t.value, "low": t.low, "high": t.high,
-               "coverage": t.coverage, "samples": t.samples}
+            | {
+                "kind": "measured",
+                "median": t.value,
+                "low": t.low,
+                "high": t.high,
+                "coverage": t.coverage,
+                "samples": t.samples,
+            }
             for key, t in medians(experiment.tables[name], columns).items()
-        ]  # fmt: skip
+        ]
         if name == "figure5":
             rows += _fitted(experiment.tables[name])
         frames[name] = pd.DataFrame(rows)

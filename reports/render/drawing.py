@@ -242,17 +242,22 @@ def _line(look: Look) -> dict[str, Any]:
     """Convert the look of a line to arguments of matplotlib."""
     style: Any = "none" if look.dash is None else (0, look.dash) if look.dash else "-"
     return {
-        "color": look.colour, "linestyle": style, "linewidth": look.width,
+        "color": look.colour,
+        "linestyle": style,
+        "linewidth": look.width,
         "alpha": look.opacity if look.opacity < 1 else None,
-    }  # fmt: skip
+    }
 
 
 def look_of(look: Look) -> dict[str, Any]:
     """Convert the look of a line and its marks to arguments of matplotlib."""
     return {
-        **_line(look), "marker": look.marker or "none", "markersize": look.size,
-        "markerfacecolor": look.fill or look.colour, "markeredgewidth": look.edge,
-    }  # fmt: skip
+        **_line(look),
+        "marker": look.marker or "none",
+        "markersize": look.size,
+        "markerfacecolor": look.fill or look.colour,
+        "markeredgewidth": look.edge,
+    }
 
 
 def _mark(axes: Axes, mark: Mark, height: float) -> None:
@@ -261,9 +266,15 @@ def _mark(axes: Axes, mark: Mark, height: float) -> None:
             _series(axes, mark, height)
         case Area():
             axes.fill_between(
-                mark.x, mark.low, mark.high, step="post" if mark.step else None,
-                color=mark.colour, alpha=mark.opacity, linewidth=0, zorder=height,
-            )  # fmt: skip
+                mark.x,
+                mark.low,
+                mark.high,
+                step="post" if mark.step else None,
+                color=mark.colour,
+                alpha=mark.opacity,
+                linewidth=0,
+                zorder=height,
+            )
         case Segments():
             ends = np.reshape(mark.ends, (-1, 2, 2))
             lines = LineCollection(
@@ -274,38 +285,59 @@ def _mark(axes: Axes, mark: Mark, height: float) -> None:
 
 def _series(axes: Axes, series: Series, height: float) -> None:
     axes.plot(
-        series.x, series.y, drawstyle="steps-post" if series.step else "default",
-        markevery=(0.07, 0.19) if series.few else None, clip_on=series.clipped,
-        zorder=height, **look_of(series.look),
-    )  # fmt: skip
+        series.x,
+        series.y,
+        drawstyle="steps-post" if series.step else "default",
+        markevery=(0.07, 0.19) if series.few else None,
+        clip_on=series.clipped,
+        zorder=height,
+        **look_of(series.look),
+    )
     if (bars := series.intervals) is not None:
         middle = np.array(series.y if bars.along == "y" else series.x)
         down, up = middle - bars.low, np.array(bars.high) - middle
         ends = np.maximum([down, up], 0)
         x, y = (None, ends) if bars.along == "y" else (ends, None)
         axes.errorbar(
-            series.x, series.y, y, x, "none", color=series.look.colour, zorder=height,
+            series.x,
+            series.y,
+            y,
+            x,
+            "none",
+            color=series.look.colour,
+            zorder=height,
             capsize=bars.cap,
-            elinewidth=bars.width, capthick=bars.width, alpha=bars.opacity,
-        )  # fmt: skip
+            elinewidth=bars.width,
+            capthick=bars.width,
+            alpha=bars.opacity,
+        )
 
 
 def _text(axes: Axes, text: Text) -> None:
     """Annotate a point; matplotlib omits annotations of points beyond the axes."""
     x, y = ("axes fraction" if part else "data" for part in text.inside)
     axes.annotate(
-        text.text, text.place, xycoords=x if x == y else (x, y), xytext=text.offset,
-        textcoords="offset points", ha=text.align[0], va=text.align[1],
+        text.text,
+        text.place,
+        xycoords=x if x == y else (x, y),
+        xytext=text.offset,
+        textcoords="offset points",
+        ha=text.align[0],
+        va=text.align[1],
         fontsize=text.size,
-    )  # fmt: skip
+    )
 
 
 def _legend(where: Axes | Canvas | SubFigure, legend: Legend) -> None:
     keys = [Line2D([], [], **look_of(key.look)) for key in legend.keys]
     where.legend(
-        keys, [key.label for key in legend.keys], loc=_PLACES[legend.place],
-        ncols=legend.columns, title=legend.title or None, fontsize=legend.size,
-    )  # fmt: skip
+        keys,
+        [key.label for key in legend.keys],
+        loc=_PLACES[legend.place],
+        ncols=legend.columns,
+        title=legend.title or None,
+        fontsize=legend.size,
+    )
 
 
 def _bar(axes: Axes, bar: ColourBar) -> None:
@@ -333,8 +365,15 @@ def draw_fields(figure: FieldFigure) -> Canvas:
             _field_panel(axes, panel)
             drawn.append(axes)
             if panel.scale:
-                _field_bar(canvas, panel.scale, axes, orientation="horizontal",
-                           aspect=30, fraction=0.06, pad=0.02)  # fmt: skip
+                _field_bar(
+                    canvas,
+                    panel.scale,
+                    axes,
+                    orientation="horizontal",
+                    aspect=30,
+                    fraction=0.06,
+                    pad=0.02,
+                )
         if figure.scale:
             _field_bar(canvas, figure.scale, drawn, aspect=32, fraction=0.04, pad=0.015)
     return canvas
@@ -365,17 +404,25 @@ def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
             x, y = mark.points.T
             mesh = Triangulation(x, y, mark.triangles)
             axes.tripcolor(
-                mesh, mark.values, cmap=_colour_map(mark.scale), shading="gouraud",
-                norm=Normalize(mark.scale.low, mark.scale.high), rasterized=True,
+                mesh,
+                mark.values,
+                cmap=_colour_map(mark.scale),
+                shading="gouraud",
+                norm=Normalize(mark.scale.low, mark.scale.high),
+                rasterized=True,
                 zorder=height,
-            )  # fmt: skip
+            )
         case Raster():
             (x0, y0), (x1, y1) = mark.low, mark.high
             axes.imshow(
-                mark.values.T, cmap=_colour_map(mark.scale), origin="lower",
-                norm=Normalize(mark.scale.low, mark.scale.high), zorder=height,
-                extent=(x0, x1, y0, y1), interpolation="nearest",
-            )  # fmt: skip
+                mark.values.T,
+                cmap=_colour_map(mark.scale),
+                origin="lower",
+                norm=Normalize(mark.scale.low, mark.scale.high),
+                zorder=height,
+                extent=(x0, x1, y0, y1),
+                interpolation="nearest",
+            )
         case Faces():
             outline = np.isnan(mark.values)
             values = np.where(outline, mark.scale.low, mark.values)
@@ -385,47 +432,74 @@ def _field_mark(axes: Axes, mark: FieldMark, height: float) -> None:
             # edges in the colour of the tile close the gaps of antialiasing
             edges = np.where(outline[:, None], to_rgba("white", 0.35), fills)
             faces = PolyCollection(
-                list(mark.corners), facecolors=fills, edgecolors=edges,
-                linewidths=np.where(outline, _OUTLINE, _SEAM), rasterized=True,
+                list(mark.corners),
+                facecolors=fills,
+                edgecolors=edges,
+                linewidths=np.where(outline, _OUTLINE, _SEAM),
+                rasterized=True,
                 zorder=height,
-            )  # fmt: skip
+            )
             axes.add_collection(faces)
         case Polygons():
             fill = to_rgba(mark.fill, mark.opacity) if mark.fill != "none" else "none"
             polygons = PolyCollection(
-                list(mark.corners), facecolor=fill, edgecolor=mark.edge,
-                linewidth=mark.width, hatch=mark.hatch or None, zorder=height,
-            )  # fmt: skip
+                list(mark.corners),
+                facecolor=fill,
+                edgecolor=mark.edge,
+                linewidth=mark.width,
+                hatch=mark.hatch or None,
+                zorder=height,
+            )
             polygons.set_path_effects(_cased(_CASING, mark.cased))
             axes.add_collection(polygons)
         case Strokes():
             axes.add_collection(
                 LineCollection(
-                    list(mark.ends), color=mark.colour, linewidth=mark.width,
-                    alpha=mark.opacity, rasterized=mark.rasterised, zorder=height,
+                    list(mark.ends),
+                    color=mark.colour,
+                    linewidth=mark.width,
+                    alpha=mark.opacity,
+                    rasterized=mark.rasterised,
+                    zorder=height,
                 )
-            )  # fmt: skip
+            )
         case Path():
             axes.plot(*mark.points.T, zorder=height, **look_of(mark.look))
         case Vectors():
             axes.quiver(
-                *mark.feet.T, *mark.vectors.T, angles="xy", scale_units="xy", scale=1,
-                width=mark.width, color=mark.colour, zorder=height,
+                *mark.feet.T,
+                *mark.vectors.T,
+                angles="xy",
+                scale_units="xy",
+                scale=1,
+                width=mark.width,
+                color=mark.colour,
+                zorder=height,
                 path_effects=_cased(_CASING, mark.cased),
-            )  # fmt: skip
+            )
         case Arrow():
             arrow = {
-                "arrowstyle": mark.head, "color": mark.colour, "lw": mark.width,
-                "mutation_scale": mark.size, "shrinkA": mark.gap, "shrinkB": 0,
-            }  # fmt: skip
+                "arrowstyle": mark.head,
+                "color": mark.colour,
+                "lw": mark.width,
+                "mutation_scale": mark.size,
+                "shrinkA": mark.gap,
+                "shrinkB": 0,
+            }
             axes.annotate("", mark.end, mark.start, arrowprops=arrow, zorder=height)
         case Label():
             axes.annotate(
-                mark.text, mark.place, xytext=mark.offset, color=mark.colour,
-                textcoords="offset points", ha=mark.align[0], va=mark.align[1],
-                path_effects=_cased(_LETTER_CASING, mark.cased), zorder=height,
+                mark.text,
+                mark.place,
+                xytext=mark.offset,
+                color=mark.colour,
+                textcoords="offset points",
+                ha=mark.align[0],
+                va=mark.align[1],
+                path_effects=_cased(_LETTER_CASING, mark.cased),
+                zorder=height,
                 fontsize=mark.size,
-            )  # fmt: skip
+            )
 
 
 def _cased(width: float, cased: bool) -> list[patheffects.AbstractPathEffect]:

@@ -28,15 +28,21 @@ def rows_of(records: Sequence[Record]) -> Rows:
 def data(page: Page, plots: Sequence[list[Data]], rows: Rows) -> str:
     """Serialise solvers, tables, plots and filter keys; `details` are separate."""
     looks = [(name, look(i)) for i, name in enumerate(page.solvers)]
-    return script({
-        "solvers": [
-            {"names": [clean(s, 40), clean(s)], "colour": k.colour, "marker": k.marker}
-            for s, k in looks
-        ],
-        "tables": [table(t, rows) for s in page.sections for t in s.tables],
-        "plots": plots,
-        "runs": _keys(page.records),
-    })  # fmt: skip
+    return script(
+        {
+            "solvers": [
+                {
+                    "names": [clean(s, 40), clean(s)],
+                    "colour": k.colour,
+                    "marker": k.marker,
+                }
+                for s, k in looks
+            ],
+            "tables": [table(t, rows) for s in page.sections for t in s.tables],
+            "plots": plots,
+            "runs": _keys(page.records),
+        }
+    )
 
 
 def details(records: Sequence[Record]) -> str:

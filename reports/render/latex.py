@@ -9,17 +9,44 @@ from mortarbench.reports.document.layout import Cell, Statement, Table
 _NOT_IN_OT1 = "«»ÐðÞþ"
 
 _SPECIAL = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "$": r"\$", "&": r"\&",
-    "#": r"\#", "%": r"\%", "_": r"\_", "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "|": r"\textbar{}", '"': r"\symbol{34}", "'": r"\textquotesingle{}",
-    "`": r"\textasciigrave{}", "–": "--", "—": "---", "…": r"\ldots{}",
-    "≤": r"$\leq$", "≥": r"$\geq$", "×": r"$\times$", "·": r"$\cdot$",
-    "±": r"$\pm$", "≈": r"$\approx$", "∞": r"$\infty$", "√": r"$\surd$",
-    "½": r"$\frac12$", "µ": r"$\mu$", "λ": r"$\lambda$", "ν": r"$\nu$",
-    "°": r"$^\circ$", "∅": r"$\emptyset$", "✓": r"$\surd$", "−": r"$-$",
-    "⋆": r"$\star$", "\0": "{}",
-}  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "$": r"\$",
+    "&": r"\&",
+    "#": r"\#",
+    "%": r"\%",
+    "_": r"\_",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\symbol{34}",
+    "'": r"\textquotesingle{}",
+    "`": r"\textasciigrave{}",
+    "–": "--",
+    "—": "---",
+    "…": r"\ldots{}",
+    "≤": r"$\leq$",
+    "≥": r"$\geq$",
+    "×": r"$\times$",
+    "·": r"$\cdot$",
+    "±": r"$\pm$",
+    "≈": r"$\approx$",
+    "∞": r"$\infty$",
+    "√": r"$\surd$",
+    "½": r"$\frac12$",
+    "µ": r"$\mu$",
+    "λ": r"$\lambda$",
+    "ν": r"$\nu$",
+    "°": r"$^\circ$",
+    "∅": r"$\emptyset$",
+    "✓": r"$\surd$",
+    "−": r"$-$",
+    "⋆": r"$\star$",
+    "\0": "{}",
+}
 
 #: text that need not be escaped
 _PLAIN = re.compile(r"(?!\[)(?:[A-Za-z0-9 .,:;()/=+?!@\[\]]|-(?!-))*")
@@ -74,16 +101,31 @@ def _table(table: Table, label: str) -> str:
     end = r"    \bottomrule"
     if len(table.rows) > ROWS:
         lines = [
-            rf"\begin{{longtable}}{{{columns}}}", rf"{caption} \tabularnewline",
-            *head, r"  \endfirsthead", *head, r"  \endhead",
-            end, r"  \endfoot", *body, r"\end{longtable}", "",
-        ]  # fmt: skip
+            rf"\begin{{longtable}}{{{columns}}}",
+            rf"{caption} \tabularnewline",
+            *head,
+            r"  \endfirsthead",
+            *head,
+            r"  \endhead",
+            end,
+            r"  \endfoot",
+            *body,
+            r"\end{longtable}",
+            "",
+        ]
     else:
         lines = [
-            r"\begin{table}", r"  \centering", caption,
-            rf"  \begin{{tabular}}{{{columns}}}", *head, *body, end,
-            r"  \end{tabular}", r"\end{table}", "",
-        ]  # fmt: skip
+            r"\begin{table}",
+            r"  \centering",
+            caption,
+            rf"  \begin{{tabular}}{{{columns}}}",
+            *head,
+            *body,
+            end,
+            r"  \end{tabular}",
+            r"\end{table}",
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -115,8 +157,11 @@ def escaped(text: str) -> str:
     hyphens = re.sub("-(?=-)", "-\0", text)
     safe = "".join(
         _SPECIAL.get(c)
-        or (c if c.isascii() or ("¡" <= c <= "ÿ" and c not in _NOT_IN_OT1)
-            else f"U+{ord(c):04X}")
+        or (
+            c
+            if c.isascii() or ("¡" <= c <= "ÿ" and c not in _NOT_IN_OT1)
+            else f"U+{ord(c):04X}"
+        )
         for c in hyphens
-    )  # fmt: skip
+    )
     return f"{{}}{safe}" if safe.startswith(("[", "*")) else safe

@@ -35,10 +35,24 @@ Data = dict[str, Any]
 #: maximum number of points of a line; longer lines keep extremes of short stretches
 MOST = 4000
 _NAMED = {
-    "lambda": "λ", "sigma": "σ", "tau": "τ", "rho": "ρ", "mu": "µ", "nu": "ν",
-    "alpha": "α", "kappa": "κ", "Gamma": "Γ", "times": "×", "cdot": "·",
-    "leq": "≤", "geq": "≥", "infty": "∞", "pm": "±", "approx": "≈", "%": "%",
-}  # fmt: skip
+    "lambda": "λ",
+    "sigma": "σ",
+    "tau": "τ",
+    "rho": "ρ",
+    "mu": "µ",
+    "nu": "ν",
+    "alpha": "α",
+    "kappa": "κ",
+    "Gamma": "Γ",
+    "times": "×",
+    "cdot": "·",
+    "leq": "≤",
+    "geq": "≥",
+    "infty": "∞",
+    "pm": "±",
+    "approx": "≈",
+    "%": "%",
+}
 _RAISED = str.maketrans("0123456789-+/nkpP.", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁺ᐟⁿᵏᵖᴾ·")
 _LOWERED = str.maketrans("0123456789kij", "₀₁₂₃₄₅₆₇₈₉ₖᵢⱼ")
 
@@ -57,12 +71,14 @@ def panels(figure: Figure, solvers: Mapping[str, int]) -> list[Data]:
     for row in whole.rows:
         for panel in row.panels:
             own = panel.x.shared or f"\0{len(parts)}"  # a unique name: not shared
-            parts.append({
-                **_panel(panel, solvers),
-                "height": round(whole.height * row.height / sum(heights), 2),
-                "share": groups.setdefault(own, len(groups)),
-                "columns": whole.columns,
-            })  # fmt: skip
+            parts.append(
+                {
+                    **_panel(panel, solvers),
+                    "height": round(whole.height * row.height / sum(heights), 2),
+                    "share": groups.setdefault(own, len(groups)),
+                    "columns": whole.columns,
+                }
+            )
     parts[0]["common"] = common
     parts[0]["heading"] = plain(whole.title)
     return parts
@@ -162,9 +178,12 @@ def _intervals(series: Series) -> Iterator[Data]:
     ends = zip(*low, *high, strict=True)
     yield _segments(tuple(ends), series.look.colour, bars.width, series.runs)
     cap = Look(
-        colour=series.look.colour, marker="_" if vertical else "|", dash=None,
-        size=2 * bars.cap, opacity=bars.opacity,
-    )  # fmt: skip
+        colour=series.look.colour,
+        marker="_" if vertical else "|",
+        dash=None,
+        size=2 * bars.cap,
+        opacity=bars.opacity,
+    )
     for at in (low, high):
         yield _line(Series(x=at[0], y=at[1], look=cap, runs=series.runs))
 

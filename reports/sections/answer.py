@@ -403,9 +403,19 @@ def _own_claims(solver: str, a: Analysis) -> Iterator[str]:
 
 
 TEXT = Sentences(
-    __name__, CASES=CASES, ENDINGS=ENDINGS, FAILURES=FAILURES, name=_name, named=_named,
-    forms=_forms, next_behind=_next_behind, depends_on_case=_depends_on_case,
-    repeats=_repeats, roughly=_roughly, shared=_shared, reason=_reason,
+    __name__,
+    CASES=CASES,
+    ENDINGS=ENDINGS,
+    FAILURES=FAILURES,
+    name=_name,
+    named=_named,
+    forms=_forms,
+    next_behind=_next_behind,
+    depends_on_case=_depends_on_case,
+    repeats=_repeats,
+    roughly=_roughly,
+    shared=_shared,
+    reason=_reason,
     noun=lambda f: "problem" if _forms(f) else "case",
     has_ties=lambda f: any(len(front) > 1 for front in f.fronts().values()),
-)  # fmt: skip
+)

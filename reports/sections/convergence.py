@@ -19,10 +19,12 @@ TEXT = Sentences(__name__, FLOOR=FLOOR, RULE=RULE)
 
 
 @section(
-    54, "convergence", "Convergence",
+    54,
+    "convergence",
+    "Convergence",
     "Convergence: no solver stored a history of its iterations. Solvers with an "
     "option history store one if the suite sets it to true.",
-)  # fmt: skip
+)
 def convergence(a: Analysis) -> Iterator[Part]:
     """Draw the cases that `RULE` selects; empty where no solver stored a history."""
     pictures = []

@@ -42,10 +42,12 @@ PARTS: dict[str, Callable[[Record], float]] = {
 
 
 @section(
-    11, "crossover", "From which size on does dualisation pay?",
+    11,
+    "crossover",
+    "From which size on does dualisation pay?",
     "From which size on does dualisation pay?: no problems with growing = KEY and "
     "three or more sizes (see suites/crossover.toml).",
-)  # fmt: skip
+)
 def crossover(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw all routes of every series with fresh builds."""
     maps = crossover_maps(a.evidence)

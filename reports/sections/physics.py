@@ -38,9 +38,11 @@ TEXT = Sentences(__name__, PERCENTILE=PERCENTILE, SCALE=SCALE)
 
 
 @section(
-    58, "energies", "Agreement of energies",
+    58,
+    "energies",
+    "Agreement of energies",
     "Agreement of energies: no verified answer has an energy.",
-)  # fmt: skip
+)
 def agreement(a: Analysis) -> Iterator[Part]:
     """Compare the energies of verified answers; empty where no case has an energy."""
     found = spreads(a.evidence.flat)
@@ -89,9 +91,11 @@ def _solver_and_form(outcome: Outcome) -> str:
 
 
 @section(
-    80, "physics", "Physical results",
+    80,
+    "physics",
+    "Physical results",
     "Physical results: no verified answer has physical quantities.",
-)  # fmt: skip
+)
 def physics(a: Analysis) -> Iterator[Part]:
     """Show sizes and physical results, one verified answer per physical case."""
     answered = [o for o in a.evidence.flat if o.verified and o.quantities]
@@ -133,9 +137,11 @@ def _quantities(
 
 
 @section(
-    82, "deformed", "Deformed bodies",
+    82,
+    "deformed",
+    "Deformed bodies",
     "Deformed bodies: no verified answer has bodies to draw.",
-)  # fmt: skip
+)
 def deformed(a: Analysis) -> Iterator[Part]:
     """Draw the largest verified cases in the plane and in space, if there are any."""
     directory = a.evidence.directory
@@ -164,9 +170,11 @@ def deformed(a: Analysis) -> Iterator[Part]:
 
 
 @section(
-    84, "tractions", "Tractions along the contact",
+    84,
+    "tractions",
+    "Tractions along the contact",
     "Tractions along the contact: no verified answer has a contact side.",
-)  # fmt: skip
+)
 def tractions(a: Analysis) -> Iterator[Part]:
     """Draw the tractions of the largest case of each family and law."""
     laws = grouped(_drawable(a), lambda o: (o.first.family, o.first.params.get("law")))

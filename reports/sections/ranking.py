@@ -46,9 +46,14 @@ DRAWN = 4  #: groups whose profiles are drawn; all are tabulated
 #: multiples of the best time; columns of the table of profiles
 FACTORS = (1.0, 2.0, 5.0, 10.0)
 TEXT = Sentences(
-    __name__, CASES=CASES, EVERY=EVERY, LARGEST_SHIFT=LARGEST_SHIFT,
-    PENALTIES=PENALTIES, SHIFTS=SHIFTS, USUAL=USUAL,
-)  # fmt: skip
+    __name__,
+    CASES=CASES,
+    EVERY=EVERY,
+    LARGEST_SHIFT=LARGEST_SHIFT,
+    PENALTIES=PENALTIES,
+    SHIFTS=SHIFTS,
+    USUAL=USUAL,
+)
 
 
 def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
@@ -61,9 +66,11 @@ def not_compared(a: Analysis, *, reasons: bool = False) -> list[str]:
         return []
     if not reasons:
         return TEXT.parts("not_repeated", a.groups, lacking)
-    poolable = not a.pool_forms and len(a.pooled) < len(a.groups) and any(
-        group.comparable for group in a.pooled
-    )  # fmt: skip
+    poolable = (
+        not a.pool_forms
+        and len(a.pooled) < len(a.groups)
+        and any(group.comparable for group in a.pooled)
+    )
     return TEXT.parts("not_compared", a.groups, lacking, poolable)
 
 
@@ -174,9 +181,10 @@ def _panel_table(ranking: Ranking, ranked: Panel) -> Table:
         if np.isnan(one.ranks[i]):
             return Cell(title="not part of this comparison")
         return Cell.number(
-            float(one.ranks[i]), "{:.0f}".format,
+            float(one.ranks[i]),
+            "{:.0f}".format,
             kind="over" if one.turned[i].any() else "",
-        )  # fmt: skip
+        )
 
     def every(i: int) -> Cell:
         found = [int(one.ranks[i]) for one in ranked.every]

@@ -48,10 +48,12 @@ _SERIES = ("case", "solver", "tol")
 
 
 @section(
-    66, "ranks", "One solve on several ranks",
+    66,
+    "ranks",
+    "One solve on several ranks",
     "One solve on several ranks: no case was verified both on one rank and on "
     "several; set ranks = [1, 2] in the suite (see suites/ranks.toml).",
-)  # fmt: skip
+)
 def ranks(a: Analysis) -> Iterator[layout.Part]:
     """Tabulate and draw solves on several ranks."""
     strong, weak = strong_series(a.evidence), weak_series(a.evidence)
@@ -110,13 +112,19 @@ def _strong_table(solves: Sequence[Solve], phase: str) -> Table:
     return Table(
         caption=TEXT("strong_caption", phase),
         columns=(
-            *_SERIES, "ranks", "iterations", "time", "speed-up", "efficiency",
-            "copies", "of copies",
+            *_SERIES,
+            "ranks",
+            "iterations",
+            "time",
+            "speed-up",
+            "efficiency",
+            "copies",
+            "of copies",
         ),
         rows=tuple(row(*each) for each in solves),
         text_columns=2,
         notes=(TIMED,),
-    )  # fmt: skip
+    )
 
 
 def _weak_table(series: WeakSeries) -> Table:
@@ -214,13 +222,21 @@ def _model_tables(
         yield Table(
             caption=TEXT("model_caption"),
             columns=(
-                *_SERIES, "fitted to ranks", "W, s", "C, s", "s", "reductions, s",
-                "messages, s", "bytes, s", "misfit", "efficiency ≥ 1/2 up to N =",
+                *_SERIES,
+                "fitted to ranks",
+                "W, s",
+                "C, s",
+                "s",
+                "reductions, s",
+                "messages, s",
+                "bytes, s",
+                "misfit",
+                "efficiency ≥ 1/2 up to N =",
             ),
             rows=tuple(row(s, s.model) for s in modelled if s.model is not None),
             text_columns=2,
             notes=(TEXT("model_note"),),
-        )  # fmt: skip
+        )
 
     def prediction(n: int, s: StrongSeries) -> Cell:
         if s.model is None or n not in predicted(s):

@@ -36,10 +36,12 @@ TEXT = Sentences(__name__, PRACTICAL=PRACTICAL)
 
 
 @section(
-    60, "scaling", "Scaling",
+    60,
+    "scaling",
+    "Scaling",
     "Scaling: no cases differ in size only, with three or more sizes (see "
     "suites/scaling.toml).",
-)  # fmt: skip
+)
 def scaling(a: Analysis) -> Iterator[Part]:
     """Tabulate every series of sizes, and draw those with the most answers."""
     if a.sizes:
@@ -99,9 +101,11 @@ def _exponent(law: PowerLaw | None, runs: str) -> Cell:
 
 
 @section(
-    62, "growth", "Do iterations grow?",
+    62,
+    "growth",
+    "Do iterations grow?",
     "Do iterations grow?: the section needs cases of four or more sizes.",
-)  # fmt: skip
+)
 def growth(a: Analysis) -> Iterator[Part]:
     """Judge the growth of iterations in every series of at least four sizes."""
     tested = [series for series in a.sizes if len(series.sizes) >= SIZES]
@@ -178,10 +182,11 @@ def per_decade(fit: Growth) -> str:
 
 
 @section(
-    64, "steps", "Steps of each kind against size",
-    "Steps of each kind against size: no solver reports counts on three or more "
-    "sizes.",
-)  # fmt: skip
+    64,
+    "steps",
+    "Steps of each kind against size",
+    "Steps of each kind against size: no solver reports counts on three or more sizes.",
+)
 def steps(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw the counts of each solver, by kind, against n and H/h."""
     by_subdomain = sweeps(a.evidence, "feti")

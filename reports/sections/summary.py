@@ -27,9 +27,12 @@ _GROUPS: dict[str, tuple[Verdict, ...]] = {
     "declined": (Verdict.DECLINED,),
 }
 TEXT = Sentences(
-    __name__, ENDINGS=ENDINGS, FACTOR=VERIFIED_FACTOR, QUIET_LOAD=QUIET_LOAD,
+    __name__,
+    ENDINGS=ENDINGS,
+    FACTOR=VERIFIED_FACTOR,
+    QUIET_LOAD=QUIET_LOAD,
     SCHEMA=SCHEMA,
-)  # fmt: skip
+)
 
 
 @section(12, "summary", "Summary")

@@ -42,10 +42,12 @@ Key = tuple[str, float]  #: case, and the accuracy that answers are judged at
 
 
 @section(
-    46, "accuracy", "Time to accuracy",
+    46,
+    "accuracy",
+    "Time to accuracy",
     "Time to accuracy: requires the key accuracy in the suite, or answers with a "
     "certified error at three or more tolerances (see suites/accuracy.toml).",
-)  # fmt: skip
+)
 def accuracy(a: Analysis) -> Iterator[Part]:
     """Tabulate and draw every sweep: certified errors, or else the largest residual."""
     solvers = a.evidence.solvers
@@ -81,9 +83,11 @@ def _table(
             return _not_reached(swept[key].get(solver, ()))
         time, outcome = cheapest[key][solver]
         return Cell.time(
-            time, title=source(outcome), after=f"tol {tolerance(outcome.tol)}",
+            time,
+            title=source(outcome),
+            after=f"tol {tolerance(outcome.tol)}",
             kind="best" if time.value == best[key] else "",
-        )  # fmt: skip
+        )
 
     return Table.of(
         TEXT("swept_caption"),
@@ -183,11 +187,13 @@ def places(found: Mapping[str, TimeAtAccuracy]) -> dict[str, str]:
     fastest = min(known.values(), key=lambda t: t.value)
     best = "" if any(m.kind == "looser" for m in found.values()) else "best"
     return {
-        s: best if t.value == fastest.value
-        else "tied" if t.low <= fastest.high and t.samples > 1
+        s: best
+        if t.value == fastest.value
+        else "tied"
+        if t.low <= fastest.high and t.samples > 1
         else ""
         for s, t in known.items()
-    }  # fmt: skip
+    }
 
 
 def _matched(found: TimeAtAccuracy, tried: Sequence[Outcome], kind: str) -> Cell:

@@ -107,10 +107,12 @@ def _time(outcome: Outcome, row: Mapping[str, Outcome]) -> Cell:
 
 
 @section(
-    22, "ratios", "Ratios within blocks",
+    22,
+    "ratios",
+    "Ratios within blocks",
     "Ratios within blocks: every solver was measured only once. Paired times need "
     "repeats, for example repeats = 3 in the suite or --repeats 3.",
-)  # fmt: skip
+)
 def ratios(a: Analysis) -> Iterator[Part]:
     """Tabulate ratios to the fastest verified answer; empty without repeats."""
     if not any(len(o.records) > 1 for o in a.evidence.flat):
@@ -170,11 +172,13 @@ class _Twins(NamedTuple):
 
 
 @section(
-    24, "precision", "Precision of the times",
+    24,
+    "precision",
+    "Precision of the times",
     "Precision of the times: the records contain no times of the canary (a fixed "
     "computation before each measurement), and the suite does not measure a solver "
     "twice (null_arm).",
-)  # fmt: skip
+)
 def precision(a: Analysis) -> Iterator[Part]:
     """Tabulate null arms and canaries; empty where the records have neither."""
     if null := _null_ratios(a.evidence):

@@ -28,10 +28,12 @@ Meshes = Mapping[str, Discretisation]
 
 
 @section(
-    48, "worth", "How much accuracy is worth paying for",
+    48,
+    "worth",
+    "How much accuracy is worth paying for",
     "How much accuracy is worth paying for: the discretisation errors are unknown. "
     '"mortarbench validate DIR" computes them for later reports.',
-)  # fmt: skip
+)
 def value_of_accuracy(a: Analysis) -> Iterator[Part]:
     """Tabulate certified errors relative to discretisation errors, where known."""
     known = read_discretisation(a.evidence.directory)

@@ -61,9 +61,11 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
                     x=tuple(max(a["error"], _FLOOR) for a in mine),
                     y=tuple(_shift(known, a) - solvers.index(solver) for a in mine),
                     runs=tuple((a["run_id"],) for a in mine),
-                    look=look, solver=solver, clipped=False,
+                    look=look,
+                    solver=solver,
+                    clipped=False,
                 )
-            )  # fmt: skip
+            )
     rules, texts = [], []
     for at, text in (
         (tol, f"t = {tolerance(tol)}"),
@@ -71,14 +73,22 @@ def error_figure(answers: Sequence[Answer], tol: float) -> Figure | None:
     ):
         rules.append(Rule(axis="x", at=at, look=_LIMIT))
         texts.append(
-            Text(text=text, place=(at, 1), inside=(False, True), offset=(0, 3),
-                 align=("center", "bottom"))
-        )  # fmt: skip
+            Text(
+                text=text,
+                place=(at, 1),
+                inside=(False, True),
+                offset=(0, 3),
+                align=("center", "bottom"),
+            )
+        )
     panel = Panel(
         x=Axis(label="certified relative error in the energy norm", log=True),
         y=categories([legible(s) for s in solvers]),
-        marks=tuple(marks), rules=tuple(rules), texts=tuple(texts), grid="y",
-    )  # fmt: skip
+        marks=tuple(marks),
+        rules=tuple(rules),
+        texts=tuple(texts),
+        grid="y",
+    )
     return Figure(
         rows=(Row(panels=(panel,)),),
         height=1.3 + 0.24 * len(solvers),

@@ -112,13 +112,15 @@ class Clarabel:
                 return Solution.without_point(qp, status, str(r.status), **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), **form.multipliers(np.array(r.z) / scale),
-                iterations=r.iterations, message=str(r.status),
+                x=np.array(r.x),
+                **form.multipliers(np.array(r.z) / scale),
+                iterations=r.iterations,
+                message=str(r.status),
                 reported={
                     "linear_solver": solver.get_info().linsolver.name,
                     "solve_seconds": r.solve_time,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             solver.update(q=new.q * scale, b=to_cone(new).rhs)

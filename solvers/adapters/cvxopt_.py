@@ -73,9 +73,12 @@ class CVXOPT:
         ]
         q, h, b = map(cvxopt.matrix, (qp.q * scale, rhs[m:].copy(), rhs[:m].copy()))
         options = dict(
-            feastol=tol, reltol=tol, abstol=1e-300, maxiters=self.max_iter,
+            feastol=tol,
+            reltol=tol,
+            abstol=1e-300,
+            maxiters=self.max_iter,
             show_progress=False,
-        )  # fmt: skip
+        )
 
         def solve() -> Solution:
             P, G, A = blocks
@@ -88,10 +91,12 @@ class CVXOPT:
             failed = Status.ITERATION_LIMIT if done else Status.FAILED
             return Solution(
                 status=Status.SOLVED if r["status"] == "optimal" else failed,
-                x=np.ravel(r["x"]), **form.multipliers(v),
-                iterations=r["iterations"], message=r["status"],
+                x=np.ravel(r["x"]),
+                **form.multipliers(v),
+                iterations=r["iterations"],
+                message=r["status"],
                 reported={"linear_solver": "lapack" if is_dense else "cholmod"},
-            )  # fmt: skip
+            )
 
         return solve
 

@@ -35,7 +35,9 @@ CALLS: Mapping[str, Call] = {
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
         # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
         {"qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1},
-        size=1.0, tighter=1e-2, floor=1e-10,
+        size=1.0,
+        tighter=1e-2,
+        floor=1e-10,
     ),
     "OSQP": Call(
         ("eps_rel",),
@@ -48,16 +50,20 @@ CALLS: Mapping[str, Call] = {
     "QOCO": Call(("reltol", "reltol_inacc"), {"abstol": NEGLIGIBLE}),
     "QPALM": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
     "SCS": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
-}  # fmt: skip
+}
 
 SECOND_ORDER = ("CLARABEL", "QOCO", "SCS")  #: backends for discs and cones
 CONIC = "cvxpy passes it a QP as a cone program, which costs half of the digits"
 LINEAR = "takes linear programs only"
 DECLINED_BACKENDS: Mapping[str, str] = {
-    "CVXOPT": CONIC, "ECOS": CONIC, "ECOS_BB": CONIC,
-    "GLPK": LINEAR, "GLPK_MI": LINEAR, "SCIPY": LINEAR,
+    "CVXOPT": CONIC,
+    "ECOS": CONIC,
+    "ECOS_BB": CONIC,
+    "GLPK": LINEAR,
+    "GLPK_MI": LINEAR,
+    "SCIPY": LINEAR,
     "PROXQP": "cvxpy cannot enable its test of the duality gap; use proxqp",
-}  # fmt: skip
+}
 
 CLAIMS = {
     "optimal": Status.SOLVED,
@@ -191,6 +197,9 @@ def _solution(
         parts = dual if isinstance(dual, list) else [dual]
         v[place] = np.concatenate([np.ravel(part) for part in parts]) / scale
     return Solution(
-        status=status, x=np.ravel(x.value), **form.multipliers(v),
-        iterations=problem.solver_stats.num_iters, message=problem.status,
-    )  # fmt: skip
+        status=status,
+        x=np.ravel(x.value),
+        **form.multipliers(v),
+        iterations=problem.solver_stats.num_iters,
+        message=problem.status,
+    )

@@ -30,10 +30,16 @@ CLAIMS = {
     -4: Status.ITERATION_LIMIT,
 }  #: anything else is FAILED
 MESSAGES = {
-    1: "optimal", 2: "soft optimal", -1: "infeasible", -2: "cycling", -3: "unbounded",
-    -4: "iteration limit", -5: "nonconvex", -6: "overdetermined initial working set",
+    1: "optimal",
+    2: "soft optimal",
+    -1: "infeasible",
+    -2: "cycling",
+    -3: "unbounded",
+    -4: "iteration limit",
+    -5: "nonconvex",
+    -6: "overdetermined initial working set",
     -7: "time limit",
-}  # fmt: skip
+}
 INFINITE = 1e30  #: DAQP's value for an absent bound
 EQUALITY = 5  #: DAQP's flag of an equality
 TOL_FACTOR = 1e-3  #: tolerances of DAQP, relative to tol
@@ -108,16 +114,20 @@ class DAQP:
                 return Solution.without_point(qp, status, message)
             lam: Vector = np.array(info["lam"]) / scale
             return Solution(
-                status=status, x=np.array(x),
-                y=lam[n : n + m], z=lam[n + m :], z_box=lam[:n],
-                iterations=info["iterations"], message=message,
+                status=status,
+                x=np.array(x),
+                y=lam[n : n + m],
+                z=lam[n + m :],
+                z_box=lam[:n],
+                iterations=info["iterations"],
+                message=message,
                 counts={"outer": info["nodes"]},
                 reported={
                     "linear_solver": "dense ldl, updated",
                     "setup_seconds": setup_seconds,
                     "solve_seconds": info["solve_time"],
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             low, high = _sides(new)

@@ -121,9 +121,12 @@ class ECOS:
             if status is Status.SOLVED and not least <= CLAIM_FACTOR * tol:
                 status, message = Status.FAILED, "reduced accuracy"
             return replace(
-                best, status=status, iterations=iterations, message=message,
+                best,
+                status=status,
+                iterations=iterations,
+                message=message,
                 reported={"linear_solver": "ldl"},
-            )  # fmt: skip
+            )
 
         return solve
 
@@ -147,11 +150,14 @@ def _solve(
     )
     equal = csc(block_array([[form.rows[:m], csc_matrix((m, 1))]])) if m else None
     answer = ecos(
-        np.append(cost, 1.0), rows,
+        np.append(cost, 1.0),
+        rows,
         np.concatenate([rhs[m:], [1.0, -1.0], np.zeros(len(root))]),
         dict(l=form.inequalities, q=[*form.cones.tolist(), 2 + len(root)]),
-        equal, rhs[:m] if m else None, **options,
-    )  # fmt: skip
+        equal,
+        rhs[:m] if m else None,
+        **options,
+    )
     assert answer["x"].size == n + 1
     answer["y"] = answer["y"] if m else np.zeros(0)
     return answer

@@ -119,31 +119,39 @@ class HiGHS:
                 return Solution.without_point(qp, status, name, **ray)
             row = -np.array(point.row_dual) / scale
             z_box = -np.array(point.col_dual) / scale
-            steps = {
-                "qpasm": info.qp_iteration_count, "hipo": info.ipm_iteration_count
-            }  # fmt: skip
+            steps = {"qpasm": info.qp_iteration_count, "hipo": info.ipm_iteration_count}
             return Solution(
-                status=status, x=np.array(point.col_value),
-                y=row[:m], z=row[m : m + p], z_box=on_present_bounds(qp, z_box),
-                iterations=steps[self.method], message=name,
+                status=status,
+                x=np.array(point.col_value),
+                y=row[:m],
+                z=row[m : m + p],
+                z_box=on_present_bounds(qp, z_box),
+                iterations=steps[self.method],
+                message=name,
                 reported={
                     "linear_solver": "lu, dense reduced hessian"
-                    if self.method == "qpasm" else "hipo",
+                    if self.method == "qpasm"
+                    else "hipo",
                     "solve_seconds": solver.getRunTime(),
                 },
-            )  # fmt: skip
+            )
 
         return solve
 
     def _options(self, tol: float) -> dict[str, Any]:
         eps = max(tol / 100, MIN_TOLERANCE)
         return {
-            "output_flag": False, "threads": 1, "solver": self.method,
-            "kkt_tolerance": eps, "ipm_optimality_tolerance": eps,
-            "qp_regularization_value": 0.0, "small_matrix_value": MIN_ENTRY,
-            "qp_iteration_limit": self.max_iter, "ipm_iteration_limit": self.max_iter,
+            "output_flag": False,
+            "threads": 1,
+            "solver": self.method,
+            "kkt_tolerance": eps,
+            "ipm_optimality_tolerance": eps,
+            "qp_regularization_value": 0.0,
+            "small_matrix_value": MIN_ENTRY,
+            "qp_iteration_limit": self.max_iter,
+            "ipm_iteration_limit": self.max_iter,
             "qp_nullspace_limit": 2**31 - 1,
-        }  # fmt: skip
+        }
 
 
 def _model(highspy: Any, qp: QP, scale: float) -> Any:

@@ -90,10 +90,18 @@ class OSQP:
         scale = objective_factor(qp) if self.polishing else 1.0
         solver = osqp.OSQP(algebra="builtin")
         solver.setup(
-            csc(triu(csc(qp.P))) * scale, qp.q * scale, rows, low, high,
-            eps_abs=NEGLIGIBLE, eps_rel=tol, check_dualgap=True,
-            max_iter=self.max_iter, polishing=self.polishing, verbose=False,
-        )  # fmt: skip
+            csc(triu(csc(qp.P))) * scale,
+            qp.q * scale,
+            rows,
+            low,
+            high,
+            eps_abs=NEGLIGIBLE,
+            eps_rel=tol,
+            check_dualgap=True,
+            max_iter=self.max_iter,
+            polishing=self.polishing,
+            verbose=False,
+        )
 
         def solve() -> Solution:
             r = solver.solve(raise_error=False)
@@ -103,8 +111,11 @@ class OSQP:
                 ray = from_two_sided(qp, r.prim_inf_cert) if name == PRIMAL else {}
                 return Solution.without_point(qp, status, r.info.status, **ray)
             return Solution(
-                status=status, x=r.x, **from_two_sided(qp, r.y / scale),
-                iterations=r.info.iter, message=r.info.status,
+                status=status,
+                x=r.x,
+                **from_two_sided(qp, r.y / scale),
+                iterations=r.info.iter,
+                message=r.info.status,
                 counts={"rho_updates": r.info.rho_updates},
                 reported={
                     "linear_solver": "qdldl",
@@ -112,7 +123,7 @@ class OSQP:
                     "solve_seconds": r.info.solve_time,
                     "polish_seconds": r.info.polish_time,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             _, low, high = two_sided(new)

@@ -47,12 +47,14 @@ class PIQP:
     max_iter: int = 250
 
     about: ClassVar[About] = About(
-        title="PIQP", method="interior point (proximal)", licence="BSD-2-Clause",
+        title="PIQP",
+        method="interior point (proximal)",
+        licence="BSD-2-Clause",
         package="piqp",
         linear_solver="its own Cholesky (dense) or sparse LDLᵀ, once per iteration",
         phases="preparing equilibrates and analyses; solving does all factorisations",
         sequence="`update` of vectors keeps the analysis; it cannot start warm",
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_iter=self.max_iter)
@@ -94,8 +96,11 @@ class PIQP:
                 ray = multipliers if info.status.name == PRIMAL else {}
                 return Solution.without_point(qp, status, info.status.name, **ray)
             return Solution(
-                status=status, x=r.x, **multipliers,
-                iterations=info.iter, message=info.status.name,
+                status=status,
+                x=r.x,
+                **multipliers,
+                iterations=info.iter,
+                message=info.status.name,
                 counts={"factor_retries": info.factor_retires},
                 reported={
                     "linear_solver": s.kkt_solver.name,
@@ -103,7 +108,7 @@ class PIQP:
                     "solve_seconds": info.solve_time,
                     "factor_seconds": info.kkt_factor_time,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             c, h = new.q * scale, new.h

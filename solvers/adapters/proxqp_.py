@@ -131,14 +131,17 @@ class ProxQP:
                 return Solution.without_point(qp, status, r.info.status.name, **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), y=np.array(r.y), **form.multipliers(np.array(r.z)),
-                iterations=r.info.iter, message=r.info.status.name,
+                x=np.array(r.x),
+                y=np.array(r.y),
+                **form.multipliers(np.array(r.z)),
+                iterations=r.info.iter,
+                message=r.info.status.name,
                 counts={"iter_ext": r.info.iter_ext, "mu_updates": r.info.mu_updates},
                 reported={
                     "linear_solver": f"{backend} ldl, updated",
                     "solve_seconds": r.info.solve_time / 1e6,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             settings.initial_guess = proxqp.WARM_START_WITH_PREVIOUS_RESULT

@@ -80,13 +80,25 @@ class QOCO:
         k = rhs.size - m
         solver = qoco.QOCO()
         solver.setup(
-            qp.q.size, k, m, csc(qp.P) * scale, qp.q * scale,
-            csc(rows[:m]) if m else None, rhs[:m] if m else None,
-            csc(rows[m:]) if k else None, rhs[m:] if k else None,
-            form.inequalities, form.cones.size, form.cones.astype(np.int32),
-            abstol=NEGLIGIBLE, reltol=tol, abstol_inacc=NEGLIGIBLE,
-            reltol_inacc=tol, max_iters=self.max_iter, verbose=0,
-        )  # fmt: skip
+            qp.q.size,
+            k,
+            m,
+            csc(qp.P) * scale,
+            qp.q * scale,
+            csc(rows[:m]) if m else None,
+            rhs[:m] if m else None,
+            csc(rows[m:]) if k else None,
+            rhs[m:] if k else None,
+            form.inequalities,
+            form.cones.size,
+            form.cones.astype(np.int32),
+            abstol=NEGLIGIBLE,
+            reltol=tol,
+            abstol_inacc=NEGLIGIBLE,
+            reltol_inacc=tol,
+            max_iters=self.max_iter,
+            verbose=0,
+        )
 
         def solve() -> Solution:
             r = solver.solve()
@@ -96,15 +108,17 @@ class QOCO:
                 return Solution.without_point(qp, Status.FAILED, "diverged")
             return Solution(
                 status=status,
-                x=x, **form.multipliers(v),
-                iterations=r.iters, message=r.status,
+                x=x,
+                **form.multipliers(v),
+                iterations=r.iters,
+                message=r.status,
                 counts={"refinement_steps": r.ir_iters},
                 reported={
                     "linear_solver": "qdldl",
                     "setup_seconds": r.setup_time_sec,
                     "solve_seconds": r.solve_time_sec,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             rhs = to_cone(new).rhs

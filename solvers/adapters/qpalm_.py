@@ -99,15 +99,18 @@ class QPALM:
                 return Solution.without_point(qp, status, info.status, **ray)
             x, y = np.array(solver.solution.x), np.array(solver.solution.y)
             return Solution(
-                status=status, x=x, **from_two_sided(qp, y),
-                iterations=info.iter, message=info.status,
+                status=status,
+                x=x,
+                **from_two_sided(qp, y),
+                iterations=info.iter,
+                message=info.status,
                 counts={"outer": info.iter_out},
                 reported={
                     "linear_solver": "ladel",
                     "setup_seconds": info.setup_time,
                     "solve_seconds": info.solve_time,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             _, low, high = _rows(new)

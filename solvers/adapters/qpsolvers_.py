@@ -44,10 +44,14 @@ CALLS: Mapping[str, Call] = {
         ("primal_feasibility_tolerance", "dual_feasibility_tolerance"),
         # by default HiGHS adds 1e-7 to the Hessian and drops entries below 1e-9
         {
-            "qp_regularization_value": 0.0, "small_matrix_value": 1e-12, "threads": 1,
+            "qp_regularization_value": 0.0,
+            "small_matrix_value": 1e-12,
+            "threads": 1,
             "qp_iteration_limit": 1_000_000,  # without a limit it may cycle forever
         },
-        size=1.0, tighter=1e-2, floor=1e-10,
+        size=1.0,
+        tighter=1e-2,
+        floor=1e-10,
     ),
     "osqp": Call(
         ("eps_rel",),
@@ -69,7 +73,7 @@ CALLS: Mapping[str, Call] = {
     "qtqp": Call(("tol_feas", "tol_gap_abs", "tol_gap_rel")),
     "scs": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE, "max_iters": 1_000_000}),
     "sip": Call(("eps_rel",), {"eps_abs": NEGLIGIBLE}),
-}  # fmt: skip
+}
 
 #: backends that take dense matrices only
 DENSE_BACKENDS = ("hpipm", "jaxopt_osqp", "pyqpmad", "qpax", "qpoases", "quadprog")

@@ -98,10 +98,15 @@ class QTQP:
 
         def solve() -> Solution:
             r = solver.solve(
-                tol_feas=tol, tol_gap_abs=tol, tol_gap_rel=tol, linear_solver=kind,
-                max_iter=self.max_iter, collect_stats=True, verbose=False,
+                tol_feas=tol,
+                tol_gap_abs=tol,
+                tol_gap_rel=tol,
+                linear_solver=kind,
+                max_iter=self.max_iter,
+                collect_stats=True,
+                verbose=False,
                 warm_start=start,
-            )  # fmt: skip
+            )
             message = r.status.value
             status = CLAIMS.get(message, Status.FAILED)
             if status is Status.INFEASIBLE:
@@ -109,11 +114,13 @@ class QTQP:
                 return Solution.without_point(qp, status, message, **ray)
             return Solution(
                 status=status,
-                x=np.array(r.x), **form.multipliers(np.array(r.y) / scale),
-                iterations=len(r.stats) - 1, message=message,
+                x=np.array(r.x),
+                **form.multipliers(np.array(r.y) / scale),
+                iterations=len(r.stats) - 1,
+                message=message,
                 counts={"accepted_starts": int(solver.warm_accepted)} if start else {},
                 reported={"linear_solver": self.linear_solver},
-            )  # fmt: skip
+            )
 
         def start_at(s: Solution) -> None:
             nonlocal start

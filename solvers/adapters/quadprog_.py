@@ -84,11 +84,14 @@ class Quadprog:
                 status = Status.INFEASIBLE if infeasible else Status.FAILED
                 return Solution.without_point(qp, status, str(e))
             return Solution(
-                status=Status.SOLVED, x=x, **form.multipliers(v[: rhs.size] / scale),
-                iterations=int(iterations[0]), message="solved",
+                status=Status.SOLVED,
+                x=x,
+                **form.multipliers(v[: rhs.size] / scale),
+                iterations=int(iterations[0]),
+                message="solved",
                 counts={"dropped_rows": int(iterations[1])},
                 reported={"linear_solver": "dense cholesky, updated qr"},
-            )  # fmt: skip
+            )
 
         return solve
 

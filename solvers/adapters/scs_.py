@@ -84,9 +84,12 @@ class SCS:
             dict(P=csc(triu(csc(qp.P))), A=form.rows, b=form.rhs, c=qp.q.copy()),
             dict(z=form.equalities, l=form.inequalities, q=form.cones.tolist()),
             linear_solver=scs.LinearSolver(self.linear_solver),
-            eps_abs=NEGLIGIBLE, eps_rel=tol, eps_infeas=CERTIFICATE,
-            max_iters=self.max_iter, verbose=False,
-        )  # fmt: skip
+            eps_abs=NEGLIGIBLE,
+            eps_rel=tol,
+            eps_infeas=CERTIFICATE,
+            max_iters=self.max_iter,
+            verbose=False,
+        )
         starts: list[Solution] = []
 
         def solve() -> Solution:
@@ -100,8 +103,11 @@ class SCS:
                 ray = form.multipliers(r["y"]) if is_primal else {}
                 return Solution.without_point(qp, status, info["status"], **ray)
             return Solution(
-                status=status, x=r["x"], **form.multipliers(r["y"]),
-                iterations=info["iter"], message=info["status"],
+                status=status,
+                x=r["x"],
+                **form.multipliers(r["y"]),
+                iterations=info["iter"],
+                message=info["status"],
                 counts={
                     "scale_updates": info["scale_updates"],
                     "accelerated_steps": info["accepted_accel_steps"],
@@ -111,7 +117,7 @@ class SCS:
                     "setup_seconds": info["setup_time"] / 1000,
                     "solve_seconds": info["solve_time"] / 1000,
                 },
-            )  # fmt: skip
+            )
 
         def update(new: QP) -> None:
             solver.update(b=to_cone(new).rhs, c=new.q.copy())

@@ -46,11 +46,12 @@ class AcceleratedGradient:
     max_iter: int = 50_000
 
     about: ClassVar[About] = About(
-        title="Accelerated projected gradient (ours)", licence="BSD-3-Clause",
+        title="Accelerated projected gradient (ours)",
+        licence="BSD-3-Clause",
         method="Nesterov's method with restarts and an adaptive step",
         linear_solver="none (products with P)",
         phases="everything happens in solving",
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(shrink=self.shrink, max_iter=self.max_iter)
@@ -117,6 +118,11 @@ def _step(problem: Problem, options: AcceleratedGradient, s: _State) -> _State:
     if s.g_y @ (x - s.x) > 0:
         after, share = 1.0, 0.0
     return _State(
-        x, g, x + share * (x - s.x), g + share * (g - s.g), after,
-        options.shrink * L, most,
-    )  # fmt: skip
+        x,
+        g,
+        x + share * (x - s.x),
+        g + share * (g - s.g),
+        after,
+        options.shrink * L,
+        most,
+    )

@@ -45,12 +45,13 @@ class BVLS:
     max_iter: int = 10_000
 
     about: ClassVar[About] = About(
-        title="Bounded least squares (scipy)", licence="BSD-3-Clause",
+        title="Bounded least squares (scipy)",
+        licence="BSD-3-Clause",
         method="active set: `nnls` and `lsq_linear` on a Cholesky factor",
         linear_solver="LAPACK, within scipy",
         phases="preparing factorises P",
         limits=("`nnls` does not report its iterations",),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_iter=self.max_iter)
@@ -119,9 +120,14 @@ def _point(
         x[free] -= np.linalg.solve(P[np.ix_(free, free)], (P @ x + qp.q)[free])
     z_box = np.where(side == 0, 0.0, -(P @ x + qp.q))
     point = Solution(
-        status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0), z_box=z_box,
-        iterations=steps, message="converged",
-    )  # fmt: skip
+        status=Status.SOLVED,
+        x=x,
+        y=np.zeros(0),
+        z=np.zeros(0),
+        z_box=z_box,
+        iterations=steps,
+        message="converged",
+    )
     if kkt_residuals(qp, point).worst <= CLAIM_FACTOR * tol:
         return point
     message = "step limit, or no further progress in rounding"

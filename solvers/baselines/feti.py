@@ -78,7 +78,8 @@ class FETI:
     max_iter: int = 2000
 
     about: ClassVar[About] = About(
-        title="FETI (ours)", licence="BSD-3-Clause",
+        title="FETI (ours)",
+        licence="BSD-3-Clause",
         method="projected preconditioned conjugate gradients",
         linear_solver="products with P; a Cholesky factor of the coarse problem",
         phases="preparing factorises the coarse problem and sets up the preconditioner",
@@ -86,7 +87,7 @@ class FETI:
             "for linear problems only: bounds and inequality rows are declined",
             "stores two vectors per iteration",
         ),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_iter=self.max_iter)
@@ -245,9 +246,13 @@ def _solve(task: _Task, tol: float, max_iter: int) -> Solution:
 
 
 def _iterate(
-    task: _Task, at: _State, directions: _Directions, norms: list[float],
-    accuracy: float, max_iter: int,
-) -> tuple[_State, str]:  # fmt: skip
+    task: _Task,
+    at: _State,
+    directions: _Directions,
+    norms: list[float],
+    accuracy: float,
+    max_iter: int,
+) -> tuple[_State, str]:
     """Iterate until ‖w‖ ≤ accuracy·‖w₀‖; the text is the reason of an earlier end."""
     least, stalled = norms[-1], 0
     while norms[-1] > accuracy * norms[0]:
@@ -294,8 +299,13 @@ def _point(task: _Task, at: _State, norms: list[float]) -> Solution:
     n, m = task.qp.q.size, len(norms)
     task.counts["P_products"] += 1  # of the residuals that follow
     return Solution(
-        status=Status.SOLVED, x=at.x, y=at.y, z=np.zeros(0),
-        z_box=np.zeros(n), iterations=m - 1, message="converged",
+        status=Status.SOLVED,
+        x=at.x,
+        y=at.y,
+        z=np.zeros(0),
+        z_box=np.zeros(n),
+        iterations=m - 1,
+        message="converged",
         counts=dict(task.counts),
         history={"step": np.full(m, "c"), "free_gradient": np.array(norms)},
-    )  # fmt: skip
+    )

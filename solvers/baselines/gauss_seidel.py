@@ -52,12 +52,13 @@ class GaussSeidel:
     max_iter: int = 10_000  #: sweeps
 
     about: ClassVar[About] = About(
-        title="Projected Gauss–Seidel (ours)", licence="BSD-3-Clause",
+        title="Projected Gauss–Seidel (ours)",
+        licence="BSD-3-Clause",
         method="minimises over one disc, cone or variable after the other (NSGS)",
         linear_solver="none (columns of P)",
         phases="everything happens in solving",
         limits=("its loop over blocks is in Python: compare sweeps, not times",),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_iter=self.max_iter)

@@ -106,11 +106,15 @@ class Problem:
         """Return x with the multipliers L(v − Π(v))."""
         self.counts["P_products"] += 1  # for the residuals that follow
         return Solution(
-            status=Status.SOLVED, x=x, y=np.zeros(0), z=np.zeros(0),
-            z_box=most * (v - self.project(v)), iterations=self.counts["steps"],
+            status=Status.SOLVED,
+            x=x,
+            y=np.zeros(0),
+            z=np.zeros(0),
+            z_box=most * (v - self.project(v)),
+            iterations=self.counts["steps"],
             counts={k: count for k, count in self.counts.items() if k != "steps"},
             message="converged",
-        )  # fmt: skip
+        )
 
 
 def _unsolved(point: Solution, message: str) -> Solution:

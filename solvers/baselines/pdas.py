@@ -100,7 +100,8 @@ class PDAS:
     max_iter: int = 5_000
 
     about: ClassVar[About] = About(
-        title="PDAS (ours)", licence="BSD-3-Clause",
+        title="PDAS (ours)",
+        licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="Cholesky of the free block: LAPACK (dense), CHOLMOD (sparse)",
         phases="preparing assembles the penalised matrix; solving factorises faces",
@@ -111,7 +112,7 @@ class PDAS:
             "the symbolic analysis is repeated for every sparse face: 97 instead of 60 "
             "ms per factor at Nr = 30, Nh = 15",
         ),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_iter=self.max_iter)
@@ -169,8 +170,10 @@ class PDAS:
 def _start(qp: QP, carry: Carry | None) -> Carry:
     """Return the last active set and point if their sizes fit, else no contact."""
     if carry is not None and [v.size for v in carry.centre] == [
-        qp.q.size, qp.b.size, qp.h.size,
-    ]:  # fmt: skip
+        qp.q.size,
+        qp.b.size,
+        qp.h.size,
+    ]:
         side, centre = carry.active.side, carry.centre
         side = np.where((side < 0) & np.isinf(qp.lb), 0, side)
         side = np.where((side > 0) & np.isinf(qp.ub), 0, side)
@@ -233,6 +236,12 @@ def _point(problem: Problem, run: Run, centre: Point) -> Solution:
     counts["P_products"] += 1  # of the residuals that follow
     other_counts = {k: v for k, v in counts.items() if k != "solves"}
     return Solution(
-        status=Status.SOLVED, x=x, y=y, z=z, z_box=z_box,
-        iterations=counts["solves"], counts=other_counts, message="converged",
-    )  # fmt: skip
+        status=Status.SOLVED,
+        x=x,
+        y=y,
+        z=z,
+        z_box=z_box,
+        iterations=counts["solves"],
+        counts=other_counts,
+        message="converged",
+    )

@@ -46,17 +46,19 @@ class PDASAMG(PDAS):
     """
 
     about: ClassVar[About] = About(
-        title="PDAS with multigrid (ours)", licence="BSD-3-Clause",
+        title="PDAS with multigrid (ours)",
+        licence="BSD-3-Clause",
         method="primal-dual active set, in a proximal method of multipliers",
         linear_solver="conjugate gradients, smoothed aggregation of pyamg",
         phases="preparing assembles the penalised matrix; solving sets up multigrid",
-        sequence="active set and point", package="pyamg",
+        sequence="active set and point",
+        package="pyamg",
         limits=(
             "rotations are missing in the near-kernel: a QP has no coordinates",
             "rows that couple several nodes need more steps: 30 to 80 a solve on "
             "beam-ring, 9 to 22 on cube-wall",
         ),
-    )  # fmt: skip
+    )
 
     def declines(self, qp: QP) -> str | None:
         if (reason := needs_matrices(qp)) is not None:
@@ -109,8 +111,11 @@ def _multigrid(
         F = inside @ F @ inside + diags_array(np.where(free, 0.0, M.diagonal()))
         levels = pyamg.smoothed_aggregation_solver(
             csr_matrix(F) if d == 1 else bsr_array(F, blocksize=(d, d)),
-            B=kernel, symmetry="symmetric", max_coarse=COARSEST, coarse_solver="splu",
-        )  # fmt: skip
+            B=kernel,
+            symmetry="symmetric",
+            max_coarse=COARSEST,
+            coarse_solver="splu",
+        )
         precondition = levels.aspreconditioner()
 
         def step(_: object) -> None:

@@ -62,12 +62,13 @@ class ProjectedGradient:
     max_iter: int = 50_000
 
     about: ClassVar[About] = About(
-        title="Spectral projected gradient (ours)", licence="BSD-3-Clause",
+        title="Spectral projected gradient (ours)",
+        licence="BSD-3-Clause",
         method="projected gradient with Barzilai-Borwein steps",
         linear_solver="none (products with P)",
         phases="everything happens in solving",
         limits=("irregular: the load steps of the benchmark take 45 to 546 products",),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(memory=self.memory, max_iter=self.max_iter)
@@ -119,17 +120,23 @@ def _step(problem: Problem, memory: int, s: _State) -> _State | Solution:
         return Solution.without_point(problem.qp, Status.INFEASIBLE, message)
     problem.counts["shortened"] += t < 1
     return _State(
-        problem.project(s.x + t * d), s.g + t * w, alpha,
-        (*s.costs, cost)[-memory:], max(s.most, 1 / alpha),
-    )  # fmt: skip
+        problem.project(s.x + t * d),
+        s.g + t * w,
+        alpha,
+        (*s.costs, cost)[-memory:],
+        max(s.most, 1 / alpha),
+    )
 
 
 def _solve(problem: Problem, tol: float, options: ProjectedGradient) -> Solution:
     problem.counts["shortened"] = 0
     return problem.solved(
-        _start(problem), partial(_step, problem, options.memory),
-        lambda s, x, g: s._replace(x=x, g=g), tol, options.max_iter,
-    )  # fmt: skip
+        _start(problem),
+        partial(_step, problem, options.memory),
+        lambda s, x, g: s._replace(x=x, g=g),
+        tol,
+        options.max_iter,
+    )
 
 
 def _proves_unbounded(qp: QP, d: Vector) -> bool:

@@ -62,12 +62,17 @@ def equilibrate(qp: QP) -> ScaledQP:
     d, e, h = d + common, e - common, h - common
     D, E, H = (np.ldexp(1.0, k) for k in (d, e, h))
     scaled = QP(
-        P=_times(d, P, d), q=D * qp.q, A=_times(e, A, d), b=E * qp.b,
-        G=_times(h, G, d), h=H * qp.h, sets=(
+        P=_times(d, P, d),
+        q=D * qp.q,
+        A=_times(e, A, d),
+        b=E * qp.b,
+        G=_times(h, G, d),
+        h=H * qp.h,
+        sets=(
             Box(qp.lb / D, qp.ub / D),
             *(one.substituted(diags_array(D), 0 * D) for one in qp.sets[1:]),
         ),
-    )  # fmt: skip
+    )
     return ScaledQP(scaled, D, E, H)
 
 

@@ -141,9 +141,12 @@ class _Problem:
         z_box[self.upper] += at.z[p : p + self.upper.size]
         z_box[self.lower] -= at.z[p + self.upper.size :]
         return Solution(
-            status=Status.SOLVED, x=at.x, y=at.y[:m],
-            z=at.z[p - self.qp.h.size : p], z_box=z_box,
-        )  # fmt: skip
+            status=Status.SOLVED,
+            x=at.x,
+            y=at.y[:m],
+            z=at.z[p - self.qp.h.size : p],
+            z_box=z_box,
+        )
 
 
 @np.errstate(all="ignore")  # a divergent residual is not finite and ends the loop
@@ -178,9 +181,11 @@ def _problem(qp: QP, delta: float) -> _Problem:
     fixed, upper, lower = (
         np.flatnonzero(mask)
         for mask in (
-            is_fixed, np.isfinite(qp.ub) & ~is_fixed, np.isfinite(qp.lb) & ~is_fixed
+            is_fixed,
+            np.isfinite(qp.ub) & ~is_fixed,
+            np.isfinite(qp.lb) & ~is_fixed,
         )
-    )  # fmt: skip
+    )
     unit = eye_array(qp.q.size, format="csr")
     A: Matrix = csr_array(vstack([csr_array(qp.A), unit[fixed]]))
     if isinstance(qp.P, np.ndarray):
@@ -192,14 +197,20 @@ def _problem(qp: QP, delta: float) -> _Problem:
     )
     without_rows = None if discs else saddle(qp.P, _stacked(A, qp.G))
     return _Problem(
-        qp=qp, A=A, b=np.append(qp.b, lb[fixed]), G=csr_array(qp.G),
-        d=np.concatenate([
-            *(one.radius / 2 for one in discs), qp.h, qp.ub[upper], -qp.lb[lower]
-        ]),
-        fixed=fixed, upper=upper, lower=lower, discs=discs,
+        qp=qp,
+        A=A,
+        b=np.append(qp.b, lb[fixed]),
+        G=csr_array(qp.G),
+        d=np.concatenate(
+            [*(one.radius / 2 for one in discs), qp.h, qp.ub[upper], -qp.lb[lower]]
+        ),
+        fixed=fixed,
+        upper=upper,
+        lower=lower,
+        discs=discs,
         saddle=lambda rows: without_rows or saddle(qp.P, _stacked(A, rows)),
         delta=delta,
-    )  # fmt: skip
+    )
 
 
 def _stacked(A: Matrix, rows: Matrix) -> Matrix:

@@ -88,10 +88,14 @@ def reference_over_ranks(qp: QP, start: Solution | None = None) -> Solution:
 
 def _check_residual(qp: QP, task: _Task, point: _Point, faces: int) -> Solution:
     s = Solution(
-        status=Status.SOLVED, x=distributed(point.x, task.G.ranks), y=point.y,
-        z=np.zeros(0), z_box=distributed(point.z, task.G.ranks), iterations=faces,
+        status=Status.SOLVED,
+        x=distributed(point.x, task.G.ranks),
+        y=point.y,
+        z=np.zeros(0),
+        z_box=distributed(point.z, task.G.ranks),
+        iterations=faces,
         counts={"P_products": task.products},
-    )  # fmt: skip
+    )
     none = DistributedColumns(no_rows(point.x.size), task.G.ranks)
     worst = kkt_residuals(replace(qp, G=none), s).worst
     if not worst <= MAX_REFERENCE_RESIDUAL:
@@ -133,9 +137,14 @@ class _Task:
         M = qp.P.preconditioner("dirichlet", "stiffness")
         q, lower, upper = (np.asarray(v) for v in (qp.q, qp.lb, qp.ub))
         return cls(
-            lambda x: np.asarray(qp.P @ x), lambda x: np.asarray(M(x)), qp.A,
-            np.asarray(qp.b), q, lower, upper,
-        )  # fmt: skip
+            lambda x: np.asarray(qp.P @ x),
+            lambda x: np.asarray(M(x)),
+            qp.A,
+            np.asarray(qp.b),
+            q,
+            lower,
+            upper,
+        )
 
     def zero_point(self) -> _Point:
         zero = np.zeros(self.q.size)

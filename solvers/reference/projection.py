@@ -85,9 +85,12 @@ class _Problem:
         force = R * (t - w)
         y, z = np.split((force[:k] / self.size).astype(float), [self.qp.b.size])
         return Solution(
-            status=Status.SOLVED, x=w[k:].astype(float), y=y, z=z,
+            status=Status.SOLVED,
+            x=w[k:].astype(float),
+            y=y,
+            z=z,
             z_box=force[k:].astype(float),
-        )  # fmt: skip
+        )
 
 
 def refine(qp: QP, start: Solution) -> Solution:

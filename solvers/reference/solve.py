@@ -219,6 +219,9 @@ def _nonnegative(qp: QP) -> Solution:
             y[free] -= cho_solve(factor, (P @ y + gradient_at_lb)[free])
     gradient = P @ y + gradient_at_lb
     return Solution(
-        status=Status.SOLVED, x=qp.lb + np.maximum(y, 0), y=np.zeros(0), z=np.zeros(0),
+        status=Status.SOLVED,
+        x=qp.lb + np.maximum(y, 0),
+        y=np.zeros(0),
+        z=np.zeros(0),
         z_box=np.where(free, 0.0, -gradient),
-    )  # fmt: skip
+    )

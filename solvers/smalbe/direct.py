@@ -50,7 +50,8 @@ class Direct:
     max_solves: int = 10_000  #: limit of solves with factors of faces, in total
 
     about: ClassVar[About] = About(
-        title="SMALBE, direct (ours)", licence="BSD-3-Clause",
+        title="SMALBE, direct (ours)",
+        licence="BSD-3-Clause",
         method="augmented Lagrangian with an exact active-set method inside",
         linear_solver="dense Cholesky factor, updated as the active set changes",
         phases="preparing orthonormalises rows and factorises the free block",
@@ -59,7 +60,7 @@ class Direct:
             f"declines more than {MAX_UNKNOWNS} unknowns; with a sparse P, `smalbe` "
             "is faster from 100 to 200 unknowns on",
         ),
-    )  # fmt: skip
+    )
 
     def __post_init__(self) -> None:
         check_positive(max_solves=self.max_solves)
@@ -120,9 +121,13 @@ class _Task:
     def solution(self, x: Vector, y: Vector, z_box: Vector) -> Solution:
         """Return a point as a claim of success; the caller checks it."""
         return Solution(
-            status=Status.SOLVED, x=x, y=y, z=np.zeros(0), z_box=z_box,
+            status=Status.SOLVED,
+            x=x,
+            y=y,
+            z=np.zeros(0),
+            z_box=z_box,
             message="converged",
-        )  # fmt: skip
+        )
 
     def _fitted(self, a: Vector, x: Vector, g: Vector) -> Vector:
         """Return the a with the least ‖(g + Cᵀa)_F‖ on the free components F."""
@@ -189,9 +194,11 @@ def _claimed(
         if not kkt_residuals(task.qp, s).worst <= CLAIM_FACTOR * tol:
             status, message = Status.ITERATION_LIMIT, otherwise
     counts = {
-        "P_products": faces.products + checked, "outer": outer,
-        "solves": faces.solves, "set_changes": faces.joined + faces.left,
-    }  # fmt: skip
+        "P_products": faces.products + checked,
+        "outer": outer,
+        "solves": faces.solves,
+        "set_changes": faces.joined + faces.left,
+    }
     return replace(
         s, status=status, message=message, iterations=faces.solves, counts=counts
     )

@@ -39,8 +39,12 @@ from mortarbench.solvers.smalbe.scaled import Scaled
 from mortarbench.solvers.smalbe.spectrum import random_start
 
 STEPS = {
-    "c": "cg", "b": "beyond", "e": "expansion", "f": "fallback", "p": "proportioning",
-}  # fmt: skip
+    "c": "cg",
+    "b": "beyond",
+    "e": "expansion",
+    "f": "fallback",
+    "p": "proportioning",
+}
 #: "solved" is claimed if the KKT residuals are within this factor of the tolerance
 CLAIM_FACTOR = 5.0
 #: Factors by which the tolerance is tightened if a residual exceeds it, smaller than
@@ -296,9 +300,12 @@ class OuterLoop:
         """Continue the outer loop from `at` to a tolerance."""
         problem = self.problem
         nu, g, mu, M, rho, done, status = self.solver.solve(
-            self.options, tol, at, partial(infeasible, problem.rows, problem.hull),
+            self.options,
+            tol,
+            at,
+            partial(infeasible, problem.rows, problem.hull),
             self.watch,
-        )  # fmt: skip
+        )
         outer = (*at.outer, *[OuterIteration(*one) for one in done])
         return Iterate(nu, g, mu, M, rho, outer, status)
 
@@ -433,10 +440,16 @@ def _point(task: _Task, at: Iterate) -> tuple[Solution, Vector]:
         if letter in letters:
             counts[name] = letters.count(letter)
     point = Solution(
-        status=Status.SOLVED, x=x, y=problem.rows.multipliers(a), z=np.zeros(0),
-        z_box=z_box, iterations=len(letters), counts=counts, message="converged",
+        status=Status.SOLVED,
+        x=x,
+        y=problem.rows.multipliers(a),
+        z=np.zeros(0),
+        z_box=z_box,
+        iterations=len(letters),
+        counts=counts,
+        message="converged",
         history=task.history.columns if task.history else {},
-    )  # fmt: skip
+    )
     if task.scaled is not None:
         return task.scaled.recovered(point), Fx * task.scaled.root
     return point if task.eliminated is None else task.eliminated.recover(point), Fx
@@ -571,15 +584,20 @@ class History:
             error = np.linalg.norm(C @ x) if len(C) else 0.0
             free, phi, beta = parts(x, g)
             active = free == 0
-            self.rows.append((
-                letter, outer, problem.F.count,
-                np.linalg.norm(phi),
-                np.linalg.norm(beta),
-                error / (size or np.linalg.norm(x) or 1.0),
-                np.count_nonzero(active),
-                np.count_nonzero(between & active) if boxes else None,
-                0.5 * x @ (g - rhs), perf_counter() - self.began,
-            ))  # fmt: skip
+            self.rows.append(
+                (
+                    letter,
+                    outer,
+                    problem.F.count,
+                    np.linalg.norm(phi),
+                    np.linalg.norm(beta),
+                    error / (size or np.linalg.norm(x) or 1.0),
+                    np.count_nonzero(active),
+                    np.count_nonzero(between & active) if boxes else None,
+                    0.5 * x @ (g - rhs),
+                    perf_counter() - self.began,
+                )
+            )
 
         return note
 

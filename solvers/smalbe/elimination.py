@@ -114,9 +114,13 @@ def eliminate_free(qp: QP, previous: FreeBlock | None = None) -> Eliminated | No
     reduced = QP(
         P=solve.complement(P_EI, _block(qp.P, ~free, ~free), G_I),
         q=qp.q[~free] + P_EI.T @ x_0 + G_I.T @ y_0,
-        A=N[:, ~free], b=others.T @ Cx, G=no_rows(int((~free).sum())), h=np.zeros(0),
-        lb=qp.lb[~free], ub=qp.ub[~free],
-    )  # fmt: skip
+        A=N[:, ~free],
+        b=others.T @ Cx,
+        G=no_rows(int((~free).sum())),
+        h=np.zeros(0),
+        lb=qp.lb[~free],
+        ub=qp.ub[~free],
+    )
 
     def recover(s: Solution) -> Solution:
         top = -qp.q[free] - P_EI @ s.x

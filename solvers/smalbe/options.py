@@ -65,9 +65,13 @@ class Options:
 
     def __post_init__(self) -> None:
         check_positive(
-            M=self.M, eta=self.eta, Gamma=self.Gamma, alpha=self.alpha,
-            lanczos_steps=self.lanczos_steps, max_steps=self.max_steps,
-        )  # fmt: skip
+            M=self.M,
+            eta=self.eta,
+            Gamma=self.Gamma,
+            alpha=self.alpha,
+            lanczos_steps=self.lanczos_steps,
+            max_steps=self.max_steps,
+        )
         if not 0 < self.beta < 1:
             raise ValueError(f"beta = {self.beta}; expected a number between 0 and 1")
         for name, value in (("rho", self.rho), ("energy", self.energy)):
@@ -78,10 +82,12 @@ class Options:
         if not self.alpha <= 2:
             raise ValueError(f"alpha = {self.alpha}; expected at most 2")
         choices = {
-            "expansion": EXPANSIONS, "proportioning": PROPORTIONINGS,
-            "preconditioner": PRECONDITIONERS, "norm": get_args(Norm),
+            "expansion": EXPANSIONS,
+            "proportioning": PROPORTIONINGS,
+            "preconditioner": PRECONDITIONERS,
+            "norm": get_args(Norm),
             "eliminate": get_args(Eliminate),
-        }  # fmt: skip
+        }
         for name, known in choices.items():
             if (value := getattr(self, name)) not in known:
                 raise ValueError(f"{name} = {value!r}; expected {', '.join(known)}")

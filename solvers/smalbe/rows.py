@@ -391,9 +391,12 @@ def _independent_rows(G: SparseColumns, e: Vector, bounded: Mask) -> SparseRows:
         return y
 
     return replace(
-        rows, G=G, e_size=float(np.linalg.norm(e)), multipliers=multipliers,
+        rows,
+        G=G,
+        e_size=float(np.linalg.norm(e)),
+        multipliers=multipliers,
         consistent=_consistent((G @ rows.x_tilde - e) / size, rows.x_tilde, e / size),
-    )  # fmt: skip
+    )
 
 
 def _consistent(missed: Vector, x_tilde: Vector, e: Vector) -> bool:
@@ -429,12 +432,18 @@ def sparse_rows(G: Matrix, e: Vector, bounded: Mask) -> SparseRows | None:
         return None
     whole = WholeGram(unit, gram, factor, has_border, b, of_bounded)
     return SparseRows(
-        G=G, e_size=float(np.linalg.norm(e)), least_pivot=factor.least_pivot,
+        G=G,
+        e_size=float(np.linalg.norm(e)),
+        least_pivot=factor.least_pivot,
         C=_Factored(unit, whole, len(e)),
-        x_tilde=unit.T @ factor(e / size), consistent=True,
+        x_tilde=unit.T @ factor(e / size),
+        consistent=True,
         multipliers=lambda a: factor.backward(a) / size,
-        unit=unit, gram=whole, bounded=b, of_bounded=of_bounded,
-    )  # fmt: skip
+        unit=unit,
+        gram=whole,
+        bounded=b,
+        of_bounded=of_bounded,
+    )
 
 
 def rows_over_ranks(
@@ -475,11 +484,18 @@ def rows_over_ranks(
 
     own = LocalRows(by_components, ranks)
     return SparseRows(
-        G=G, C=_Factored(own, gram, len(e)), e_size=float(np.linalg.norm(e)),
-        least_pivot=factor.least_pivot, consistent=True, multipliers=multipliers,
-        x_tilde=own.T @ factor(at.additive((e / size)[rows])), unit=own, gram=gram,
-        bounded=b, of_bounded=part_of_bounded,
-    )  # fmt: skip
+        G=G,
+        C=_Factored(own, gram, len(e)),
+        e_size=float(np.linalg.norm(e)),
+        least_pivot=factor.least_pivot,
+        consistent=True,
+        multipliers=multipliers,
+        x_tilde=own.T @ factor(at.additive((e / size)[rows])),
+        unit=own,
+        gram=gram,
+        bounded=b,
+        of_bounded=part_of_bounded,
+    )
 
 
 def _gram(G: SparseColumns, columns: Mask | None = None) -> Matrix:

@@ -47,9 +47,15 @@ class Scaled:
         if (most := diagonal.max()) > MAX_UNSCALED * diagonal.min():
             P_scaled = csr_array((data, P.indices, P.indptr), shape=P.shape)
             scaled = QP(
-                P=P_scaled, q=qp.q * inverse, A=qp.A, b=qp.b, G=qp.G, h=qp.h,
-                lb=qp.lb * root, ub=qp.ub * root,
-            )  # fmt: skip
+                P=P_scaled,
+                q=qp.q * inverse,
+                A=qp.A,
+                b=qp.b,
+                G=qp.G,
+                h=qp.h,
+                lb=qp.lb * root,
+                ub=qp.ub * root,
+            )
         else:  # ‖P‖ ≤ ‖H‖ max D
             root, norm = one, float(norm * most)
         weights, has_weights = one, True

@@ -42,7 +42,8 @@ class SMALBE(Options):
     """
 
     about: ClassVar[About] = About(
-        title="SMALBE (ours)", licence="BSD-3-Clause",
+        title="SMALBE (ours)",
+        licence="BSD-3-Clause",
         method="augmented Lagrangian with an active-set method inside (MPRGP)",
         linear_solver="none (products with P, small dense systems of its model, "
         "incomplete factors of a sparse P)",
@@ -53,7 +54,7 @@ class SMALBE(Options):
             "of 2100 hostile random QPs (ill-conditioned, degenerate, with nearly "
             "parallel rows, tolerances to 1e-12) 1 ended as `iteration_limit`",
         ),
-    )  # fmt: skip
+    )
 
     accepts: ClassVar[tuple[type, ...]] = (Box, Discs)
     on_ranks: ClassVar[bool] = True  #: see `harness.processes.ranks`
@@ -98,24 +99,45 @@ class SMALBE(Options):
 #: constants and step rules of PERMON (docs/smalbe-options.md): MPRGP with the standard
 #: expansion and ᾱ = 2/‖H‖ from the power method, ρ = 1.1‖F‖, M = 100‖F‖
 PERMON = SMALBE(
-    expansion="std", proportioning="cg", preconditioner="none", rho=1.1, M=100.0,
-    reduced=False, alpha=2.0, norm="power", eliminate="never", energy=0.0,
+    expansion="std",
+    proportioning="cg",
+    preconditioner="none",
+    rho=1.1,
+    M=100.0,
+    reduced=False,
+    alpha=2.0,
+    norm="power",
+    eliminate="never",
+    energy=0.0,
     recycle=False,
-)  # fmt: skip
+)
 
 #: constants and step rules of ESPRESO: projected CG steps with a check of the cost,
 #: gradient projection as proportioning, all constants relative to ‖𝒫F𝒫‖
 ESPRESO = SMALBE(
-    expansion="mixed", proportioning="model", preconditioner="none", rho=1.0,
-    beta=0.8, eta=1.0, alpha=2.0, norm="power", eliminate="never", energy=0.0,
+    expansion="mixed",
+    proportioning="model",
+    preconditioner="none",
+    rho=1.0,
+    beta=0.8,
+    eta=1.0,
+    alpha=2.0,
+    norm="power",
+    eliminate="never",
+    energy=0.0,
     recycle=False,
-)  # fmt: skip
+)
 
 #: constants and step rules of the textbook (the paper's reference [3]): Γ = 1, reduced
 #: free gradient, fixed ᾱ
 PAPER = SMALBE(
-    expansion="std", proportioning="cg", preconditioner="none", rho=1.0,
-    eliminate="never", energy=0.0, recycle=False,
-)  # fmt: skip
+    expansion="std",
+    proportioning="cg",
+    preconditioner="none",
+    rho=1.0,
+    eliminate="never",
+    energy=0.0,
+    recycle=False,
+)
 
 CONDENSED = SMALBE(eliminate="always")

@@ -258,11 +258,13 @@ def _integrals(
         return total
 
     return Overlaps(
-        e[pairs], m[pairs], summed(weighted[..., 0]),
+        e[pairs],
+        m[pairs],
+        summed(weighted[..., 0]),
         summed(weighted @ N.transpose(0, 2, 1)),
         summed(weighted @ N_m.transpose(0, 2, 1)),
         summed((weighted @ g[..., None])[..., 0]),
-    )  # fmt: skip
+    )
 
 
 def _with_ones(triangles: Points) -> NDArray[np.float64]:

@@ -27,14 +27,20 @@ _LINEAR = "Mesh.ElementOrder = 1 in the .geo file, or gmsh -{} -order 1"
 _NAMING = 'Physical {}("NAME") in the .geo file'
 _WORDS = {
     2: Words(
-        "physical surface", "physical curve", "physical point",
-        _NAMING.format("Surface"), _LINEAR.format(2),
+        "physical surface",
+        "physical curve",
+        "physical point",
+        _NAMING.format("Surface"),
+        _LINEAR.format(2),
     ),
     3: Words(
-        "physical volume", "physical surface", "physical point or curve",
-        _NAMING.format("Volume"), _LINEAR.format(3),
+        "physical volume",
+        "physical surface",
+        "physical point or curve",
+        _NAMING.format("Volume"),
+        _LINEAR.format(3),
     ),
-}  # fmt: skip
+}
 _SAVED = "only physical groups: Mesh.SaveAll = 0"
 
 
@@ -68,13 +74,16 @@ def read_msh_sets(path: Path) -> FileMesh:
     is_all = mesh.field_data and any((tag == 0).any() for tag in tags)
     more = f"; or, if they are of no body, save {_SAVED}" if is_all else ""
     return FileMesh(
-        path=path, points=np.asarray(mesh.points, dtype=float), blocks=blocks,
-        cell_sets=cell_sets, node_sets={},
+        path=path,
+        points=np.asarray(mesh.points, dtype=float),
+        blocks=blocks,
+        cell_sets=cell_sets,
+        node_sets={},
         vocabulary={
             dim: words._replace(naming=words.naming + more)
             for dim, words in _WORDS.items()
         },
-    )  # fmt: skip
+    )
 
 
 def _read(path: Path) -> Any:

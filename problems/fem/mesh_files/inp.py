@@ -35,16 +35,30 @@ from mortarbench.problems.fem.mesh_files.named import (
 #: memory of the parser and members of all sets, as multiples of the size of the file
 _PARSER_FACTOR = 32
 _WORDS = Words(
-    body="element set", boundary="surface, element set or node set", point="node set",
+    body="element set",
+    boundary="surface, element set or node set",
+    point="node set",
     naming="*ELEMENT, ELSET=NAME or *ELSET, ELSET=NAME",
     linear="C3D4, C3D6, C3D8, or CPE3, CPE4 in the plane; choose linear (first order) "
     "elements in the program that wrote the file, in gmsh -order 1",
-)  # fmt: skip
+)
 #: dimension of element types, by the letters before their number of nodes
 _FAMILIES = {
-    "C3D": 3, "DC3D": 3, "CPE": 2, "CPS": 2, "CPEG": 2, "S": 2, "STRI": 2, "M": 2,
-    "M3D": 2, "SFM3D": 2, "R3D": 2, "T2D": 1, "T3D": 1, "R2D": 1,
-}  # fmt: skip
+    "C3D": 3,
+    "DC3D": 3,
+    "CPE": 2,
+    "CPS": 2,
+    "CPEG": 2,
+    "S": 2,
+    "STRI": 2,
+    "M": 2,
+    "M3D": 2,
+    "SFM3D": 2,
+    "R3D": 2,
+    "T2D": 1,
+    "T3D": 1,
+    "R2D": 1,
+}
 _TYPE = re.compile(r"([A-Z]+(?:[23]D)?)(\d+)[A-Z]*\d?")
 #: corners of the faces S1, S2, … of the cells of each kind, counted from 0
 _FACES: Mapping[str, Sequence[Sequence[int]]] = {
@@ -63,9 +77,15 @@ _REFUSED = {
     "INCLUDE": "other files are not opened; expected all data in this file",
     "PART": f"{_FLAT}: in Abaqus/CAE, Model, Edit Attributes, Do not use parts and "
     "assemblies in input files",
-    "INSTANCE": _FLAT, "SYSTEM": _FLAT, "NGEN": _FLAT, "NFILL": _FLAT, "NCOPY": _FLAT,
-    "NMAP": _FLAT, "ELGEN": _FLAT, "ELCOPY": _FLAT,
-}  # fmt: skip
+    "INSTANCE": _FLAT,
+    "SYSTEM": _FLAT,
+    "NGEN": _FLAT,
+    "NFILL": _FLAT,
+    "NCOPY": _FLAT,
+    "NMAP": _FLAT,
+    "ELGEN": _FLAT,
+    "ELCOPY": _FLAT,
+}
 
 
 class _Section(NamedTuple):
@@ -133,9 +153,10 @@ class _Sets:
                 is_range = "GENERATE" in section.params
                 self.extend(
                     name,
-                    self.generate(section) if is_range
+                    self.generate(section)
+                    if is_range
                     else self.resolve(section.fields, f"set {shortened(name)!r}"),
-                )  # fmt: skip
+                )
 
     def by_name(self) -> dict[str, Nodes]:
         """Return the sorted members of all sets by name."""
@@ -230,7 +251,8 @@ def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
     for (dim, name), rows_by_kind in chosen.items():
         cell_sets[dim][name] = [rows_by_kind.get(kind, _NONE) for kind in tables]
     return FileMesh(
-        path=path, points=points,
+        path=path,
+        points=points,
         blocks=[(kind, np.concatenate(parts)) for kind, parts in tables.items()],
         cell_sets=cell_sets,
         node_sets={
@@ -238,7 +260,7 @@ def _mesh(path: Path, sections: Sequence[_Section], limit: int) -> FileMesh:
             for name, members in node_sets.by_name().items()
         },
         vocabulary={2: _WORDS, 3: _WORDS},
-    )  # fmt: skip
+    )
 
 
 def _nodes(
@@ -298,9 +320,11 @@ def _elements(
         sets.extend(name, members)
     sizes = [n.size for n in numbers.values()]
     return _Elements(
-        cells=cells, number=number[order], kind=np.repeat(list(cells), sizes)[order],
+        cells=cells,
+        number=number[order],
+        kind=np.repeat(list(cells), sizes)[order],
         row=np.concatenate([np.arange(size) for size in sizes])[order],
-    ), sets  # fmt: skip
+    ), sets
 
 
 def _kind(name: str) -> str:

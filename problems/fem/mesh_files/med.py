@@ -29,18 +29,41 @@ from mortarbench.problems.fem.mesh_files.named import DIMENSION, FileMesh, Words
 
 _EXPECTED = "a .med file"
 _KINDS = {
-    "PO1": "vertex", "SE2": "line", "TR3": "triangle", "QU4": "quad", "TE4": "tetra",
-    "PE6": "wedge", "HE8": "hexahedron", "PY5": "pyramid", "SE3": "line3",
-    "TR6": "triangle6", "TR7": "triangle7", "QU8": "quad8", "QU9": "quad9",
-    "T10": "tetra10", "P15": "wedge15", "H20": "hexahedron20", "H27": "hexahedron27",
-}  # fmt: skip
+    "PO1": "vertex",
+    "SE2": "line",
+    "TR3": "triangle",
+    "QU4": "quad",
+    "TE4": "tetra",
+    "PE6": "wedge",
+    "HE8": "hexahedron",
+    "PY5": "pyramid",
+    "SE3": "line3",
+    "TR6": "triangle6",
+    "TR7": "triangle7",
+    "QU8": "quad8",
+    "QU9": "quad9",
+    "T10": "tetra10",
+    "P15": "wedge15",
+    "H20": "hexahedron20",
+    "H27": "hexahedron27",
+}
 _LINEAR = "in Salome, Modification, Convert to/from quadratic; in gmsh, -order 1"
 _WORDS = {
-    2: Words("group of faces", "group of edges", "group of nodes",
-             "a group of its faces", _LINEAR),
-    3: Words("group of volumes", "group of faces", "group of nodes or edges",
-             "a group of its volumes", _LINEAR),
-}  # fmt: skip
+    2: Words(
+        "group of faces",
+        "group of edges",
+        "group of nodes",
+        "a group of its faces",
+        _LINEAR,
+    ),
+    3: Words(
+        "group of volumes",
+        "group of faces",
+        "group of nodes or edges",
+        "a group of its volumes",
+        _LINEAR,
+    ),
+}
 #: memory of the tables made from an array, as a multiple of its size
 _PARSER_FACTOR = 8
 
@@ -105,14 +128,16 @@ def _mesh(path: Path, nodes: Mapping[str, Any]) -> FileMesh:
                 sets.setdefault(group, [none] * len(blocks))[k] = rows
     at = _families(nodes, f"{grid}/NOE/", coordinates.size // dim)
     return FileMesh(
-        path=path, points=coordinates.reshape(dim, -1).T, blocks=blocks,
+        path=path,
+        points=coordinates.reshape(dim, -1).T,
+        blocks=blocks,
         cell_sets=cell_sets,
         node_sets={
             group: np.flatnonzero(np.isin(at, ids))
             for group, ids in _groups(nodes, f"FAS/{name}/NOEUD/").items()
         },
         vocabulary=_WORDS,
-    )  # fmt: skip
+    )
 
 
 def _families(nodes: Mapping[str, Any], place: str, count: int) -> NDArray[np.int64]:

@@ -187,10 +187,11 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
         for name, nodes in node_sets.items()
     }
     facets = {
-        name: _directed(path, name, renumbered[file.cells(dim - 1, rows)], directed,
-                        words)
+        name: _directed(
+            path, name, renumbered[file.cells(dim - 1, rows)], directed, words
+        )
         for name, rows in file.cell_sets.get(dim - 1, {}).items()
-    }  # fmt: skip
+    }
     spots = {
         name: nodes
         for below in range(dim - 1)
@@ -199,12 +200,14 @@ def named_mesh(file: FileMesh, bodies: Collection[str] = ()) -> NamedMesh:
         if (nodes >= 0).all()
     }
     return NamedMesh(
-        points, cells, surfaces,
+        points,
+        cells,
+        surfaces,
         curves={name: at for name, at in covered.items() if len(at)} | facets,
         spots={name: nodes for name, nodes in node_sets.items() if nodes.size}
         | {name: np.unique(nodes) for name, nodes in spots.items()},
         words=words,
-    )  # fmt: skip
+    )
 
 
 def refine(mesh: NamedMesh) -> NamedMesh:
@@ -226,15 +229,20 @@ def refine(mesh: NamedMesh) -> NamedMesh:
     number = np.where(is_edge, n + np.cumsum(is_edge) - 1, ends[:, 0])
     m = number[middle].reshape(-1, 4).T
     centre = n + is_edge.sum() + np.cumsum(is_quad) - 1
-    points = np.concatenate([
-        mesh.points,
-        mesh.points[ends[is_edge]].mean(axis=1),
-        mesh.points[cells[is_quad]].mean(axis=1),
-    ])  # fmt: skip
-    children = np.stack([
-        np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
-        for k in range(4)
-    ], axis=-1)  # fmt: skip
+    points = np.concatenate(
+        [
+            mesh.points,
+            mesh.points[ends[is_edge]].mean(axis=1),
+            mesh.points[cells[is_quad]].mean(axis=1),
+        ]
+    )
+    children = np.stack(
+        [
+            np.stack([corners[k], m[k], np.where(is_quad, centre, m[k - 1]), m[k - 1]])
+            for k in range(4)
+        ],
+        axis=-1,
+    )
     # of the third corner, which a triangle repeats: one child cut off there, and the
     # triangle of the midpoints in place of the other
     children[:, ~is_quad, 2] = np.stack([corners[2], m[3], m[1], m[1]])[:, ~is_quad]
@@ -251,12 +259,13 @@ def refine(mesh: NamedMesh) -> NamedMesh:
         return np.asarray(renumbered[np.stack([a, at, at, b], axis=-1).reshape(-1, 2)])
 
     return NamedMesh(
-        points[used], renumbered[fine.reshape(-1, 4)],
+        points[used],
+        renumbered[fine.reshape(-1, 4)],
         {k: (4 * v[:, None] + np.arange(4)).ravel() for k, v in mesh.surfaces.items()},
         {name: cut(curve) for name, curve in mesh.curves.items()},
         {name: renumbered[spot] for name, spot in mesh.spots.items()},
         mesh.words,
-    )  # fmt: skip
+    )
 
 
 def _bodies(

@@ -99,9 +99,10 @@ def half_space_case(params: Mapping[str, Value], reference: Reference) -> Case:
     exact = PointContact(LOAD, RADIUS / 2, YOUNG / (2 * (1 - p["nu"] ** 2)))
     is_rough = p["law"] == "rough"
     cells = Cells(
-        p["n"], np.argwhere(np.ones((p["n"], p["n"]), dtype=bool)),
+        p["n"],
+        np.argwhere(np.ones((p["n"], p["n"]), dtype=bool)),
         ROUGH_SHARE if is_rough else CONTACT_SHARE,
-    )  # fmt: skip
+    )
     pressed = cells[cells.r < 1]
     if p["law"] == "mindlin":
         return _tangential_case(
@@ -125,9 +126,15 @@ def half_space_case(params: Mapping[str, Value], reference: Reference) -> Case:
 def _normal_qp(cells: Cells, gap: Vector) -> QP:
     n = gap.size
     return QP(
-        P=influence_operator(cells.places, cells.h), q=gap, A=no_rows(n), b=np.zeros(0),
-        G=no_rows(n), h=np.zeros(0), lb=np.zeros(n), ub=np.full(n, np.inf),
-    )  # fmt: skip
+        P=influence_operator(cells.places, cells.h),
+        q=gap,
+        A=no_rows(n),
+        b=np.zeros(0),
+        G=no_rows(n),
+        h=np.zeros(0),
+        lb=np.zeros(n),
+        ub=np.full(n, np.inf),
+    )
 
 
 def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -> Case:
@@ -168,16 +175,27 @@ def _normal_case(qp: QP, cells: Cells, exact: PointContact, *, is_rough: bool) -
         p = s.x * exact.P / area
         force = np.zeros((p.size, 3))
         force[:, 2] = p * area
-        return _surface(cells, exact, ContactSide(
-            name=SIDE, nodes=np.arange(p.size), length=np.full(p.size, area),
-            force=force, pressure=p, gap=-s.z_box * length,
-            exact=None if is_rough else _curves(exact),
-        ))  # fmt: skip
+        return _surface(
+            cells,
+            exact,
+            ContactSide(
+                name=SIDE,
+                nodes=np.arange(p.size),
+                length=np.full(p.size, area),
+                force=force,
+                pressure=p,
+                gap=-s.z_box * length,
+                exact=None if is_rough else _curves(exact),
+            ),
+        )
 
     return Case(
-        qp=qp, recover=lambda s: (qp.P @ s.x) * length, quantities=quantities,
-        fields=fields, scale=-exact.P * length,
-    )  # fmt: skip
+        qp=qp,
+        recover=lambda s: (qp.P @ s.x) * length,
+        quantities=quantities,
+        fields=fields,
+        scale=-exact.P * length,
+    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -197,19 +215,25 @@ def _coulomb(normal: Vector, exact: PointContact, p: Mapping[str, Any]) -> _Load
     sheared = ShearedPointContact(exact, p["mu"], p["nu"], p["Q"])
     unit = p["mu"] * exact.P
     return _Loading(
-        exact=exact, nu=p["nu"], normal=normal, bound=normal, unit=unit,
+        exact=exact,
+        nu=p["nu"],
+        normal=normal,
+        bound=normal,
+        unit=unit,
         delta=sheared.displacement * np.pi * sheared.G * exact.a / unit,
         sheared=sheared,
-    )  # fmt: skip
+    )
 
 
 def _tresca(cells: Cells, exact: PointContact, p: Mapping[str, Any]) -> _Loading:
     return _Loading(
-        exact=exact, nu=p["nu"], normal=_hertz_forces(cells, exact),
+        exact=exact,
+        nu=p["nu"],
+        normal=_hertz_forces(cells, exact),
         bound=np.full(len(cells.places), cells.h**2 / np.pi),
         delta=np.pi / 4 * (2 - p["nu"]) * p["Q"],
         unit=p["bound"] * np.pi * exact.a**2,
-    )  # fmt: skip
+    )
 
 
 def _hertz_forces(cells: Cells, exact: PointContact) -> Vector:
@@ -224,10 +248,14 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
     length, area = unit / (np.pi * G * exact.a), (cells.h * exact.a) ** 2
     P = influence_operator(cells.places, cells.h, loading.nu)
     qp = QP(
-        P=P, q=np.tile([-loading.delta, 0.0], k), A=no_rows(2 * k), b=np.zeros(0),
-        G=no_rows(2 * k), h=np.zeros(0),
+        P=P,
+        q=np.tile([-loading.delta, 0.0], k),
+        A=no_rows(2 * k),
+        b=np.zeros(0),
+        G=no_rows(2 * k),
+        h=np.zeros(0),
         sets=(Discs(np.arange(2 * k).reshape(k, 2), bound),),
-    )  # fmt: skip
+    )
 
     def slipping(s: Solution) -> NDArray[np.bool_]:
         shear = np.hypot(*s.x.reshape(k, 2).T)
@@ -272,18 +300,29 @@ def _tangential_case(cells: Cells, loading: _Loading) -> Case:
     def fields(s: Solution) -> Fields:
         force = np.empty((k, 3))
         force[:, :2], force[:, 2] = -unit * s.x.reshape(k, 2), exact.P * loading.normal
-        return _surface(cells, exact, ContactSide(
-            name=SIDE, nodes=np.arange(k), length=np.full(k, area), force=force,
-            pressure=force[:, 2] / area, gap=np.zeros(k),
-            shear=np.hypot(*force[:, :2].T) / area,
-            friction=np.where(slipping(s), "slip", "stick"),
-            exact=None if sheared is None else _curves(exact, sheared),
-        ))  # fmt: skip
+        return _surface(
+            cells,
+            exact,
+            ContactSide(
+                name=SIDE,
+                nodes=np.arange(k),
+                length=np.full(k, area),
+                force=force,
+                pressure=force[:, 2] / area,
+                gap=np.zeros(k),
+                shear=np.hypot(*force[:, :2].T) / area,
+                friction=np.where(slipping(s), "slip", "stick"),
+                exact=None if sheared is None else _curves(exact, sheared),
+            ),
+        )
 
     return Case(
-        qp=qp, recover=lambda s: (P @ s.x) * length, quantities=quantities,
-        fields=fields, scale=-unit * length,
-    )  # fmt: skip
+        qp=qp,
+        recover=lambda s: (P @ s.x) * length,
+        quantities=quantities,
+        fields=fields,
+        scale=-unit * length,
+    )
 
 
 def _curves(
@@ -304,10 +343,14 @@ def _surface(cells: Cells, exact: PointContact, side: ContactSide) -> Fields:
     points = np.zeros((k, 3))
     points[:, :2] = exact.a * cells.centres
     return Fields(
-        points=points, displacement=np.zeros((k, 3)),
-        cells=np.zeros((0, 4), dtype=np.int64), bodies=np.zeros(0, dtype=np.int64),
-        contact_nodes=side.nodes, contact_forces=side.force, contacts=(side,),
-    )  # fmt: skip
+        points=points,
+        displacement=np.zeros((k, 3)),
+        cells=np.zeros((0, 4), dtype=np.int64),
+        bodies=np.zeros(0, dtype=np.int64),
+        contact_nodes=side.nodes,
+        contact_forces=side.force,
+        contacts=(side,),
+    )
 
 
 def _distance(got: NDArray[np.float64], exact: NDArray[np.float64]) -> float:

@@ -73,9 +73,10 @@ def cell_integrals(m0: int, m1: int) -> CellIntegrals:
         return np.asarray(np.diff(np.diff(f, axis=0), axis=1))
 
     return CellIntegrals(
-        xx=over_corners(Y * log_sum(X, Y)), yy=over_corners(X * log_sum(Y, X)),
+        xx=over_corners(Y * log_sum(X, Y)),
+        yy=over_corners(X * log_sum(Y, X)),
         xy=over_corners(-r),
-    )  # fmt: skip
+    )
 
 
 class Influence:
@@ -226,9 +227,10 @@ def influence_operator(
 ) -> SerialisableOperator:
     """Return F on cells of a grid; see `Influence`."""
     arrays = {
-        "cells": cells.astype(np.int32), "h": np.array([h]),
+        "cells": cells.astype(np.int32),
+        "h": np.array([h]),
         "nu": np.array([] if nu is None else [nu]),
-    }  # fmt: skip
+    }
     n = cells.shape[0] * (1 if nu is None else 2)
     return SerialisableOperator(n, NAME, arrays, {NAME: influence_from_arrays})
 

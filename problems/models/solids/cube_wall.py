@@ -57,14 +57,20 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
 
     return ContactProblem(
         bodies=ElasticBodies(
-            shape=shape, names=("cube",), materials=(MATERIAL,), plane=None,
-            length=SIDE, force=FORCE, fixed=fixed, forces=forces,
+            shape=shape,
+            names=("cube",),
+            materials=(MATERIAL,),
+            plane=None,
+            length=SIDE,
+            force=FORCE,
+            fixed=fixed,
+            forces=forces,
             pairs=(ContactPair(shape.sides["right"], np.zeros((0, 4), dtype=int)),),
         ),
         stages=load_steps(1, 1, forces, fixed),
         linearise=lambda bodies, _: lambda u: wall_rows(bodies, np.zeros_like(u)),
         results=results,
-    )  # fmt: skip
+    )
 
 
 def wall_rows(bodies: UnassembledBodies | ContactSides, u: Vector) -> ContactRows:

@@ -81,8 +81,9 @@ MAX_RATIO = 1 / 8
 GROUND = RigidPlane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 #: names of the bodies by the key `against`
 NAMES: Mapping[str, tuple[str, ...]] = {
-    "plane": ("sphere",), "sphere": ("upper", "lower"),
-}  # fmt: skip
+    "plane": ("sphere",),
+    "sphere": ("upper", "lower"),
+}
 
 
 class _Block(NamedTuple):
@@ -190,8 +191,9 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
             values |= _shear_quantities(solution, sheared, copies)
         return {
             **values,
-            "approach": approach, "approach_error": approach / exact.approach - 1,
-        }  # fmt: skip
+            "approach": approach,
+            "approach_error": approach / exact.approach - 1,
+        }
 
     def linearise(
         bodies: UnassembledBodies | ContactSides, laws: Sequence[FrictionLaw]
@@ -205,11 +207,20 @@ def problem(params: Mapping[str, Value]) -> ContactProblem:
     )
     return ContactProblem(
         bodies=ElasticBodies(
-            shape=shape, names=names, materials=(material,) * len(names), plane=None,
-            length=p["R"], force=exact.P, fixed=held, forces=force, pairs=(pair,),
+            shape=shape,
+            names=names,
+            materials=(material,) * len(names),
+            plane=None,
+            length=p["R"],
+            force=exact.P,
+            fixed=held,
+            forces=force,
+            pairs=(pair,),
         ),
-        stages=stages, linearise=linearise, results=results,
-    )  # fmt: skip
+        stages=stages,
+        linearise=linearise,
+        results=results,
+    )
 
 
 def _exact(params: Mapping[str, Value]) -> PointContact:
@@ -232,10 +243,14 @@ def _programme(
     return (
         Stage(step=1, part=1.0, forces=pressing, fixed=np.append(held, upright)),
         Stage(
-            step=1, part=1.0, forces=both, fixed=held,
-            laws=(FrictionLaw("coulomb", mu=mu),), begin=restart_slip,
+            step=1,
+            part=1.0,
+            forces=both,
+            fixed=held,
+            laws=(FrictionLaw("coulomb", mu=mu),),
+            begin=restart_slip,
         ),
-    )  # fmt: skip
+    )
 
 
 def _block(a: float, R: float, n: int, up: int, copies: int) -> _Block:
@@ -263,9 +278,10 @@ def _near(block: _Block, half_width: float) -> Nodes:
 
 
 def _far_forces(
-    block: _Block, stress: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    block: _Block,
+    stress: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     axis: int,
-) -> Forces:  # fmt: skip
+) -> Forces:
     """Return the nodal forces of the rest of the half space that balance a point force.
 
     The point force on the block at the origin is 1 along z, away from the contact, or
@@ -301,9 +317,13 @@ def _joined_forces(forces: Sequence[Forces], first: Nodes) -> Forces:
 
 
 def _approach(
-    block: _Block, solution: ContactSolution, start: int, P: float,
-    material: Material, length: float,
-) -> float:  # fmt: skip
+    block: _Block,
+    solution: ContactSolution,
+    start: int,
+    P: float,
+    material: Material,
+    length: float,
+) -> float:
     """Return the approach of distant points of a body to z = 0, m.
 
     It is the mean over the side opposite the contact.
@@ -388,10 +408,13 @@ def _quantities(
         # the force on the master, on the slave if the master is rigid
         "contact_force": list(forces.values())[-1],
         "multiplier_sum": float(copies * s.z[: primal.h.size].sum() * bodies.force),
-        "contacts": {name: pair}, "force_error": float(on_slave[2] / exact.P - 1),
-        "contact_radius": float(a), "contact_radius_error": float(a / exact.a - 1),
-        "p_max": largest, "p_max_error": largest / exact.p0 - 1,
-    }  # fmt: skip
+        "contacts": {name: pair},
+        "force_error": float(on_slave[2] / exact.P - 1),
+        "contact_radius": float(a),
+        "contact_radius_error": float(a / exact.a - 1),
+        "p_max": largest,
+        "p_max_error": largest / exact.p0 - 1,
+    }
 
 
 def _shear_quantities(
@@ -414,7 +437,8 @@ def _shear_quantities(
     return {
         "tangential_force": float(total),
         "tangential_force_error": float(total / (exact.Q * limit) - 1),
-        "stick_radius": float(radius), "c_over_a": float(radius / a),
+        "stick_radius": float(radius),
+        "c_over_a": float(radius / a),
         "c_over_a_error": float(radius / exact.c - 1),
         "c_over_a_moment": float(max(1 - moment, 0.0) ** 0.2),
-    }  # fmt: skip
+    }
