@@ -42,7 +42,7 @@ MOTION_ROUNDING = 1e-10
 class Inverse(Protocol):
     """A symmetric K⁺, zero on prescribed components and the inverse of K on the others.
 
-    If the supports leave rigid motions R,  K K⁺ b = b  holds for Rᵀb = 0.
+    If the supports allow rigid motions R,  K K⁺ b = b  holds for Rᵀb = 0.
     """
 
     @property
@@ -315,9 +315,9 @@ class AdmissibleForces:
 class Exact(NamedTuple):
     """The data of the contact problem except K, in extended precision.
 
-    The rows are those of contact, then those of friction. With v = Bu − c, multipliers
-    are normal to the motion: λ ∈ Λ and σ(v) = λᵀv with the support function σ of Λ,
-    zero for v ≤ 0 on contact rows, and Σ gᵢ‖vᵢ‖ on friction vectors.
+    The rows are those of contact, then those of friction. At a solution, v = Bu − c is
+    normal to Λ at λ: λ ∈ Λ and λᵀv = σ(v). The support function σ of Λ is Σ gᵢ‖vᵢ‖,
+    summed over friction vectors, if v ≤ 0 on all contact rows, and infinite otherwise.
     """
 
     f: Extended  #: (n,)
@@ -363,7 +363,7 @@ class Exact(NamedTuple):
 
 
 class RigidMotions(NamedTuple):
-    """Rigid motions that the supports leave: felt by contact, or free.
+    """Rigid motions that the supports allow: felt by contact, or free.
 
     Columns are orthonormal in extended precision. K·felt is zero up to rounding, which
     matters if bodies move far; see `harness.verify.certificate`.
@@ -592,7 +592,7 @@ class Mechanics:
 
     @cached_property
     def kernel(self) -> Any:
-        """Rigid motions (n, r) that the supports leave, in extended precision."""
+        """Rigid motions (n, r) that the supports allow, in extended precision."""
         return _orthonormal(self.inverse.kernel)
 
     @cached_property

@@ -155,9 +155,9 @@ def _finds_the_planted_solution(shape: str, dense: bool, solver: Solver) -> None
 
 
 def _solves_over_sets(shape: str, solver: Solver) -> Result:
-    """Require the objective to 1e-8, and report the error in x.
+    """Require a relative accuracy of 1e-8 of the objective; report the error in x.
 
-    An error δ of x increases the objective by at least 0.05 δ², since the eigenvalues
+    An error δ in x increases the objective by at least 0.05 δ², since the eigenvalues
     of P exceed 0.1. The points of interior-point methods may therefore have errors of
     up to √(20·1e-8·|f|).
     """

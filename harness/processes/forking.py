@@ -42,7 +42,7 @@ class Fork:
 
     def __init__(self, pid: int, stdin: BinaryIO) -> None:
         self.pid = pid
-        # A number is reused once its process is collected; the descriptor is not.
+        # A number is reused once its process is reaped; the descriptor is not.
         self._process_fd = os.pidfd_open(pid)
         self.stdin = stdin  #: closing it, or the parent's death, kills the tree
 
@@ -56,7 +56,7 @@ class Fork:
 
         """
         deadline = None if timeout is None else time.monotonic() + timeout
-        with suppress(ChildProcessError):  # collected already, together with its tree
+        with suppress(ChildProcessError):  # reaped already, together with its tree
             while os.waitid(os.P_PIDFD, self._process_fd, _ENDED) is None:
                 if deadline is not None and time.monotonic() > deadline:
                     raise subprocess.TimeoutExpired("a fork", timeout or 0.0)

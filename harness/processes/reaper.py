@@ -215,7 +215,7 @@ def supervise(begin: Callable[[], None], cpu: int, pipes: tuple[int, int]) -> No
     status = ended.get(worker)
     creators = {worker, *ended, *_reap(), *descendants(reaper)}
     kill_descendants(reaper)
-    # In a container whose init collects nothing, zombies would fill the process table.
+    # In a container whose init reaps nothing, zombies would fill the process table.
     _reap()
     # Only segments whose creator has ended: a living process with its number is another
     # one, to which the segment may belong.

@@ -559,8 +559,8 @@ class WorkerProcess:
     def _is_dead(self) -> bool:
         """Return True if the sub-reaper has ended, or was not started.
 
-        A pidfd becomes readable at the end of its process, and stays so whoever
-        collects the process; waitpid(2) would fail after other code has done that.
+        A pidfd becomes readable when its process ends, and remains so whoever reaps the
+        process; waitpid(2) would fail after other code has reaped it.
         """
         if self._reaper_fd == -1:
             return True
@@ -649,7 +649,7 @@ def _describe_exit(process: int) -> tuple[str, int]:
     Raises
     ------
     ChildProcessError
-        If it was collected already, or is not a child of this process.
+        If it was reaped already, or is not a child of this process.
 
     """
     end = os.waitid(os.P_PIDFD, process, os.WEXITED | os.WNOWAIT)

@@ -143,8 +143,8 @@ def refuse_foreign(folder: Path) -> None:
     Raises
     ------
     InputError
-        If it contains a link, or files with names that runs use but was not written by
-        a run.
+        If it contains a link, or if no run has written it but it contains files with
+        names that runs use.
 
     """
     if folder.is_dir():

@@ -107,7 +107,7 @@ def _student(freedom: float, coverage: float = COVERAGE) -> float:
 def largest_half_width(times: Mapping[str, Mapping[Block, float]]) -> float | None:
     """Return the largest relative half-width of the ratios to the fastest solver.
 
-    Return None for fewer than two solvers, infinity if a ratio has no interval yet.
+    Return None for fewer than two solvers, and infinity if a ratio has no interval yet.
 
     times : seconds by solver and block
     """

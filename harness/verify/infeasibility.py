@@ -1,7 +1,7 @@
 """Certificates of infeasibility, by Farkas' lemma, without rounding.
 
-Multipliers y, z ≥ 0 of the rows Ax = b, Gx ≤ h with c = Aᵀy + Gᵀz prove that no x has
-lb ≤ x ≤ ub and satisfies them if
+Multipliers y and z ≥ 0 of the rows Ax = b and Gx ≤ h, with c = Aᵀy + Gᵀz, prove that
+no x satisfies both the rows and lb ≤ x ≤ ub if
 
     V = bᵀy + hᵀz − Σ min(cⱼlbⱼ, cⱼubⱼ) < 0,
 

@@ -213,10 +213,10 @@ class MPIReduction:
 def certify_over_ranks(
     local: LocalBodies, claimed: Vector, multipliers: Vector
 ) -> Certificate:
-    """Bound the error of an answer; called by all ranks, which get the same bound.
+    """Bound the error of an answer; all ranks call this and get the same bound.
 
-    The pairs tried are those of `harness.verify.certificate.certify`, without an
-    exchange of rows.
+    The pairs tried are those of `harness.verify.certificate.certify`, except the third,
+    which exchanges rows.
 
     Parameters
     ----------
@@ -336,7 +336,7 @@ def _at_rows(local: LocalBodies, at: NDArray[np.int64]) -> tuple[Exact, Vector]:
 
 @dataclass(frozen=True, eq=False)
 class _RigidMotions:
-    """Rigid motions that the supports leave, and the balance of the load along them.
+    """Rigid motions that the supports allow, and the balance of the load along them.
 
     Columns are orthonormal in extended precision, with the inner product over the
     components of all ranks. The K of subdomains is exactly zero along them.

@@ -69,7 +69,7 @@ class Split(Protocol):
     """Operations of the certificate with K = TᵀK_T T + E.
 
     Vectors of components (n,) have extended precision, and are zero on fixed
-    components. Columns of R are the rigid motions that the supports leave, first those
+    components. Columns of R are the rigid motions that the supports allow, first those
     that contact feels.
     """
 
@@ -364,7 +364,7 @@ class Sharing:
         Parameters
         ----------
         fixed : prescribed components
-        floating : (r, q) coefficients in R_T of the motions that the supports leave
+        floating : (r, q) coefficients in R_T of the motions that the supports allow
         reduction : completes sums over subdomains
 
         """

@@ -255,7 +255,7 @@ def factorise_clamped(bodies: Bodies) -> GeneralisedInverse:
 def factorise_supported(bodies: Bodies) -> GeneralisedInverse:
     """Factorise K without the prescribed components; bodies may float.
 
-    Further components are fixed where the supports leave rigid motions, see
+    Further components are fixed where the supports allow rigid motions, see
     `problems.fem.inverse.supported_inverse`.
     """
     free = np.setdiff1d(np.arange(bodies.mesh.dofs), bodies.B_D.indices)

@@ -1,6 +1,6 @@
 """Contact sides in the current configuration: facets, normals and nodal areas.
 
-In the plane facets are the segments of a chain of nodes, in space faces of cells.
+In the plane, facets are the segments of a chain of nodes; in space, faces of cells.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ MIN_RELATIVE_LENGTH = 1e-12
 class Surface:
     """Facets with the body on their left; segments of zero length are left out.
 
-    A segment with the unit tangent t has the outward normal (t_y, −t_x), a face that of
-    the plane through the midpoints of its edges. The normal of a node is the normalised
-    sum of the normals of its facets, in the plane one at an end of the chain and two
-    elsewhere (the averaged nodal normal of Popp, Gee and Wall 2009, without weights).
+    A segment with the unit tangent t has the outward normal (t_y, −t_x). The normal of
+    a face is that of the plane through the midpoints of its edges. The normal of a node
+    is the normalised sum of the normals of its facets (the averaged nodal normal of
+    Popp, Gee and Wall 2009, without weights). In the plane, a node at an end of the
+    chain has one facet, any other node has two.
     """
 
     x: Points  #: (v, dim) nodes, m

@@ -179,7 +179,7 @@ def _force_rows(problem: DecomposedProblem) -> Nodes:
 
 
 def floating_bodies(problem: DecomposedProblem) -> list[int]:
-    """Return the numbers of the bodies that supports leave a rigid motion."""
+    """Return the numbers of the bodies with a rigid motion that the supports allow."""
     layout, d = problem.layout, problem.components
     node, axis = np.divmod(problem.fixed, d)
     body = layout.body[layout.holder(node)]

@@ -57,7 +57,7 @@ def graph_partition(
     counts = np.bincount(body)
     if not counts.size <= parts <= max(counts.size, len(cells) // 2):
         raise InputError(
-            f"parts={parts} of {counts.size} bodies with {len(cells)} cells; expected "
+            f"parts={parts} for {counts.size} bodies with {len(cells)} cells; expected "
             f"{counts.size} to {len(cells) // 2}, or 0 for one piece per body"
         )
     label, first = np.empty(len(cells), dtype=np.int64), 0
@@ -133,13 +133,13 @@ def _partition_body(graph: csr_array, parts: int) -> Labels:
         if np.unique(label).size == parts:
             return label
     raise InputError(
-        f"METIS found no {parts} connected parts in a body of {label.size} cells; "
-        "expected fewer parts"
+        f"METIS found no partition of a body of {label.size} cells into {parts} "
+        "connected parts; expected fewer parts"
     )
 
 
 def _reconnect(graph: csr_array, label: Labels) -> Labels:
-    """Assign all but the largest piece of a part to the parts that they touch most."""
+    """Assign each piece of a part, except the largest, to the part it touches most."""
     cell, other = graph.nonzero()
     while True:
         same = label[cell] == label[other]

@@ -36,8 +36,8 @@ def string(n: int) -> Case:
 def journal_bearing(n: int, eccentricity: float) -> Case:
     """Return the problem of the pressure v ≥ 0 in a journal bearing, n² inner nodes.
 
-    v minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b), v = 0 at the
-    boundary. Node i + n·j is at the i-th ξ and the j-th height.
+    v minimises ∫ ½(1 + ε cos ξ)³|∇v|² − ε sin ξ v over (0, 2π) × (0, 2b), with v = 0
+    on the boundary. Node i + n·j is at the i-th ξ and the j-th height.
     """
     hx, hy = 2 * np.pi / (n + 1), 2 * HALF_WIDTH / (n + 1)
     xi = hx * np.arange(n + 2)
@@ -55,7 +55,7 @@ def journal_bearing(n: int, eccentricity: float) -> Case:
 def torsion(n: int, twist: float) -> Case:
     """Return the problem of the stress function v of a twisted bar, n² inner nodes.
 
-    v minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 at the boundary and |v|
+    v minimises ∫ ½|∇v|² − c v over the unit square, with v = 0 on the boundary and |v|
     bounded by the distance from the boundary; c is the twist per length. The bar is
     plastic where |v| is at its bound.
     """

@@ -1,11 +1,12 @@
 """SMALBE: semimonotonic augmented Lagrangians for bounds, discs and equalities.
 
 Minimises ½xᵀFx − dᵀx subject to Gx = e and l ≤ x ≤ u (Dostál 2009, the paper's
-reference [3], Chapter 6; equation (2) of the paper), and to ‖x_I‖ ≤ r on discs: then
-the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's reference [12]; Bouchala,
-Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps (mprgp.pxi).
+reference [3], Chapter 6; equation (2) of the paper), and to ‖x_I‖ ≤ r on discs. With
+discs, the inner loop is MPGP (Dostál and Pospíšil 2016, the paper's reference [12];
+Bouchala, Dostál, Kozubek, Pospíšil and Vodstrčil), by default with spectral steps
+(mprgp.pxi).
 
-1. C: orthonormal rows that span those of G; e is transformed with them.
+1. Compute orthonormal rows C with the same span as those of G; transform e likewise.
 2. Homogenise: x = x̃ + ν with x̃ = Cᵀe, so that Cν = 0 and l − x̃ ≤ ν ≤ u − x̃.
 3. Project with Q = CᵀC, 𝒫 = I − Q, and normalise by ‖𝒫F𝒫‖ (Lanczos):
    H = 𝒫F𝒫/‖𝒫F𝒫‖ + ρQ,   b = 𝒫(d − Fx̃)/‖𝒫F𝒫‖.

@@ -88,7 +88,7 @@ def test_bodies_in_parts_are_those_in_one_piece(glue):
 @pytest.mark.parametrize(
     ("form", "keys", "message"),
     [("primal", {"parts": 5}, "parts with form primal is not built"),
-     ("dual", {"parts": 1}, "parts=1 of 2 bodies"),
+     ("dual", {"parts": 1}, "parts=1 for 2 bodies"),
      ("dual", {"parts": 5, "glue": "tape"}, "glue='tape' is unknown")],
 )  # fmt: skip
 def test_impossible_parts_are_refused(form, keys, message):

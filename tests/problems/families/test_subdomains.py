@@ -117,7 +117,7 @@ def test_the_dual_of_an_obstacle_problem_has_supports_as_rows(name):
         ("bodies:press.toml/parts=8/primal", "parts with form primal is not built"),
         (
             "bodies:press.toml/parts=2/dual",
-            r"parts=2 of 3 bodies .* expected 3 to 1044",
+            r"parts=2 for 3 bodies .* expected 3 to 1044",
         ),
     ],
 )

@@ -62,7 +62,7 @@ def test_cells_that_hang_together_in_a_node_are_no_body():
 def test_too_few_and_too_many_parts_are_refused(parts):
     mesh, body = disc_and_block()
     with pytest.raises(
-        InputError, match=rf"parts={parts} of 2 bodies .* expected 2 to"
+        InputError, match=rf"parts={parts} for 2 bodies .* expected 2 to"
     ):
         graph_partition(mesh.points, mesh.cells, body, parts)
 
