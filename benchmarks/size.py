@@ -43,7 +43,8 @@ def one(form, Nr):
     inverse = factorise(bodies)
     lap()
     u = np.zeros(bodies.mesh.dofs)
-    rows = node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
+    slave, master, *_ = bodies.pairs[0]
+    rows = node_to_segment(bodies.mesh.points, u, slave, master)
     dual = transform(primal_qp(bodies, rows), inverse)
     lap()
     s = SMALBE().prepare(dual.qp, 1e-8)()

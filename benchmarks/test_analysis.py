@@ -46,7 +46,8 @@ def analysis(form, Nr=30, Nh=15, steps=10):
 
     def linearise(u):
         lap("recovery")
-        rows = node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
+        slave, master, *_ = bodies.pairs[0]
+        rows = node_to_segment(bodies.mesh.points, u, slave, master)
         lap("contact rows")
         return rows
 

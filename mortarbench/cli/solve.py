@@ -110,14 +110,24 @@ def _hint(answer: Answer) -> str:
         return ""
     import numpy as np
 
+    from mortarbench.harness import Box, Cones, Discs
     from mortarbench.harness.qp import no_rows
     from mortarbench.harness.registry import resolve
     from mortarbench.harness.verify.measure import reason_to_decline
 
     qp = case.family_case.qp
     n = qp.q.size
-    without_rows = replace(qp, G=no_rows(n), h=qp.h[:0])
-    like_dual = without_rows.with_bounds(0 * qp.q, 0 * qp.q + np.inf)
+    # multipliers of inequality rows have bounds, those of cones ‖w‖ ≤ t lie in discs
+    discs = [
+        Discs(one.index[:, 1:], np.ones(len(one.index)))
+        for one in qp.sets
+        if isinstance(one, Cones)
+    ]
+    lower = np.zeros(n)
+    for disc in discs:
+        lower[disc.index] = -np.inf
+    bounds = Box(lower, np.full(n, np.inf))
+    like_dual = replace(qp, G=no_rows(n), h=qp.h[:0], sets=(bounds, *discs))
     solver = resolve(answer.spec, case.registries.solvers)
     try:
         dual = assemble(case.id.family, case.params, "dual").name

@@ -100,7 +100,7 @@ class GmshBodies(ContactFamily):
 
         finer = super().refined(params)
         laws = [law.kind for law in laws_of(params)]
-        refuse_coulomb(self.name, laws, "halvings=0, 1 and 2")
+        refuse_coulomb(self.name, laws, "halvings=0, 1 and 2, or with finer mesh files")
         return finer
 
     def unrefined(self, params: Mapping[str, Value]) -> str:

@@ -10,7 +10,8 @@ aggregates. Rotations are not used: a QP has no coordinates.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.sparse import bsr_array, csr_array, csr_matrix, diags_array
 from scipy.sparse.linalg import cg
 
-from mortarbench.harness import QP, About, Matrix, Vector, needs_matrices
+from mortarbench.harness import QP, About, Matrix, Solution, Vector, needs_matrices
 from mortarbench.solvers.baselines.face import (
     Faces,
     Factorise,
@@ -26,7 +27,7 @@ from mortarbench.solvers.baselines.face import (
     Mask,
     Solve,
 )
-from mortarbench.solvers.baselines.pdas import PDAS
+from mortarbench.solvers.baselines.pdas import PDAS, Carry
 
 KERNEL_ROUNDING = 1e-8  #: |P t| of a translation t, relative to the row sums of |P|
 #: Residual of conjugate gradients relative to the tolerance. With 1e-3, the solves were
@@ -66,6 +67,18 @@ class PDASAMG(PDAS):
         if isinstance(qp.P, np.ndarray):
             return "P is dense; multigrid needs a sparse matrix"
         return None
+
+    def _set_up(
+        self, qp: QP, tol: float, carry: Carry | None
+    ) -> Callable[[], tuple[Solution, Carry | None]]:
+        run = super()._set_up(qp, tol, carry)
+
+        def reporting() -> tuple[Solution, Carry | None]:
+            solution, carried = run()
+            name = {"linear_solver": "smoothed aggregation (pyamg)"}
+            return replace(solution, reported={**solution.reported, **name}), carried
+
+        return reporting
 
     def faces(self, qp: QP, tol: float, counts: Counter[str]) -> Factorise:
         kernel, rtol = _near_kernel(qp.P), CG_SHARE * tol

@@ -840,9 +840,9 @@ def test_the_module_is_the_same_command_from_any_folder(tmp_path):
     )
 
     assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        "accuracy", "crossval", "demo", "discs", "finite-strain", "fixed-point",
-        "fleet", "friction", "large", "paper", "paper-accuracy", "paper-fleet", "path",
-        "ranks", "scaling", "scaling-feti", "smoke", "solids",
+        "accuracy", "crossover", "crossval", "demo", "discs", "fclib", "finite-strain",
+        "fixed-point", "fleet", "friction", "large", "paper", "paper-accuracy",
+        "paper-fleet", "path", "ranks", "scaling", "scaling-feti", "smoke", "solids",
     ]  # fmt: skip
 
 
@@ -900,6 +900,11 @@ def test_a_decline_names_the_dual_where_there_is_one(capsys, tmp_path, monkeypat
         "inequality rows\n"
     )
     assert "dualise" not in declined(f"{case}/primal", "feti")
+    sliding = "greco/n=2/dim=3"  # friction in space: cones, and discs in the dual
+    for solver, is_named in (("smalbe", True), ("osqp", False)):
+        message = declined(f"{sliding}/primal", solver)
+        assert "sets of the kind Cones" in message
+        assert (f"solve {sliding}/dual\n" in message) is is_named
 
 
 def test_the_dual_that_a_decline_names_is_solved(capsys):

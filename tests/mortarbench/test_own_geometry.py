@@ -81,7 +81,7 @@ def test_what_the_page_says_of_refusals_is_what_is_said(solved):
     code = "".join(
         path.read_text("utf-8")
         for folder in ("problems/fem", "problems/contact", "problems/models")
-        for path in (ROOT / folder).glob("*.py")
+        for path in (ROOT / folder).rglob("*.py")
     )
     for words in (
         "cells of type", "cells without a name", "share nodes", "closes on itself",

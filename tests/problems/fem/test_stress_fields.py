@@ -71,7 +71,8 @@ def test_von_mises_is_the_deviators_norm(plane):
 def test_fields_carry_the_stresses_of_the_dimensional_displacement():
     bodies = model(2, 2, 4, "strain")
     u = stretched(bodies)
-    rows = node_to_segment(bodies.mesh.points, u, *bodies.pairs[0])
+    slave, master, *_ = bodies.pairs[0]
+    rows = node_to_segment(bodies.mesh.points, u, slave, master)
     primal = primal_qp(bodies, rows)
     s = Solution(
         status=Status.SOLVED, x=u / bodies.length, y=0 * primal.b, z=0 * primal.h,
