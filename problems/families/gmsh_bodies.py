@@ -129,6 +129,7 @@ class GmshBodies(ContactFamily):
         from sksparse.cholmod import CholmodNotPositiveDefiniteError
 
         from mortarbench.problems.models.description import remarks
+        from mortarbench.problems.models.gmsh_bodies import overlap_remark
 
         path = str(params["path"])
         try:
@@ -138,4 +139,4 @@ class GmshBodies(ContactFamily):
                 f"{path}: the stiffness has no Cholesky factor in double precision; "
                 "expected smaller ratios of the sides of cells, and of the moduli E"
             ) from None
-        return replace(case, remarks=remarks(Path(path)))
+        return replace(case, remarks=(*remarks(Path(path)), *overlap_remark(params)))

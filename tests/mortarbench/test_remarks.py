@@ -74,6 +74,18 @@ def test_a_contact_that_never_closes_is_remarked_upon(tmp_path, form, solver):
     assert told.startswith("no node is in contact: the sides stay apart")
 
 
+@pytest.mark.parametrize(("overlap", "is_named"), [(0.01, False), (0.1, True)])
+def test_bodies_that_overlap_before_any_load_are_remarked_upon(
+    tmp_path, overlap, is_named
+):
+    """The side of each block is 2: an overlap of 0.1 is 5 % of it."""
+    case = mb.build(f"bodies:{stacked_blocks(tmp_path, gap=-overlap)}/dual")
+
+    assert len(case.remarks) == is_named
+    if is_named:
+        assert "a slave node lies 0.1 m inside its master" in case.remarks[0]
+
+
 @pytest.mark.parametrize(
     ("bound", "told"),
     [
