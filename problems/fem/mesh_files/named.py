@@ -31,7 +31,7 @@ _MIRRORED = {
 
 
 class Words(NamedTuple):
-    """What a file format calls named parts, for messages."""
+    """Terms of a file format for named parts, used in messages."""
 
     body: str = "body"
     boundary: str = "boundary"
