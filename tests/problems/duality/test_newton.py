@@ -632,7 +632,7 @@ def test_rotations_either_way_are_rotations(monkeypatch, sign):
     monkeypatch.setattr(newton, "null_space", turned)
     bodies = replace(bodies, B_D=rows)
     path = newton.NewtonPath(bodies=bodies, cells=None, gaps=None, reference=None)
-    with pytest.raises(InputError, match="supports leave body 'beam' to rotate"):
+    with pytest.raises(InputError, match="supports allow body 'beam' to rotate"):
         path.iterations(1)
 
 
@@ -728,7 +728,7 @@ def test_supports_that_leave_a_rotation_are_refused():
     one_node = np.unique(bodies.B_D.indices)[:2]
     rows = csr_array(eye_array(bodies.mesh.dofs, format="csr")[one_node])
 
-    with pytest.raises(InputError, match="supports leave body 'beam' to rotate"):
+    with pytest.raises(InputError, match="supports allow body 'beam' to rotate"):
         newton.free_translations(replace(bodies, B_D=rows))
 
 
