@@ -400,7 +400,7 @@ class NewtonPath:
     def _convex(
         self, at: Configuration, lam: Vector, curvature: Curvature | None
     ) -> tuple[csc_array, GeneralisedInverse, int]:
-        """Return a positive definite tangent, its factor and the count of clipped cells.
+        """Return a positive definite tangent, its factor and `Iteration.clipped`.
 
         If the tangent is indefinite, negative eigenvalues of the contact stiffness are
         removed first. If that does not suffice, those of the cell tangents follow.
